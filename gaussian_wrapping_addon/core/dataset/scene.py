@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What was photographed: undistorted views, sparse points, and the scene frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .camera import Camera
+from .similarity import Similarity
+
+
+@dataclass(frozen=True)
+class View:
+    """One photo that matches its pinhole camera pixel for pixel."""
+
+    camera: Camera
+    photo_path: Path
+    mask_path: Path | None = None
+    """Greyscale image of the same size; black pixels are ignored."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Views and sparse points in the scene frame.
+
+    The scene frame is Z-up (automatic up direction), has the mean of the camera centres at 0, and
+    is scaled so that 1.1 x the largest camera distance to 0 is ``tolerances.SCENE_RADIUS``.
+    ``world_from_scene`` leads back to the frame of the input, in float64.
+    """
+
+    views: tuple[View, ...]
+    points: np.ndarray
+    """(n, 3) float64 sparse points, scene frame; may be empty."""
+    point_colors: np.ndarray
+    """(n, 3) uint8."""
+    world_from_scene: Similarity
+    warnings: tuple[str, ...] = ()
+    """Findings a person should read, one sentence each."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """What was read (kind of input, counts), for the report."""
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Cameras of all views, in order."""
+        return [view.camera for view in self.views]

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Typed errors: every one says what is wrong, where, and what to do next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+EXIT_DONE = 0
+EXIT_OTHER = 1
+EXIT_USAGE = 2
+EXIT_BAD_DATA = 3
+EXIT_RESOURCES = 4
+EXIT_CANCELLED = 5
+
+
+class WrapError(Exception):
+    """Base of every error that a user is shown.
+
+    Parameters
+    ----------
+    message : str
+        One sentence: what is wrong and where.
+    hint : str
+        The next step a person can take.
+    """
+
+    exit_code = EXIT_OTHER
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return f"{self.message} {self.hint}".strip()
+
+
+class UsageError(WrapError):
+    """A command line, setting or job file that asks for something impossible."""
+
+    exit_code = EXIT_USAGE
+
+
+class DatasetError(WrapError):
+    """The photos or camera poses cannot be used as they are."""
+
+    exit_code = EXIT_BAD_DATA
+
+
+class ParseError(DatasetError):
+    """A file does not hold what its format promises.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    place : str
+        Where in it, such as ``"byte 120"``, ``"line 7"`` or ``"frames[3].file_path"``.
+    """
+
+    def __init__(self, path: str | Path, place: str, message: str, hint: str = "") -> None:
+        super().__init__(f"{Path(path).name}, {place}: {message}", hint)
+        self.path = Path(path)
+        self.place = place
+
+
+class ResourceError(WrapError):
+    """Not enough memory, disk or time, or a limit of ``limits.py`` was reached."""
+
+    exit_code = EXIT_RESOURCES
+
+
+class Cancelled(WrapError):  # noqa: N818 - a request that was obeyed, not an error
+    """The user asked to stop."""
+
+    exit_code = EXIT_CANCELLED
+
+    def __init__(self, message: str = "Cancelled.", hint: str = "") -> None:
+        super().__init__(message, hint)
+
+
+class WorkerError(WrapError):
+    """A worker or helper process failed; the message carries its last words."""
+
+
+class MeshingError(WrapError):
+    """The field holds no surface in the region, or a mesh cannot be made of it."""
+
+    exit_code = EXIT_BAD_DATA

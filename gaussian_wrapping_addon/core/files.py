@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bounded, atomic file access: JSON in and out, names that stay inside a folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import uuid
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from . import limits
+from .errors import ParseError
+
+_RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{d}{i}" for d in ("COM", "LPT") for i in range(1, 10))}
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Write JSON so that a reader sees the old file or the new one, never a half."""
+    write_bytes(path, json.dumps(values, indent=1, allow_nan=False).encode())
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write bytes atomically beside the target, then replace it."""
+    partial = path.with_name(f"{path.name}.writing.{uuid.uuid4().hex[:8]}")
+    try:
+        with partial.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON with bounds on size and depth; NaN and infinities are refused.
+
+    Raises
+    ------
+    ParseError
+        Names the line, or says which bound was passed.
+    """
+    size_bytes = path.stat().st_size
+    if size_bytes > limits.MAX_JSON_BYTES:
+        raise ParseError(path, "whole file", f"{size_bytes} bytes are too many.", "Split it.")
+
+    def refuse(name: str) -> Any:
+        raise ValueError(f"{name} is not a number")
+
+    try:
+        values = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=refuse)
+    except json.JSONDecodeError as error:
+        raise ParseError(
+            path, f"line {error.lineno}", f"not JSON: {error.msg}.", "Export the file again."
+        ) from None
+    except UnicodeDecodeError as error:
+        raise ParseError(
+            path, f"byte {error.start}", "not UTF-8 text.", "Save it as UTF-8."
+        ) from None
+    except (ValueError, RecursionError) as error:
+        raise ParseError(path, "whole file", f"{error}.", "Export the file again.") from None
+    _check_depth(path, values, 0)
+    return values
+
+
+def _check_depth(path: Path, values: Any, depth: int) -> None:
+    if depth > limits.MAX_JSON_DEPTH:
+        raise ParseError(path, "whole file", "nested too deeply.", "Export the file again.")
+    children = values.values() if isinstance(values, dict) else values
+    if isinstance(values, (dict, list)):
+        for child in children:
+            _check_depth(path, child, depth + 1)
+
+
+def resolve_inside(root: Path, name: str) -> Path | None:
+    """Return the path of ``name`` under ``root``, or ``None`` when the name is not safe.
+
+    Refused: absolute names, drives, UNC, ``..``, NUL, reserved Windows names, and links that
+    lead out of the folder.
+    """
+    clean = name.replace("\\", "/")
+    parts = PurePosixPath(clean).parts
+    if not parts or "\0" in clean or len(clean.encode(errors="replace")) > limits.MAX_NAME_BYTES:
+        return None
+    if clean.startswith("/") or ":" in parts[0] or ".." in parts:
+        return None
+    if any(part.split(".")[0].upper() in _RESERVED for part in parts):
+        return None
+    path = root.joinpath(*parts)
+    if not path.resolve().is_relative_to(root.resolve()):
+        return None
+    return path

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The model: parameters, activations, spherical harmonics, mip filter, PLY."""

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Start of a helper process: set the memory limit, run the module, report typed failures."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+
+from .errors import WrapError
+from .helper_process import emit
+
+_PARENT_POLL_S = 1.0
+
+
+def main(arguments: list[str]) -> int:
+    """Run ``arguments = [module, folder, memory_bytes]``; return the exit code."""
+    module, folder, memory_bytes = arguments[0], Path(arguments[1]), int(arguments[2])
+    if memory_bytes and sys.platform.startswith("linux"):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+    try:
+        package = __name__.rsplit(".", 1)[0]
+        importlib.import_module(f"{package}.{module}").main(folder)
+    except WrapError as error:
+        emit(error=error.message, hint=error.hint)
+        return error.exit_code
+    return 0
+
+
+def _end_with_parent(parent: int) -> None:
+    """A helper must not outlive the worker that waits for it."""
+    while os.getppid() == parent:
+        time.sleep(_PARENT_POLL_S)
+    os._exit(1)

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Run foreign native code (xatlas, pycolmap) in a process with a deadline and a memory limit.
+
+A helper is a module with ``main(arguments) -> int``; it is given a folder, reads ``task.json`` and
+arrays there, writes its results there, and reports on stdout, one JSON object a line:
+``{"fraction": 0.5, "message": "..."}``. A typed failure is ``{"error": "...", "hint": "..."}``
+followed by exit code 3.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import IO, Any
+
+from . import limits
+from .errors import DatasetError, ResourceError, WorkerError
+from .progress import Progress
+
+_logger = logging.getLogger(__name__)
+
+_POLL_S = 0.1
+_LAST_WORDS_LINES = 8
+
+
+def child_environment() -> dict[str, str]:
+    """Return the environment for a child: nothing that steers Python except our own names."""
+    return {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+
+
+def child_command(module: str, *arguments: str, python: str | None = None) -> list[str]:
+    """Return the argument list that runs ``core.<module>`` in a child interpreter."""
+    entry = Path(__file__).with_name("worker_main.py")
+    return [python or sys.executable, "-I", "-u", str(entry), module, *arguments]
+
+
+def emit(**values: Any) -> None:
+    """Write one JSON line to stdout; helpers and the worker speak through this."""
+    sys.stdout.write(json.dumps(values, allow_nan=False) + "\n")
+    sys.stdout.flush()
+
+
+def kill_group(process: subprocess.Popen[Any], grace_s: float = 2.0) -> None:
+    """End a child that leads its own group: terminate, wait, then kill the whole group."""
+    for number in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)):
+        if process.poll() is not None:
+            return
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            if hasattr(os, "killpg"):
+                os.killpg(process.pid, number)
+            else:
+                process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(grace_s)
+
+
+def run_helper(
+    module: str,
+    folder: Path,
+    progress: Progress,
+    *,
+    deadline_s: float = limits.HELPER_DEADLINE_S,
+    memory_bytes: int | None = None,
+) -> None:
+    """Run ``core.<module>`` on ``folder`` and wait, passing its progress on.
+
+    Raises
+    ------
+    Cancelled
+        The user asked to stop; the helper is ended first.
+    DatasetError
+        The helper reported a typed failure.
+    ResourceError
+        The deadline passed.
+    WorkerError
+        The helper crashed; the message names the signal and its last words.
+    """
+    command = child_command("helper_entry", module, str(folder), str(memory_bytes or 0))
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=child_environment(),
+        start_new_session=True,
+    )
+    lines: queue.Queue[tuple[str, str]] = queue.Queue()
+    assert process.stdout is not None
+    assert process.stderr is not None
+    readers = [
+        threading.Thread(target=_drain, args=(stream, name, lines), daemon=True)
+        for name, stream in (("out", process.stdout), ("err", process.stderr))
+    ]
+    for reader in readers:
+        reader.start()
+    begun_s = time.monotonic()
+    failure: dict[str, Any] = {}
+    last_words: list[str] = []
+    try:
+        while process.poll() is None or any(r.is_alive() for r in readers) or not lines.empty():
+            progress.check()
+            if time.monotonic() - begun_s > deadline_s:
+                raise ResourceError(
+                    f"{module} took longer than {deadline_s:.0f} s.", "Try a smaller input."
+                )
+            try:
+                source, line = lines.get(timeout=_POLL_S)
+            except queue.Empty:
+                continue
+            values = _parse(line) if source == "out" else None
+            if values is None:
+                last_words = [*last_words, line.rstrip()][-_LAST_WORDS_LINES:]
+                _logger.debug("%s: %s", module, line.rstrip())
+            elif "error" in values:
+                failure = values
+            else:
+                progress.update(float(values.get("fraction", 0.0)), str(values.get("message", "")))
+    finally:
+        kill_group(process)
+        for reader in readers:
+            reader.join(1.0)
+    code = process.returncode
+    if failure:
+        raise DatasetError(str(failure["error"]), str(failure.get("hint", "")))
+    if code != 0:
+        reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
+        raise WorkerError(f"{module} {reason}: {' | '.join(last_words)[-500:]}", "See the log.")
+
+
+def _drain(stream: IO[bytes], name: str, lines: queue.Queue[tuple[str, str]]) -> None:
+    for raw in stream:
+        lines.put((name, raw.decode(errors="replace")))
+
+
+def _parse(line: str) -> dict[str, Any] | None:
+    try:
+        values = json.loads(line)
+    except ValueError:
+        return None
+    return values if isinstance(values, dict) else None

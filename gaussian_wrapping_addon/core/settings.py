@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every setting of a job, as frozen dataclasses shared by panel, command line and worker."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import typing
+from dataclasses import dataclass, field
+from typing import Any
+
+from .errors import UsageError
+
+PRESETS = ("draft", "standard", "fine")
+EXPORT_FORMATS = ("glb", "obj", "ply", "usd")
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How the Gaussians are trained. Iteration milestones are fractions of ``iterations``."""
+
+    iterations: int = 3000
+    max_gaussians: int = 80_000
+    max_image_px: int = 640
+    """Long side of the finest training image, pixels."""
+    sh_degree: int = 2
+    holdout_every: int = 8
+    """Every n-th photo (sorted by name) is kept for measuring only; 0 keeps none."""
+    lambda_dssim: float = 0.2
+    lambda_depth_normal: float = 0.05
+    lambda_normal: float = 0.03
+    depth_from: float = 7 / 30
+    """Depth-normal loss starts here (method.md 3)."""
+    densify_from: float = 0.5 / 30
+    densify_until: float = 0.5
+    densify_every: int = 100
+    orient_from: float = 20 / 30
+    wrap_rounds: int = 3
+    wrap_from: float = 22 / 30
+    wrap_until: float = 26 / 30
+    wrap_share: float = 0.05
+    checkpoint_every_s: float = 60.0
+
+
+@dataclass(frozen=True)
+class MeshingSettings:
+    """How a region is meshed. Exactly one of ``edge_length`` and ``points`` decides; 0 = unset."""
+
+    edge_length: float = 0.0
+    """Target edge length in world units of the input."""
+    points: int = 0
+    """Target number of surface points."""
+    min_component_share: float = 0.01
+    """Solids smaller than this share of the largest (by area) are removed and counted."""
+
+
+@dataclass(frozen=True)
+class TextureSettings:
+    """How the mesh is unwrapped and textured."""
+
+    size_px: int = 0
+    """Side of the square texture; 0 chooses it from the photos' footprint."""
+    gutter_px: int = 8
+
+
+@dataclass(frozen=True)
+class JobSettings:
+    """All settings of one job."""
+
+    preset: str = "standard"
+    seed: int = 0
+    threads: int = 0
+    """0 uses every core this process may use."""
+    regions: tuple[str, ...] = ("auto",)
+    """``"auto"``, ``"all"``, or the path of a region file (method.md 7.3)."""
+    export: tuple[str, ...] = ("glb",)
+    training: TrainingSettings = field(default_factory=TrainingSettings)
+    meshing: MeshingSettings = field(default_factory=MeshingSettings)
+    texture: TextureSettings = field(default_factory=TextureSettings)
+
+    def validated(self) -> JobSettings:
+        """Return self, or raise :class:`UsageError` naming the first setting out of range."""
+        checks = (
+            ("preset", self.preset in PRESETS, f"one of {', '.join(PRESETS)}"),
+            ("threads", 0 <= self.threads <= 1024, "from 0 to 1024"),
+            ("seed", 0 <= self.seed < 2**31, "from 0 to 2147483647"),
+            ("regions", len(self.regions) > 0, "at least one region"),
+            (
+                "export",
+                set(self.export) <= set(EXPORT_FORMATS),
+                f"among {', '.join(EXPORT_FORMATS)}",
+            ),
+            ("training.iterations", 1 <= self.training.iterations <= 10**6, "from 1 to 1000000"),
+            (
+                "training.max_gaussians",
+                100 <= self.training.max_gaussians <= 20_000_000,
+                "from 100 to 20000000",
+            ),
+            (
+                "training.max_image_px",
+                32 <= self.training.max_image_px <= 16384,
+                "from 32 to 16384",
+            ),
+            ("training.sh_degree", 0 <= self.training.sh_degree <= 3, "from 0 to 3"),
+            (
+                "meshing.edge_length",
+                math.isfinite(self.meshing.edge_length) and self.meshing.edge_length >= 0,
+                "a positive length",
+            ),
+            ("meshing.points", 0 <= self.meshing.points <= 5_000_000, "from 0 to 5000000"),
+            (
+                "texture.size_px",
+                self.texture.size_px == 0 or 64 <= self.texture.size_px <= 8192,
+                "0 (automatic) or from 64 to 8192",
+            ),
+            ("texture.gutter_px", 1 <= self.texture.gutter_px <= 64, "from 1 to 64"),
+        )
+        for name, good, wanted in checks:
+            if not good:
+                raise UsageError(f"Setting {name} is out of range.", f"Give {wanted}.")
+        return self
+
+
+def preset(name: str, **overrides: Any) -> JobSettings:
+    """Return the settings of ``"draft"``, ``"standard"`` or ``"fine"``."""
+    if name not in PRESETS:
+        raise UsageError(f"There is no preset {name!r}.", f"Choose one of {', '.join(PRESETS)}.")
+    training = {
+        "draft": TrainingSettings(
+            iterations=1500, max_gaussians=40_000, max_image_px=480, sh_degree=1, wrap_rounds=2
+        ),
+        "standard": TrainingSettings(),
+        "fine": TrainingSettings(
+            iterations=7000, max_gaussians=200_000, max_image_px=1024, sh_degree=3, wrap_rounds=5
+        ),
+    }[name]
+    return JobSettings(preset=name, training=training, **overrides)
+
+
+def to_json(settings: Any) -> dict[str, Any]:
+    """Turn a settings dataclass into plain JSON values."""
+    return dataclasses.asdict(settings)
+
+
+def from_json(kind: type, values: Any, place: str = "settings") -> Any:
+    """Build a settings dataclass from JSON values; unknown keys and wrong types are refused.
+
+    Raises
+    ------
+    UsageError
+        Names the place and what was expected.
+    """
+    if not isinstance(values, dict):
+        raise UsageError(f"{place} must be an object.", "Write it as {...}.")
+    hints = typing.get_type_hints(kind)
+    fields = {f.name for f in dataclasses.fields(kind)}
+    unknown = sorted(set(values) - fields)
+    if unknown:
+        raise UsageError(f"{place} has an unknown entry {unknown[0]!r}.", "Remove it.")
+    arguments = {}
+    for name, value in values.items():
+        wanted = hints[name]
+        where = f"{place}.{name}"
+        if dataclasses.is_dataclass(wanted):
+            arguments[name] = from_json(typing.cast(type, wanted), value, where)
+        elif wanted is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+            arguments[name] = float(value)
+        elif wanted in (int, str) and type(value) is wanted:
+            arguments[name] = value
+        elif typing.get_origin(wanted) is tuple and isinstance(value, (list, tuple)):
+            if not all(isinstance(v, str) for v in value):
+                raise UsageError(f"{where} must hold only text.", "Use strings.")
+            arguments[name] = tuple(value)
+        else:
+            raise UsageError(f"{where} has the wrong type.", f"Expected {wanted}.")
+    return kind(**arguments)
