@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The job: what is asked for, the same for button, command line and bug report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import DatasetError, UsageError
+from ..files import read_json, write_json
+from ..settings import JobSettings, from_json, to_json
+
+SCHEMA_VERSION = 1
+COMMANDS = ("wrap", "mesh")
+AUTOMATIC_REGIONS = ("auto", "all")
+
+
+@dataclass(frozen=True)
+class JobFile:
+    """One job. Region files are read when the job is made, so that a resume needs none of them."""
+
+    command: str
+    source: str
+    """Absolute path of the input: a folder or a transforms.json."""
+    settings: JobSettings
+    region_bodies: dict[str, Any] = field(default_factory=dict)
+    """Content of each region file, by the string that names it in ``settings.regions``."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "command": self.command,
+            "source": self.source,
+            "settings": to_json(self.settings),
+            "region_bodies": self.region_bodies,
+        }
+
+    @classmethod
+    def from_json(cls, values: Any) -> JobFile:
+        """Build from :meth:`to_json`'s values.
+
+        Raises
+        ------
+        UsageError
+            An entry is missing, unknown, of the wrong type or out of range.
+        """
+        wanted = {"schema_version", "command", "source", "settings", "region_bodies"}
+        if not isinstance(values, dict) or set(values) != wanted:
+            raise UsageError("job.json does not hold the entries of a job.", "Start the job again.")
+        if values["schema_version"] != SCHEMA_VERSION:
+            raise UsageError(
+                f"job.json has schema version {values['schema_version']!r}, not {SCHEMA_VERSION}.",
+                "Start the job again with this version of the add-on.",
+            )
+        if values["command"] not in COMMANDS or not isinstance(values["source"], str):
+            raise UsageError("job.json names no command or source.", "Start the job again.")
+        if not isinstance(values["region_bodies"], dict):
+            raise UsageError("job.json: region_bodies must be an object.", "Start the job again.")
+        settings = from_json(JobSettings, values["settings"]).validated()
+        return cls(values["command"], values["source"], settings, values["region_bodies"])
+
+
+def make_job(command: str, source: Path, settings: JobSettings) -> JobFile:
+    """Check the settings, read the region files, and return the job.
+
+    Raises
+    ------
+    UsageError, DatasetError
+        A setting is out of range; the source or a region file is missing or unreadable.
+    """
+    settings = settings.validated()
+    if not source.exists():
+        raise DatasetError(f"{source} does not exist.", "Check the path.")
+    names: list[str] = []
+    bodies: dict[str, Any] = {}
+    for region in settings.regions:
+        if region in AUTOMATIC_REGIONS:
+            names.append(region)
+            continue
+        path = Path(region)
+        if not path.is_file():
+            raise DatasetError(f"Region file {region} does not exist.", "Check the path.")
+        name = str(path.resolve())
+        bodies[name] = read_json(path)
+        names.append(name)
+    return JobFile(command, str(source.resolve()), replace(settings, regions=tuple(names)), bodies)
+
+
+def read_job(path: Path) -> JobFile:
+    """Read ``job.json``."""
+    if not path.is_file():
+        raise UsageError(f"{path} does not exist.", "Choose a folder in which a job was started.")
+    return JobFile.from_json(read_json(path))
+
+
+def write_job(path: Path, job: JobFile) -> None:
+    """Write ``job.json`` atomically."""
+    write_json(path, job.to_json())

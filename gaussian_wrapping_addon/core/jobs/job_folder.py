@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The job folder: where everything of a job lies, its status, its lock, its cancel request.
+
+Layout: ``job.json``, ``status.json``, ``log.txt``, ``lock.json``, ``cancel`` (a file asks to
+stop), ``stages/<name>-<hash>/`` (``done.json`` last), ``result/``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import time
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from ..errors import ParseError, UsageError
+from ..files import read_json, write_json
+
+STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
+ACTIVE_STATES = ("NEW", "RUNNING", "CANCELLING")
+MARKER = ".gaussian-wrapping-job"
+
+
+@dataclass(frozen=True)
+class JobStatus:
+    """What ``status.json`` says; ``fraction`` and ``seconds_left`` are of the whole job."""
+
+    state: str = "NEW"
+    stage: str = ""
+    fraction: float = 0.0
+    message: str = ""
+    seconds_left: float | None = None
+    error: str = ""
+    hint: str = ""
+    exit_code: int | None = None
+    pid: int = 0
+    pid_started: int = 0
+    """Start time of the process in the system's own ticks: tells a re-used pid."""
+    heartbeat_s: float = 0.0
+    """Unix time of the last sign of life."""
+    result: str = ""
+    """Absolute path of the result folder, once there is one."""
+
+    @property
+    def active(self) -> bool:
+        """Whether a worker is (or should be) at work."""
+        return self.state in ACTIVE_STATES
+
+    @classmethod
+    def from_json(cls, values: Any) -> JobStatus:
+        """Build from JSON values, ignoring entries of other versions."""
+        known = {f.name for f in fields(cls)}
+        return cls(**{k: v for k, v in dict(values).items() if k in known})
+
+
+def process_start_ticks(pid: int) -> int:
+    """Return the start time of a process in system ticks; 0 where the system does not tell."""
+    if not sys.platform.startswith("linux"):
+        return 0
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return 0
+    # The command name, in parentheses, may hold spaces; field 22 is the start time.
+    return int(text.rsplit(")", 1)[1].split()[19])
+
+
+def process_alive(pid: int, started: int) -> bool:
+    """Tell whether the process that began at ``started`` still runs (a zombie does not)."""
+    if pid <= 0:
+        return False
+    if sys.platform.startswith("linux"):
+        try:
+            text = Path(f"/proc/{pid}/stat").read_text()
+        except OSError:
+            return False
+        state = text.rsplit(")", 1)[1].split()[0]
+        return state not in ("Z", "X") and (not started or process_start_ticks(pid) == started)
+    if sys.platform == "win32":
+        return _alive_windows(pid)
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _alive_windows(pid: int) -> bool:
+    import ctypes
+
+    query_limited_information, still_active = 0x1000, 259
+    kernel32 = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
+    handle = kernel32.OpenProcess(query_limited_information, False, pid)
+    if not handle:
+        return False
+    code = ctypes.c_ulong()
+    kernel32.GetExitCodeProcess(handle, ctypes.byref(code))
+    kernel32.CloseHandle(handle)
+    return code.value == still_active
+
+
+@dataclass(frozen=True)
+class JobFolder:
+    """Paths of one job folder and the small files in it."""
+
+    root: Path
+
+    @property
+    def job_path(self) -> Path:
+        """``job.json``."""
+        return self.root / "job.json"
+
+    @property
+    def status_path(self) -> Path:
+        """``status.json``."""
+        return self.root / "status.json"
+
+    @property
+    def log_path(self) -> Path:
+        """``log.txt``."""
+        return self.root / "log.txt"
+
+    @property
+    def cancel_path(self) -> Path:
+        """A file of this name asks the worker to stop."""
+        return self.root / "cancel"
+
+    @property
+    def lock_path(self) -> Path:
+        """Names the process that works here."""
+        return self.root / "lock.json"
+
+    @property
+    def stages(self) -> Path:
+        """Folder of the stages."""
+        return self.root / "stages"
+
+    @property
+    def result(self) -> Path:
+        """Folder of the results."""
+        return self.root / "result"
+
+    def create(self) -> None:
+        """Make the folder, or accept an existing job folder or an empty folder.
+
+        Raises
+        ------
+        UsageError
+            The path is a file, or a folder with other content.
+        """
+        if self.root.exists() and not self.root.is_dir():
+            raise UsageError(f"{self.root} is a file.", "Choose a folder for the results.")
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            if not (self.root / MARKER).exists() and any(self.root.iterdir()):
+                raise UsageError(
+                    f"{self.root} holds other files.", "Choose a new or empty folder for results."
+                )
+            (self.root / MARKER).touch()
+            self.stages.mkdir(exist_ok=True)
+        except OSError as error:
+            raise UsageError(
+                f"{self.root} cannot be written: {error.strerror}.", "Choose another folder."
+            ) from None
+
+    def is_job(self) -> bool:
+        """Whether a job was started here."""
+        return (self.root / MARKER).exists() and self.job_path.exists()
+
+    def read_status(self) -> JobStatus:
+        """Return the status; a running job whose process is gone is reported as LOST."""
+        try:
+            status = JobStatus.from_json(read_json(self.status_path))
+        except (OSError, ParseError, TypeError, ValueError):
+            return JobStatus()
+        if status.state in ("RUNNING", "CANCELLING") and not process_alive(
+            status.pid, status.pid_started
+        ):
+            return JobStatus(
+                **{
+                    **asdict(status),
+                    "state": "LOST",
+                    "error": "The worker process has ended without a word.",
+                    "hint": "Resume the job; it continues from the last checkpoint.",
+                }
+            )
+        return status
+
+    def write_status(self, status: JobStatus) -> None:
+        """Write the status atomically."""
+        write_json(self.status_path, asdict(status))
+
+    def lock(self) -> None:
+        """Take the folder for this process; a lock of a dead process is taken over.
+
+        Raises
+        ------
+        UsageError
+            Another process is at work here.
+        """
+        with contextlib.suppress(OSError, ParseError, KeyError, TypeError):
+            owner = read_json(self.lock_path)
+            pid, started = int(owner["pid"]), int(owner["started"])
+            if pid != os.getpid() and process_alive(pid, started):
+                raise UsageError(
+                    f"Process {pid} is working in {self.root}.",
+                    "Wait for it, cancel it, or choose another folder.",
+                )
+        write_json(
+            self.lock_path,
+            {
+                "pid": os.getpid(),
+                "started": process_start_ticks(os.getpid()),
+                "time_s": time.time(),
+            },
+        )
+
+    def unlock(self) -> None:
+        """Give the folder free."""
+        self.lock_path.unlink(missing_ok=True)

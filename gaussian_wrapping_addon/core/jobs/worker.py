@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The worker process: lock the folder, run the job, keep ``status.json`` true to the end."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+
+from ..errors import EXIT_DONE, EXIT_OTHER, EXIT_RESOURCES, Cancelled, WrapError
+from ..progress import ProgressEvent
+from .job_file import read_job
+from .job_folder import JobFolder, JobStatus, process_start_ticks
+
+_logger = logging.getLogger(__name__)
+
+HEARTBEAT_S = 5.0
+STATUS_EVERY_S = 0.25
+PARENT_POLL_S = 1.0
+
+
+class _Reporter:
+    """Turns progress events into status writes, at a bounded rate, and polls for cancelling."""
+
+    def __init__(self, folder: JobFolder, status: JobStatus) -> None:
+        self.folder = folder
+        self.status = status
+        self._guard = threading.Lock()
+        self._written_s = 0.0
+        self._logged_s = 0.0
+        self._stop = threading.Event()
+        self.stop_asked = False
+
+    def event(self, event: ProgressEvent) -> None:
+        """Take one report of the runner; fraction and time left are of the whole job."""
+        now_s = time.monotonic()
+        changed = event.stage != self.status.stage
+        with self._guard:
+            self.status = replace(
+                self.status,
+                stage=event.stage,
+                fraction=event.fraction,
+                message=event.message,
+                seconds_left=event.seconds_left,
+            )
+        if changed or now_s - self._written_s > STATUS_EVERY_S:
+            self.write()
+        if changed or now_s - self._logged_s > HEARTBEAT_S:
+            self._logged_s = now_s
+            _logger.info("%s %.1f %% %s", event.stage, 100 * event.fraction, event.message)
+
+    def write(self, **changes: object) -> None:
+        """Write the status now, with a fresh heartbeat."""
+        with self._guard:
+            self.status = replace(self.status, heartbeat_s=time.time(), **changes)  # type: ignore[arg-type]
+            self._written_s = time.monotonic()
+            self.folder.write_status(self.status)
+
+    def cancelled(self) -> bool:
+        """Whether a cancel file lies there or the process was asked to terminate."""
+        return self.stop_asked or self.folder.cancel_path.exists()
+
+    def beat(self, parent: int) -> None:
+        """Keep the heartbeat; ask for a stop when the parent has gone. Runs in a thread."""
+        while not self._stop.wait(PARENT_POLL_S):
+            if parent and os.getppid() != parent:
+                self.stop_asked = True
+            if self.cancelled() and self.status.state == "RUNNING":
+                self.write(state="CANCELLING")
+            elif time.time() - self.status.heartbeat_s > HEARTBEAT_S:
+                self.write()
+
+    def end(self) -> None:
+        """Stop the heartbeat."""
+        self._stop.set()
+
+
+def _log_to(path: Path) -> None:
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    root = logging.getLogger()
+    root.addHandler(handler)
+    root.setLevel(logging.INFO)
+    for noisy in ("numba", "PIL", "matplotlib", "trimesh"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+def main(arguments: list[str]) -> int:
+    """Run the job of ``arguments = [folder, parent pid or 0]``; return the exit code."""
+    folder = JobFolder(Path(arguments[0]))
+    parent = int(arguments[1]) if len(arguments) > 1 else 0
+    _log_to(folder.log_path)
+    reporter = _Reporter(
+        folder,
+        JobStatus(state="RUNNING", pid=os.getpid(), pid_started=process_start_ticks(os.getpid())),
+    )
+
+    def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
+        reporter.stop_asked = True
+
+    signal.signal(signal.SIGTERM, ask_to_stop)
+    signal.signal(signal.SIGINT, ask_to_stop)
+    try:
+        folder.lock()
+        reporter.write()
+        threading.Thread(target=reporter.beat, args=(parent,), daemon=True).start()
+        from .runner import run_job
+
+        run_job(folder, read_job(folder.job_path), reporter.event, reporter.cancelled)
+    except Cancelled:
+        _logger.info("cancelled")
+        code = Cancelled.exit_code
+        state, error, hint = "CANCELLED", "", "Resume continues from the last checkpoint."
+    except WrapError as failure:
+        _logger.error("%s", failure)
+        code, state, error, hint = failure.exit_code, "FAILED", failure.message, failure.hint
+    except MemoryError:
+        _logger.exception("out of memory")
+        code, state = EXIT_RESOURCES, "FAILED"
+        error, hint = "Not enough memory.", "Use a smaller preset or close other programs."
+    except Exception as failure:
+        _logger.exception("unexpected failure")
+        code, state = EXIT_OTHER, "FAILED"
+        error = f"Unexpected {type(failure).__name__}: {failure}"
+        hint = "See log.txt in the job folder and report it."
+    else:
+        code, state, error, hint = EXIT_DONE, "DONE", "", ""
+    reporter.end()
+    result = str(folder.result) if folder.result.is_dir() else ""
+    figures = {"fraction": 1.0, "seconds_left": 0.0, "message": ""} if state == "DONE" else {}
+    reporter.write(state=state, error=error, hint=hint, exit_code=code, result=result, **figures)
+    folder.unlock()
+    return code
