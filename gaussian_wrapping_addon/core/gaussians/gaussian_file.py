@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Gaussians on disk between stages: a compressed-free npz of the raw parameters."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..errors import ParseError
+from ..files import write_bytes
+from .model import OrientedGaussians
+
+_SHAPES = {
+    "means": (3,), "log_scales": (3,), "quats": (4,), "opacity_logits": (), "orientation": (4,),
+    "filter_3d": (),
+}  # fmt: skip
+
+
+def save_gaussians(path: Path, gaussians: OrientedGaussians) -> None:
+    """Write all parameters atomically."""
+    stream = io.BytesIO()
+    np.savez(stream, **{k: v.detach().cpu().numpy() for k, v in gaussians.tensors()})
+    write_bytes(path, stream.getvalue())
+
+
+def load_gaussians(path: Path) -> OrientedGaussians:
+    """Read what :func:`save_gaussians` wrote.
+
+    Raises
+    ------
+    ParseError
+        An array is missing, of the wrong shape, or not finite.
+    """
+    hint = "Delete the folder and run the job again."
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            loaded = {name: arrays[name] for name in (*_SHAPES, "sh")}
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise ParseError(path, "whole file", f"not a file of Gaussians ({error}).", hint) from None
+    count = len(loaded["means"])
+    for name, array in loaded.items():
+        good = array.shape[1:] == _SHAPES[name] if name != "sh" else array.ndim == 3
+        if not good or len(array) != count or not np.isfinite(array).all():
+            raise ParseError(path, name, "wrong shape or values that are not finite.", hint)
+    return OrientedGaussians(**{name: torch.from_numpy(array) for name, array in loaded.items()})

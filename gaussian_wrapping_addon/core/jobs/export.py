@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The last stage: gather results of all regions into ``result/`` and write the report."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from ..evaluation.report import write_report
+from ..files import read_json, write_json
+from ..progress import Progress
+from .job_file import JobFile
+from .job_folder import JobFolder
+from .stages import Stage
+
+
+def export_results(
+    folder: JobFolder,
+    job: JobFile,
+    cameras: Stage,
+    trained: Stage,
+    regions: list[tuple[str, Stage, Stage]],
+    summary: dict[str, Any],
+    progress: Progress,
+) -> None:
+    """Fill ``result/``; regions of earlier jobs in the same folder stay.
+
+    Parameters
+    ----------
+    regions : list of (name, mesh stage, texture stage)
+    summary : dict
+        What the runner measured of the whole job.
+    """
+    from ..dataset.scene_file import load_saved_scene
+    from ..gaussians.gaussian_file import load_gaussians
+    from ..gaussians.splat_ply import write_splat_ply
+    from .runner import write_scene_summary
+
+    result = folder.result
+    result.mkdir(exist_ok=True)
+    progress.update(0.1, "writing the scene")
+    write_scene_summary(result / "scene.json", cameras)
+    scene = load_saved_scene(cameras.folder)
+    if not (trained.reused and (result / "gaussians.ply").exists()):
+        gaussians = load_gaussians(trained.folder / "gaussians.npz")
+        write_splat_ply(result / "gaussians.ply", gaussians, scene.world_from_scene)
+    for index, (name, meshed, textured) in enumerate(regions):
+        progress.update(0.2 + 0.6 * index / len(regions), f"writing {name}")
+        target = result / name
+        if target.exists():
+            shutil.rmtree(target)
+        shutil.copytree(textured.folder / "files", target)
+        shutil.copy2(meshed.folder / "region.json", target / "region.json")
+        write_json(target / "figures.json", _region_figures(meshed, textured))
+    shutil.copy2(regions[0][2].folder / "preview.png", result / "preview.png")
+    for name, _, textured in regions:
+        shutil.copy2(textured.folder / "preview.png", result / name / "preview.png")
+    progress.update(0.9, "writing the report")
+    all_regions = {
+        path.parent.name: read_json(path) for path in sorted(result.glob("*/figures.json"))
+    }
+    write_report(result, _plain({**summary, **_whole(cameras, trained, regions)}), all_regions)
+
+
+def _whole(
+    cameras: Stage, trained: Stage, regions: list[tuple[str, Stage, Stage]]
+) -> dict[str, Any]:
+    stages = [cameras, trained, *(s for _, m, t in regions for s in (m, t))]
+    return {
+        "stages": [
+            {"name": s.name, "seconds": s.done.get("seconds"), "reused": s.reused} for s in stages
+        ],
+        "cameras": {k: v for k, v in cameras.done.items() if k != "finished_unix_s"},
+        "training": {k: v for k, v in trained.done.items() if k != "finished_unix_s"},
+    }
+
+
+def _region_figures(meshed: Stage, textured: Stage) -> dict[str, Any]:
+    figures = {**meshed.done, **textured.done}
+    figures["seconds"] = {"mesh": meshed.done["seconds"], "texture": textured.done["seconds"]}
+    return _plain(figures)
+
+
+def _plain(values: Any) -> Any:
+    """Return the values as JSON would read them back, so that a report is never half numpy."""
+    return json.loads(json.dumps(values))
+
+
+def result_of(folder: Path) -> Path:
+    """Return the result folder of a job folder."""
+    return JobFolder(folder).result

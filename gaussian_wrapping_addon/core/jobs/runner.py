@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The one runner behind button and command line: cameras, train, mesh, texture, export."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import MeshingError, UsageError
+from ..files import write_json
+from ..parallel import default_threads
+from ..progress import Progress, ProgressEvent
+from ..settings import to_json
+from .job_file import AUTOMATIC_REGIONS, JobFile
+from .job_folder import JobFolder
+from .machine import describe_machine, peak_memory_bytes
+from .stages import Stage, note_interrupted, run_stage, source_fingerprint, stage_key
+
+_logger = logging.getLogger(__name__)
+
+# Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
+STAGE_VERSIONS = {"cameras": 1, "train": 1, "mesh": 1, "texture": 1}
+
+# Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
+SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
+
+NAME_CHARACTERS = 40
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Part of the overall bar that belongs to one stage."""
+
+    begin: float
+    end: float
+
+
+class _Overall:
+    """Maps the fraction of each stage onto the whole job, with the time left of the whole."""
+
+    def __init__(
+        self, sink: Callable[[ProgressEvent], None], is_cancelled: Callable[[], bool]
+    ) -> None:
+        self._sink = sink
+        self._is_cancelled = is_cancelled
+        self._begun_s = time.monotonic()
+        self._offset = 0.0
+
+    def stage(self, name: str, span: _Span) -> Progress:
+        def forward(event: ProgressEvent) -> None:
+            overall = span.begin + (span.end - span.begin) * event.fraction
+            elapsed_s = time.monotonic() - self._begun_s
+            gained = overall - self._offset
+            left_s = elapsed_s * (1.0 - overall) / gained if gained > 0.01 else None
+            self._sink(ProgressEvent(name, overall, event.message, event.figures, left_s))
+
+        return Progress(name, forward, self._is_cancelled)
+
+    def skip_to(self, fraction: float) -> None:
+        """Stages up to here were re-used: they tell nothing about the time left."""
+        self._begun_s = time.monotonic()
+        self._offset = fraction
+
+
+def region_name(request: str, body: Any) -> str:
+    """Return the folder name of a requested region: ASCII, short, never empty."""
+    if request in AUTOMATIC_REGIONS:
+        return request
+    wanted = body.get("blender_object_name") if isinstance(body, dict) else None
+    text = wanted if isinstance(wanted, str) and wanted.strip() else Path(request).stem
+    clean = re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_")[:NAME_CHARACTERS]
+    if not clean or clean.lower() in AUTOMATIC_REGIONS:
+        clean = f"region_{stage_key(request)[:6]}"
+    return clean
+
+
+def run_job(
+    folder: JobFolder,
+    job: JobFile,
+    sink: Callable[[ProgressEvent], None],
+    is_cancelled: Callable[[], bool],
+) -> None:
+    """Run a job to its end in ``folder``; finished stages are re-used.
+
+    Raises
+    ------
+    WrapError
+        Any typed failure of a stage; stages finished so far stay.
+    """
+    threads = job.settings.threads or default_threads()
+    overall = _Overall(sink, is_cancelled)
+    begun_s = time.time()
+
+    cameras = _run_cameras(folder, job, overall, threads)
+    if cameras.reused:
+        overall.skip_to(SHARES["cameras"])
+    trained = _run_training(folder, job, cameras, overall, threads)
+    if trained.reused:
+        overall.skip_to(SHARES["cameras"] + SHARES["train"])
+
+    names = [region_name(r, job.region_bodies.get(r)) for r in job.settings.regions]
+    if len(set(names)) < len(names):
+        raise UsageError("Two regions have the same name.", "Give each region its own name.")
+    begin = SHARES["cameras"] + SHARES["train"]
+    share = (1.0 - SHARES["export"] - begin) / len(names)
+    regions: list[tuple[str, Stage, Stage]] = []
+    for index, (request, name) in enumerate(zip(job.settings.regions, names, strict=True)):
+        start = begin + index * share
+        cut = start + share * SHARES["mesh"] / (SHARES["mesh"] + SHARES["texture"])
+        meshed = _run_meshing(
+            folder, job, request, name, cameras, trained, overall.stage("mesh", _Span(start, cut)),
+            threads,
+        )  # fmt: skip
+        textured = _run_texture(
+            folder, job, name, cameras, meshed,
+            overall.stage("texture", _Span(cut, start + share)), threads,
+        )  # fmt: skip
+        regions.append((name, meshed, textured))
+
+    progress = overall.stage("export", _Span(1.0 - SHARES["export"], 1.0))
+    from .export import export_results
+
+    summary = {
+        "command": job.command,
+        "source": Path(job.source).name,
+        "settings": to_json(job.settings),
+        "machine": describe_machine(threads),
+        "started_unix_s": round(begun_s, 1),
+        "wall_seconds": round(time.time() - begun_s, 1),
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+    export_results(folder, job, cameras, trained, regions, summary, progress)
+    progress.update(1.0, "finished")
+
+
+def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: int) -> Stage:
+    from ..dataset.load import load_scene
+    from ..dataset.scene_file import save_scene
+
+    source = Path(job.source)
+    key = stage_key(
+        STAGE_VERSIONS["cameras"], job.source, source_fingerprint(source), job.settings.seed
+    )
+
+    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        scene = load_scene(source, stage_folder, progress, seed=job.settings.seed, threads=threads)
+        save_scene(scene, stage_folder)
+        return {
+            "views": len(scene.views),
+            "points": len(scene.points),
+            "warnings": list(scene.warnings),
+            "facts": scene.facts,
+        }
+
+    span = _Span(0.0, SHARES["cameras"])
+    return run_stage(folder.stages, "cameras", key, overall.stage("cameras", span), work)
+
+
+def _run_training(
+    folder: JobFolder, job: JobFile, cameras: Stage, overall: _Overall, threads: int
+) -> Stage:
+    training = job.settings.training
+    described = to_json(training)
+    described.pop("checkpoint_every_s")
+    key = stage_key(STAGE_VERSIONS["train"], cameras.key, described, job.settings.seed)
+
+    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        from ..dataset.photos import PhotoStore
+        from ..dataset.scene_file import load_saved_scene
+        from ..gaussians.gaussian_file import save_gaussians
+        from ..training.trainer import train
+
+        scene = load_saved_scene(cameras.folder)
+        photos = PhotoStore(scene, training.max_image_px)
+        begun_s = time.monotonic()
+        try:
+            result = train(
+                scene, photos, training, stage_folder, progress,
+                seed=job.settings.seed, threads=threads,
+            )  # fmt: skip
+        except BaseException:
+            note_interrupted(folder.stages, "train", key, time.monotonic() - begun_s)
+            raise
+        save_gaussians(stage_folder / "gaussians.npz", result.gaussians)
+        return result.to_json()
+
+    span = _Span(SHARES["cameras"], SHARES["cameras"] + SHARES["train"])
+    return run_stage(folder.stages, "train", key, overall.stage("train", span), work)
+
+
+def _run_meshing(
+    folder: JobFolder,
+    job: JobFile,
+    request: str,
+    name: str,
+    cameras: Stage,
+    trained: Stage,
+    progress: Progress,
+    threads: int,
+) -> Stage:
+    meshing = job.settings.meshing
+    body = job.region_bodies.get(request)
+    key = stage_key(
+        STAGE_VERSIONS["mesh"], trained.key, request if body is None else body, name,
+        to_json(meshing), job.settings.seed,
+    )  # fmt: skip
+
+    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        import numpy as np
+
+        from ..dataset.scene_file import load_saved_scene
+        from ..field.vacancy import VacancyField
+        from ..field.vector_field import VectorField
+        from ..gaussians.gaussian_file import load_gaussians
+        from ..meshing.mesh_file import save_mesh
+        from ..meshing.primal_adaptive import mesh_region
+        from ..meshing.region import automatic_region, parse_region, whole_region, write_region
+        from ..meshing.statistics import mesh_statistics
+
+        scene = load_saved_scene(cameras.folder)
+        arrays = load_gaussians(trained.folder / "gaussians.npz").arrays()
+        if request == "auto":
+            region = automatic_region(scene)
+        elif request == "all":
+            region = whole_region(scene, arrays)
+        else:
+            world_region = parse_region(body, Path(request))
+            region = world_region.transformed(scene.world_from_scene.inverse())
+        vacancy = VacancyField(arrays, scene.cameras, threads=threads)
+        vectors = VectorField(arrays, threads=threads)
+        mesh = mesh_region(
+            vacancy, vectors, arrays, scene.cameras, region, meshing, progress.span(0.0, 0.95),
+            seed=job.settings.seed, threads=threads,
+            edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
+        )  # fmt: skip
+        if not np.isfinite(mesh.vertices).all():
+            raise MeshingError("The mesh has vertices that are not finite.", "Report the job.")
+        save_mesh(stage_folder / "mesh.npz", mesh)
+        write_region(stage_folder / "region.json", region.transformed(scene.world_from_scene))
+        progress.update(0.97, "measuring the mesh")
+        return {
+            "statistics": mesh_statistics(mesh).to_json(),
+            "provenance": mesh.provenance,
+            "edge_length_world": meshing.edge_length,
+        }
+
+    return run_stage(folder.stages, f"mesh-{name}", key, progress, work)
+
+
+def _run_texture(
+    folder: JobFolder,
+    job: JobFile,
+    name: str,
+    cameras: Stage,
+    meshed: Stage,
+    progress: Progress,
+    threads: int,
+) -> Stage:
+    texture = job.settings.texture
+    key = stage_key(STAGE_VERSIONS["texture"], meshed.key, to_json(texture))
+
+    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        from ..dataset.photos import PhotoStore
+        from ..dataset.scene_file import load_saved_scene
+        from ..evaluation.preview import write_preview
+        from ..limits import MAX_IMAGE_SIDE_PX
+        from ..meshing.mesh_file import load_mesh
+        from ..texture.export import write_textured
+        from ..texture.texture_mesh import texture_mesh
+
+        scene = load_saved_scene(cameras.folder)
+        photos = PhotoStore(scene, MAX_IMAGE_SIDE_PX)
+        mesh = load_mesh(meshed.folder / "mesh.npz")
+        textured = texture_mesh(
+            mesh, scene, photos, texture, stage_folder, progress.span(0.0, 0.9), threads=threads
+        )
+        formats = tuple(f for f in job.settings.export if f != "usd")
+        write_textured(textured, stage_folder / "files", formats, scene.world_from_scene)
+        progress.update(0.95, "rendering the preview")
+        write_preview(textured, scene, photos, stage_folder / "preview.png")
+        return {"texture": textured.statistics}
+
+    formats = json.dumps(sorted(job.settings.export))
+    return run_stage(folder.stages, f"texture-{name}", stage_key(key, formats), progress, work)
+
+
+def write_scene_summary(path: Path, cameras: Stage) -> None:
+    """Write ``result/scene.json``: what Blender needs of the scene (docs/architecture.md)."""
+    from ..dataset.scene_file import load_saved_scene
+    from ..tolerances import SCENE_RADIUS
+
+    scene = load_saved_scene(cameras.folder)
+    write_json(
+        path,
+        {
+            "version": 1,
+            "world_from_scene": scene.world_from_scene.to_json(),
+            "radius": SCENE_RADIUS,
+            "cameras": [
+                {**view.camera.to_json(), "photo": str(view.photo_path)} for view in scene.views
+            ],
+        },
+    )

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Meshes on disk between stages."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import ParseError
+from ..files import write_bytes
+from .surface_mesh import SurfaceMesh
+
+
+def save_mesh(path: Path, mesh: SurfaceMesh) -> None:
+    """Write vertices, faces and provenance atomically."""
+    stream = io.BytesIO()
+    provenance = np.frombuffer(json.dumps(mesh.provenance).encode(), np.uint8)
+    np.savez(stream, vertices=mesh.vertices, faces=mesh.faces, provenance=provenance)
+    write_bytes(path, stream.getvalue())
+
+
+def load_mesh(path: Path) -> SurfaceMesh:
+    """Read what :func:`save_mesh` wrote; :class:`ParseError` where the file is not that."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            provenance = json.loads(arrays["provenance"].tobytes())
+            return SurfaceMesh(arrays["vertices"], arrays["faces"], None, provenance)
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise ParseError(
+            path, "whole file", f"not a mesh file ({error}).", "Delete the folder and run again."
+        ) from None
