@@ -27,6 +27,24 @@ def write_report(result: Path, summary: dict[str, Any], regions: dict[str, Any])
     write_bytes(result / "report.md", _markdown(report).encode())
 
 
+def headline(report: dict[str, Any]) -> list[str]:
+    """Return the few figures of a report that a person wants first, one line each."""
+    training = report["training"]
+    lines = [f"time: {report['wall_seconds']:.0f} s, {training['gaussians']} Gaussians"]
+    if training["held_out"]:
+        count = len(training["held_out"])
+        lines.append(f"held-out photos: PSNR {training['held_out_psnr']:.2f} dB ({count} photos)")
+    for name, region in report["regions"].items():
+        statistics = region["statistics"]
+        closed = "closed" if statistics["closed"] else "not closed"
+        coverage = region["texture"]["coverage"]
+        lines.append(
+            f"region {name}: {statistics['faces']} faces, {closed}, "
+            f"{100 * coverage:.1f} % of the texture seen by photos"
+        )
+    return lines
+
+
 def _markdown(report: dict[str, Any]) -> str:
     cameras, training = report["cameras"], report["training"]
     machine, settings = report["machine"], report["settings"]
@@ -35,7 +53,7 @@ def _markdown(report: dict[str, Any]) -> str:
     lines = [
         f"# Report: {report['source']}",
         "",
-        f"Preset {settings['preset']}, seed {settings['seed']}, {date}. "
+        f"Preset {settings['preset']}, seed {settings['seed']}, {date}.",
         f"{machine['processor']}, {machine['threads']} threads, Python {machine['python']}.",
         "",
         "![preview](preview.png)",
@@ -76,7 +94,7 @@ def _held_out(training: dict[str, Any]) -> list[str]:
     if not held_out:
         return ["No photo was held out: there are too few. No PSNR is claimed."]
     lines = [
-        f"Held-out photos (never trained on): PSNR {training['held_out_psnr']:.2f} dB, "
+        f"Held-out photos (never trained on): PSNR {training['held_out_psnr']:.2f} dB,",
         f"SSIM {training['held_out_ssim']:.4f}, mean of {len(held_out)}.",
         "",
         "| photo | PSNR dB | SSIM |",

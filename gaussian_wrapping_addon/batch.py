@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The command line: ``blender --background -P batch.py -- wrap INPUT --out DIR``, or plain Python.
+
+It starts the same worker as the buttons do, shows its progress, and writes ``scene.blend``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import logging
+import sys
+import time
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from .core.jobs.client import JobClient
+    from .core.jobs.job_file import JobFile
+    from .core.settings import JobSettings
+
+_logger = logging.getLogger("gaussian_wrapping")
+
+POLL_S = 0.2
+LINE_EVERY_S = 5.0
+CANCEL_WAIT_S = 12.0
+
+
+def main(arguments: list[str]) -> int:
+    """Run one command and return the exit code (0, 1, 2, 3, 4, 5: see the README)."""
+    from .core.errors import EXIT_OTHER, WrapError
+
+    _log_to_terminal()
+    try:
+        options = _parser().parse_args(arguments)
+        return int(options.run(options))
+    except WrapError as error:
+        _logger.error("error: %s", error)
+        return error.exit_code
+    except OSError as error:
+        _logger.error("error: %s", error)
+        return EXIT_OTHER
+
+
+class _Parser(ArgumentParser):
+    """Raises our usage error instead of leaving the process, so that Blender ends in order."""
+
+    def error(self, message: str) -> NoReturn:
+        from .core.errors import UsageError
+
+        raise UsageError(
+            f"{message}.", f"Usage: {self.format_usage().split('usage: ')[-1].strip()}"
+        )
+
+
+def _parser() -> ArgumentParser:
+    from .core.settings import EXPORT_FORMATS, PRESETS
+
+    parser = _Parser(prog="batch.py", description="Photos in, a textured mesh out.")
+    commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
+
+    wrap = commands.add_parser("wrap", help="photos, a COLMAP project or a transforms.json -> mesh")
+    wrap.add_argument("input", type=Path)
+    wrap.add_argument("--preset", choices=PRESETS, default="standard")
+    wrap.add_argument("--seed", type=int, default=0)
+    wrap.add_argument("--iterations", type=int, help="training iterations instead of the preset's")
+    wrap.add_argument("--max-gaussians", type=int, help="cap instead of the preset's")
+    wrap.add_argument(
+        "--max-image-px", type=int, help="training image size instead of the preset's"
+    )
+    wrap.set_defaults(run=_wrap)
+
+    mesh = commands.add_parser(
+        "mesh", help="another region or resolution, from a finished training"
+    )
+    mesh.set_defaults(run=_mesh)
+
+    resume = commands.add_parser("resume", help="continue a job that was stopped")
+    resume.add_argument("out", type=Path, metavar="DIR")
+    resume.set_defaults(run=_resume)
+
+    for command in (wrap, mesh):
+        command.add_argument("--out", type=Path, required=True, metavar="DIR")
+        command.add_argument(
+            "--region", nargs="+", default=["auto"], metavar="auto|all|REGION.json"
+        )
+        size = command.add_mutually_exclusive_group()
+        size.add_argument("--edge-length", type=float, default=0.0, help="world units of the input")
+        size.add_argument("--points", type=int, default=0, help="number of surface points")
+        command.add_argument("--texture-size", default="auto", metavar="auto|N")
+        command.add_argument(
+            "--export", default="glb", help=f"comma separated, of {','.join(EXPORT_FORMATS)}"
+        )
+    for command in (wrap, mesh, resume):
+        command.add_argument("--no-blend", action="store_true", help="needs no bpy")
+        command.add_argument("--threads", type=int, default=0 if command is not resume else None)
+
+    check = commands.add_parser("check", help="findings about an input, without starting anything")
+    check.add_argument("input", type=Path)
+    check.set_defaults(run=_check)
+    doctor = commands.add_parser("doctor", help="findings about the worker's Python")
+    doctor.set_defaults(run=_doctor)
+    return parser
+
+
+def _wrap(options: Namespace) -> int:
+    from .core.dataset.check import check_input
+    from .core.errors import DatasetError
+    from .core.jobs.client import JobClient, worker_python
+    from .core.jobs.job_file import make_job
+    from .core.settings import preset
+
+    settings = preset(options.preset)
+    changes = {
+        name: value
+        for name in ("iterations", "max_gaussians", "max_image_px")
+        if (value := getattr(options, name)) is not None
+    }
+    settings = replace(settings, seed=options.seed, training=replace(settings.training, **changes))
+    job = make_job("wrap", options.input, _region_settings(settings, options))
+    _require_bpy(job, options)
+    for finding in check_input(options.input):
+        if finding.severity == "error":
+            raise DatasetError(finding.message, finding.hint)
+        if finding.severity == "warning":
+            _logger.warning("warning: %s %s", finding.message, finding.hint)
+    return _follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+
+
+def _mesh(options: Namespace) -> int:
+    from .core.errors import UsageError
+    from .core.jobs.client import JobClient, worker_python
+    from .core.jobs.job_file import make_job, read_job
+    from .core.jobs.job_folder import JobFolder
+    from .core.jobs.stages import read_done
+
+    folder = JobFolder(options.out.resolve())
+    earlier = read_job(folder.job_path)
+    if not any(read_done(path) for path in folder.stages.glob("train-*")):
+        raise UsageError(
+            f"{options.out} holds no finished training.", "Run wrap, or resume it, first."
+        )
+    job = make_job("mesh", Path(earlier.source), _region_settings(earlier.settings, options))
+    _require_bpy(job, options)
+    return _follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+
+
+def _resume(options: Namespace) -> int:
+    from .core.jobs.client import JobClient, worker_python
+    from .core.jobs.job_file import read_job
+    from .core.jobs.job_folder import JobFolder
+
+    job = read_job(JobFolder(options.out.resolve()).job_path)
+    _require_bpy(job, options)
+    return _follow(JobClient.resume(options.out, python=worker_python()), job, options)
+
+
+def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
+    """Put the options that ``wrap`` and ``mesh`` share into the settings."""
+    from .core.errors import UsageError
+
+    size = options.texture_size
+    if size != "auto" and not size.isdecimal():
+        raise UsageError(
+            f"--texture-size {size} is not a number.", "Give auto or a size in pixels."
+        )
+    return replace(
+        settings,
+        threads=options.threads,
+        regions=tuple(options.region),
+        export=tuple(dict.fromkeys(f for f in options.export.split(",") if f)),
+        meshing=replace(settings.meshing, edge_length=options.edge_length, points=options.points),
+        texture=replace(settings.texture, size_px=0 if size == "auto" else int(size)),
+    )
+
+
+def _check(options: Namespace) -> int:
+    from .core.dataset.check import check_input
+    from .core.errors import EXIT_BAD_DATA, EXIT_DONE
+
+    findings = check_input(options.input)
+    for finding in findings:
+        _logger.info("%s: %s %s", finding.severity, finding.message, finding.hint)
+    bad = any(finding.severity == "error" for finding in findings)
+    return EXIT_BAD_DATA if bad else EXIT_DONE
+
+
+def _doctor(_options: Namespace) -> int:
+    from .core.errors import EXIT_BAD_DATA, EXIT_DONE
+    from .core.jobs.client import worker_python
+    from .core.jobs.doctor import diagnose_worker
+
+    findings = diagnose_worker(worker_python())
+    for finding in findings:
+        mark = "good" if finding.good else "BAD "
+        _logger.info("%s  %-9s %s", mark, finding.subject, finding.finding)
+        if not finding.good:
+            _logger.info("               %s", finding.hint)
+    _logger.info("bpy       %s", "present" if _has_bpy() else "absent: use --no-blend")
+    return EXIT_DONE if all(f.good for f in findings) else EXIT_BAD_DATA
+
+
+def _has_bpy() -> bool:
+    return importlib.util.find_spec("bpy") is not None
+
+
+def _require_bpy(job: JobFile, options: Namespace) -> None:
+    """Refuse before the start what could not be finished without bpy."""
+    from .core.errors import UsageError
+
+    wants = "usd" in job.settings.export or not options.no_blend
+    if wants and not _has_bpy():
+        raise UsageError(
+            "Writing scene.blend or USD needs bpy, which this Python does not have.",
+            "Add --no-blend (and leave usd out), run it in Blender, or pip install bpy.",
+        )
+
+
+def _follow(client: JobClient, job: JobFile, options: Namespace) -> int:
+    """Show progress until the worker ends; then write the Blender files."""
+    from .core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
+
+    shown_s, shown_stage, interrupted_s = 0.0, "", 0.0
+    while True:
+        try:
+            status = client.poll()
+            now_s = time.monotonic()
+            if status.stage and (status.stage != shown_stage or now_s - shown_s > LINE_EVERY_S):
+                shown_s, shown_stage = now_s, status.stage
+                left = (
+                    "" if status.seconds_left is None else f" · {_span(status.seconds_left)} left"
+                )
+                _logger.info(
+                    "[%5.1f %%] %-7s %s%s",
+                    100 * status.fraction,
+                    status.stage,
+                    status.message,
+                    left,
+                )
+            if not status.active:
+                break
+            if interrupted_s and now_s - interrupted_s > CANCEL_WAIT_S:
+                client.kill()
+                return EXIT_CANCELLED
+            time.sleep(POLL_S)
+        except KeyboardInterrupt:
+            _logger.info("cancelling; the job can be resumed")
+            client.cancel()
+            interrupted_s = time.monotonic()
+    if status.state == "CANCELLED":
+        _logger.info("cancelled; continue with: resume %s", client.folder.root)
+        return EXIT_CANCELLED
+    if status.state != "DONE":
+        _logger.error("error: %s %s", status.error, status.hint)
+        return status.exit_code or EXIT_OTHER
+    return _finish(client.folder.result, job, options) or EXIT_DONE
+
+
+def _finish(result: Path, job: JobFile, options: Namespace) -> int:
+    if not options.no_blend:
+        from .ops.scene_objects import write_blend
+
+        write_blend(result, result / "scene.blend")
+    if "usd" in job.settings.export:
+        from .ops.scene_objects import export_usd
+
+        export_usd(result)
+    from .core.evaluation.report import headline
+    from .core.files import read_json
+
+    _logger.info("results: %s", result)
+    for line in headline(read_json(result / "report.json")):
+        _logger.info("  %s", line)
+    return 0
+
+
+def _span(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+def _log_to_terminal() -> None:
+    if _logger.handlers:
+        return
+    handler = logging.StreamHandler(sys.stdout)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    _logger.addHandler(handler)
+    _logger.setLevel(logging.INFO)
+    _logger.propagate = False
+
+
+def _arguments(argv: list[str]) -> list[str]:
+    """Return what follows ``--`` (inside Blender), or everything (plain Python)."""
+    if "--" in argv:
+        return argv[argv.index("--") + 1 :]
+    bpy = sys.modules.get("bpy")
+    if bpy is not None and not getattr(bpy.app, "module", False):
+        return []
+    return argv[1:]
+
+
+def _main_as_script() -> int:
+    """Load the package from where this file lies, then run its ``batch`` module."""
+    name = "gaussian_wrapping_addon"
+    root = Path(__file__).resolve().parent
+    spec = importlib.util.spec_from_file_location(
+        name, root / "__init__.py", submodule_search_locations=[str(root)]
+    )
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{root} holds no package")
+    package = importlib.util.module_from_spec(spec)
+    sys.modules[name] = package
+    spec.loader.exec_module(package)
+    # The folder of this file would put ``core``, ``ops`` and ``ui`` on the path as top-level names.
+    sys.path[:] = [p for p in sys.path if not p or Path(p).resolve() != root]
+    return int(importlib.import_module(f"{name}.batch").main(_arguments(sys.argv)))
+
+
+if __name__ == "__main__":
+    sys.exit(_main_as_script())

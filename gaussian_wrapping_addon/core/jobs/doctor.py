@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Findings about an environment: can this Python run a worker, and what is missing."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import json
+import platform
+import shutil
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from ..errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError
+from ..helper_process import child_command, child_environment, emit
+
+MIN_PYTHON = (3, 11)
+MIN_MEMORY_BYTES = 4 * 2**30
+MIN_DISK_BYTES = 2 * 2**30
+DOCTOR_DEADLINE_S = 120.0
+
+REQUIRED = {
+    "numpy": "numpy", "torch": "torch", "numba": "numba", "scipy": "scipy", "shull": "shull",
+    "trimesh": "trimesh", "embreex": "embreex", "pycolmap": "pycolmap", "xatlas": "xatlas",
+    "PIL": "pillow",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """One line of the doctor: ``good`` tells whether it stands in the way of a job."""
+
+    subject: str
+    good: bool
+    finding: str
+    hint: str = ""
+
+
+def diagnose(folder: str = ".") -> list[Diagnosis]:
+    """Examine the interpreter that runs this."""
+    found = [
+        Diagnosis(
+            "Python",
+            sys.version_info[:2] >= MIN_PYTHON,
+            f"{platform.python_version()} at {sys.executable}",
+            "Use Python 3.11 or newer.",
+        )
+    ]
+    for module, package in REQUIRED.items():
+        try:
+            importlib.import_module(module)
+        except Exception as error:  # a broken binary package can raise anything
+            found.append(
+                Diagnosis(package, False, f"cannot be imported: {error}", f"pip install {package}")
+            )
+        else:
+            found.append(Diagnosis(package, True, importlib.metadata.version(package)))
+    found.append(_device())
+    found.append(_memory())
+    free_bytes = shutil.disk_usage(folder).free
+    found.append(
+        Diagnosis(
+            "Disk",
+            free_bytes > MIN_DISK_BYTES,
+            f"{free_bytes / 2**30:.1f} GiB free",
+            "Free at least 2 GiB.",
+        )
+    )
+    return found
+
+
+def _device() -> Diagnosis:
+    try:
+        import torch
+    except ImportError:
+        return Diagnosis("Device", False, "torch is missing", "pip install torch")
+    if torch.cuda.is_available():
+        return Diagnosis(
+            "Device", True, f"{torch.cuda.get_device_name(0)} is present; jobs run on the processor"
+        )
+    return Diagnosis("Device", True, "no CUDA device; jobs run on the processor")
+
+
+def _memory() -> Diagnosis:
+    from .machine import _memory_bytes
+
+    total_bytes = _memory_bytes()
+    if not total_bytes:
+        return Diagnosis("Memory", True, "unknown")
+    return Diagnosis(
+        "Memory",
+        total_bytes >= MIN_MEMORY_BYTES,
+        f"{total_bytes / 2**30:.1f} GiB",
+        "At least 4 GiB are needed.",
+    )
+
+
+def main(arguments: list[str]) -> int:
+    """Write the findings about this interpreter to stdout, one JSON object a line."""
+    findings = diagnose(arguments[0] if arguments else ".")
+    for finding in findings:
+        emit(**asdict(finding))
+    return EXIT_DONE if all(f.good for f in findings) else EXIT_BAD_DATA
+
+
+def diagnose_worker(python: str) -> list[Diagnosis]:
+    """Examine another interpreter, in a child process.
+
+    Raises
+    ------
+    WorkerError
+        The interpreter does not start or gives no answer.
+    """
+    try:
+        done = subprocess.run(
+            child_command("jobs.doctor", python=python),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            env=child_environment(),
+            timeout=DOCTOR_DEADLINE_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise WorkerError(f"{python} does not run: {error}.", "Choose another Python.") from None
+    findings: list[Diagnosis] = []
+    for line in done.stdout.decode(errors="replace").splitlines():
+        try:
+            values: Any = json.loads(line)
+            findings.append(Diagnosis(**values))
+        except (ValueError, TypeError):
+            continue
+    if not findings:
+        words = done.stderr.decode(errors="replace").strip().splitlines()
+        raise WorkerError(
+            f"{python} gave no answer: {words[-1] if words else 'no output'}.",
+            "Choose a Python 3.11 or newer that has the packages of requirements-worker.txt.",
+        )
+    return findings
