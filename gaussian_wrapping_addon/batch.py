@@ -93,9 +93,9 @@ def _parser() -> ArgumentParser:
         command.add_argument(
             "--export", default="glb", help=f"comma separated, of {','.join(EXPORT_FORMATS)}"
         )
+        command.add_argument("--threads", type=int, default=0, help="0 uses every core")
     for command in (wrap, mesh, resume):
         command.add_argument("--no-blend", action="store_true", help="needs no bpy")
-        command.add_argument("--threads", type=int, default=0 if command is not resume else None)
 
     check = commands.add_parser("check", help="findings about an input, without starting anything")
     check.add_argument("input", type=Path)
