@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Job files: round trip, and refusal of what is not one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
+from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_job, write_job
+from gaussian_wrapping_addon.core.jobs.runner import region_name
+from gaussian_wrapping_addon.core.settings import JobSettings, preset
+
+
+def test_round_trip_keeps_settings_and_region_content(tmp_path: Path) -> None:
+    region = tmp_path / "head.json"
+    region.write_text(json.dumps({"version": 1, "vertices": []}))
+    settings = preset("fine", regions=("auto", str(region)), export=("glb", "ply"), seed=7)
+    job = make_job("wrap", tmp_path, settings)
+    write_job(tmp_path / "job.json", job)
+    region.unlink()
+    again = read_job(tmp_path / "job.json")
+    assert again == job
+    assert again.region_bodies[str(region.resolve())] == {"version": 1, "vertices": []}
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"schema_version": 99}, "schema version"),
+        ({"command": "erase"}, "command"),
+        ({"extra": 1}, "entries"),
+        ({"settings": {"preset": "draft", "colour": 1}}, "colour"),
+        ({"settings": {"training": {"iterations": "many"}}}, "iterations"),
+        ({"settings": {"training": {"iterations": True}}}, "iterations"),
+        ({"settings": {"meshing": {"edge_length": -1.0}}}, "edge_length"),
+        ({"settings": []}, "object"),
+    ],
+)
+def test_what_is_not_a_job_is_refused_by_name(tmp_path: Path, change: dict, word: str) -> None:
+    values = make_job("wrap", tmp_path, JobSettings()).to_json()
+    values.update(change)
+    with pytest.raises(UsageError, match=word):
+        JobFile.from_json(json.loads(json.dumps(values)))
+
+
+def test_half_a_job_file_names_the_line(tmp_path: Path) -> None:
+    path = tmp_path / "job.json"
+    path.write_text('{"schema_version": 1,\n "command": ')
+    with pytest.raises(ParseError, match="line 2"):
+        read_job(path)
+
+
+def test_missing_source_and_region_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="does not exist"):
+        make_job("wrap", tmp_path / "nothing", JobSettings())
+    with pytest.raises(DatasetError, match="Region file"):
+        make_job("wrap", tmp_path, replace(JobSettings(), regions=("nothing.json",)))
+
+
+@pytest.mark.parametrize(
+    ("request_", "body", "name"),
+    [
+        ("auto", None, "auto"),
+        ("all", None, "all"),
+        ("x/Left hand.json", {}, "Left_hand"),
+        ("x/a.json", {"blender_object_name": "Région 1/2"}, "R_gion_1_2"),
+        ("x/a.json", {"blender_object_name": "../../etc"}, "etc"),
+    ],
+)
+def test_region_names_are_safe_folder_names(request_: str, body: object, name: str) -> None:
+    assert region_name(request_, body) == name
+
+
+def test_a_region_name_never_hides_the_automatic_one() -> None:
+    assert region_name("x/auto.json", {}) not in ("auto", "all", "")
+    assert region_name("x/\u4e2d.json", {}) not in ("auto", "all", "")

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Job folders: ownership, locks, states of processes that are gone."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.jobs.job_folder import (
+    JobFolder,
+    JobStatus,
+    process_alive,
+    process_start_ticks,
+)
+
+
+def dead_pid() -> int:
+    child = subprocess.Popen([sys.executable, "-c", "pass"])
+    child.wait()
+    return child.pid
+
+
+def test_a_folder_with_other_content_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "holiday.jpg").write_bytes(b"x")
+    with pytest.raises(UsageError, match="other files"):
+        JobFolder(tmp_path).create()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["holiday.jpg"]
+
+
+def test_a_job_folder_is_accepted_again(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path / "new" / "deep")
+    folder.create()
+    (folder.root / "log.txt").write_text("x")
+    folder.create()
+    assert folder.stages.is_dir()
+
+
+def test_a_file_is_not_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("x")
+    with pytest.raises(UsageError, match="is a file"):
+        JobFolder(tmp_path / "a").create()
+
+
+def test_status_of_a_dead_worker_is_lost(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    folder.write_status(JobStatus(state="RUNNING", pid=dead_pid(), heartbeat_s=time.time()))
+    status = folder.read_status()
+    assert status.state == "LOST"
+    assert "resume" in status.hint.lower()
+
+
+def test_status_of_a_living_worker_stays(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    mine = JobStatus(state="RUNNING", pid=os.getpid(), pid_started=process_start_ticks(os.getpid()))
+    folder.write_status(mine)
+    assert folder.read_status() == mine
+
+
+def test_a_reused_pid_is_not_taken_for_the_worker() -> None:
+    started = process_start_ticks(os.getpid())
+    assert process_alive(os.getpid(), started)
+    if started:
+        assert not process_alive(os.getpid(), started + 1)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"state": 3}', "\x00"])
+def test_half_a_status_reads_as_not_yet(tmp_path: Path, content: str) -> None:
+    folder = JobFolder(tmp_path)
+    folder.status_path.write_text(content)
+    assert folder.read_status().fraction == 0.0
+
+
+def test_lock_of_a_living_process_is_respected_and_a_stale_one_taken(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        started = process_start_ticks(other.pid)
+        write_json(folder.lock_path, {"pid": other.pid, "started": started})
+        with pytest.raises(UsageError, match=str(other.pid)):
+            folder.lock()
+        other.kill()
+        other.wait()
+    folder.lock()
+    folder.unlock()
+    assert not folder.lock_path.exists()

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Client and worker process together: bad input, cancel, crash, a second worker."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.jobs.client import JobClient
+from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job
+from gaussian_wrapping_addon.core.settings import JobSettings
+
+BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"
+
+
+def test_an_empty_folder_fails_with_words_and_code_3(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    source.mkdir()
+    client = JobClient.start(tmp_path / "out", make_job("wrap", source, JobSettings()))
+    status = client.wait(60)
+    assert status.state == "FAILED"
+    assert status.exit_code == 3
+    assert status.error
+    assert status.hint
+    assert not client.folder.lock_path.exists()
+
+
+def test_a_killed_worker_is_lost_and_says_the_signal(tmp_path: Path) -> None:
+    # A FIFO as a photo keeps the worker from ending by itself only where it is opened; a source
+    # that vanishes would end it. So stop the process at once instead, before it can do either.
+    source = tmp_path / "photos"
+    source.mkdir()
+    client = JobClient.start(tmp_path / "out", make_job("wrap", source, JobSettings()))
+    assert client._process is not None
+    os.kill(client._process.pid, signal.SIGKILL)
+    status = client.wait(60)
+    assert status.state in ("LOST", "FAILED")
+    assert "signal 9" in status.error
+
+
+def test_a_locked_folder_is_refused(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    source.mkdir()
+    job = make_job("wrap", source, JobSettings())
+    JobClient.start(tmp_path / "out", job).wait(60)
+    from gaussian_wrapping_addon.core.files import write_json
+    from gaussian_wrapping_addon.core.jobs.job_folder import process_start_ticks
+
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        lock = {"pid": other.pid, "started": process_start_ticks(other.pid)}
+        write_json(tmp_path / "out" / "lock.json", lock)
+        with pytest.raises(UsageError, match="running"):
+            JobClient.resume(tmp_path / "out")
+        other.kill()
+
+
+def test_a_broken_job_file_is_reported_by_the_worker(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    source.mkdir()
+    client = JobClient.start(tmp_path / "out", make_job("wrap", source, JobSettings()))
+    client.wait(60)
+    client.folder.job_path.write_text("{}")
+    status = JobClient.resume(tmp_path / "out").wait(60)
+    assert status.state == "FAILED"
+    assert status.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        ([], 2),
+        (["wrap"], 2),
+        (["wrap", "photos"], 2),
+        (["dance"], 2),
+        (["wrap", "missing", "--out", "out", "--no-blend"], 3),
+        (["wrap", "photos", "--out", "out", "--no-blend"], 3),
+        (["wrap", "photos", "--out", "out", "--texture-size", "big", "--no-blend"], 2),
+        (["wrap", "photos", "--out", "out", "--edge-length", "nan", "--no-blend"], 2),
+        (["wrap", "photos", "--out", "out", "--export", "fbx", "--no-blend"], 2),
+        (["mesh", "--out", "photos", "--no-blend"], 2),
+        (["resume", "photos", "--no-blend"], 2),
+        (["check", "photos"], 3),
+    ],
+)
+def test_exit_codes_of_bad_command_lines(tmp_path: Path, arguments: list[str], code: int) -> None:
+    (tmp_path / "photos").mkdir()
+    begun_s = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, str(BATCH), *arguments], cwd=tmp_path, capture_output=True, check=False
+    )
+    assert done.returncode == code, done.stdout.decode() + done.stderr.decode()
+    assert b"Traceback" not in done.stdout + done.stderr
+    assert done.stdout.strip()
+    assert time.monotonic() - begun_s < 5.0
+    assert not (tmp_path / "out").exists()
+
+
+def test_job_files_do_not_carry_program_paths(tmp_path: Path) -> None:
+    job = make_job("wrap", tmp_path, JobSettings())
+    assert "python" not in str(JobFile.from_json(job.to_json()).to_json()).lower()

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Settings: presets, ranges, JSON."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+
+from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.settings import (
+    PRESETS,
+    JobSettings,
+    MeshingSettings,
+    from_json,
+    preset,
+    to_json,
+)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_valid_and_survive_json(name: str) -> None:
+    settings = preset(name).validated()
+    assert from_json(JobSettings, to_json(settings)) == settings
+
+
+def test_presets_grow() -> None:
+    draft, standard, fine = (preset(n).training for n in PRESETS)
+    for name in ("iterations", "max_gaussians", "max_image_px"):
+        assert getattr(draft, name) < getattr(standard, name) < getattr(fine, name)
+
+
+def test_unknown_preset_is_refused() -> None:
+    with pytest.raises(UsageError, match="huge"):
+        preset("huge")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"threads": -1}, {"seed": -1}, {"regions": ()}, {"export": ("stl",)},
+        {"meshing": MeshingSettings(edge_length=float("nan"))},
+        {"meshing": MeshingSettings(edge_length=-1.0)},
+        {"meshing": MeshingSettings(points=-5)},
+    ],
+)  # fmt: skip
+def test_values_out_of_range_are_named(change: dict) -> None:
+    with pytest.raises(UsageError, match=next(iter(change))):
+        replace(JobSettings(), **change).validated()
+
+
+def test_every_training_setting_is_a_plain_number() -> None:
+    training = preset("draft").training
+    assert all(isinstance(getattr(training, f.name), (int, float)) for f in fields(training))
