@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Small random scenes and cameras that the tests of the renderer share."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+
+
+def look_at(
+    eye: tuple[float, float, float],
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    width: int = 40,
+    height: int = 30,
+    focal: float = 45.0,
+    name: str = "camera",
+) -> Camera:
+    """Return a camera at ``eye`` looking at ``target``, Z up, off-centre principal point."""
+    forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
+    forward /= np.linalg.norm(forward)
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.concatenate([rotation, -(rotation @ np.asarray(eye, np.float64))[:, None]], 1)
+    return Camera(
+        name,
+        width,
+        height,
+        focal,
+        1.03 * focal,
+        0.5 * width + 0.7,
+        0.5 * height - 0.4,
+        np.ascontiguousarray(pose),
+    )
+
+
+def random_gaussians(
+    count: int,
+    seed: int = 0,
+    *,
+    dtype: torch.dtype = torch.float64,
+    sh_degree: int = 2,
+    spread: float = 0.8,
+    scale: tuple[float, float] = (0.04, 0.3),
+    opacity: tuple[float, float] = (0.05, 0.95),
+    filter_size: float = 0.01,
+) -> OrientedGaussians:
+    """Return anisotropic oriented Gaussians in a box of half side ``spread`` around 0."""
+    random = np.random.default_rng(seed)
+    alpha = random.uniform(*opacity, count)
+    values = {
+        "means": random.uniform(-spread, spread, (count, 3)),
+        "log_scales": random.uniform(np.log(scale[0]), np.log(scale[1]), (count, 3)),
+        "quats": random.normal(size=(count, 4)) * random.uniform(0.5, 2.0, (count, 1)),
+        "opacity_logits": np.log(alpha / (1.0 - alpha)),
+        "sh": random.normal(size=(count, (sh_degree + 1) ** 2, 3)) * 0.3,
+        "orientation": random.normal(size=(count, 4)),
+        "filter_3d": np.full(count, filter_size),
+    }
+    return OrientedGaussians(**{k: torch.as_tensor(v).to(dtype) for k, v in values.items()})
+
+
+def isotropic(
+    means: list[tuple[float, float, float]],
+    sigmas: list[float],
+    opacities: list[float],
+    dtype: torch.dtype = torch.float64,
+) -> OrientedGaussians:
+    """Return round Gaussians with effective standard deviations and opacities as given."""
+    count = len(means)
+    alpha = torch.tensor(opacities, dtype=dtype)
+    quats = torch.zeros((count, 4), dtype=dtype)
+    quats[:, 0] = 1.0
+    return OrientedGaussians(
+        torch.tensor(means, dtype=dtype),
+        torch.log(torch.tensor(sigmas, dtype=dtype))[:, None].repeat(1, 3),
+        quats,
+        torch.log(alpha) - torch.log1p(-alpha),
+        torch.zeros((count, 1, 3), dtype=dtype),
+        torch.tensor([[0.0, 0.0, 1.0, 0.5]], dtype=dtype).repeat(count, 1),
+        torch.zeros(count, dtype=dtype),
+    )
