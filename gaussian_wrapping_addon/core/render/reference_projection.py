@@ -21,7 +21,7 @@ class ReferenceScreen:
 
     params: Tensor  # (n, 24); column 23 is 0
     depths: Tensor  # (n,) distance from the camera to the mean
-    usable: Tensor  # (n,) bool: beyond the near plane, fainter than never, all values finite
+    usable: Tensor  # (n,) bool: beyond the near plane, opacity above 1/255, all values finite
 
 
 def reference_projection(
@@ -31,13 +31,13 @@ def reference_projection(
 
     Rows that are not usable hold zeros and carry no gradient.
     """
-    like = {"dtype": gaussians.means.dtype, "device": gaussians.means.device}
-    rotation = torch.tensor(camera.rotation, **like)  # (3, 3)
-    translation = torch.tensor(camera.cam_from_world[:, 3], **like)  # (3,)
-    focal = torch.tensor([camera.fx, camera.fy], **like)  # (2,)
-    offset = torch.tensor([camera.cx, camera.cy], **like)  # (2,)
+    means = gaussians.means
+    rotation = means.new_tensor(camera.rotation)  # (3, 3)
+    translation = means.new_tensor(camera.cam_from_world[:, 3])  # (3,)
+    focal = means.new_tensor([camera.fx, camera.fy])  # (2,)
+    offset = means.new_tensor([camera.cx, camera.cy])  # (2,)
 
-    in_front = (gaussians.means @ rotation[2] + translation[2]).detach() > options.near_z
+    in_front = (means @ rotation[2] + translation[2]).detach() > options.near_z
     chosen = gaussians.select(in_front)
     local = chosen.means @ rotation.T + translation  # (m, 3)
     z = local[:, 2]
@@ -83,8 +83,8 @@ def reference_projection(
     index = torch.nonzero(in_front)[:, 0]
     usable = torch.zeros(len(gaussians), dtype=torch.bool, device=rows.device)
     usable[index] = good
-    params = torch.zeros((len(gaussians), 24), **like).index_put((index[good],), rows[good])
-    distance = torch.full((len(gaussians),), torch.inf, **like)
+    params = means.new_zeros((len(gaussians), 24)).index_put((index[good],), rows[good])
+    distance = means.new_full((len(gaussians),), torch.inf)
     distance = distance.index_put((index,), local.norm(dim=1))
     return ReferenceScreen(params, distance.detach(), usable)
 
@@ -92,7 +92,7 @@ def reference_projection(
 def _colors(gaussians: OrientedGaussians, camera: Camera, options: RenderOptions) -> Tensor:
     """(n, 3) harmonics at the direction camera -> mean, + 0.5, clamped at 0 (method.md 2.1)."""
     degree = used_degree(gaussians.sh.shape[1], options)
-    center = torch.tensor(camera.center, dtype=gaussians.means.dtype)
+    center = gaussians.means.new_tensor(camera.center)
     offset = gaussians.means - center
     direction = offset / offset.norm(dim=1, keepdim=True)
     basis = harmonics_basis(direction, degree)  # (n, k)
