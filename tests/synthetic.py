@@ -77,7 +77,7 @@ def photograph(camera: Camera) -> np.ndarray:
     for row in range(SAMPLES):
         for column in range(SAMPLES):
             shift_x, shift_y = (column + 0.5) / SAMPLES - 0.5, (row + 0.5) / SAMPLES - 0.5
-            rays = camera.rays() + [shift_x / camera.fx, shift_y / camera.fy, 0.0]
+            rays = camera.rays() + np.array([shift_x / camera.fx, shift_y / camera.fy, 0.0])
             world = rays.reshape(-1, 3) @ camera.rotation
             total += trace(camera.center, world).reshape(total.shape)
     return np.round(255 * total / SAMPLES**2).astype(np.uint8)
