@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The whole road on a tiny scene with exact ground truth, through the command line."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder
+from tests.synthetic import BALL_RADIUS, BallScene, write_ball_scene
+
+BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"
+OFFSET, SCALE = (5e5, 4e6, 100.0), 20.0
+ITERATIONS = "400"
+
+
+def batch(*arguments: str, timeout_s: float = 240) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(BATCH), *arguments],
+        capture_output=True, text=True, check=False, timeout=timeout_s,
+    )  # fmt: skip
+
+
+def write_box(
+    path: Path, scene: BallScene, half: float, center: tuple[float, float, float]
+) -> Path:
+    """Write a region file: an axis-aligned box in world coordinates, given in ball units."""
+    corners = [[x, y, z] for x in (-half, half) for y in (-half, half) for z in (-half, half)]
+    vertices = scene.scale * (np.array(corners) + center) + scene.offset
+    path.write_text(
+        json.dumps(
+            {
+                "class_name": "GaussianWrappingBoundingVolume",
+                "version": 1,
+                "blender_object_name": path.stem,
+                "vertices": vertices.tolist(),
+                "hull_simplices": None,
+            }
+        )
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def wrapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[BallScene, Path, str]:
+    """Train the ball scene once (far from the origin, scaled) and mesh a box around the ball."""
+    root = tmp_path_factory.mktemp("ball")
+    scene = write_ball_scene(root / "input", offset=OFFSET, scale=SCALE)
+    box = write_box(root / "ball.json", scene, 1.3, (0, 0, 0.35))
+    done = batch(
+        "wrap", str(root / "input"), "--out", str(root / "out"), "--preset", "draft",
+        "--iterations", ITERATIONS, "--max-gaussians", "6000", "--region", str(box),
+        "--points", "4000", "--texture-size", "512", "--export", "glb,obj,ply", "--no-blend",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return scene, root, done.stdout
+
+
+def world_mesh(root: Path, region: str) -> trimesh.Trimesh:
+    result = root / "out" / "result"
+    with np.load(result / region / "mesh.npz", allow_pickle=False) as arrays:
+        vertices, faces = arrays["vertices"], arrays["faces"]
+    frame = json.loads((result / "scene.json").read_text())["world_from_scene"]
+    world = Similarity.from_json(frame).points(vertices)
+    return trimesh.Trimesh(world, faces, process=False)
+
+
+def test_the_mesh_is_closed_and_lies_on_the_ball(wrapped: tuple[BallScene, Path, str]) -> None:
+    scene, root, _ = wrapped
+    mesh = world_mesh(root, "ball")
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.volume > 0
+    local = (mesh.triangles_center - scene.offset) / scene.scale  # ball units
+    # Judge the part that photos see and that belongs to the ball: well above the floor.
+    upper = local[:, 2] > -0.2
+    assert upper.sum() > 1000
+    distance = np.abs(np.linalg.norm(local[upper], axis=1) - BALL_RADIUS)
+    assert np.median(distance) < 0.02
+    assert np.percentile(distance, 95) < 0.08
+    # The ball is covered from all sides, not only met by what there is of the mesh.
+    generator = np.random.default_rng(0)
+    truth = generator.normal(size=(2000, 3))
+    truth /= np.linalg.norm(truth, axis=1, keepdims=True)
+    truth = truth[truth[:, 2] > 0.0]
+    _, gap, _ = trimesh.proximity.closest_point(mesh, scene.scale * truth + scene.offset)
+    assert np.percentile(gap / scene.scale, 95) < 0.08
+
+
+def test_result_files_are_there_and_agree(wrapped: tuple[BallScene, Path, str]) -> None:
+    _, root, output = wrapped
+    result = root / "out" / "result"
+    for name in ("gaussians.ply", "report.json", "report.md", "preview.png", "scene.json"):
+        assert (result / name).stat().st_size > 0, name
+    for name in ("mesh.ply", "mesh.glb", "mesh.obj", "albedo.png", "mesh.npz", "region.json"):
+        assert (result / "ball" / name).stat().st_size > 0, name
+    report = json.loads((result / "report.json").read_text())
+    figures = report["regions"]["ball"]
+    assert figures["statistics"]["closed"] is True
+    assert report["training"]["held_out_psnr"] > 20.0
+    assert {s["name"] for s in report["stages"]} == {
+        "cameras", "train", "mesh-ball", "texture-ball",
+    }  # fmt: skip
+    assert figures["texture"]["coverage"] > 0.6
+    ply = trimesh.load(result / "ball" / "mesh.ply", process=False)
+    assert np.abs(ply.vertices - world_mesh(root, "ball").vertices).max() < 1e-6 * SCALE
+    assert "PSNR" in output
+
+
+def test_another_region_and_resolution_needs_no_training(
+    wrapped: tuple[BallScene, Path, str],
+) -> None:
+    scene, root, _ = wrapped
+    box = write_box(root / "cap.json", scene, 0.6, (0, 0, 1.0))
+    before = {p: p.stat().st_mtime_ns for p in (root / "out" / "stages").glob("train-*/*")}
+    done = batch(
+        "mesh", "--out", str(root / "out"), "--region", str(box),
+        "--edge-length", str(0.04 * SCALE), "--texture-size", "256", "--no-blend",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads((root / "out" / "result" / "report.json").read_text())
+    reused = {s["name"]: s["reused"] for s in report["stages"]}
+    assert reused["cameras"]
+    assert reused["train"]
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+    assert set(report["regions"]) == {"ball", "cap"}
+    mesh = world_mesh(root, "cap")
+    assert mesh.is_watertight
+    local = (mesh.vertices - scene.offset) / scene.scale
+    assert np.abs(local[:, :2]).max() < 0.6 + 1e-6
+    edges = mesh.edges_unique_length / scene.scale
+    assert 0.02 < np.median(edges) < 0.08
+
+
+def test_a_killed_training_resumes_to_the_same_gaussians(
+    wrapped: tuple[BallScene, Path, str], tmp_path: Path
+) -> None:
+    _, root, _ = wrapped
+    arguments = [
+        "wrap", str(root / "input"), "--out", str(tmp_path / "out"), "--preset", "draft",
+        "--iterations", ITERATIONS, "--max-gaussians", "6000",
+        "--region", str(root / "ball.json"), "--points", "4000", "--texture-size", "512",
+        "--export", "glb,obj,ply", "--no-blend",
+    ]  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, str(BATCH), *arguments], stdout=subprocess.PIPE, text=True
+    )
+    folder = JobFolder(tmp_path / "out")
+    deadline_s = time.monotonic() + 200
+    while time.monotonic() < deadline_s:
+        status = folder.read_status()
+        if status.stage == "train" and "iteration 2" in status.message:
+            break
+        assert process.poll() is None, "the job ended before it could be stopped"
+        time.sleep(0.02)
+    # First a polite stop, which keeps a checkpoint; then the real thing: SIGKILL.
+    folder.cancel_path.touch()
+    assert process.wait(60) == 5
+    resumed = subprocess.Popen(
+        [sys.executable, str(BATCH), "resume", str(tmp_path / "out"), "--no-blend"],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    while time.monotonic() < deadline_s:
+        status = folder.read_status()
+        if status.state == "RUNNING" and status.stage == "train" and "iteration" in status.message:
+            os.kill(status.pid, signal.SIGKILL)
+            break
+        assert resumed.poll() is None, "the job ended before it could be killed"
+        time.sleep(0.02)
+    assert resumed.wait(60) not in (0, None)
+    done = batch("resume", str(tmp_path / "out"), "--no-blend")
+    assert done.returncode == 0, done.stdout + done.stderr
+    (first,) = (root / "out" / "stages").glob("train-*/gaussians.npz")
+    (second,) = (tmp_path / "out" / "stages").glob("train-*/gaussians.npz")
+    with np.load(first, allow_pickle=False) as a, np.load(second, allow_pickle=False) as b:
+        for name in a.files:
+            assert np.array_equal(a[name], b[name]), name
