@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The Gaussians that one camera sees, packed and listed by tile for vacancy queries."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import tolerances
+from ..dataset.camera import Camera
+from ..errors import ResourceError
+from ..gaussians.model import GaussianArrays
+from ..render.projection import pack_camera, project_arrays
+from .vacancy_kernels import ROW_COLUMNS, count_tiles, scatter_tiles
+
+VIRTUAL_SIDE_PX = 65536
+"""Longer side of the screen that queries use. Nothing is drawn, so the only thing that pixels
+decide is which Gaussians are lost between pixel centres: at this size, none that matters."""
+TILES_ALONG_SIDE = 64
+TILE_PX = VIRTUAL_SIDE_PX // TILES_ALONG_SIDE
+DEPTH_TAIL = 1e-5
+"""In front of the depth where a Gaussian's value first exceeds this, it is left out."""
+MAX_PAIRS = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class CameraBins:
+    """What :func:`..vacancy_kernels.transmittance_of_cells` reads for one camera."""
+
+    packed: np.ndarray
+    """(22,) float64 camera of the virtual screen."""
+    tiles_x: int
+    tiles_y: int
+    rows: np.ndarray
+    """(m, 16) float32, nearest first."""
+    boxes: np.ndarray
+    """(m, 4) float32, pixels of the virtual screen."""
+    tile_start: np.ndarray
+    """(tiles + 1,) int64."""
+    tile_ids: np.ndarray
+    """(pairs,) int32."""
+    longest_list: int
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory held."""
+        return sum(a.nbytes for a in (self.rows, self.boxes, self.tile_start, self.tile_ids))
+
+
+def virtual_camera(camera: Camera) -> Camera:
+    """Return the camera with its longer side resampled to :data:`VIRTUAL_SIDE_PX`."""
+    scale = VIRTUAL_SIDE_PX / max(camera.width, camera.height)
+    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+
+
+def region_window(
+    camera: Camera, bounds: np.ndarray, near_z: float
+) -> tuple[float, float, float, float, float] | None:
+    """Return the part of the image and the depth in which a box can be seen.
+
+    Parameters
+    ----------
+    bounds : (2, 3) float64
+        Lowest and highest corner, scene frame.
+
+    Returns
+    -------
+    tuple or None
+        x0, y0, x1, y1 in pixels and the largest z-depth; ``None`` if the camera cannot see it.
+    """
+    corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), -1).reshape(-1, 3)  # (8, 3)
+    pixels, depth = camera.project(corners)
+    if depth.max() <= near_z:
+        return None
+    x0, y0, x1, y1 = 0.0, 0.0, float(camera.width), float(camera.height)
+    if depth.min() > 1e-6 * depth.max():
+        # Only then is the box's picture inside the hull of its corners' pictures.
+        x0, y0 = max(x0, pixels[:, 0].min() - 1.0), max(y0, pixels[:, 1].min() - 1.0)
+        x1, y1 = min(x1, pixels[:, 0].max() + 1.0), min(y1, pixels[:, 1].max() + 1.0)
+        if x0 > x1 or y0 > y1:
+            return None
+    return x0, y0, x1, y1, float(depth.max())
+
+
+def bin_camera(
+    arrays: GaussianArrays,
+    camera: Camera,
+    near_z: float,
+    bounds: np.ndarray | None,
+    threads: int,
+) -> CameraBins | None:
+    """Project, pack and bin what a camera sees of the region; ``None`` if it cannot see it.
+
+    Raises
+    ------
+    ResourceError
+        If the tile lists do not fit.
+    """
+    virtual = virtual_camera(camera)
+    window = None if bounds is None else region_window(virtual, bounds, near_z)
+    if bounds is not None and window is None:
+        return None
+    screen = project_arrays(arrays, virtual, near_z, threads=threads)
+    kept = screen.visible.copy()
+    log_opacity = arrays.log_opacities
+    reach = np.maximum(2.0 * (log_opacity - math.log(tolerances.ALPHA_MIN)), 0.0)  # (n,)
+    depth_reach = np.sqrt(2.0 * np.maximum(log_opacity - math.log(DEPTH_TAIL), 0.0))
+    begin_z = screen.params[:, 10] - depth_reach * screen.params[:, 22]  # (n,)
+    boxes = screen.boxes
+    if window is not None:
+        x0, y0, x1, y1, deepest = window
+        kept &= (boxes[:, 0] <= x1) & (boxes[:, 2] >= x0)
+        kept &= (boxes[:, 1] <= y1) & (boxes[:, 3] >= y0) & (begin_z <= deepest)
+    ids = np.flatnonzero(kept)
+    ids = ids[np.argsort(screen.depths[ids], kind="stable")]
+    rows = np.zeros((len(ids), ROW_COLUMNS), np.float32)
+    rows[:, :11] = screen.params[ids, :11]
+    rows[:, 11] = screen.params[ids, 12]
+    rows[:, 12] = screen.params[ids, 11]
+    rows[:, 13] = reach[ids]
+    rows[:, 14] = begin_z[ids]
+    near_boxes = np.ascontiguousarray(boxes[ids])
+    if window is not None:
+        # Lists of tiles outside the window are never read.
+        near_boxes[:, :2] = np.maximum(near_boxes[:, :2], np.array([x0, y0], np.float32))
+        near_boxes[:, 2:] = np.minimum(near_boxes[:, 2:], np.array([x1, y1], np.float32))
+    tiles_x, tiles_y = -(-virtual.width // TILE_PX), -(-virtual.height // TILE_PX)
+    start = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    count_tiles(near_boxes, TILE_PX, tiles_x, tiles_y, start[1:])
+    longest = int(start.max())
+    np.cumsum(start, out=start)
+    if start[-1] > MAX_PAIRS:
+        raise ResourceError(
+            f"Camera {camera.name} would list {start[-1]} pairs of Gaussian and tile.",
+            "Train with fewer Gaussians.",
+        )
+    tile_ids = np.empty(start[-1], np.int32)
+    scatter_tiles(near_boxes, TILE_PX, tiles_x, tiles_y, start[:-1].copy(), tile_ids)
+    packed = pack_camera(virtual, near_z)
+    return CameraBins(packed, tiles_x, tiles_y, rows, near_boxes, start, tile_ids, longest)

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Forms of log alpha, log G, log(1 - G) and G / (1 - G) that keep all their digits."""
+
+from __future__ import annotations
+
+import numpy as np
+
+LOG_HALF = -0.6931471805599453
+
+
+def log_sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Return the logarithm of the opacity of a logit, ``-softplus(-logit)``.
+
+    Parameters
+    ----------
+    logits : (...) array
+        Opacity logits, any finite value.
+
+    Returns
+    -------
+    (...) float64, < 0
+        Accurate to a few ulp also where the opacity rounds to 1 (method.md 5.4).
+    """
+    logits = np.asarray(logits, np.float64)
+    # Either branch alone loses digits or overflows on the other side of zero.
+    return np.minimum(logits, 0.0) - np.log1p(np.exp(-np.abs(logits)))
+
+
+def log_gaussian(log_alpha: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return ``log G = log alpha - q / 2``.
+
+    Parameters
+    ----------
+    log_alpha : (...) array, <= 0
+    q : (...) array
+        Squared Mahalanobis distance, >= 0.
+    """
+    return np.asarray(log_alpha, np.float64) - 0.5 * np.asarray(q, np.float64)
+
+
+def log_one_minus(log_g: np.ndarray) -> np.ndarray:
+    """Return ``log(1 - G)`` of ``log G``.
+
+    Parameters
+    ----------
+    log_g : (...) array, <= 0
+
+    Returns
+    -------
+    (...) float64, <= 0
+        ``-inf`` where ``log_g`` is 0 (method.md 5.4).
+    """
+    log_g = np.asarray(log_g, np.float64)
+    with np.errstate(divide="ignore"):
+        near_one = np.log(-np.expm1(log_g))
+    # Where G is small, 1 - G rounds; log1p does not need it.
+    return np.where(log_g < LOG_HALF, np.log1p(-np.exp(log_g)), near_one)
+
+
+def odds(log_g: np.ndarray) -> np.ndarray:
+    """Return ``H = G / (1 - G) = 1 / expm1(-log G)``.
+
+    Parameters
+    ----------
+    log_g : (...) array, <= 0
+
+    Returns
+    -------
+    (...) float64, >= 0
+        ``inf`` where ``log_g`` is 0, 0 where G underflows (method.md 5.4).
+    """
+    with np.errstate(divide="ignore", over="ignore"):
+        return 1.0 / np.expm1(-np.asarray(log_g, np.float64))
