@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The material of a result: the photo texture, lit or unlit, glTF-safe both ways."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+SHADINGS = ("LIT", "UNLIT")
+_IMAGE, _LIT, _UNLIT, _OUTPUT = "Photo Texture", "Lit", "Unlit", "Output"
+
+# Photos carry their own light: a glossy guess on top of it would look wrong from most sides.
+_ROUGHNESS = 0.9
+_SPECULAR = 0.1
+
+
+def load_texture(path: Path) -> bpy.types.Image:
+    """Load an image by path (not packed), or reload it where it is loaded already."""
+    image = bpy.data.images.load(str(path), check_existing=True)
+    if image.users:
+        image.reload()
+    image.colorspace_settings.name = "sRGB"
+    return image
+
+
+def create_material(name: str, image: bpy.types.Image) -> bpy.types.Material:
+    """Make a material with both branches, linked as lit.
+
+    Unlit is the pattern that the glTF exporter writes as ``KHR_materials_unlit``.
+    """
+    material = bpy.data.materials.new(name)
+    if material.node_tree is None:  # Blender 4 makes materials without nodes
+        material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    texture = nodes.new("ShaderNodeTexImage")
+    texture.name, texture.image, texture.location = _IMAGE, image, (-600, 200)
+    lit = nodes.new("ShaderNodeBsdfPrincipled")
+    lit.name, lit.location = _LIT, (-200, 400)
+    lit.inputs["Roughness"].default_value = _ROUGHNESS
+    lit.inputs["Specular IOR Level"].default_value = _SPECULAR
+    links.new(texture.outputs["Color"], lit.inputs["Base Color"])
+    emission = nodes.new("ShaderNodeEmission")
+    emission.location = (-200, -300)
+    links.new(texture.outputs["Color"], emission.inputs["Color"])
+    transparent = nodes.new("ShaderNodeBsdfTransparent")
+    transparent.location = (-200, -450)
+    path = nodes.new("ShaderNodeLightPath")
+    path.location = (-600, -200)
+    unlit = nodes.new("ShaderNodeMixShader")
+    unlit.name, unlit.location = _UNLIT, (50, -300)
+    links.new(path.outputs["Is Camera Ray"], unlit.inputs[0])
+    links.new(transparent.outputs[0], unlit.inputs[1])
+    links.new(emission.outputs[0], unlit.inputs[2])
+    output = nodes.new("ShaderNodeOutputMaterial")
+    output.name, output.location = _OUTPUT, (300, 200)
+    links.new(lit.outputs[0], output.inputs["Surface"])
+    # Workbench draws the texture of the active image node.
+    nodes.active = texture
+    return material
+
+
+def set_shading(material: bpy.types.Material, shading: str) -> bool:
+    """Link the lit or the unlit branch; False where the material is not one of ours."""
+    tree = material.node_tree
+    if tree is None or not {_LIT, _UNLIT, _OUTPUT} <= set(tree.nodes.keys()):
+        return False
+    source = tree.nodes[_LIT if shading == "LIT" else _UNLIT]
+    tree.links.new(source.outputs[0], tree.nodes[_OUTPUT].inputs["Surface"])
+    return True
+
+
+def shading_of(material: bpy.types.Material | None) -> str | None:
+    """Return ``"LIT"`` or ``"UNLIT"``, None where the material is not one of ours."""
+    tree = material.node_tree if material is not None else None
+    if tree is None or not {_LIT, _UNLIT, _OUTPUT} <= set(tree.nodes.keys()):
+        return None
+    links = tree.nodes[_OUTPUT].inputs["Surface"].links
+    return "UNLIT" if links and links[0].from_node.name == _UNLIT else "LIT"

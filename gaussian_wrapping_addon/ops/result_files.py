@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Read a result folder into plain arrays, with every bound checked before Blender sees them."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core import limits
+from ..core.dataset.camera import Camera
+from ..core.dataset.similarity import Similarity
+from ..core.errors import DatasetError, ParseError
+from ..core.files import read_json
+from .region_geometry import vertices_of_region
+
+# An import of this size already takes minutes; a larger claim is a broken or hostile file.
+MAX_MESH_BYTES = 4 * 2**30
+
+
+@dataclass(frozen=True)
+class RegionResult:
+    """One region's mesh and texture."""
+
+    name: str
+    vertices: np.ndarray
+    """(v, 3) float64, scene frame, finite."""
+    faces: np.ndarray
+    """(f, 3) int32, indices within range."""
+    corner_uvs: np.ndarray
+    """(f, 3, 2) float32, finite."""
+    albedo: Path
+    box_vertices: np.ndarray
+    """(n, 3) float64, world frame: corners of the region."""
+    stamp: str
+    """Changes when the mesh file changes."""
+
+
+@dataclass(frozen=True)
+class ResultFiles:
+    """All that Blender shows of a job."""
+
+    folder: Path
+    cameras: tuple[tuple[Camera, str], ...]
+    """Cameras in the scene frame with the path of their photo."""
+    world_from_scene: Similarity
+    radius: float
+    fingerprint: str
+    """Hash of ``scene.json``: finds a result again whose folder was moved."""
+    regions: tuple[RegionResult, ...]
+    figures: dict[str, Any] = field(default_factory=dict)
+    """The figures of the report that the panel shows; empty without a report."""
+
+
+def read_result(folder: Path) -> ResultFiles:
+    """Read and check ``DIR/result`` (docs/architecture.md, "Result folder").
+
+    Raises
+    ------
+    DatasetError
+        The folder is no result folder, or holds no region.
+    ParseError
+        A file in it is not what it should be; names file and place.
+    """
+    folder = folder.resolve()
+    scene_path = folder / "scene.json"
+    if not scene_path.is_file():
+        raise DatasetError(
+            f"{folder} holds no scene.json.", "Choose the folder named result of a finished job."
+        )
+    cameras, world_from_scene, radius = _scene(scene_path)
+    regions = tuple(
+        _region(path.parent) for path in sorted(folder.glob("*/mesh.npz")) if path.is_file()
+    )
+    if not regions:
+        raise DatasetError(f"{folder} holds no mesh.", "Mesh a region first.")
+    report_path = folder / "report.json"
+    report = read_json(report_path) if report_path.is_file() else {}
+    return ResultFiles(
+        folder,
+        cameras,
+        world_from_scene,
+        radius,
+        hashlib.sha256(scene_path.read_bytes()).hexdigest()[:16],
+        regions,
+        report_figures(report),
+    )
+
+
+def _scene(path: Path) -> tuple[tuple[tuple[Camera, str], ...], Similarity, float]:
+    values = read_json(path)
+    hint = "Run the job again."
+    try:
+        world_from_scene = Similarity.from_json(values["world_from_scene"])
+        radius = float(values["radius"])
+        entries = values["cameras"]
+        if not isinstance(entries, list) or len(entries) > limits.MAX_IMAGES:
+            raise ValueError("cameras is not a list of a possible length")
+        cameras = []
+        for entry in entries:
+            entry = dict(entry)
+            photo = str(entry.pop("photo"))
+            cameras.append((Camera.from_json(entry), photo))
+        numbers = np.concatenate(
+            [world_from_scene.matrix().ravel(), [radius]]
+            + [
+                np.array([*c.cam_from_world.ravel(), c.fx, c.fy, c.cx, c.cy, c.width, c.height])
+                for c, _ in cameras
+            ]
+        )
+        if not np.isfinite(numbers).all():
+            raise ValueError("a number is not finite")
+        if not (world_from_scene.scale > 0.0 and radius > 0.0):
+            raise ValueError("the scale or the radius is not positive")
+        if any(min(c.fx, c.fy, c.width, c.height) <= 0 for c, _ in cameras):
+            raise ValueError("a camera has no size or focal length")
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise ParseError(path, "whole file", f"not a scene file ({error}).", hint) from None
+    return tuple(cameras), world_from_scene, radius
+
+
+def _region(folder: Path) -> RegionResult:
+    path = folder / "mesh.npz"
+    vertices, faces, corner_uvs = _mesh(path)
+    state = path.stat()
+    region_path = folder / "region.json"
+    if not region_path.is_file():
+        raise DatasetError(f"{folder} holds no region.json.", "Mesh the region again.")
+    albedo = folder / "albedo.png"
+    if not albedo.is_file():
+        raise DatasetError(f"{folder} holds no albedo.png.", "Mesh the region again.")
+    box = vertices_of_region(read_json(region_path), region_path)
+    stamp = f"{state.st_size}:{state.st_mtime_ns}"
+    return RegionResult(folder.name, vertices, faces, corner_uvs, albedo, box, stamp)
+
+
+def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    hint = "Mesh the region again."
+    try:
+        with zipfile.ZipFile(path) as archive:
+            claimed_bytes = sum(item.file_size for item in archive.infolist())
+        if claimed_bytes > MAX_MESH_BYTES:
+            raise ValueError(f"{claimed_bytes} bytes are too many")
+        with np.load(path, allow_pickle=False) as arrays:
+            vertices = np.asarray(arrays["vertices"], np.float64)
+            faces = np.asarray(arrays["faces"])
+            corner_uvs = np.asarray(arrays["corner_uvs"], np.float32)
+    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as error:
+        raise ParseError(path, "whole file", f"not a mesh file ({error}).", hint) from None
+    if vertices.ndim != 2 or vertices.shape[1:] != (3,):
+        raise ParseError(path, "vertices", f"shape {vertices.shape} is not (v, 3).", hint)
+    if faces.ndim != 2 or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
+        raise ParseError(path, "faces", f"shape {faces.shape} is not (f, 3) of integers.", hint)
+    if corner_uvs.shape != (len(faces), 3, 2):
+        raise ParseError(path, "corner_uvs", f"shape {corner_uvs.shape} is not (f, 3, 2).", hint)
+    if len(faces) == 0:
+        raise ParseError(path, "faces", "there is none.", hint)
+    for name, values in (("vertices", vertices), ("corner_uvs", corner_uvs)):
+        bad = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(1))
+        if len(bad):
+            raise ParseError(path, f"{name}[{bad[0]}]", "not a finite number.", hint)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ParseError(path, "faces", "an index is out of range.", hint)
+    return vertices, faces.astype(np.int32), corner_uvs
+
+
+def report_figures(report: Any) -> dict[str, Any]:
+    """Pick the figures that the panel shows; what a report lacks is left out.
+
+    Returns
+    -------
+    figures : dict
+        ``seconds``, ``gaussians``, ``psnr`` (held-out photos), and ``regions``: for each name
+        ``faces``, ``closed``, ``coverage``.
+    """
+    figures: dict[str, Any] = {}
+    training = _dict(report, "training")
+    for name, value in (
+        ("seconds", _dict(report).get("wall_seconds")),
+        ("gaussians", training.get("gaussians")),
+        ("psnr", training.get("held_out_psnr") if training.get("held_out") else None),
+    ):
+        if isinstance(value, (int, float)):
+            figures[name] = value
+    regions = {}
+    for name, region in _dict(report, "regions").items():
+        statistics, texture = _dict(region, "statistics"), _dict(region, "texture")
+        regions[name] = {
+            key: value
+            for key, value in (
+                ("faces", statistics.get("faces")),
+                ("closed", statistics.get("closed")),
+                ("coverage", texture.get("coverage")),
+            )
+            if isinstance(value, (int, float))
+        }
+    if regions:
+        figures["regions"] = regions
+    return figures
+
+
+def _dict(values: Any, key: str | None = None) -> dict[str, Any]:
+    inner = values if key is None or not isinstance(values, dict) else values.get(key)
+    return inner if isinstance(inner, dict) else {}

@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Turn a result folder into Blender objects, and write them as .blend and USD."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ..core.errors import UsageError
+from . import tags
+from .camera_objects import create_camera, look_through
+from .materials import create_material, load_texture
+from .region_objects import create_region
+from .result_files import RegionResult, ResultFiles, read_result
+
+_logger = logging.getLogger(__name__)
+
+FRAME_NAME = "blender_from_scene"
+
+# Camera frusta this share of the scene's radius are visible and do not hide the mesh.
+_CAMERA_SIZE_SHARE = 0.03
+
+
+@dataclass(frozen=True)
+class ImportedResult:
+    """The objects of one result, new and found again."""
+
+    collection: bpy.types.Collection
+    frame: bpy.types.Object
+    """The parent empty; its matrix is ``blender_from_scene``."""
+    meshes: tuple[bpy.types.Object, ...]
+    cameras: tuple[bpy.types.Object, ...]
+    regions: tuple[bpy.types.Object, ...]
+
+
+def import_result(folder: Path, scene: bpy.types.Scene) -> ImportedResult:
+    """Build, or bring up to date, the objects of a result folder.
+
+    A result that was imported before is found again by its folder; then meshes whose file has
+    changed get the new geometry, what is missing is added, and everything else, such as the
+    transforms, modifiers and materials of the user, stays.
+
+    Parameters
+    ----------
+    folder : Path
+        ``DIR/result`` (docs/architecture.md).
+    scene : Scene
+        Where new objects are linked.
+
+    Raises
+    ------
+    DatasetError, ParseError
+        The folder does not hold a sound result; nothing has been changed then.
+    """
+    files = read_result(folder)
+    frame = _find_frame(files) or _create_frame(files)
+    frame[tags.RESULT] = str(files.folder)
+    frame[tags.FINGERPRINT] = files.fingerprint
+    frame[tags.WORLD_FROM_SCENE] = json.dumps(files.world_from_scene.to_json())
+    frame[tags.FIGURES] = json.dumps(files.figures)
+    collection = _collection_of(frame, files, scene)
+    children = [c for c in bpy.data.objects if c.parent == frame and c.library is None]
+    meshes, regions = [], []
+    for region in files.regions:
+        meshes.append(_update_mesh(region, children, frame, collection))
+        regions.append(_update_region(region, files, children, frame, collection))
+    cameras = _update_cameras(files, children, frame, collection)
+    return ImportedResult(collection, frame, tuple(meshes), cameras, tuple(regions))
+
+
+def _find_frame(files: ResultFiles) -> bpy.types.Object | None:
+    moved = None
+    for thing in bpy.data.objects:
+        if tags.kind_of(thing) != "frame" or thing.library is not None:
+            continue
+        try:
+            stored = tags.result_folder(thing)
+        except UsageError:
+            continue
+        if stored.resolve() == files.folder:
+            return thing
+        if thing.get(tags.FINGERPRINT) == files.fingerprint and not stored.exists():
+            moved = thing
+    return moved
+
+
+def _create_frame(files: ResultFiles) -> bpy.types.Object:
+    frame = bpy.data.objects.new(FRAME_NAME, None)
+    frame.empty_display_type = "PLAIN_AXES"
+    frame.empty_display_size = 0.2 * files.radius
+    frame[tags.KIND] = "frame"
+    return frame
+
+
+def _collection_of(
+    frame: bpy.types.Object, files: ResultFiles, scene: bpy.types.Scene
+) -> bpy.types.Collection:
+    """Return the collection that holds the frame, linked to the scene."""
+    if frame.users_collection:
+        collection = frame.users_collection[0]
+    else:
+        collection = bpy.data.collections.new(files.folder.parent.name or "Gaussian Wrapping")
+        collection.objects.link(frame)
+    if collection != scene.collection and collection not in scene.collection.children_recursive:
+        scene.collection.children.link(collection)
+    return collection
+
+
+def _found(
+    children: list[bpy.types.Object], kind: str, key: str, value: str
+) -> bpy.types.Object | None:
+    return next((c for c in children if tags.kind_of(c) == kind and c.get(key) == value), None)
+
+
+def build_mesh(region: RegionResult) -> bpy.types.Mesh:
+    """Make mesh data of a region's arrays: smooth shaded, one UV layer."""
+    mesh = bpy.data.meshes.new(region.name)
+    count = len(region.faces)
+    mesh.vertices.add(len(region.vertices))
+    mesh.vertices.foreach_set("co", region.vertices.astype(np.float32).ravel())
+    mesh.loops.add(3 * count)
+    mesh.loops.foreach_set("vertex_index", region.faces.ravel())
+    mesh.polygons.add(count)
+    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
+    mesh.polygons.foreach_set("use_smooth", np.ones(count, bool))
+    layer = mesh.uv_layers.new(name="UVMap", do_init=False)
+    layer.uv.foreach_set("vector", region.corner_uvs.ravel())
+    mesh.update(calc_edges=True)
+    if mesh.validate():
+        _logger.warning("mesh of region %s: broken faces were removed", region.name)
+    return mesh
+
+
+def _update_mesh(
+    region: RegionResult,
+    children: list[bpy.types.Object],
+    frame: bpy.types.Object,
+    collection: bpy.types.Collection,
+) -> bpy.types.Object:
+    thing = _found(children, "mesh", tags.REGION, region.name)
+    if thing is not None and thing.get(tags.STAMP) == region.stamp:
+        return thing
+    mesh = build_mesh(region)
+    image = load_texture(region.albedo)
+    if thing is None:
+        mesh.materials.append(create_material(region.name, image))
+        thing = bpy.data.objects.new(region.name, mesh)
+        thing.parent = frame
+        thing[tags.KIND] = "mesh"
+        thing[tags.REGION] = region.name
+        collection.objects.link(thing)
+    else:
+        old = thing.data
+        for material in old.materials:
+            mesh.materials.append(material)
+        thing.data = mesh
+        if old.users == 0:
+            name = old.name
+            bpy.data.meshes.remove(old)
+            mesh.name = name
+    thing[tags.STAMP] = region.stamp
+    return thing
+
+
+def _update_region(
+    region: RegionResult,
+    files: ResultFiles,
+    children: list[bpy.types.Object],
+    frame: bpy.types.Object,
+    collection: bpy.types.Collection,
+) -> bpy.types.Object:
+    thing = _found(children, "region", tags.REGION, region.name)
+    if thing is None:
+        vertices = files.world_from_scene.inverse().points(region.box_vertices)
+        thing = create_region(f"{region.name} region", vertices, frame, collection)
+        thing[tags.REGION] = region.name
+    return thing
+
+
+def _update_cameras(
+    files: ResultFiles,
+    children: list[bpy.types.Object],
+    frame: bpy.types.Object,
+    collection: bpy.types.Collection,
+) -> tuple[bpy.types.Object, ...]:
+    known = {c.get(tags.PHOTO): c for c in children if tags.kind_of(c) == "camera"}
+    folder = next((c for c in collection.children if c.name.startswith("Photo Cameras")), None)
+    cameras = []
+    for camera, photo in files.cameras:
+        thing = known.get(photo)
+        if thing is None:
+            if folder is None:
+                folder = bpy.data.collections.new("Photo Cameras")
+                collection.children.link(folder)
+            thing = create_camera(camera, photo, _CAMERA_SIZE_SHARE * files.radius, folder)
+            thing.parent = frame
+        cameras.append(thing)
+    return tuple(cameras)
+
+
+def write_blend(result_folder: Path, path: Path) -> None:
+    """Write a .blend file of a result; images stay beside it, with relative paths.
+
+    The file that is open in this Blender is closed without saving, so that this is for
+    background Blender only.
+
+    Raises
+    ------
+    UsageError
+        Blender has a window, or the file cannot be written.
+    DatasetError, ParseError
+        The folder does not hold a sound result.
+    """
+    path = path.resolve()
+    _start_empty("Writing a .blend file of a result")
+    scene = bpy.context.scene
+    imported = import_result(result_folder, scene)
+    for thing in imported.regions:
+        thing.hide_render = True
+    if imported.cameras:
+        look_through(scene, imported.cameras[0])
+    world = bpy.data.worlds.new("World")
+    world.color = (0.5, 0.5, 0.5)
+    scene.world = world
+    for screen in bpy.data.screens:
+        for area in screen.areas:
+            if area.type == "VIEW_3D":
+                area.spaces.active.shading.color_type = "TEXTURE"
+    for image in bpy.data.images:
+        if image.source == "FILE":
+            image.filepath = _relative(Path(image.filepath), path.parent)
+    imported.frame[tags.RESULT] = _relative(result_folder.resolve(), path.parent)
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=str(path), relative_remap=False, check_existing=False)
+    except RuntimeError as error:
+        raise UsageError(f"{path} cannot be written: {error}.", "Choose another folder.") from None
+
+
+def export_usd(result_folder: Path) -> list[Path]:
+    """Write ``<region>/mesh.usdc`` for each region of a result, textures by relative path.
+
+    Closes the open file, as :func:`write_blend` does.
+
+    Returns
+    -------
+    paths : list of Path
+        The files written.
+    """
+    _start_empty("Writing USD")
+    imported = import_result(result_folder, bpy.context.scene)
+    options = {
+        "selected_objects_only": True,
+        "export_materials": True,
+        "relative_paths": True,
+        "export_textures": False,  # before Blender 4.4
+        "export_textures_mode": "KEEP",  # since
+    }
+    known = bpy.ops.wm.usd_export.get_rna_type().properties.keys()
+    paths = []
+    for mesh in imported.meshes:
+        for thing in bpy.context.view_layer.objects:
+            thing.select_set(thing == mesh)
+        path = result_folder.resolve() / mesh[tags.REGION] / "mesh.usdc"
+        bpy.ops.wm.usd_export(
+            filepath=str(path), **{k: v for k, v in options.items() if k in known}
+        )
+        if not path.is_file():
+            raise UsageError(f"{path} cannot be written.", "Check the folder's permissions.")
+        paths.append(path)
+    return paths
+
+
+def _start_empty(purpose: str) -> None:
+    if not bpy.app.background:
+        raise UsageError(f"{purpose} would close the open file.", "Do it in background Blender.")
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """Return Blender's way to write a path relative to the file in ``folder``."""
+    try:
+        return "//" + os.path.relpath(path, folder).replace("\\", "/")
+    except ValueError:  # another Windows drive
+        return str(path)
