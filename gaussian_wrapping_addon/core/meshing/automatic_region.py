@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The automatic first region: a robust box around what the cameras look at."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..dataset.camera import Camera
+from ..dataset.scene import Scene
+from ..errors import MeshingError
+from ..gaussians.model import GaussianArrays
+from .convex_region import Region
+
+_logger = logging.getLogger(__name__)
+
+MIN_POINTS = 24
+"""Fewer weighted points than this say nothing about an extent."""
+
+WEIGHT_THAT_COUNTS = 1e-3
+
+WELL_SEEN_SHARE = 0.6
+"""Points in fewer than this share of the most-seen point's views hardly count."""
+
+VOXEL_SHARE = 0.06
+"""Side, in frame sizes, of the cells that balance the density of keypoints."""
+
+TAIL_SHARE = 0.01
+"""Weight left out at each end of each axis."""
+
+PADDING_SHARE = 0.08
+"""Room around the points: keypoints lie on the surface, seldom at its outermost places."""
+
+HEADROOM = 0.15
+HEAD_TAIL_DIVISOR = 5.0
+"""The top of the box: this share of the height more, and a tail this many times smaller."""
+
+ROTATED_GAIN = 0.9
+"""A turned box must be this much smaller than an upright one to be preferred."""
+
+WHOLE_TAIL_SHARE = 0.005
+WHOLE_MIN_ALPHA = 0.1
+WHOLE_MIN_VIEWS = 2
+WHOLE_REACH = 6.0
+"""The whole scene ends at this multiple of the median camera-to-centre distance."""
+
+
+def automatic_region(scene: Scene) -> Region:
+    """Return a Z-up box, possibly turned about Z, around what the cameras look at.
+
+    Sparse points are weighted by the share of views whose frame holds them and by their closeness
+    to the point where the optical axes converge, measured in the size of the frame there; the box
+    spans robust quantiles of the weight. Outlying cameras and points carry none.
+
+    Parameters
+    ----------
+    scene : Scene
+        In the scene frame; its points may be few or none.
+
+    Returns
+    -------
+    Region
+        In the scene frame, named ``"auto"``.
+
+    Raises
+    ------
+    MeshingError
+        The scene has no usable camera.
+    """
+    cameras = _usable_cameras(scene.cameras)
+    focus, distance = _focus(cameras, scene.points)
+    frame_size = distance * _half_frame(cameras)  # half of the frame's short side at the focus
+    points = scene.points[np.isfinite(scene.points).all(1)] if len(scene.points) else scene.points
+    if len(points) >= MIN_POINTS:
+        seen = _views_of(points, cameras) / len(cameras)  # (n,) share of views
+        steady = _ramp(seen / max(seen.max(), 1e-12)) * _thinned(points, VOXEL_SHARE * frame_size)
+        for _ in range(3):
+            offset = np.linalg.norm(points - focus, axis=1) / frame_size  # (n,)
+            weight = np.exp(-2.0 * offset**2) * steady
+            if (weight > WEIGHT_THAT_COUNTS).sum() < MIN_POINTS:
+                break
+            focus = _weighted_quantiles(points, weight, np.array([0.5]))[0]
+        if (weight > WEIGHT_THAT_COUNTS).sum() >= MIN_POINTS:
+            return _box_around("auto", points, weight, TAIL_SHARE, PADDING_SHARE)
+    _logger.warning("Too few sparse points for an automatic region: using the cameras alone")
+    half = np.full(3, 0.6 * frame_size)
+    return Region.box("auto", focus - half, focus + half)
+
+
+def whole_region(scene: Scene, arrays: GaussianArrays) -> Region:
+    """Return the robust box of everything that at least two photos see.
+
+    Parameters
+    ----------
+    scene : Scene
+    arrays : GaussianArrays
+        Trained Gaussians, scene frame; faint ones do not count.
+
+    Raises
+    ------
+    MeshingError
+        No Gaussian is seen.
+    """
+    cameras = _usable_cameras(scene.cameras)
+    focus, distance = _focus(cameras, scene.points)
+    solid = arrays.log_opacities > np.log(WHOLE_MIN_ALPHA)
+    points = arrays.means[solid & np.isfinite(arrays.means).all(1)]
+    near = np.linalg.norm(points - focus, axis=1) < WHOLE_REACH * distance
+    points = points[near]
+    seen = _views_of(points, cameras)
+    points = points[seen >= min(WHOLE_MIN_VIEWS, len(cameras))]
+    if len(points) < 4:
+        raise MeshingError(
+            "No Gaussian is seen by two photos.", "Train longer, or draw a region by hand."
+        )
+    return _box_around("all", points, np.ones(len(points)), WHOLE_TAIL_SHARE, PADDING_SHARE)
+
+
+def _usable_cameras(cameras: Sequence[Camera]) -> list[Camera]:
+    """Leave out cameras that are not finite or lie absurdly far from the others."""
+    good = [c for c in cameras if np.isfinite(c.cam_from_world).all()]
+    if not good:
+        raise MeshingError("The scene has no usable camera.", "Check the camera poses.")
+    centers = np.array([c.center for c in good])  # (c, 3)
+    away = np.linalg.norm(centers - np.median(centers, 0), axis=1)
+    limit = 10.0 * np.median(away)
+    return [c for c, a in zip(good, away, strict=True) if a <= limit] or good
+
+
+def _half_frame(cameras: Sequence[Camera]) -> float:
+    """Median tangent of half the narrower field of view."""
+    return float(np.median([min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]))
+
+
+def _focus(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the point that the optical axes approach best, and its median camera distance.
+
+    Along each axis a weak prior pulls towards the depth of the sparse points, so that near-parallel
+    axes (one camera, a forward-facing row) still give a sensible place.
+    """
+    centers = np.array([c.center for c in cameras])  # (c, 3)
+    forwards = np.array([c.forward for c in cameras])  # (c, 3)
+    depth = _median_depth(cameras, points)
+    prior = centers + forwards * depth[:, None]  # (c, 3)
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # (c, 3, 3)
+    focus = np.median(prior, 0)
+    for _ in range(20):
+        miss = np.linalg.norm(np.einsum("cij,cj->ci", across, focus - centers), axis=1)  # (c,)
+        weight = 1.0 / np.maximum(miss, 1e-3 * np.median(depth))
+        pull = 0.01 * weight
+        matrix = np.einsum("c,cij->ij", weight, across) + np.eye(3) * pull.sum()
+        right = np.einsum("c,cij,cj->i", weight, across, centers) + pull @ prior
+        focus = np.linalg.solve(matrix, right)
+    in_front = ((focus - centers) * forwards).sum(1) > 0
+    if in_front.mean() < 0.5:  # cameras that look outwards: take what lies before them
+        focus = np.median(prior, 0)
+    return focus, float(np.median(np.linalg.norm(focus - centers, axis=1)))
+
+
+def _median_depth(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
+    """(c,) median depth of the sparse points in each frame; their median where there are none."""
+    centers = np.array([c.center for c in cameras])
+    spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
+    result = np.full(len(cameras), np.nan)
+    for index, camera in enumerate(cameras):
+        if len(points):
+            inside, depth = _in_frame(points, camera)
+            if inside.sum() >= MIN_POINTS:
+                result[index] = np.median(depth[inside])
+    known = result[np.isfinite(result)]
+    fallback = float(np.median(known)) if len(known) else max(spread, 1e-6)
+    return np.where(np.isfinite(result), result, fallback)
+
+
+def _in_frame(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    pixels, depth = camera.project(points)
+    inside = (depth > 0) & (pixels >= 0).all(1)
+    return inside & (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height), depth
+
+
+def _views_of(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """(n,) number of cameras whose frame holds the point."""
+    count = np.zeros(len(points))
+    for camera in cameras:
+        count += _in_frame(points, camera)[0]
+    return count
+
+
+def _thinned(points: np.ndarray, side: float) -> np.ndarray:
+    """(n,) weights that balance cells of very different density, 0 for points alone in a cell.
+
+    A smooth thing on a textured carpet has few keypoints; without this the carpet decides.
+    """
+    cells = np.floor((points - points.min(0)) / side).astype(np.int64)  # (n, 3)
+    _, index, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    own = count[index.reshape(-1)].astype(np.float64)
+    return np.where(own > 1, own**-0.75, 0.0)
+
+
+def _ramp(share: np.ndarray) -> np.ndarray:
+    """0 below half of :data:`WELL_SEEN_SHARE`, 1 above it."""
+    return np.clip(2.0 * share / WELL_SEEN_SHARE - 1.0, 0.0, 1.0)
+
+
+def _weighted_quantiles(values: np.ndarray, weight: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Return weighted quantiles of each column of (n, k) values, (len(shares), k)."""
+    result = np.empty((len(shares), values.shape[1]))
+    for column in range(values.shape[1]):
+        order = np.argsort(values[:, column], kind="stable")
+        total = np.cumsum(weight[order])
+        middle = (total - weight[order] / 2) / total[-1]
+        result[:, column] = np.interp(shares, middle, values[order, column])
+    return result
+
+
+def _box_around(
+    name: str, points: np.ndarray, weight: np.ndarray, tail: float, padding: float
+) -> Region:
+    """Return the smallest robust Z-up box over yaw angles."""
+    shares = np.array([tail, 1.0 - tail])
+    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
+    for angle in np.deg2rad(np.arange(0.0, 90.0, 3.0)):
+        cosine, sine = np.cos(angle), np.sin(angle)
+        rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        low, high = _weighted_quantiles(points @ rotation, weight, shares)
+        footprint = float((high[0] - low[0]) * (high[1] - low[1]))
+        cost = footprint if angle == 0.0 else footprint / ROTATED_GAIN
+        if best is None or cost < best[0]:
+            best = (cost, rotation, low, high)
+    assert best is not None
+    _, rotation, low, high = best
+    size = high - low
+    pad = padding * size + 0.25 * padding * size.max()  # flat scenes need room as well
+    # Air above costs nothing, and tips (a stem, a finial) have few keypoints.
+    head = _weighted_quantiles(points[:, 2:], weight, np.array([1.0 - tail / HEAD_TAIL_DIVISOR]))
+    high[2] = max(high[2], float(head[0, 0])) + HEADROOM * size[2]
+    return Region.box(name, low - pad, high + pad, rotation)
