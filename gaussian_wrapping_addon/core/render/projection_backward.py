@@ -193,15 +193,15 @@ def backward_range(
             grad[column] = grad_params[i, column]
 
         # The activations of the forward pass again; cheaper than keeping them.
-        m0, m1, m2 = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
+        m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         x = camera[0] * m0 + camera[1] * m1 + camera[2] * m2 + camera[9]
         y = camera[3] * m0 + camera[4] * m1 + camera[5] * m2 + camera[10]
         z = camera[6] * m0 + camera[7] * m1 + camera[8] * m2 + camera[11]
         qw, qx, qy, qz = (
-            float(quats[i, 0]),
-            float(quats[i, 1]),
-            float(quats[i, 2]),
-            float(quats[i, 3]),
+            np.float64(quats[i, 0]),
+            np.float64(quats[i, 1]),
+            np.float64(quats[i, 2]),
+            np.float64(quats[i, 3]),
         )
         norm = rotation_from_quat(qw, qx, qy, qz, rotation)
         for k in range(3):
@@ -211,15 +211,15 @@ def backward_range(
                     + camera[3 * row + 1] * rotation[1, k]
                     + camera[3 * row + 2] * rotation[2, k]
                 )
-        filter_sq = float(filter_3d[i]) * float(filter_3d[i])
+        filter_sq = np.float64(filter_3d[i]) * np.float64(filter_3d[i])
         product = 1.0
         for k in range(3):
-            raw = math.exp(2.0 * float(log_scales[i, k]))
+            raw = math.exp(2.0 * np.float64(log_scales[i, k]))
             variances[k] = raw + filter_sq
             kept[k] = raw / variances[k]
             product *= kept[k]
-        sigmoid = 1.0 / (1.0 + math.exp(-float(opacity_logits[i])))
-        fade = 1.0 / (1.0 + math.exp(float(opacity_logits[i])))
+        sigmoid = 1.0 / (1.0 + math.exp(-np.float64(opacity_logits[i])))
+        fade = 1.0 / (1.0 + math.exp(np.float64(opacity_logits[i])))
         opacity = math.sqrt(product) * sigmoid
 
         _shape_gradient(x, y, z, variances, camera, axes, grad, grad_axes, grad_logs, grad_local)
@@ -251,12 +251,12 @@ def backward_range(
         for channel in range(3):
             value = 0.5
             for k in range(count):
-                value += harmonics[k] * float(sh[i, k, channel])
+                value += harmonics[k] * np.float64(sh[i, k, channel])
             if value < 0.0:
                 continue
             g = grad[13 + channel]
             for k in range(count):
-                coefficient = g * float(sh[i, k, channel])
+                coefficient = g * np.float64(sh[i, k, channel])
                 grad_sh[i, k, channel] += g * harmonics[k]
                 g0 += coefficient * slopes[k, 0]
                 g1 += coefficient * slopes[k, 1]
@@ -275,11 +275,15 @@ def backward_range(
             )
 
         # Learned normal tanh(s) d / |d|.
-        n0, n1, n2 = float(orientation[i, 0]), float(orientation[i, 1]), float(orientation[i, 2])
+        n0, n1, n2 = (
+            np.float64(orientation[i, 0]),
+            np.float64(orientation[i, 1]),
+            np.float64(orientation[i, 2]),
+        )
         length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
         if length > _DIRECTION_MIN_NORM:
             n0, n1, n2 = n0 / length, n1 / length, n2 / length
-            gain = math.tanh(float(orientation[i, 3]))
+            gain = math.tanh(np.float64(orientation[i, 3]))
             along = grad[16] * n0 + grad[17] * n1 + grad[18] * n2
             grad_orientation[i, 0] += gain * (grad[16] - along * n0) / length
             grad_orientation[i, 1] += gain * (grad[17] - along * n1) / length

@@ -41,7 +41,7 @@ _FARTHEST_PX = 1.0e9
 def rotation_from_quat(w: float, x: float, y: float, z: float, out: np.ndarray) -> float:
     """Write the (3, 3) rotation of a quaternion; return its norm, or 0 where it is degenerate."""
     norm = math.sqrt(w * w + x * x + y * y + z * z)
-    if not norm > _QUATERNION_MIN_NORM:
+    if norm <= _QUATERNION_MIN_NORM:
         w, x, y, z = 1.0, 0.0, 0.0, 0.0
         norm = 0.0
     else:
@@ -231,26 +231,26 @@ def project_raw_range(
     variances = np.zeros(3)
     harmonics = np.zeros(16)
     for i in range(begin, end):
-        m0, m1, m2 = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
+        m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         z = camera[6] * m0 + camera[7] * m1 + camera[8] * m2 + camera[11]
         seen = z > camera[21]
         if seen:
             x = camera[0] * m0 + camera[1] * m1 + camera[2] * m2 + camera[9]
             y = camera[3] * m0 + camera[4] * m1 + camera[5] * m2 + camera[10]
             rotation_from_quat(
-                float(quats[i, 0]),
-                float(quats[i, 1]),
-                float(quats[i, 2]),
-                float(quats[i, 3]),
+                np.float64(quats[i, 0]),
+                np.float64(quats[i, 1]),
+                np.float64(quats[i, 2]),
+                np.float64(quats[i, 3]),
                 rotation,
             )
-            filter_sq = float(filter_3d[i]) * float(filter_3d[i])
+            filter_sq = np.float64(filter_3d[i]) * np.float64(filter_3d[i])
             kept = 1.0
             for k in range(3):
-                raw = math.exp(2.0 * float(log_scales[i, k]))
+                raw = math.exp(2.0 * np.float64(log_scales[i, k]))
                 variances[k] = raw + filter_sq
                 kept *= raw / variances[k]
-            opacity = math.sqrt(kept) / (1.0 + math.exp(-float(opacity_logits[i])))
+            opacity = math.sqrt(kept) / (1.0 + math.exp(-np.float64(opacity_logits[i])))
             seen = _project_shape(
                 i, x, y, z, rotation, variances, opacity, camera, axes, params, boxes, depths, skews
             )
@@ -261,16 +261,16 @@ def project_raw_range(
             for channel in range(3):
                 value = 0.5
                 for k in range((degree + 1) * (degree + 1)):
-                    value += harmonics[k] * float(sh[i, k, channel])
+                    value += harmonics[k] * np.float64(sh[i, k, channel])
                 # Written so that NaN stays NaN and hides the row below.
                 params[i, 13 + channel] = 0.0 if value <= 0.0 else value
             n0, n1, n2 = (
-                float(orientation[i, 0]),
-                float(orientation[i, 1]),
-                float(orientation[i, 2]),
+                np.float64(orientation[i, 0]),
+                np.float64(orientation[i, 1]),
+                np.float64(orientation[i, 2]),
             )
             length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-            gain = math.tanh(float(orientation[i, 3])) / max(length, _DIRECTION_MIN_NORM)
+            gain = math.tanh(np.float64(orientation[i, 3])) / max(length, _DIRECTION_MIN_NORM)
             params[i, 16], params[i, 17], params[i, 18] = gain * n0, gain * n1, gain * n2
             seen = _row_is_finite(i, params, boxes)
         visible[i] = seen

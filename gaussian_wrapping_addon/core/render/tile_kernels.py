@@ -29,13 +29,13 @@ def _tile_columns(i: int, row: int, boxes: np.ndarray, skews: np.ndarray, ranges
     first, last = ranges[i, 2] // _TILE, ranges[i, 3] // _TILE
     if last == first or ranges[i, 0] // _TILE == ranges[i, 1] // _TILE or math.isinf(skews[i]):
         return first, last
-    half_x = 0.5 * (float(boxes[i, 2]) - float(boxes[i, 0]))
-    half_y = 0.5 * (float(boxes[i, 3]) - float(boxes[i, 1]))
+    half_x = 0.5 * (np.float64(boxes[i, 2]) - np.float64(boxes[i, 0]))
+    half_y = 0.5 * (np.float64(boxes[i, 3]) - np.float64(boxes[i, 1]))
     if not (half_x > 0.0 and half_y > 0.0):
         return first, last
-    center_x = 0.5 * (float(boxes[i, 2]) + float(boxes[i, 0]))
-    center_y = 0.5 * (float(boxes[i, 3]) + float(boxes[i, 1]))
-    skew = float(skews[i])
+    center_x = 0.5 * (np.float64(boxes[i, 2]) + np.float64(boxes[i, 0]))
+    center_y = 0.5 * (np.float64(boxes[i, 3]) + np.float64(boxes[i, 1]))
+    skew = np.float64(skews[i])
     top = (max(row * _TILE, ranges[i, 0]) + 0.5 - _PIXEL_MARGIN - center_y) / half_y
     bottom = (min(row * _TILE + _TILE - 1, ranges[i, 1]) + 0.5 + _PIXEL_MARGIN - center_y) / half_y
     top, bottom = max(top, -1.0), min(bottom, 1.0)
@@ -52,8 +52,8 @@ def _tile_columns(i: int, row: int, boxes: np.ndarray, skews: np.ndarray, ranges
     first_px = np.ceil(center_x + left - margin - 0.5)
     last_px = np.floor(center_x + right + margin - 0.5)
     # Both ends lie within the box up to the margin, so the conversion cannot overflow.
-    first_px = min(max(first_px, float(ranges[i, 2])), float(ranges[i, 3] + 1))
-    last_px = max(min(last_px, float(ranges[i, 3])), float(ranges[i, 2] - 1))
+    first_px = min(max(first_px, np.float64(ranges[i, 2])), np.float64(ranges[i, 3] + 1))
+    last_px = max(min(last_px, np.float64(ranges[i, 3])), np.float64(ranges[i, 2] - 1))
     if first_px > last_px:
         return first, first - 1
     return int(first_px) // _TILE, int(last_px) // _TILE

@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compiled projection: against torch, 60-digit arithmetic, autograd, and hard cases."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+
+from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.render.projection import (
+    RawArrays,
+    RawGradients,
+    ScreenGaussians,
+    project_arrays,
+    project_backward,
+    project_gaussians,
+)
+from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from tests.core.render.scenes import isotropic, look_at, random_gaussians
+
+NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
+CAMERA = look_at((2.0, 0.6, 0.9))
+OPTIONS = RenderOptions(threads=1)
+
+
+def project(
+    gaussians: OrientedGaussians, camera: Camera = CAMERA, options: RenderOptions = OPTIONS
+) -> ScreenGaussians:
+    return project_gaussians(RawArrays.from_gaussians(gaussians), camera, options)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_columns_equal_torch(degree: int, dtype: torch.dtype) -> None:
+    gaussians = random_gaussians(300, degree, sh_degree=degree, dtype=dtype)
+    screen = project(gaussians)
+    wide = OrientedGaussians(**{k: v.double() for k, v in gaussians.tensors()})
+    reference = reference_projection(wide, CAMERA, OPTIONS)
+    seen = screen.visible
+    assert seen.mean() > 0.8
+    assert reference.usable.numpy()[seen].all()
+    wanted = reference.params.numpy()
+    # One rounding to float32; a cancelled entry is judged by its block's size.
+    size = np.abs(wanted)
+    for block in ((2, 5), (5, 7), (7, 10), (13, 16), (16, 19), (19, 22)):
+        size[:, slice(*block)] = size[:, slice(*block)].max(1, keepdims=True)
+    error = np.abs(screen.params - wanted)[seen]
+    assert (error <= 6.1e-8 * size[seen] + 1e-12).all()
+    np.testing.assert_allclose(screen.depths[seen], reference.depths.numpy()[seen], rtol=1e-7)
+    assert not screen.params[~seen].any()
+
+
+def test_used_degree_can_be_lowered() -> None:
+    gaussians = random_gaussians(50, 1, sh_degree=3)
+    low = project(gaussians, options=RenderOptions(sh_degree=1, threads=1))
+    cut = project(gaussians.replaced(sh=gaussians.sh[:, :4]))
+    np.testing.assert_array_equal(low.params, cut.params)
+    with pytest.raises(UsageError, match="coefficients"):
+        project(gaussians.replaced(sh=gaussians.sh[:, :5]))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_backward_equals_autograd(degree: int, seed: int) -> None:
+    gaussians = random_gaussians(200, seed, sh_degree=degree, filter_size=0.08)
+    # Bright and dark colours: some are clamped.
+    gaussians = gaussians.replaced(sh=gaussians.sh * 3.0)
+    raw = RawArrays.from_gaussians(gaussians)
+    screen = project(gaussians)
+    grad_params = np.random.default_rng(seed).normal(size=(200, 24))
+    leaves = {
+        name: t.clone().requires_grad_(name != "filter_3d") for name, t in gaussians.tensors()
+    }
+    reference = reference_projection(OrientedGaussians(**leaves), CAMERA, OPTIONS)
+    weights = torch.from_numpy(np.where(screen.visible[:, None], grad_params, 0.0))
+    (reference.params * weights).sum().backward()
+    grads = RawGradients.zeros(raw)
+    project_backward(raw, CAMERA, OPTIONS, screen, grad_params, grads)
+    assert (screen.params[screen.visible, 13:16] == 0.0).any()
+    for name in NAMES:
+        wanted = leaves[name].grad.numpy()  # type: ignore[union-attr]
+        got = getattr(grads, name)
+        rows = (len(wanted), -1)
+        size = np.abs(wanted.reshape(rows)).max(1)
+        error = np.abs(got - wanted).reshape(rows).max(1)
+        assert (error <= 1e-10 * (size + 1e-6 * size.max())).all(), name
+        assert not got[~screen.visible].any()
+
+
+def test_backward_adds_and_float32_is_close() -> None:
+    gaussians = random_gaussians(100, 2)
+    raw = RawArrays.from_gaussians(gaussians)
+    screen = project(gaussians)
+    grad_params = np.random.default_rng(0).normal(size=(100, 24)).astype(np.float32)
+    once, twice = RawGradients.zeros(raw), RawGradients.zeros(raw)
+    project_backward(raw, CAMERA, OPTIONS, screen, grad_params, once)
+    for _ in range(2):
+        project_backward(raw, CAMERA, OPTIONS, screen, grad_params, twice)
+    narrow = RawArrays(
+        **{f.name: getattr(raw, f.name).astype(np.float32) for f in dataclasses.fields(raw)}
+    )
+    small = RawGradients.zeros(narrow)
+    project_backward(narrow, CAMERA, OPTIONS, screen, grad_params, small)
+    for name in NAMES:
+        wanted = getattr(once, name)
+        np.testing.assert_array_equal(getattr(twice, name), 2.0 * wanted)
+        got = getattr(small, name)
+        assert got.dtype == np.float32
+        assert np.abs(got - wanted).max() <= 1e-4 * np.abs(wanted).max(), name
+
+
+def test_boxes_are_those_of_the_conic() -> None:
+    gaussians = random_gaussians(400, 5, scale=(0.01, 0.2))
+    screen = project(gaussians)
+    params = reference_projection(gaussians, CAMERA, OPTIONS).params.numpy()
+    u, v, qa, qb, qc, px, py, r, s, t, _, opacity = params[:, :12].T
+    threshold = 2.0 * np.log(255.0 * np.where(screen.visible, opacity, 1.0))
+    shape = np.stack([qa, qb / 2, qb / 2, qc], 1).reshape(-1, 2, 2)
+    shape -= threshold[:, None, None] * np.stack([r, s / 2, s / 2, t], 1).reshape(-1, 2, 2)
+    bounded = screen.visible & np.isfinite(screen.skews)
+    assert bounded.sum() > 300
+    inverse = np.linalg.inv(shape[bounded])
+    linear = np.stack([px, py], 1)[bounded]
+    threshold = threshold[bounded]
+    shift = threshold[:, None] * np.einsum("nij,nj->ni", inverse, linear)
+    level = threshold + threshold * np.einsum("ni,ni->n", linear, shift)
+    center = np.stack([u, v], 1)[bounded] + shift
+    half = np.sqrt(level[:, None] * inverse[:, [0, 1], [0, 1]])
+    wanted = np.concatenate([center - half, center + half], 1)
+    boxes = screen.boxes[bounded]
+    np.testing.assert_allclose(boxes, wanted, rtol=2e-7, atol=2e-6)
+    slack = 1e-9 * (1.0 + np.abs(wanted))
+    assert (boxes[:, :2] <= wanted[:, :2] + slack[:, :2]).all()
+    assert (boxes[:, 2:] >= wanted[:, 2:] - slack[:, 2:]).all()
+    skew = np.sqrt(level) * inverse[:, 0, 1] / np.sqrt(inverse[:, 1, 1])
+    np.testing.assert_allclose(screen.skews[bounded], skew, rtol=1e-6, atol=1e-6)
+
+
+def test_activated_arrays_give_the_same_rows() -> None:
+    gaussians = random_gaussians(200, 7)
+    screen = project(gaussians)
+    other = project_arrays(gaussians.arrays(), CAMERA, OPTIONS.near_z, threads=2)
+    np.testing.assert_array_equal(other.visible, screen.visible)
+    columns = [*range(13), *range(16, 24)]
+    np.testing.assert_allclose(
+        other.params[:, columns], screen.params[:, columns], rtol=3e-7, atol=1e-9
+    )
+    assert not other.params[:, 13:16].any()
+    np.testing.assert_allclose(other.boxes, screen.boxes, rtol=1e-6, atol=1e-5)
+
+
+def test_threads_and_reused_output_change_nothing() -> None:
+    gaussians = random_gaussians(500, 8)
+    alone = project(gaussians)
+    reused = ScreenGaussians.allocate(500)
+    for field in dataclasses.fields(reused):
+        getattr(reused, field.name)[:] = 77
+    got = project_gaussians(
+        RawArrays.from_gaussians(gaussians), CAMERA, RenderOptions(threads=3), reused
+    )
+    assert got is reused
+    for field in dataclasses.fields(reused):
+        np.testing.assert_array_equal(getattr(got, field.name), getattr(alone, field.name))
+    with pytest.raises(UsageError, match="rows"):
+        project_gaussians(
+            RawArrays.from_gaussians(gaussians), CAMERA, OPTIONS, ScreenGaussians.allocate(3)
+        )
+
+
+# -- hard cases -----------------------------------------------------------------------------------
+
+AXIS = Camera("axis", 64, 48, 60.0, 66.0, 32.5, 23.5, np.eye(3, 4))
+
+
+def single(**changes: object) -> OrientedGaussians:
+    """One Gaussian in front of AXIS, with entries exchanged."""
+    gaussians = isotropic([(0.1, -0.2, 3.0)], [0.1], [0.8])
+    values = {k: torch.tensor([v], dtype=torch.float64) for k, v in changes.items()}
+    return gaussians.replaced(**values)
+
+
+def exact_columns(gaussians: OrientedGaussians, camera: Camera) -> list[float]:
+    """Columns 0-10, 12 and 19-22 of one unfiltered Gaussian with 60 digits."""
+    with mpmath.workdps(60):
+        raw = {k: v[0].tolist() for k, v in gaussians.tensors() if k not in ("sh", "filter_3d")}
+        w, x, y, z = (mpmath.mpf(q) for q in raw["quats"])
+        n = mpmath.sqrt(w * w + x * x + y * y + z * z)
+        w, x, y, z = w / n, x / n, y / n, z / n
+        turn = mpmath.matrix(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        pose = mpmath.matrix(camera.cam_from_world.tolist())
+        view = pose[:, 0:3]
+        mean = view * mpmath.matrix(raw["means"]) + pose[:, 3]
+        axes = view * turn
+        variance = mpmath.diag([mpmath.exp(2 * mpmath.mpf(s)) for s in raw["log_scales"]])
+        covariance = axes * variance * axes.T
+        precision = axes * variance**-1 * axes.T
+        ray = mean / mean[2]
+        slant = precision * ray
+        a0 = (ray.T * slant)[0]
+        fx, fy = mpmath.mpf(camera.fx), mpmath.mpf(camera.fy)
+        kx, ky = slant[0] / fx, slant[1] / fy
+        bxx, bxy, byy = precision[0, 0] / fx**2, precision[0, 1] / fx / fy, precision[1, 1] / fy**2
+        zz = mean[2] ** 2
+        normal = view.T * slant * (-1 / mpmath.norm(slant))
+        values = [
+            fx * ray[0] + camera.cx, fy * ray[1] + camera.cy,
+            zz * (bxx - kx * kx / a0), 2 * zz * (bxy - kx * ky / a0), zz * (byy - ky * ky / a0),
+            kx / a0, ky / a0, bxx / a0, 2 * bxy / a0, byy / a0, mean[2], a0,
+            normal[0], normal[1], normal[2], mpmath.sqrt(covariance[2, 2]),
+        ]  # fmt: skip
+        return [float(value) for value in values]
+
+
+EDGE_ON = {"log_scales": [0.0, 0.0, np.log(1e-6)], "quats": [1.0, 1.0, 0.0, 0.0]}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"log_scales": [0.0, -0.5, np.log(1e-6)], "quats": [0.9, 0.1, 0.3, -0.2]},
+        {"log_scales": [np.log(1e-6), np.log(2e-6), -1.0], "quats": [0.2, 0.5, 0.7, -0.6]},
+        {"log_scales": [np.log(1e-6), np.log(2e-6), -1.0], "quats": [1.0, 0.0, 0.0, 0.0]},
+        EDGE_ON,
+        EDGE_ON | {"means": [0.0, 0.0, 3.0]},
+        {"log_scales": [np.log(1e-4)] * 3, "means": [0.0, 0.0, 1e3]},
+        {"log_scales": [np.log(3e-4), np.log(1e-4), np.log(1e-4)], "means": [50.0, 9.0, 1e3]},
+        {"log_scales": [4.0, 3.0, 2.0], "means": [4.0, 3.0, 20.0], "quats": [0.9, 0.1, 0.3, 0.1]},
+    ],
+)
+def test_hard_shapes_against_sixty_digits(changes: dict[str, object]) -> None:
+    gaussians = single(**changes)
+    # A wide image, so that every case is seen; a pixel centre on the small ones.
+    u = AXIS.fx * float(gaussians.means[0, 0] / gaussians.means[0, 2])
+    v = AXIS.fy * float(gaussians.means[0, 1] / gaussians.means[0, 2])
+    camera = dataclasses.replace(AXIS, cx=32.5 - u, cy=23.5 - v)
+    screen = project(gaussians, camera)
+    assert screen.visible.all()
+    wanted = np.array(exact_columns(gaussians, camera))
+    got = screen.params[0, [*range(11), 12, *range(19, 23)]].astype(np.float64)
+    size = np.abs(wanted)
+    for block in ((2, 5), (5, 7), (7, 10), (12, 15)):
+        size[slice(*block)] = size[slice(*block)].max()
+    slack = np.full(len(size), 1e-9)
+    # A rounding of the axes by eps turns the gradient of an edge-on disc by eps (1e6)^2.
+    slack[[5, 6, 12, 13, 14]] += 1e-15 * np.exp(2.0 * np.ptp(gaussians.log_scales.numpy()))
+    assert (np.abs(got - wanted) <= 1e-7 * size + slack).all()
+    assert np.isfinite(screen.boxes).all()
+
+    raw = RawArrays.from_gaussians(gaussians)
+    grads = RawGradients.zeros(raw)
+    project_backward(raw, camera, OPTIONS, screen, np.ones((1, 24)), grads)
+    assert all(np.isfinite(getattr(grads, name)).all() for name in NAMES)
+
+
+def test_zero_quaternion_is_the_identity_and_gets_no_gradient() -> None:
+    scales = {"log_scales": [-1.0, -2.0, -3.0]}
+    zero, unit = single(quats=[0.0] * 4, **scales), single(quats=[1.0, 0.0, 0.0, 0.0], **scales)
+    np.testing.assert_array_equal(project(zero, AXIS).params, project(unit, AXIS).params)
+    raw = RawArrays.from_gaussians(zero)
+    grads = RawGradients.zeros(raw)
+    project_backward(raw, AXIS, OPTIONS, project(zero, AXIS), np.ones((1, 24)), grads)
+    assert not grads.quats.any()
+    assert np.isfinite(grads.log_scales).all()
+
+
+@pytest.mark.parametrize(
+    ("logit", "seen"), [(20.0, True), (800.0, True), (-20.0, False), (-5.6, False), (-5.5, True)]
+)
+def test_extreme_opacities(logit: float, seen: bool) -> None:
+    screen = project(single(opacity_logits=logit), AXIS)
+    assert screen.visible[0] == seen
+    if seen:
+        assert screen.params[0, 11] == np.float32(1.0 / (1.0 + np.exp(-logit)))
+
+
+def test_filter_dims_and_widens() -> None:
+    screen = project(single(filter_3d=0.1, log_scales=[np.log(0.1)] * 3), AXIS)
+    assert screen.params[0, 11] == pytest.approx(0.8 * 2.0**-1.5, rel=1e-6)
+    assert screen.params[0, 22] == pytest.approx(0.1 * 2.0**0.5, rel=1e-6)
+    # A vanishing scale leaves nothing of the opacity and is not visible.
+    assert not project(single(filter_3d=0.1, log_scales=[-400.0] * 3), AXIS).visible[0]
+
+
+@pytest.mark.parametrize(
+    "name", ["means", "log_scales", "quats", "opacity_logits", "sh", "orientation", "filter_3d"]
+)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_hide_the_gaussian(name: str, value: float) -> None:
+    gaussians = isotropic([(0.1, -0.2, 3.0), (0.2, 0.1, 3.0)], [0.1, 0.1], [0.8, 0.8])
+    broken = getattr(gaussians, name).clone()
+    broken[0] = value
+    screen = project(gaussians.replaced(**{name: broken}), AXIS)
+    if name == "opacity_logits" and value == np.inf:
+        assert screen.params[0, 11] == 1.0  # an opaque limit that is well defined
+    else:
+        assert not screen.visible[0]
+        assert not screen.params[0].any()
+    assert screen.visible[1]
+    assert np.isfinite(screen.params).all()
+
+
+def test_around_and_behind_the_camera() -> None:
+    near = {"log_scales": [0.0] * 3}
+    around = project(single(means=[0.0, 0.0, 0.5], **near), AXIS)
+    assert around.visible[0]
+    np.testing.assert_array_equal(around.boxes[0], [0.0, 0.0, 64.0, 48.0])
+    assert np.isinf(around.skews[0])
+    for z in (0.2, 0.0, -1.0):
+        assert not project(single(means=[0.0, 0.0, z], **near), AXIS).visible[0]
+    # Bounded as soon as the ellipsoid at 1/255 clears the camera plane.
+    reach = np.sqrt(2.0 * np.log(255.0 * 0.8))
+    assert np.isinf(project(single(means=[0.0, 0.0, 0.999 * reach], **near), AXIS).skews[0])
+    assert np.isfinite(project(single(means=[0.0, 0.0, 1.001 * reach], **near), AXIS).skews[0])
+
+
+def test_off_the_image_or_between_pixel_centres_is_not_visible() -> None:
+    assert not project(single(means=[9.0, 0.0, 3.0]), AXIS).visible[0]
+    tiny = {"log_scales": [np.log(1e-5)] * 3}
+    on_center = project(single(means=[0.0, 0.0, 3.0], **tiny), AXIS)
+    assert on_center.visible[0]
+    between = dataclasses.replace(AXIS, cx=32.0)
+    assert not project(single(means=[0.0, 0.0, 3.0], **tiny), between).visible[0]
