@@ -33,6 +33,7 @@ _DIRECTION_MIN_NORM = tolerances.DIRECTION_MIN_NORM
 # An ellipsoid that touches the camera plane within rounding is treated as crossing it.
 _PLANE_MARGIN = 1e-12
 _FLOAT32_MAX = 3.0e38
+_FLOAT32_STEP = 2.0**-23
 # Boxes end here so that pixel ranges always fit an int32.
 _FARTHEST_PX = 1.0e9
 
@@ -59,14 +60,10 @@ def rotation_from_quat(w: float, x: float, y: float, z: float, out: np.ndarray) 
 
 
 @kernel(fast=False)
-def _outward(value: float, up: bool) -> np.float32:
-    """Round to float32 away from the box's inside."""
-    rounded = np.float32(min(max(value, -_FARTHEST_PX), _FARTHEST_PX))
-    if up and rounded < value:
-        rounded = np.nextafter(rounded, np.float32(np.inf))
-    elif not up and rounded > value:
-        rounded = np.nextafter(rounded, np.float32(-np.inf))
-    return rounded
+def _outward(value: float, side: float) -> float:
+    """Move a box edge one float32 step outwards (``side`` -1 or 1), so that rounding is safe."""
+    value = min(max(value, -_FARTHEST_PX), _FARTHEST_PX)
+    return value + side * _FLOAT32_STEP * abs(value)
 
 
 @kernel(fast=False)
@@ -175,10 +172,10 @@ def _project_shape(
         spread_xy = share * (cov_xy + share * cov_xz * cov_yz)
         spread_yy = share * (cov_yy + share * cov_yz * cov_yz)
         half_x, half_y = fx * math.sqrt(spread_xx), fy * math.sqrt(spread_yy)
-        boxes[i, 0] = _outward(center_x - half_x, False)
-        boxes[i, 1] = _outward(center_y - half_y, False)
-        boxes[i, 2] = _outward(center_x + half_x, True)
-        boxes[i, 3] = _outward(center_y + half_y, True)
+        boxes[i, 0] = _outward(center_x - half_x, -1.0)
+        boxes[i, 1] = _outward(center_y - half_y, -1.0)
+        boxes[i, 2] = _outward(center_x + half_x, 1.0)
+        boxes[i, 3] = _outward(center_y + half_y, 1.0)
         skews[i] = fx * spread_xy / math.sqrt(spread_yy)
     else:
         boxes[i, 0] = boxes[i, 1] = 0.0

@@ -42,7 +42,8 @@ def _tile_columns(i: int, row: int, boxes: np.ndarray, skews: np.ndarray, ranges
     if top > bottom:
         return first, last
     # At height t (in half heights) the ellipse spans skew t +- across sqrt(1 - t^2).
-    across = math.sqrt(max(half_x * half_x * (1.0 + _SHARE_MARGIN) - skew * skew, 0.0))
+    across_sq = half_x * half_x * (1.0 + _SHARE_MARGIN) - skew * skew
+    across = math.sqrt(across_sq) if across_sq > 0.0 else 0.0
     extreme = skew / half_x  # height of the rightmost point; the leftmost is opposite
     t = min(max(extreme, top), bottom)
     right = skew * t + across * math.sqrt(max(1.0 - t * t, 0.0))
@@ -130,23 +131,29 @@ def radix_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
 
 
 @kernel(fast=False)
-def count_pairs(
+def list_range(
     begin: int,
     end: int,
     order: np.ndarray,
+    rank_offsets: np.ndarray,
     boxes: np.ndarray,
     skews: np.ndarray,
     ranges: np.ndarray,
     tiles_x: int,
+    tiles: np.ndarray,
     counts: np.ndarray,
 ) -> None:
-    """Add the pairs of the Gaussians ``order[begin .. end]`` to ``counts`` per tile."""
+    """Write the tiles of the Gaussians ``order[begin .. end]`` and add them to ``counts``."""
     for k in range(begin, end):
         i = order[k]
+        place = rank_offsets[k]
         for row in range(ranges[i, 0] // _TILE, ranges[i, 1] // _TILE + 1):
             first, last = _tile_columns(i, row, boxes, skews, ranges)
             for column in range(first, last + 1):
-                counts[row * tiles_x + column] += 1
+                tile = row * tiles_x + column
+                tiles[place] = tile
+                counts[tile] += 1
+                place += 1
 
 
 @kernel(fast=False)
@@ -154,11 +161,9 @@ def scatter_range(
     begin: int,
     end: int,
     order: np.ndarray,
-    boxes: np.ndarray,
-    skews: np.ndarray,
-    ranges: np.ndarray,
+    rank_offsets: np.ndarray,
     pair_offsets: np.ndarray,
-    tiles_x: int,
+    tiles: np.ndarray,
     heads: np.ndarray,
     gaussian_ids: np.ndarray,
     pair_slots: np.ndarray,
@@ -167,12 +172,10 @@ def scatter_range(
     for k in range(begin, end):
         i = order[k]
         slot = pair_offsets[i]
-        for row in range(ranges[i, 0] // _TILE, ranges[i, 1] // _TILE + 1):
-            first, last = _tile_columns(i, row, boxes, skews, ranges)
-            for column in range(first, last + 1):
-                tile = row * tiles_x + column
-                place = heads[tile]
-                heads[tile] = place + 1
-                gaussian_ids[place] = i
-                pair_slots[place] = slot
-                slot += 1
+        for listed in range(rank_offsets[k], rank_offsets[k + 1]):
+            tile = tiles[listed]
+            place = heads[tile]
+            heads[tile] = place + 1
+            gaussian_ids[place] = i
+            pair_slots[place] = slot
+            slot += 1

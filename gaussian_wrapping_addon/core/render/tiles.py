@@ -11,7 +11,7 @@ from .. import tolerances
 from ..errors import ResourceError
 from ..parallel import default_threads, even_bounds, run_chunks
 from .projection import ScreenGaussians
-from .tile_kernels import count_pairs, radix_order, scatter_range, span_range
+from .tile_kernels import list_range, radix_order, scatter_range, span_range
 
 _MAX_PAIRS = 2**31 - 1
 
@@ -64,10 +64,19 @@ def bin_gaussians(screen: ScreenGaussians, width: int, height: int, threads: int
     tiles_x, tiles_y = -(-width // tile), -(-height // tile)
     ranges = np.zeros((count, 4), np.int32)
     pair_counts = np.zeros(count, np.int64)
-    args = (screen.boxes, screen.skews, screen.visible)
 
     def spans(begin: int, end: int) -> None:
-        span_range(begin, end, *args, width, height, ranges, pair_counts)
+        span_range(
+            begin,
+            end,
+            screen.boxes,
+            screen.skews,
+            screen.visible,
+            width,
+            height,
+            ranges,
+            pair_counts,
+        )
 
     run_chunks(spans, even_bounds(count, threads), threads)
     pair_offsets = np.zeros(count + 1, np.int64)
@@ -79,21 +88,22 @@ def bin_gaussians(screen: ScreenGaussians, width: int, height: int, threads: int
         )
 
     order = radix_order(screen.depths, screen.visible)
+    rank_offsets = np.zeros(len(order) + 1, np.int64)
+    np.cumsum(pair_counts[order], out=rank_offsets[1:])
+    tiles = np.zeros(pairs, np.int32)  # of each pair, in blending order
     # Runs of the order are counted apart, so that each knows where it writes in every tile.
     bounds = even_bounds(len(order), threads, 1)
-    runs = len(bounds) - 1
-    heads = np.zeros((max(runs, 1), tiles_x * tiles_y), np.int64)
+    heads = np.zeros((max(len(bounds) - 1, 1), tiles_x * tiles_y), np.int64)
     run_of = {int(begin): run for run, begin in enumerate(bounds[:-1])}
 
-    def tally(begin: int, end: int) -> None:
-        count_pairs(
-            begin, end, order, screen.boxes, screen.skews, ranges, tiles_x, heads[run_of[begin]]
-        )
+    def list_tiles(begin: int, end: int) -> None:
+        counts = heads[run_of[begin]]
+        boxes, skews = screen.boxes, screen.skews
+        list_range(begin, end, order, rank_offsets, boxes, skews, ranges, tiles_x, tiles, counts)
 
-    run_chunks(tally, bounds, threads)
-    totals = heads.sum(0)
+    run_chunks(list_tiles, bounds, threads)
     start = np.zeros(tiles_x * tiles_y + 1, np.int64)
-    np.cumsum(totals, out=start[1:])
+    np.cumsum(heads.sum(0), out=start[1:])
     heads[1:] = start[:-1] + np.cumsum(heads[:-1], axis=0)
     heads[0] = start[:-1]
     gaussian_ids = np.zeros(pairs, np.int32)
@@ -104,11 +114,9 @@ def bin_gaussians(screen: ScreenGaussians, width: int, height: int, threads: int
             begin,
             end,
             order,
-            screen.boxes,
-            screen.skews,
-            ranges,
+            rank_offsets,
             pair_offsets,
-            tiles_x,
+            tiles,
             heads[run_of[begin]],
             gaussian_ids,
             pair_slots,
