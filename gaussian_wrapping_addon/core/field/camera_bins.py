@@ -13,7 +13,7 @@ from ..dataset.camera import Camera
 from ..errors import ResourceError
 from ..gaussians.model import GaussianArrays
 from ..render.projection import pack_camera, project_arrays
-from .vacancy_kernels import ROW_COLUMNS, count_tiles, scatter_tiles
+from .vacancy_kernels import BOUND_COLUMNS, ROW_COLUMNS, list_tiles
 
 VIRTUAL_SIDE_PX = 65536
 """Longer side of the screen that queries use. Nothing is drawn, so the only thing that pixels
@@ -22,6 +22,8 @@ TILES_ALONG_SIDE = 64
 TILE_PX = VIRTUAL_SIDE_PX // TILES_ALONG_SIDE
 DEPTH_TAIL = 1e-5
 """In front of the depth where a Gaussian's value first exceeds this, it is left out."""
+STRIP_MARGIN_PX = 0.05
+"""Several float32 roundings of a coordinate on the virtual screen."""
 MAX_PAIRS = 2**31 - 1
 
 
@@ -35,8 +37,8 @@ class CameraBins:
     tiles_y: int
     rows: np.ndarray
     """(m, 16) float32, nearest first."""
-    boxes: np.ndarray
-    """(m, 4) float32, pixels of the virtual screen."""
+    bounds: np.ndarray
+    """(m, 8) float32, pixels of the virtual screen."""
     tile_start: np.ndarray
     """(tiles + 1,) int64."""
     tile_ids: np.ndarray
@@ -46,7 +48,7 @@ class CameraBins:
     @property
     def size_bytes(self) -> int:
         """Memory held."""
-        return sum(a.nbytes for a in (self.rows, self.boxes, self.tile_start, self.tile_ids))
+        return sum(a.nbytes for a in (self.rows, self.bounds, self.tile_start, self.tile_ids))
 
 
 def virtual_camera(camera: Camera) -> Camera:
@@ -82,6 +84,41 @@ def region_window(
         if x0 > x1 or y0 > y1:
             return None
     return x0, y0, x1, y1, float(depth.max())
+
+
+def footprint_bounds(boxes: np.ndarray, skews: np.ndarray) -> np.ndarray:
+    """Bound elliptic footprints by their box and by the narrowest strip that holds them.
+
+    Parameters
+    ----------
+    boxes : (n, 4) float32
+        x0 y0 x1 y1, pixels.
+    skews : (n,) float32
+        x offset from the middle to the ellipse's point of largest y; inf where unbounded.
+
+    Returns
+    -------
+    (n, 8) float32
+        See ``vacancy_kernels.BOUND_COLUMNS``. A strip of infinite width bounds nothing.
+    """
+    wide = boxes.astype(np.float64)
+    middle = 0.5 * (wide[:, :2] + wide[:, 2:])  # (n, 2)
+    half = 0.5 * (wide[:, 2:] - wide[:, :2])  # (n, 2)
+    bounded = np.isfinite(skews)
+    # The ellipse's matrix C: its width along a unit normal is sqrt(normal^T C normal).
+    xx, yy = half[:, 0] ** 2, half[:, 1] ** 2
+    xy = np.where(bounded, skews, 0.0) * half[:, 1]
+    turn = 0.5 * np.arctan2(2.0 * xy, xx - yy) + 0.5 * math.pi  # angle of the minor axis
+    normal = np.stack([np.cos(turn), np.sin(turn)], 1)  # (n, 2)
+    width_sq = normal[:, 0] ** 2 * xx + 2.0 * normal.prod(1) * xy + normal[:, 1] ** 2 * yy
+    # xy comes from rounded float32 values, so a thin ellipse's width is known to about this.
+    width = np.sqrt(np.maximum(width_sq, 0.0) + 1e-6 * (xx + yy)) + STRIP_MARGIN_PX
+    out = np.empty((len(boxes), BOUND_COLUMNS), np.float32)
+    out[:, :4] = boxes
+    out[:, 4:6] = normal
+    out[:, 6] = (normal * middle).sum(1)
+    out[:, 7] = np.where(bounded, width, np.inf)
+    return out
 
 
 def bin_camera(
@@ -121,14 +158,16 @@ def bin_camera(
     rows[:, 12] = screen.params[ids, 11]
     rows[:, 13] = reach[ids]
     rows[:, 14] = begin_z[ids]
-    near_boxes = np.ascontiguousarray(boxes[ids])
+    footprints = footprint_bounds(boxes[ids], screen.skews[ids])
     if window is not None:
         # Lists of tiles outside the window are never read.
-        near_boxes[:, :2] = np.maximum(near_boxes[:, :2], np.array([x0, y0], np.float32))
-        near_boxes[:, 2:] = np.minimum(near_boxes[:, 2:], np.array([x1, y1], np.float32))
+        footprints[:, :2] = np.maximum(footprints[:, :2], np.array([x0, y0], np.float32))
+        footprints[:, 2:4] = np.minimum(footprints[:, 2:4], np.array([x1, y1], np.float32))
     tiles_x, tiles_y = -(-virtual.width // TILE_PX), -(-virtual.height // TILE_PX)
     start = np.zeros(tiles_x * tiles_y + 1, np.int64)
-    count_tiles(near_boxes, TILE_PX, tiles_x, tiles_y, start[1:])
+    tile_ids = np.empty(0, np.int32)
+    tile_px = np.float32(TILE_PX)
+    list_tiles(footprints, tile_px, tiles_x, tiles_y, start[1:], tile_ids, False)
     longest = int(start.max())
     np.cumsum(start, out=start)
     if start[-1] > MAX_PAIRS:
@@ -137,6 +176,6 @@ def bin_camera(
             "Train with fewer Gaussians.",
         )
     tile_ids = np.empty(start[-1], np.int32)
-    scatter_tiles(near_boxes, TILE_PX, tiles_x, tiles_y, start[:-1].copy(), tile_ids)
+    list_tiles(footprints, tile_px, tiles_x, tiles_y, start[:-1].copy(), tile_ids, True)
     packed = pack_camera(virtual, near_z)
-    return CameraBins(packed, tiles_x, tiles_y, rows, near_boxes, start, tile_ids, longest)
+    return CameraBins(packed, tiles_x, tiles_y, rows, footprints, start, tile_ids, longest)

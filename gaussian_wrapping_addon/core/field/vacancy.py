@@ -22,7 +22,7 @@ SETTLED = 1.0 - 1e-3
 """A point this vacant is not looked at from further cameras."""
 POINTS_PER_PASS = 1 << 21
 CACHE_BYTES = 1 << 30
-POINTS_PER_CELL = 12
+POINTS_PER_CELL = 40
 """Cells are made as small as leaves about this many points in each: fewer waste lanes, more widen
 the lists of Gaussians."""
 MAX_CELL_SHIFT = 3
@@ -272,7 +272,7 @@ class VacancyField:
 
         def evaluate(begin: int, end: int) -> None:
             transmittance_of_cells(
-                begin, end, start, order, screen, bins.rows, bins.boxes, bins.tile_start,
+                begin, end, start, order, screen, bins.rows, bins.bounds, bins.tile_start,
                 bins.tile_ids, bins.longest_list, np.float32(TILE_PX), shift, bins.tiles_x,
                 index, best, winner,
             )  # fmt: skip

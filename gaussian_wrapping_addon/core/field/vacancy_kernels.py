@@ -12,6 +12,10 @@ ROW_COLUMNS = 16
 """One Gaussian on a screen, one cache line of float32: u v qa qb qc px py r s t z a0 opacity, the
 largest footprint distance, the depth where it begins to matter, and 0."""
 
+BOUND_COLUMNS = 8
+"""Bounds of one footprint, float32 pixels: x0 y0 x1 y1, unit normal of its narrowest strip, the
+strip's middle along the normal, and its half width."""
+
 GROUP = 64
 LANES = 16
 CHECK_EVERY = 16
@@ -46,31 +50,34 @@ def _exp_minus(x):
     return e * e
 
 
-@kernel(fast=False)
-def count_tiles(boxes, tile_px, tiles_x, tiles_y, counts):
-    """Count the Gaussians of each tile; boxes are pixels, clipped to the tiles."""
-    for i in range(boxes.shape[0]):
-        x0 = min(max(int(boxes[i, 0] / tile_px), 0), tiles_x - 1)
-        x1 = min(max(int(boxes[i, 2] / tile_px), 0), tiles_x - 1)
-        y0 = min(max(int(boxes[i, 1] / tile_px), 0), tiles_y - 1)
-        y1 = min(max(int(boxes[i, 3] / tile_px), 0), tiles_y - 1)
-        for y in range(y0, y1 + 1):
-            for x in range(x0, x1 + 1):
-                counts[y * tiles_x + x] += 1
+@inline
+def _strip_misses(bounds, i, x, y, half):
+    """Tell whether the square of half side ``half`` around (x, y) lies outside the strip."""
+    nx, ny = bounds[i, 4], bounds[i, 5]
+    return abs(nx * x + ny * y - bounds[i, 6]) > bounds[i, 7] + half * (abs(nx) + abs(ny))
 
 
 @kernel(fast=False)
-def scatter_tiles(boxes, tile_px, tiles_x, tiles_y, heads, ids):
-    """Write each Gaussian into its tiles' lists, in order; ``heads`` are advanced."""
-    for i in range(boxes.shape[0]):
-        x0 = min(max(int(boxes[i, 0] / tile_px), 0), tiles_x - 1)
-        x1 = min(max(int(boxes[i, 2] / tile_px), 0), tiles_x - 1)
-        y0 = min(max(int(boxes[i, 1] / tile_px), 0), tiles_y - 1)
-        y1 = min(max(int(boxes[i, 3] / tile_px), 0), tiles_y - 1)
+def list_tiles(bounds, tile_px, tiles_x, tiles_y, heads, ids, write):
+    """Count the footprints of each tile in ``heads``, or write them, in order, into their lists.
+
+    When writing, ``heads`` holds where each list begins and is advanced.
+    """
+    half = _HALF * tile_px
+    for i in range(bounds.shape[0]):
+        x0 = min(max(int(bounds[i, 0] / tile_px), 0), tiles_x - 1)
+        x1 = min(max(int(bounds[i, 2] / tile_px), 0), tiles_x - 1)
+        y0 = min(max(int(bounds[i, 1] / tile_px), 0), tiles_y - 1)
+        y1 = min(max(int(bounds[i, 3] / tile_px), 0), tiles_y - 1)
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
+                middle_x = np.float32(x) * tile_px + half
+                middle_y = np.float32(y) * tile_px + half
+                if _strip_misses(bounds, i, middle_x, middle_y, half):
+                    continue
                 t = y * tiles_x + x
-                ids[heads[t]] = i
+                if write:
+                    ids[heads[t]] = i
                 heads[t] += 1
 
 
@@ -130,7 +137,7 @@ def sort_by_cell(cells, start, order):
 
 @kernel(fast=True)
 def transmittance_of_cells(
-    begin, end, cell_start, order, screen, rows, boxes, tile_start, tile_ids, list_capacity,
+    begin, end, cell_start, order, screen, rows, bounds, tile_start, tile_ids, list_capacity,
     tile_px, shift, tiles_x, camera_index, best, winner,
 ):  # fmt: skip
     """Raise ``best`` and ``winner`` of the points of cells ``begin .. end`` by one camera.
@@ -139,6 +146,7 @@ def transmittance_of_cells(
     """
     mask = (1 << shift) - 1
     cell_px = tile_px / np.float32(mask + 1)
+    half = _HALF * cell_px
     near = np.empty(list_capacity, np.int32)
     # Rows of GROUP: x, y, depth, transmittance, value to beat. One array at constant offsets lets
     # the compiler prove that nothing overlaps (kernels.md 4).
@@ -161,11 +169,12 @@ def transmittance_of_cells(
         for k in range(tile_start[tile], tile_start[tile + 1]):
             i = tile_ids[k]
             if (
-                boxes[i, 0] <= x1
-                and boxes[i, 2] >= x0
-                and boxes[i, 1] <= y1
-                and boxes[i, 3] >= y0
+                bounds[i, 0] <= x1
+                and bounds[i, 2] >= x0
+                and bounds[i, 1] <= y1
+                and bounds[i, 3] >= y0
                 and rows[i, 14] <= deepest
+                and not _strip_misses(bounds, i, x0 + half, y0 + half, half)
             ):
                 near[count] = i
                 count += 1
