@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     ScreenGaussians,
@@ -30,9 +31,25 @@ def tiles_of(lists: TileLists) -> np.ndarray:
     return np.repeat(np.arange(len(lists.start) - 1), np.diff(lists.start))
 
 
-def make(seed: int = 0, count: int = 300, **scene: object) -> tuple[ScreenGaussians, np.ndarray]:
+def wild(gaussians: OrientedGaussians, seed: int) -> OrientedGaussians:
+    """Spread distances over 7 decades, sizes over 10 and opacity logits over +-20."""
+    random = np.random.default_rng(seed)
+    count = len(gaussians)
+    return gaussians.replaced(
+        means=gaussians.means * torch.from_numpy(10.0 ** random.uniform(-3, 4, (count, 1))),
+        log_scales=torch.from_numpy(random.uniform(-16, 8, (count, 3))),
+        opacity_logits=torch.from_numpy(random.normal(size=count) * 10),
+        filter_3d=torch.from_numpy(10.0 ** random.uniform(-9, 1, count)),
+    )
+
+
+def make(
+    seed: int = 0, count: int = 300, *, extreme: bool = False, **scene: object
+) -> tuple[ScreenGaussians, np.ndarray]:
     """Return screen Gaussians and their float64 alpha at every pixel centre, (n, h, w)."""
     gaussians = random_gaussians(count, seed, **scene)  # type: ignore[arg-type]
+    if extreme:
+        gaussians = wild(gaussians, seed)
     screen = project_gaussians(RawArrays.from_gaussians(gaussians), CAMERA, OPTIONS)
     with torch.no_grad():
         params = reference_projection(gaussians, CAMERA, OPTIONS).params.numpy()
@@ -40,7 +57,8 @@ def make(seed: int = 0, count: int = 300, **scene: object) -> tuple[ScreenGaussi
     dx = np.arange(CAMERA.width) + 0.5 - u
     dy = (np.arange(CAMERA.height) + 0.5)[:, None] - v
     den = 1.0 + 2.0 * (px * dx + py * dy) + r * dx * dx + s * dx * dy + t * dy * dy
-    alpha = opacity * np.exp(-0.5 * (qa * dx * dx + qb * dx * dy + qc * dy * dy) / den)
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # rows of zeros
+        alpha = opacity * np.exp(-0.5 * (qa * dx * dx + qb * dx * dy + qc * dy * dy) / den)
     return screen, alpha
 
 
@@ -49,6 +67,7 @@ SCENES = [
     {"seed": 1, "scale": (0.003, 0.6), "filter_size": 0.0},
     {"seed": 2, "scale": (0.001, 0.05)},
     {"seed": 3, "scale": (0.5, 2.0), "count": 60},
+    {"seed": 4, "extreme": True, "count": 900},
 ]
 
 
