@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside or outside: progressive sampling of tetrahedra, and a minimum cut over the undecided."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from .. import tolerances
+from ..progress import Progress
+
+_logger = logging.getLogger(__name__)
+
+Vacancy = Callable[[np.ndarray], np.ndarray]
+"""Maps (n, 3) points to (n,) vacancy."""
+
+ROUNDS = (1, 3, 6)
+"""Interior points added in each round: the centroid, then random ones (10 in all, as in PAM)."""
+
+DECIDED_MARGIN = 0.3
+"""A mean vacancy this far from 0.5 needs no further samples ..."""
+LONELY_NEIGHBOURS = 3
+"""... unless so many neighbours carry the other label."""
+
+FIXED_MARGIN = 0.25
+"""Tetrahedra at least this far from 0.5 after all rounds keep their label."""
+DATA_WEIGHT = 1.0
+"""Cost of a label against the vote, in units of the tetrahedron's own mean face area."""
+CAPACITY_STEPS = 4096.0
+"""Integer steps of the median face area in the minimum cut."""
+MAX_CUT_NODES = 400_000
+SWEEPS = 8
+
+POINTS_PER_CHUNK = 1 << 19
+
+
+@dataclass(frozen=True)
+class Classification:
+    """Labels of tetrahedra and how they came about."""
+
+    inside: np.ndarray
+    """(m,) bool."""
+    vacancy: np.ndarray
+    """(m,) float64 mean vacancy of the interior samples; 1 where not sampled."""
+    samples: np.ndarray
+    """(m,) int64 number of interior samples."""
+    undecided: int
+    """Tetrahedra whose label was left to the minimum cut."""
+    flipped: int
+    """Tetrahedra whose label the minimum cut changed."""
+
+
+def classify(
+    points: np.ndarray,
+    tetrahedra: np.ndarray,
+    neighbours: np.ndarray,
+    outer: np.ndarray,
+    vacancy: Vacancy,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> Classification:
+    """Label tetrahedra by the vacancy of interior points (method.md 7.5).
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+    tetrahedra : (m, 4) int64
+    neighbours : (m, 4) int64
+        Tetrahedron behind the face opposite each corner, -1 on the hull.
+    outer : (m,) bool
+        Outside by definition (beyond the region); never sampled.
+    """
+    count = len(tetrahedra)
+    total, samples = np.zeros(count), np.zeros(count, np.int64)
+    total[outer], samples[outer] = 1.0, 1
+    rows = np.flatnonzero(~outer)
+    for turn, extra in enumerate(ROUNDS):
+        span = progress.span(0.8 * turn / len(ROUNDS), 0.8 * (turn + 1) / len(ROUNDS))
+        for step in range(extra):
+            for begin in range(0, len(rows), POINTS_PER_CHUNK):
+                part = rows[begin : begin + POINTS_PER_CHUNK]
+                span.update(
+                    (step + begin / len(rows)) / extra, f"classifying {len(rows)} tetrahedra"
+                )
+                weights = _interior_weights(len(part), turn == 0, rng)
+                where = np.einsum("kc,kcx->kx", weights, points[tetrahedra[part]])
+                total[part] += vacancy(where)
+                samples[part] += 1
+        mean = total / np.maximum(samples, 1)
+        inside = (mean <= tolerances.ISO_LEVEL) & ~outer
+        near = np.abs(mean - tolerances.ISO_LEVEL) < DECIDED_MARGIN
+        lonely = _disagreeing(inside, neighbours) >= LONELY_NEIGHBOURS
+        rows = np.flatnonzero((near | lonely) & ~outer)
+    progress.update(0.85, "smoothing labels")
+    free = (np.abs(mean - tolerances.ISO_LEVEL) < FIXED_MARGIN) & ~outer
+    areas = face_areas(points, tetrahedra)
+    smooth = regularised(inside, mean, free, neighbours, areas)
+    progress.update(1.0, "smoothing labels")
+    flipped = int((smooth != inside).sum())
+    return Classification(smooth, mean, samples, int(free.sum()), flipped)
+
+
+def _interior_weights(count: int, centroid: bool, rng: np.random.Generator) -> np.ndarray:
+    """Barycentric weights, (count, 4): the centroid, or uniform ones (Dirichlet(1, 1, 1, 1))."""
+    if centroid:
+        return np.full((count, 4), 0.25)
+    weights = rng.standard_exponential((count, 4))
+    return weights / weights.sum(1, keepdims=True)
+
+
+def _disagreeing(inside: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+    """(m,) number of neighbours with the other label; beyond the hull is outside."""
+    theirs = np.where(neighbours >= 0, inside[neighbours], False)  # (m, 4)
+    return (theirs != inside[:, None]).sum(1)
+
+
+def face_areas(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Return (m, 4) areas of the faces opposite each corner."""
+    result = np.empty(tetrahedra.shape)
+    for k in range(4):
+        a, b, c = (points[tetrahedra[:, j]] for j in range(4) if j != k)
+        result[:, k] = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    return result
+
+
+def regularised(
+    inside: np.ndarray,
+    vacancy: np.ndarray,
+    free: np.ndarray,
+    neighbours: np.ndarray,
+    areas: np.ndarray,
+) -> np.ndarray:
+    """Choose the labels of ``free`` tetrahedra by a minimum cut.
+
+    Minimises the area between the labels plus, for each tetrahedron labelled against its vote,
+    ``DATA_WEIGHT * 2 |vacancy - 0.5|`` times its mean face area. The other labels stay, so thin
+    parts that the field shows clearly cannot be smoothed away.
+
+    Returns
+    -------
+    (m,) bool
+    """
+    nodes = np.flatnonzero(free)
+    if len(nodes) == 0:
+        return inside.copy()
+    own = np.full(len(free), -1, np.int64)
+    own[nodes] = np.arange(len(nodes))
+    links, weight = neighbours[nodes], areas[nodes]  # (k, 4)
+    known = links >= 0
+    theirs = np.where(known, own[links], -1)
+    fixed_inside = known & (theirs < 0) & inside[links]
+    fixed_outside = (theirs < 0) & ~fixed_inside
+    confidence = DATA_WEIGHT * 2 * np.abs(vacancy[nodes] - tolerances.ISO_LEVEL) * weight.mean(1)
+    votes_inside = inside[nodes]
+    to_inside = (weight * fixed_inside).sum(1) + np.where(votes_inside, confidence, 0.0)
+    to_outside = (weight * fixed_outside).sum(1) + np.where(votes_inside, 0.0, confidence)
+    result = inside.copy()
+    if len(nodes) <= MAX_CUT_NODES:
+        result[nodes] = _minimum_cut(theirs, weight, to_inside, to_outside)
+    else:
+        _logger.warning("%d undecided tetrahedra: smoothing by sweeps", len(nodes))
+        result[nodes] = _sweeps(votes_inside, theirs, weight, to_inside, to_outside)
+    return result
+
+
+def _minimum_cut(
+    links: np.ndarray, weight: np.ndarray, to_inside: np.ndarray, to_outside: np.ndarray
+) -> np.ndarray:
+    """Return which nodes end on the inside of the cheapest cut, (k,) bool."""
+    count = len(links)
+    source, sink = count, count + 1
+    row, column = np.nonzero(links >= 0)
+    # What both terminals give cancels; only the difference flows.
+    excess = to_inside - to_outside
+    strong, weak = np.flatnonzero(excess > 0), np.flatnonzero(excess < 0)
+    begins = np.concatenate([row, np.full(len(strong), source), weak])
+    ends = np.concatenate([links[row, column], strong, np.full(len(weak), sink)])
+    values = np.concatenate([weight[row, column], excess[strong], -excess[weak]])
+    unit = np.median(weight) / CAPACITY_STEPS
+    limit = np.iinfo(np.int32).max // 64  # sums of flows at a node must fit as well
+    capacity = np.minimum(np.rint(values / max(unit, 1e-300)), limit).astype(np.int32)
+    graph = csr_matrix((capacity, (begins, ends)), shape=(count + 2, count + 2))
+    flow = maximum_flow(graph, source, sink).flow
+    residual = graph - flow
+    residual.data[residual.data < 0] = 0
+    residual.eliminate_zeros()
+    reached = breadth_first_order(residual, source, return_predecessors=False)
+    result = np.zeros(count + 2, np.bool_)
+    result[reached] = True
+    return result[:count]
+
+
+def _sweeps(
+    start: np.ndarray,
+    links: np.ndarray,
+    weight: np.ndarray,
+    to_inside: np.ndarray,
+    to_outside: np.ndarray,
+) -> np.ndarray:
+    """Relax labels by weighted majority; alternate halves, so that neighbours do not chase."""
+    label = start.copy()
+    half = np.arange(len(label)) % 2 == 0
+    for sweep in range(2 * SWEEPS):
+        mine = np.where(links >= 0, np.where(label[links], 1.0, -1.0), 0.0)  # (k, 4)
+        balance = (mine * weight).sum(1) + to_inside - to_outside
+        change = ((balance > 0) != label) & (balance != 0) & (half == (sweep % 2 == 0))
+        label = label ^ change
+    return label

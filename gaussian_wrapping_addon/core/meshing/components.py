@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Connected parts of a mesh, and removal of floaters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from .sampling import triangle_normals
+
+
+def face_components(vertex_count: int, faces: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return the number of connected parts and the part of each face, (f,) int64.
+
+    Faces that share a vertex belong to one part.
+    """
+    if len(faces) == 0:
+        return 0, np.zeros(0, np.int64)
+    rows, columns = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    shape = (vertex_count, vertex_count)
+    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=shape)
+    _, label = connected_components(graph, directed=False)
+    used, part = np.unique(label[faces[:, 0]], return_inverse=True)
+    return len(used), part.astype(np.int64)
+
+
+def volumes_and_areas(
+    vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the signed volume and the area of each part, (count,) each.
+
+    The volume is that of a closed part; a cavity inside a solid has a negative one.
+    """
+    center = vertices[faces.reshape(-1)].mean(0) if len(faces) else np.zeros(3)
+    a, b, c = (vertices[faces[:, k]] - center for k in range(3))
+    each = (a * np.cross(b, c)).sum(1) / 6.0
+    _, areas = triangle_normals(vertices, faces)
+    return (
+        np.bincount(part, weights=each, minlength=count),
+        np.bincount(part, weights=areas, minlength=count),
+    )
+
+
+@dataclass(frozen=True)
+class Floaters:
+    """What :func:`without_floaters` did."""
+
+    faces: np.ndarray
+    """(g, 3) faces that stay."""
+    kept: int
+    removed_solids: int
+    removed_cavities: int
+    removed_area_share: float
+    """Area of all removed parts, of the total."""
+
+
+def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> Floaters:
+    """Remove closed parts whose area is below ``min_share`` of the largest part's.
+
+    Small cavities go as well, which fills them. A cavity whose solid goes is small itself.
+    """
+    count, part = face_components(len(vertices), faces)
+    volume, area = volumes_and_areas(vertices, faces, part, count)
+    keep = area >= min_share * area.max(initial=0.0)
+    removed = float(area[~keep].sum() / max(area.sum(), 1e-300))
+    return Floaters(
+        faces[keep[part]],
+        int(keep.sum()),
+        int((~keep & (volume >= 0)).sum()),
+        int((~keep & (volume < 0)).sum()),
+        removed,
+    )
+
+
+def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drop unused vertices.
+
+    Returns
+    -------
+    vertices : (w, 3)
+    faces : (f, 3) int64
+    source : (w,) int64
+        Old index of each vertex.
+    """
+    source, index = np.unique(faces, return_inverse=True)
+    return vertices[source], index.reshape(-1, 3).astype(np.int64), source

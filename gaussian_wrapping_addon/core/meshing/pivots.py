@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Two-pivot points of oriented Gaussians (method.md 6.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .. import tolerances
+from ..gaussians.model import GaussianArrays
+from .convex_region import Region
+
+PIVOT_SIGMAS = 3.0
+"""The outer pivot lies at this many standard deviations along the normal."""
+
+MAX_PIVOT_GAUSSIANS = 250_000
+"""With more, one Gaussian a cell and direction stands for its neighbours (memory)."""
+
+
+def reaching(arrays: GaussianArrays, region: Region, margin: float) -> np.ndarray:
+    """Return indices of the Gaussians whose 3-sigma body comes within ``margin`` of the region.
+
+    Gaussians that no kernel shows (opacity below 1/255), and those whose centre is farther away
+    than the region is large, are left out.
+    """
+    normals, offsets = region.half_spaces
+    good = arrays.log_opacities > np.log(tolerances.ALPHA_MIN)
+    good &= np.isfinite(arrays.means).all(1) & np.isfinite(arrays.scales).all(1)
+    local = arrays.means - region.center  # (n, 3)
+    good &= np.linalg.norm(local, axis=1) < 1.5 * region.diagonal
+    for normal, offset in zip(normals, offsets, strict=True):
+        index = np.flatnonzero(good)
+        width = directional_sigma(arrays, index, np.broadcast_to(normal, (len(index), 3)))
+        good[index] = local[index] @ normal - offset <= PIVOT_SIGMAS * width + margin
+    return np.flatnonzero(good)
+
+
+def directional_sigma(
+    arrays: GaussianArrays, index: np.ndarray, directions: np.ndarray
+) -> np.ndarray:
+    """Return ``sqrt(d^T Sigma d)`` of the Gaussians ``index`` along unit ``directions``, (k,)."""
+    along = np.einsum("kij,ki->kj", arrays.rotations[index], directions)  # (k, 3) R^T d
+    return np.linalg.norm(arrays.scales[index] * along, axis=1)
+
+
+def two_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
+    """Return centre and outer pivots of the Gaussians ``index``.
+
+    A Gaussian without orientation (normal shorter than ``tolerances.ORIENTED_MIN_NORM``) gets
+    outer pivots on both sides along its shortest axis.
+
+    Returns
+    -------
+    (p, 3) float64
+        Centres first, then outer pivots.
+    """
+    means = arrays.means[index]
+    normals = arrays.normals[index]
+    length = np.linalg.norm(normals, axis=1)
+    oriented = length >= tolerances.ORIENTED_MIN_NORM
+    rows = np.arange(len(index))
+    shortest = arrays.rotations[index][rows, :, arrays.scales[index].argmin(1)]  # (k, 3)
+    unit = np.where(oriented[:, None], normals / np.maximum(length, 1e-300)[:, None], shortest)
+    step = PIVOT_SIGMAS * directional_sigma(arrays, index, unit)[:, None] * unit  # (k, 3)
+    return np.concatenate([means, means + step, means[~oriented] - step[~oriented]])
+
+
+def representative(arrays: GaussianArrays, index: np.ndarray, limit: int) -> np.ndarray:
+    """Return at most about ``limit`` of the Gaussians ``index``, evenly over space and direction.
+
+    In each cell the most opaque Gaussian of each octant of normals stays. Cells grow until the
+    rest is small enough.
+    """
+    if len(index) <= limit:
+        return index
+    means = arrays.means[index]
+    low, high = means.min(0), means.max(0)
+    octant = (arrays.normals[index] > 0) @ np.array([1, 2, 4])  # (k,)
+    order = np.argsort(-arrays.log_opacities[index], kind="stable")
+    cells_across = 1024.0
+    while True:
+        side = float((high - low).max()) / cells_across
+        cell = np.floor((means - low) / side).astype(np.int64)  # (k, 3)
+        key = ((cell[:, 0] * 2048 + cell[:, 1]) * 2048 + cell[:, 2]) * 8 + octant
+        _, first = np.unique(key[order], return_index=True)
+        if len(first) <= limit:
+            return np.sort(index[order[first]])
+        cells_across *= 0.8

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How densely a region is meshed: edge length, number of points, and their caps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import limits
+from ..errors import ResourceError, UsageError
+from .convex_region import Region
+from .sampling import EDGE_PER_RADIUS, POINTS_PER_SQUARE
+
+AUTOMATIC_POINTS = 24_000
+"""Surface points where nothing is asked for: 40 to 50 thousand faces."""
+
+COARSEST_SHARE = 1 / 8
+"""Edges longer than this share of the diagonal would not show a region's contents."""
+
+FINEST_SHARE = 1e-6
+"""Edges shorter than this share of the diagonal are refused without any computation."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What was asked for: an edge length, a number of points, or neither (0 and 0)."""
+
+    edge_length: float
+    """Scene units."""
+    points: int
+    notes: tuple[str, ...] = ()
+    """What was changed, for the report."""
+
+
+def checked_request(edge_length: float, points: int, region: Region) -> Request:
+    """Check a request before any work is done (conventions D.5, case 37).
+
+    Raises
+    ------
+    UsageError
+        Not a number, negative, or both given.
+    ResourceError
+        Absurdly fine.
+    """
+    if not math.isfinite(edge_length) or edge_length < 0 or points < 0:
+        raise UsageError(
+            f"Edge length {edge_length} with {points} points is not possible.",
+            "Give a positive edge length, or a number of points, or leave both 0.",
+        )
+    if edge_length > 0 and points > 0:
+        raise UsageError("Both an edge length and a number of points are given.", "Give one.")
+    if points > limits.MAX_MESH_POINTS:
+        raise ResourceError(
+            f"{points} surface points are too many.", f"Ask for {limits.MAX_MESH_POINTS} at most."
+        )
+    if 0 < edge_length < FINEST_SHARE * region.diagonal:
+        factor = FINEST_SHARE * region.diagonal / edge_length
+        raise ResourceError(
+            f"Edges of a {region.diagonal / edge_length:.0e}th of region {region.name!r} cannot be "
+            "made.", f"Use edges at least {factor:.0e} times longer, or a smaller region.",
+        )  # fmt: skip
+    coarsest = COARSEST_SHARE * region.diagonal
+    if edge_length > coarsest:
+        share = f"1/{1 / COARSEST_SHARE:.0f} of the region's diagonal"
+        note = f"The edge length was larger than {share} and was reduced to that."
+        return Request(coarsest, 0, (note,))
+    return Request(edge_length, points)
+
+
+def thinning_radius(request: Request, area: float, density: float, region: Region) -> float:
+    """Return the largest thinning radius of the surface points.
+
+    Parameters
+    ----------
+    area : float
+        Area of the candidate surface in the region.
+    density : float
+        Points relative to a uniform radius, >= 1 (denser where the surface turns quickly).
+
+    Raises
+    ------
+    ResourceError
+        The expected number of points passes ``limits.MAX_MESH_POINTS``.
+    """
+    if request.edge_length > 0:
+        radius = request.edge_length / EDGE_PER_RADIUS
+        expected = POINTS_PER_SQUARE * area * density / radius**2
+        if expected > limits.MAX_MESH_POINTS:
+            factor = math.sqrt(expected / limits.MAX_MESH_POINTS)
+            raise ResourceError(
+                f"This edge length needs about {expected:.1e} surface points; "
+                f"{limits.MAX_MESH_POINTS:.0e} is the most.",
+                f"Use edges at least {factor:.2g} times longer, or a smaller region.",
+            )
+        return radius
+    points = request.points or AUTOMATIC_POINTS
+    radius = float(np.sqrt(POINTS_PER_SQUARE * area * density / points))
+    return min(radius, COARSEST_SHARE * region.diagonal)

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Evenly spread points on the isosurface, made from a candidate surface (method.md 7.2, 1-5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .. import tolerances
+from ..field.isosurface_projection import TOLERANCE, project_to_isosurface
+from ..progress import Progress
+from .candidate_surface import CandidateSurface
+from .convex_region import Region
+from .marching_tetrahedra import bisect
+from .region_caps import cap_points
+from .resolution import Request, thinning_radius
+from .sampling import curvature, local_radii, sample_triangles, thin, triangle_normals
+
+KIND_SURFACE, KIND_CAP, KIND_JUMP = 0, 1, 2
+"""On the isosurface; on the region's boundary; where vacancy jumps over 0.5 (the end of what the
+cameras see)."""
+
+PRIORITY_SURFACE = 3.0
+"""Between the rims and the inner part of the caps; see region_caps."""
+
+OVERSAMPLING = 9.0
+"""Candidates per point, before the first thinning."""
+FIRST_THINNING = 0.55
+"""Candidates closer than this share of the radius are not worth projecting."""
+SCOUTS = 20_000
+"""Candidates from which curvature, and so the local radius, is estimated."""
+MOST_DENSE = 2.0
+"""Curvature may multiply the number of points by this at most."""
+
+SEARCH_SHARES = (0.25, -0.25, 0.5, -0.5, 1.0, -1.0)
+"""Distances along the normal, in radii, at which a point without a crossing looks for one."""
+BRACKET_SHARE = 1e-3
+"""A found crossing is bracketed to this share of the radius."""
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points that become the vertices of the mesh."""
+
+    points: np.ndarray
+    """(n, 3) float64."""
+    kind: np.ndarray
+    """(n,) uint8."""
+    radius: float
+    """Largest thinning radius."""
+    figures: dict[str, Any]
+
+
+class SurfaceSampler:
+    """Spreads points over a candidate surface and moves them onto the isosurface."""
+
+    def __init__(
+        self, vacancy: Any, vectors: Any, region: Region, surface: CandidateSurface, threads: int
+    ) -> None:
+        self._vacancy, self._vectors, self._region = vacancy, vectors, region
+        self._vertices = surface.vertices
+        centers = surface.vertices[surface.faces].mean(1)
+        self._faces = surface.faces[region.contains(centers, 0.0)]
+        if len(self._faces) == 0:  # the whole surface lies in the margin
+            self._faces = surface.faces
+        self._normals, areas = triangle_normals(self._vertices, self._faces)
+        self.area = float(areas.sum())
+        self._threads = threads
+
+    def sample(
+        self, request: Request, rng: np.random.Generator, progress: Progress
+    ) -> SurfacePoints:
+        """Return surface, jump and cap points at the requested density.
+
+        Raises
+        ------
+        ResourceError
+            The request needs more points than the cap.
+        """
+        radius, density = self._scout(request, rng)
+        progress.update(0.05, "spreading points")
+        count = int(OVERSAMPLING * density * 0.7 * self.area / radius**2) + 64
+        points, face = sample_triangles(self._vertices, self._faces, count, rng)
+        normals = self._normals_at(points, self._normals[face])
+        radii = local_radii(curvature(points, normals, 1.3 * radius, self._threads), radius, MOST_DENSE)
+        kept = thin(points, normals, FIRST_THINNING * radii, rng.random(count))
+        points, normals, radii = points[kept], normals[kept], radii[kept]
+        progress.update(0.2, f"moving {len(points)} points onto the surface")
+        found = project_to_isosurface(
+            points, self._vacancy, self._vectors, progress.span(0.2, 0.7), tolerance=TOLERANCE
+        )
+        kind = np.full(len(points), KIND_SURFACE, np.uint8)
+        lost = np.flatnonzero(~found.on_surface)
+        moved = found.points.copy()
+        searched, kind_of_lost = self._search(points[lost], normals[lost], radius, progress)
+        moved[lost] = searched
+        good = found.on_surface.copy()
+        good[lost] = kind_of_lost >= 0
+        kind[lost] = np.maximum(kind_of_lost, 0)
+        good &= self._region.contains(moved, 0.0)
+        moved, kind, radii = moved[good], kind[good], radii[good]
+        normals = self._normals_at(moved, normals[good])
+        caps = cap_points(
+            self._region, self._vacancy.is_empty, radius, rng, progress.span(0.8, 1.0)
+        )
+        # Jumps last among surface points: where both are near, the isosurface is the better one.
+        priority = PRIORITY_SURFACE + 0.5 * (rng.random(len(moved)) + (kind == KIND_JUMP))
+        everything = np.concatenate([caps.points, moved])
+        kept = thin(
+            everything,
+            np.concatenate([caps.normals, normals]),
+            np.concatenate([np.full(len(caps.points), radius), radii]),
+            np.concatenate([caps.priority, priority]),
+        )
+        kinds = np.concatenate([np.full(len(caps.points), KIND_CAP, np.uint8), kind])[kept]
+        figures = {
+            "candidates": len(points),
+            "dropped_candidates": int((~good).sum()),
+            "surface_points": int((kinds == KIND_SURFACE).sum()),
+            "jump_points": int((kinds == KIND_JUMP).sum()),
+            "cap_points": int((kinds == KIND_CAP).sum()),
+            "projection_evaluations": int(found.vacancy_evaluations),
+        }
+        return SurfacePoints(everything[kept], kinds, radius, figures)
+
+    def _scout(self, request: Request, rng: np.random.Generator) -> tuple[float, float]:
+        """Return the thinning radius and the expected density relative to a uniform one."""
+        radius = thinning_radius(request, self.area, 1.0, self._region)
+        points, face = sample_triangles(self._vertices, self._faces, SCOUTS, rng)
+        normals = self._normals_at(points, self._normals[face])
+        density = 1.0
+        for _ in range(3):  # density depends on the radius, which depends on the density
+            turning = curvature(points, normals, max(1.3 * radius, self._reach()), self._threads)
+            density = float(np.mean((local_radii(turning, radius, MOST_DENSE) / radius) ** -2.0))
+            if request.edge_length > 0:
+                break
+            radius = thinning_radius(request, self.area, density, self._region)
+        return thinning_radius(request, self.area, density, self._region), density
+
+    def _reach(self) -> float:
+        """Distance within which a scout has about a dozen neighbours."""
+        return float(np.sqrt(4.0 * self.area / SCOUTS))
+
+    def _normals_at(self, points: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+        """Unit vectors of the vector field, or the triangle's normal where that has none."""
+        V = self._vectors.evaluate(points).V
+        length = np.linalg.norm(V, axis=1)
+        good = np.isfinite(length) & (length > 0)
+        unit = np.where(good[:, None], V, fallback) / np.where(good, length, 1.0)[:, None]
+        opposed = (unit * fallback).sum(1) < 0
+        return np.where(opposed[:, None], fallback, unit)
+
+    def _search(
+        self, points: np.ndarray, normals: np.ndarray, radius: float, progress: Progress
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Look for a crossing along the normal where the projection found none.
+
+        Returns
+        -------
+        points : (k, 3)
+            Middle of the bracket.
+        kind : (k,) int
+            :data:`KIND_SURFACE`, :data:`KIND_JUMP`, or -1 without a crossing.
+        """
+        kind = np.full(len(points), -1)
+        moved = points.copy()
+        if len(points) == 0:
+            return moved, kind
+        start = self._vacancy.is_empty(points)
+        other, open_rows = points.copy(), np.arange(len(points))
+        for share in SEARCH_SHARES:
+            trial = points[open_rows] + share * radius * normals[open_rows]
+            hit = self._vacancy.is_empty(trial) != start[open_rows]
+            other[open_rows[hit]] = trial[hit]
+            kind[open_rows[hit]] = KIND_JUMP
+            open_rows = open_rows[~hit]
+        rows = np.flatnonzero(kind >= 0)
+        empty = start[rows, None]
+        inside, outside = bisect(
+            np.where(empty, other[rows], points[rows]),
+            np.where(empty, points[rows], other[rows]),
+            self._vacancy.is_empty,
+            BRACKET_SHARE * radius,
+            progress.span(0.7, 0.8),
+        )
+        moved[rows] = (inside + outside) / 2
+        value = self._vacancy.vacancy(moved[rows]).vacancy
+        exact = np.abs(value - tolerances.ISO_LEVEL) <= TOLERANCE
+        kind[rows[exact]] = KIND_SURFACE
+        return moved, kind
