@@ -19,6 +19,8 @@ TAIL = 1e-4
 """Gaussians whose value at a point is below this are left out (method.md 5.2)."""
 MEDIAN_CAPACITY = 512
 """At most this many Gaussians at a point take part in the median of their thickness."""
+MIN_SLOPE = 1e-6
+"""|V| times local sigma below which V has no direction."""
 FALLBACK_NEIGHBOURS = 8
 POINTS_PER_CHUNK = 4096
 
@@ -131,6 +133,9 @@ class VectorFieldResult:
     nearest: np.ndarray
     """(n,) int32: the Gaussian with the largest value at the point, or the one with the nearest
     mean where none reaches; -1 if there are no Gaussians."""
+    outward: np.ndarray
+    """(n, 3) float64: unit direction of V, or of the learned normal of ``nearest`` where V is too
+    small to have one (behind the Gaussians, or far off); 0 where neither is known."""
 
 
 class VectorField:
@@ -155,6 +160,7 @@ class VectorField:
         self.threads = threads or default_threads()
         self.oriented = oriented
         self._means = np.ascontiguousarray(arrays.means, np.float64)
+        self._normals = np.ascontiguousarray(arrays.normals, np.float64)
         self._thickness = arrays.scales.min(1) if len(arrays) else np.zeros(0)
         q_cut = 2.0 * (arrays.log_opacities - math.log(TAIL))
         self._kept = np.flatnonzero(q_cut > 0.0)  # rows of the table -> rows of arrays
@@ -202,4 +208,17 @@ class VectorField:
             _, index = self._tree.query(points[lost], k=np.arange(1, k + 1), workers=self.threads)
             nearest[lost] = index[:, 0]
             sigma_local[lost] = np.median(self._thickness[index], axis=1)
-        return VectorFieldResult(V, sigma_local, nearest)
+        return VectorFieldResult(V, sigma_local, nearest, self._outward(V, sigma_local, nearest))
+
+    def _outward(self, V: np.ndarray, sigma: np.ndarray, nearest: np.ndarray) -> np.ndarray:
+        length = np.linalg.norm(V, axis=1)
+        weak = ~((length * sigma > MIN_SLOPE) & np.isfinite(length))
+        out = V / np.where(weak, 1.0, length)[:, None]
+        out[weak] = 0.0
+        if self.oriented:
+            known = np.flatnonzero(weak & (nearest >= 0))
+            normals = self._normals[nearest[known]]  # (k, 3)
+            norm = np.linalg.norm(normals, axis=1)
+            oriented = norm >= tolerances.ORIENTED_MIN_NORM
+            out[known[oriented]] = normals[oriented] / norm[oriented, None]
+        return out

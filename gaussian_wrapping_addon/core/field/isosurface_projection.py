@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Moving points onto the surface ``vacancy = 0.5``: safeguarded Newton, then a kept bracket."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol
+
+import numpy as np
+
+from .. import tolerances
+from ..dataset.camera import Camera
+from ..progress import Progress
+from .vacancy import SETTLED, VacancyResult
+from .vector_field import MIN_SLOPE, VectorFieldResult
+
+TOLERANCE = 0.01
+MAX_ROUNDS = 40
+MAX_TRAVEL_SIGMAS = 16.0
+MAX_HALVINGS = 4
+MAX_STEP_SIGMAS = 1.0
+MAX_INWARD_MARCH = 8
+BRACKET_END_SIGMAS = 1e-3
+"""A bracket this short is not cut any further (method.md 5.6)."""
+SLOPE_RATIO = 4.0
+"""Newton trusts V's length within this factor, and corrects it by what the last step showed."""
+RESOLVED = (1e-4, SETTLED)
+"""Outside this range the field does not resolve vacancy, so there is no slope to follow."""
+
+
+class ProjectionStatus(IntEnum):
+    """How a point ended."""
+
+    CONVERGED = 0
+    """Newton steps reached the tolerance."""
+    BISECTED = 1
+    """A bracket was found and shortened until the tolerance was reached."""
+    DROPPED = 2
+    """Not on the surface: no camera sees the point, or there is no crossing in its neighbourhood,
+    or vacancy jumps over the tolerance there."""
+
+
+@dataclass(frozen=True)
+class ProjectionResult:
+    """Where the points ended; every point has a status and a residual."""
+
+    points: np.ndarray
+    """(n, 3) float64 scene frame: the closest to the surface that was seen on the way."""
+    vacancy: np.ndarray
+    """(n,) float32 there."""
+    status: np.ndarray
+    """(n,) uint8, :class:`ProjectionStatus`."""
+    residual: np.ndarray
+    """(n,) float32 ``|vacancy - 0.5|`` there."""
+    camera: np.ndarray
+    """(n,) int32: the camera that sees the point best, or -1."""
+    vacancy_rounds: int
+    """Batches of vacancy evaluations."""
+    vacancy_evaluations: int
+    """Points summed over the batches: what the projection cost."""
+
+    @property
+    def on_surface(self) -> np.ndarray:
+        """(n,) bool: not dropped."""
+        return self.status != ProjectionStatus.DROPPED
+
+
+class HasVacancy(Protocol):
+    """What is needed of a vacancy field."""
+
+    @property
+    def cameras(self) -> Sequence[Camera]:
+        """Cameras by the indices that ``vacancy`` returns."""
+
+    def vacancy(self, points: np.ndarray) -> VacancyResult:
+        """Evaluate at (n, 3) points."""
+
+
+class HasVectors(Protocol):
+    """What is needed of a vector field."""
+
+    def evaluate(self, points: np.ndarray) -> VectorFieldResult:
+        """Evaluate at (n, 3) points."""
+
+
+_NEWTON, _MARCH, _BRACKET = 0, 1, 2
+
+
+def project_to_isosurface(
+    points: np.ndarray,
+    vacancy_field: HasVacancy,
+    vector_field: HasVectors,
+    progress: Progress | None = None,
+    *,
+    tolerance: float = TOLERANCE,
+    max_steps: int = MAX_ROUNDS,
+    max_travel_sigmas: float = MAX_TRAVEL_SIGMAS,
+) -> ProjectionResult:
+    """Move points onto the surface ``vacancy = 0.5`` (method.md 5.6).
+
+    Newton steps on ``log v`` along V, at most one local sigma long, are taken while they lessen
+    ``|v - 0.5|`` and are halved up to four times where they do not. As soon as two points on
+    opposite sides are known, the segment between them is cut (false position, every third time in
+    the middle) until the tolerance is reached. Where Newton fails or the field is flat, a bracket
+    is searched along the outward direction of the vector field (occupied points outwards, by
+    doubling distances; empty ones inwards, by steps of one sigma), and if that fails along the
+    ray of the camera that sees the point best, on which transmittance must rise to 1. All lengths
+    are in local sigmas, so the result scales with the scene.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Scene frame.
+    vacancy_field : VacancyField
+    vector_field : VectorField
+    progress : Progress, optional
+    tolerance : float
+        Largest ``|v - 0.5|`` of a point that is kept; 1e-3 to 2e-2 make sense.
+    max_steps : int
+        Batches of vacancy evaluations at most; points still under way then are dropped.
+    max_travel_sigmas : float
+        No point is ever moved further from its start than this many local sigmas.
+
+    Returns
+    -------
+    ProjectionResult
+    """
+    progress = progress or Progress()
+    points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
+    centers = np.array([camera.center for camera in vacancy_field.cameras]).reshape(-1, 3)
+    vectors = vector_field.evaluate(points)
+    answer = vacancy_field.vacancy(points)
+    walk = _Walk(points, answer, vectors, centers, tolerance, max_travel_sigmas)
+    rounds, evaluations = 1, len(points)
+    while len(walk.rows) and rounds < max_steps:
+        share = 1.0 - len(walk.rows) / max(1, len(points))
+        progress.update(share, "Moving points onto the surface")
+        trial = walk.next_trials()
+        if len(trial) == 0:
+            break
+        answer = vacancy_field.vacancy(trial)
+        rounds, evaluations = rounds + 1, evaluations + len(trial)
+        accepted = walk.judge(trial, answer)
+        if len(accepted):
+            fresh = vector_field.evaluate(walk.x[accepted])
+            walk.V[accepted], walk.outward[accepted] = fresh.V, fresh.outward
+    progress.update(1.0, "Points are on the surface")
+    return walk.result(rounds, evaluations)
+
+
+class _Walk:
+    """State of every point (full-length arrays) and ``rows``, the points still under way."""
+
+    def __init__(
+        self,
+        points: np.ndarray,
+        first: VacancyResult,
+        vectors: VectorFieldResult,
+        centers: np.ndarray,
+        tolerance: float,
+        max_travel_sigmas: float,
+    ) -> None:
+        n = len(points)
+        self.centers = centers
+        self.tolerance = tolerance
+        self.sigma = vectors.sigma_local
+        self.max_travel = max_travel_sigmas * self.sigma
+        self.start = points
+        # Newton's current point; the march starts from it.
+        self.x = points.copy()
+        self.v = first.vacancy.astype(np.float64)
+        self.V = vectors.V.copy()
+        self.outward = vectors.outward.copy()
+        self.camera = first.camera.copy()
+        self.slope = np.ones(n)  # how much of |V| the last step showed to be true
+        self.halvings = np.zeros(n, np.int64)
+        # The march's last point and its direction.
+        self.marched = np.zeros(n, np.int64)
+        self.along_ray = np.zeros(n, bool)
+        self.march_x = np.zeros((n, 3))
+        self.march_v = np.zeros(n)
+        self.direction = np.zeros((n, 3))
+        # The bracket's occupied and empty end, and v - 0.5 there as false position weighs it.
+        self.ends = np.zeros((n, 2, 3))
+        self.weights = np.zeros((n, 2))
+        self.cuts = np.zeros(n, np.int64)
+        self.last_side = np.full(n, -1, np.int64)
+
+        self.best_x = points.copy()
+        self.best_v = self.v.copy()
+        self.best_camera = first.camera.copy()
+        self.phase = np.full(n, _NEWTON, np.int8)
+        self.status = np.full(n, ProjectionStatus.DROPPED, np.uint8)
+        seen = first.camera >= 0
+        done = seen & (np.abs(self.v - tolerances.ISO_LEVEL) <= tolerance)
+        self.status[done] = ProjectionStatus.CONVERGED
+        # Unseen points have no vacancy of their own; without Gaussians there is no length.
+        self.rows = np.flatnonzero(seen & ~done & (self.sigma > 0.0))
+
+    def result(self, rounds: int, evaluations: int) -> ProjectionResult:
+        """Return where all points are now."""
+        residual = np.abs(self.best_v - tolerances.ISO_LEVEL)
+        return ProjectionResult(
+            self.best_x,
+            self.best_v.astype(np.float32),
+            self.status,
+            residual.astype(np.float32),
+            self.best_camera,
+            rounds,
+            evaluations,
+        )
+
+    # -- where to look next -----------------------------------------------------------------------
+
+    def next_trials(self) -> np.ndarray:
+        """Return the next point of each row; rows that have none are dropped."""
+        rows = self.rows
+        newton = rows[self.phase[rows] == _NEWTON]
+        length = np.linalg.norm(self.V[newton], axis=1)
+        flat = ~(length * self.sigma[newton] > MIN_SLOPE) | ~np.isfinite(length)
+        flat |= (self.v[newton] < RESOLVED[0]) | (self.v[newton] > RESOLVED[1])
+        flat |= self.halvings[newton] > MAX_HALVINGS
+        self._begin_march(newton[flat])
+
+        trial = np.empty((len(rows), 3))
+        alive = np.ones(len(rows), bool)
+        phase = self.phase[rows]
+        trial[phase == _NEWTON] = self._newton(rows[phase == _NEWTON])
+        trial[phase == _BRACKET], alive[phase == _BRACKET] = self._cut(rows[phase == _BRACKET])
+        march = np.flatnonzero(phase == _MARCH)
+        trial[march] = self._march(rows[march])
+        spent = self._is_spent(rows[march], trial[march])
+        again = march[spent & ~self.along_ray[rows[march]]]
+        self._begin_march(rows[again], along_ray=True)
+        trial[again] = self._march(rows[again])
+        alive[march] = ~self._is_spent(rows[march], trial[march])
+        alive &= self._travel(rows, trial) <= self.max_travel[rows]
+        self.rows = rows[alive]
+        return trial[alive]
+
+    def _travel(self, rows: np.ndarray, trial: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(trial - self.start[rows], axis=1)
+
+    def _is_spent(self, rows: np.ndarray, trial: np.ndarray) -> np.ndarray:
+        inward = self.v[rows] > tolerances.ISO_LEVEL
+        too_far = self._travel(rows, trial) > self.max_travel[rows]
+        return too_far | (inward & (self.marched[rows] > MAX_INWARD_MARCH))
+
+    def _newton(self, rows: np.ndarray) -> np.ndarray:
+        length = np.linalg.norm(self.V[rows], axis=1)  # > 0
+        step = np.log(tolerances.ISO_LEVEL / self.v[rows]) / (length * self.slope[rows])
+        limit = MAX_STEP_SIGMAS * self.sigma[rows]
+        step = np.clip(step, -limit, limit) * 0.5 ** self.halvings[rows]
+        return self.x[rows] + (step / length)[:, None] * self.V[rows]
+
+    def _begin_march(self, rows: np.ndarray, along_ray: bool = False) -> None:
+        self.phase[rows] = _MARCH
+        self.marched[rows] = 0
+        self.march_x[rows] = self.x[rows]
+        self.march_v[rows] = self.v[rows]
+        to_camera = self.centers[self.camera[rows]] - self.x[rows]
+        to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-300)
+        known = (self.outward[rows] != 0.0).any(1) & (not along_ray)
+        outward = np.where(known[:, None], self.outward[rows], to_camera)
+        self.along_ray[rows] = ~known
+        occupied = self.v[rows] < tolerances.ISO_LEVEL
+        self.direction[rows] = np.where(occupied[:, None], outward, -outward)
+
+    def _march(self, rows: np.ndarray) -> np.ndarray:
+        self.marched[rows] += 1
+        count = self.marched[rows]
+        # Inwards, longer steps could miss a thin wall.
+        occupied = self.v[rows] < tolerances.ISO_LEVEL
+        reach = np.where(occupied, 2.0 ** (count - 1), count) * self.sigma[rows]
+        return self.x[rows] + reach[:, None] * self.direction[rows]
+
+    def _cut(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self.cuts[rows] += 1
+        at = self.weights[rows, 0] / (self.weights[rows, 0] - self.weights[rows, 1])
+        at = np.where(self.cuts[rows] % 3 == 0, 0.5, np.clip(at, 0.02, 0.98))
+        occupied, empty = self.ends[rows, 0], self.ends[rows, 1]
+        span = np.linalg.norm(empty - occupied, axis=1)
+        trial = occupied + at[:, None] * (empty - occupied)
+        return trial, span > BRACKET_END_SIGMAS * self.sigma[rows]
+
+    # -- what the answer means --------------------------------------------------------------------
+
+    def judge(self, trial: np.ndarray, answer: VacancyResult) -> np.ndarray:
+        """Digest the vacancy of the trials; return the rows where Newton moved on."""
+        rows = self.rows
+        v = answer.vacancy.astype(np.float64)
+        seen = answer.camera >= 0
+        error = np.abs(v - tolerances.ISO_LEVEL)
+        better = seen & (error < np.abs(self.best_v[rows] - tolerances.ISO_LEVEL))
+        self.best_x[rows[better]] = trial[better]
+        self.best_v[rows[better]] = v[better]
+        self.best_camera[rows[better]] = answer.camera[better]
+
+        done = seen & (error <= self.tolerance)
+        newton = self.phase[rows] == _NEWTON
+        march = self.phase[rows] == _MARCH
+        cut = self.phase[rows] == _BRACKET
+        self.status[rows[done & newton]] = ProjectionStatus.CONVERGED
+        self.status[rows[done & ~newton]] = ProjectionStatus.BISECTED
+
+        crossed = seen & ((v > tolerances.ISO_LEVEL) != (self.v[rows] > tolerances.ISO_LEVEL))
+        opened = newton & crossed & ~done
+        self._open_bracket(rows[opened], self.x, self.v, trial[opened], v[opened])
+        opened = march & crossed & ~done
+        self._open_bracket(rows[opened], self.march_x, self.march_v, trial[opened], v[opened])
+
+        # A lower error on the same side: Newton goes on from there, knowing the true slope.
+        taken = newton & better & ~crossed & ~done
+        now = rows[taken]
+        expected = np.einsum("ni,ni->n", self.V[now], trial[taken] - self.x[now])
+        shown = np.log(v[taken] / self.v[now]) / np.where(expected == 0.0, 1.0, expected)
+        shown = np.where(np.isfinite(shown), shown, 1.0)
+        self.slope[now] = np.clip(shown, 1.0 / SLOPE_RATIO, SLOPE_RATIO)
+        self.x[now], self.v[now], self.camera[now] = trial[taken], v[taken], answer.camera[taken]
+        self.halvings[now] = 0
+        self.halvings[rows[newton & ~taken & ~crossed & ~done]] += 1
+
+        on = march & ~crossed & ~done
+        self.march_x[rows[on]], self.march_v[rows[on]] = trial[on], v[on]
+        self._shorten(rows[cut & ~done], trial[cut & ~done], v[cut & ~done])
+        self.rows = rows[~done]
+        return now
+
+    def _open_bracket(
+        self, rows: np.ndarray, from_x: np.ndarray, from_v: np.ndarray, x: np.ndarray, v: np.ndarray
+    ) -> None:
+        self.phase[rows] = _BRACKET
+        side = (v > tolerances.ISO_LEVEL).astype(np.int64)
+        self.ends[rows, side] = x
+        self.weights[rows, side] = v - tolerances.ISO_LEVEL
+        self.ends[rows, 1 - side] = from_x[rows]
+        self.weights[rows, 1 - side] = from_v[rows] - tolerances.ISO_LEVEL
+
+    def _shorten(self, rows: np.ndarray, x: np.ndarray, v: np.ndarray) -> None:
+        side = (v > tolerances.ISO_LEVEL).astype(np.int64)
+        self.ends[rows, side] = x
+        self.weights[rows, side] = v - tolerances.ISO_LEVEL
+        # Illinois rule: an end that stays twice loses half its weight, or it would stay for ever.
+        again = side == self.last_side[rows]
+        self.weights[rows[again], 1 - side[again]] *= 0.5
+        self.last_side[rows] = side
