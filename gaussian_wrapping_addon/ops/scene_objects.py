@@ -263,6 +263,7 @@ def export_usd(result_folder: Path) -> list[Path]:
     }
     known = bpy.ops.wm.usd_export.get_rna_type().properties.keys()
     paths = []
+    bpy.context.view_layer.update()  # new objects cannot be selected before
     for mesh in imported.meshes:
         for thing in bpy.context.view_layer.objects:
             thing.select_set(thing == mesh)

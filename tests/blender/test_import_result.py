@@ -13,6 +13,13 @@ import numpy as np
 import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
+
+from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, WrapError
+from gaussian_wrapping_addon.ops import tags
+from gaussian_wrapping_addon.ops.camera_objects import look_through
+from gaussian_wrapping_addon.ops.materials import set_shading, shading_of
+from gaussian_wrapping_addon.ops.region_objects import region_from_object
+from gaussian_wrapping_addon.ops.scene_objects import export_usd, import_result, write_blend
 from tests.blender.synthetic_result import (
     BOX_SCENE,
     CAMERAS,
@@ -21,13 +28,6 @@ from tests.blender.synthetic_result import (
     write_region_result,
     write_result,
 )
-
-from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, WrapError
-from gaussian_wrapping_addon.ops import tags
-from gaussian_wrapping_addon.ops.camera_objects import look_through
-from gaussian_wrapping_addon.ops.materials import set_shading, shading_of
-from gaussian_wrapping_addon.ops.region_objects import region_from_object
-from gaussian_wrapping_addon.ops.scene_objects import export_usd, import_result, write_blend
 
 
 def edge_face_counts(mesh: bpy.types.Mesh) -> set[int]:
@@ -238,12 +238,14 @@ def test_usd_of_each_region(tmp_path: Path) -> None:
     result = write_result(tmp_path / "job", regions=("auto", "leaf"))
     paths = export_usd(result)
     assert paths == [result / "auto" / "mesh.usdc", result / "leaf" / "mesh.usdc"]
-    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    bpy.ops.wm.usd_import(filepath=str(paths[1]))
-    (mesh,) = [o for o in bpy.data.objects if o.type == "MESH"]
-    assert len(mesh.data.polygons) == 12
-    assert len(mesh.data.uv_layers) == 1
-    assert [i for i in bpy.data.images if Path(bpy.path.abspath(i.filepath)).name == "albedo.png"]
+    for path in paths:
+        bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+        bpy.ops.wm.usd_import(filepath=str(path))
+        (mesh,) = [o for o in bpy.data.objects if o.type == "MESH"]
+        assert len(mesh.data.polygons) == 12
+        assert len(mesh.data.uv_layers) == 1
+        (image,) = [i for i in bpy.data.images if i.source == "FILE"]
+        assert Path(bpy.path.abspath(image.filepath)).resolve() == path.with_name("albedo.png")
 
 
 def test_gltf_export_of_both_shadings(tmp_path: Path) -> None:

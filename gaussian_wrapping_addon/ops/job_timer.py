@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Watch jobs from one Blender timer, and import what they have made.
+
+Nothing of Blender is kept from one tick to the next: undo and file loading invalidate every
+reference, so that scenes are found by their session uid and jobs by their folder. The panel draws
+from :func:`status_of`, which reads no file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..core import limits
+from ..core.errors import UsageError, WrapError
+from ..core.jobs.client import JobClient
+from ..core.jobs.job_folder import JobStatus
+from . import known_jobs, tags
+from .scene_objects import import_result
+
+_logger = logging.getLogger(__name__)
+
+POLL_S = 0.3
+
+
+@dataclass
+class _Job:
+    client: JobClient
+    status: JobStatus
+    scene_uid: int
+    """Session uid of the scene that shows the job; 0 where the open file has none."""
+    imports: bool
+    """Whether its result is still wanted in the scene."""
+    cancel_asked_s: float | None = None
+    waits_for_mode: bool = False
+    """Finished, but Blender is in a mode in which nothing can be imported."""
+
+
+_jobs: dict[str, _Job] = {}
+
+
+def key_of(folder: str) -> str:
+    """Return the name by which the job of a stored folder is known; ``""`` for none."""
+    return str(Path(bpy.path.abspath(folder))) if folder else ""
+
+
+def watch(scene: bpy.types.Scene, folder: Path, client: JobClient, *, imports: bool = True) -> None:
+    """Show a job in a scene and follow it to its end."""
+    known_jobs.remember(folder)
+    scene.gwrap.job_folder = str(folder)
+    _jobs[key_of(str(folder))] = _Job(client, client.poll(), scene.session_uid, imports)
+    start_timer()
+
+
+def status_of(folder: str) -> JobStatus | None:
+    """Return the last known status of a scene's job folder; None where it is not watched."""
+    job = _jobs.get(key_of(folder))
+    return job.status if job else None
+
+
+def result_to_import(scene: bpy.types.Scene) -> str:
+    """Return the result folder of a finished job that the scene does not show, or ``""``."""
+    status = status_of(scene.gwrap.job_folder)
+    if status is None or status.state != "DONE" or not status.result:
+        return ""
+    wanted = os.path.normpath(status.result)
+    shown = (
+        os.path.normpath(bpy.path.abspath(str(frame.get(tags.RESULT, ""))))
+        for frame in tags.objects_of_kind(scene, "frame")
+    )
+    return "" if wanted in shown else status.result
+
+
+def is_running(folder: str) -> bool:
+    """Tell whether a job works in this folder, as far as this Blender knows."""
+    status = status_of(folder)
+    return status is not None and status.active
+
+
+def waits_for_object_mode(folder: str) -> bool:
+    """Tell whether a finished job waits for Object Mode to be imported."""
+    job = _jobs.get(key_of(folder))
+    return job is not None and job.waits_for_mode
+
+
+def cancel(folder: str) -> None:
+    """Ask a job to stop; it is ended by force when it does not.
+
+    Raises
+    ------
+    UsageError
+        No job is watched in this folder.
+    """
+    job = _jobs.get(key_of(folder))
+    if job is None:
+        raise UsageError("No job is running.", "Start one first.")
+    job.client.cancel()
+    if job.cancel_asked_s is None:
+        job.cancel_asked_s = time.monotonic()
+
+
+def forget_all() -> None:
+    """Stop watching; workers go on, and are found again by :func:`attach_open_file`."""
+    _jobs.clear()
+
+
+def start_timer() -> None:
+    """Let Blender call :func:`tick`."""
+    if not bpy.app.timers.is_registered(tick):
+        bpy.app.timers.register(tick, first_interval=POLL_S, persistent=True)
+
+
+def stop_timer() -> None:
+    """Take the timer out."""
+    if bpy.app.timers.is_registered(tick):
+        bpy.app.timers.unregister(tick)
+
+
+def tick() -> float | None:
+    """Look at all jobs once; return the seconds to the next look, None when idle."""
+    return POLL_S if poll_jobs() else None
+
+
+def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
+    """Look at all jobs once and import what is done; tell whether another look is needed."""
+    busy = changed = False
+    for folder, job in list(_jobs.items()):
+        if not (job.status.active or job.waits_for_mode):
+            continue
+        before = (job.status, job.waits_for_mode)
+        _poll(folder, job, clock())
+        busy = busy or job.status.active or job.waits_for_mode
+        changed = changed or before != (job.status, job.waits_for_mode)
+    if changed:
+        _redraw()
+    return busy
+
+
+def _poll(folder: str, job: _Job, now_s: float) -> None:
+    job.status = job.client.poll()
+    if job.status.state == "LOST":
+        # It may have written its last word between our look at the file and at the process.
+        job.status = job.client.poll()
+    job.waits_for_mode = False
+    if job.status.active:
+        if job.cancel_asked_s is not None and now_s - job.cancel_asked_s > limits.CANCEL_GRACE_S:
+            _logger.warning("job in %s does not stop; ending it", folder)
+            job.cancel_asked_s = now_s
+            job.client.kill()
+        return
+    if job.status.state == "LOST" and job.cancel_asked_s is not None:
+        hint = "Resume continues from the last checkpoint."
+        job.status = replace(job.status, state="CANCELLED", error="", hint=hint)
+    if job.status.state == "DONE" and job.imports:
+        scene = scene_of_uid(job.scene_uid)
+        # Without its scene another file is open: opening the old one again imports it.
+        job.waits_for_mode = scene is not None and bpy.context.mode != "OBJECT"
+        if scene is not None and not job.waits_for_mode:
+            job.imports = False
+            _import(folder, job, scene)
+
+
+def _import(folder: str, job: _Job, scene: bpy.types.Scene) -> None:
+    try:
+        import_result(Path(job.status.result), scene)
+        _push_undo("Import Wrap Result")
+    except WrapError as error:
+        job.status = replace(job.status, state="FAILED", error=error.message, hint=error.hint)
+    except Exception as error:  # a timer that raises would be dropped without a word
+        _logger.exception("importing the result of %s", folder)
+        job.status = replace(
+            job.status,
+            state="FAILED",
+            error=f"The result could not be imported: {error}",
+            hint="See the system console, then try Import Result.",
+        )
+
+
+def _push_undo(message: str) -> None:
+    windows = bpy.context.window_manager.windows
+    if bpy.app.background or not windows:
+        return  # no undo without a window
+    with bpy.context.temp_override(window=bpy.context.window or windows[0]):
+        bpy.ops.ed.undo_push(message=message)
+
+
+def _redraw() -> None:
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+
+def scene_of_uid(uid: int) -> bpy.types.Scene | None:
+    """Return the scene of a session uid in the open file."""
+    return next((s for s in bpy.data.scenes if s.session_uid == uid), None)
+
+
+def find_job_folder(stored: str) -> Path | None:
+    """Return the job folder that the open file means, or None where there is none to be had.
+
+    A folder that has moved together with the .blend file is found beside it.
+    """
+    if not stored:
+        return None
+    folder = Path(bpy.path.abspath(stored))
+    candidates = [folder]
+    if bpy.data.filepath:
+        candidates.append(Path(bpy.data.filepath).parent / folder.name)
+    for candidate in candidates:
+        if known_jobs.is_trusted(candidate) and candidate.is_dir():
+            return candidate
+    return None
+
+
+def attach(scene: bpy.types.Scene, folder: Path) -> JobStatus:
+    """Watch a job that lies in a folder; a running one is imported when it is done.
+
+    Raises
+    ------
+    UsageError
+        The folder holds no job.
+    """
+    client = JobClient.attach(folder)
+    status = client.poll()
+    scene.gwrap.job_folder = str(folder)
+    _jobs[key_of(str(folder))] = _Job(client, status, scene.session_uid, status.active)
+    if status.active:
+        start_timer()
+    return status
+
+
+def attach_open_file() -> None:
+    """Find the jobs of the open file again; only reads their status, starts and asks nothing."""
+    for job in _jobs.values():
+        job.scene_uid = 0
+    for scene in bpy.data.scenes:
+        stored = scene.gwrap.job_folder
+        job = _jobs.get(key_of(stored))
+        if job is not None:
+            job.scene_uid = scene.session_uid
+            if job.imports:  # finished while another file was open
+                job.waits_for_mode = not job.status.active
+                start_timer()
+            continue
+        folder = find_job_folder(stored)
+        if folder is None:
+            continue
+        try:
+            attach(scene, folder)
+        except (WrapError, OSError) as error:
+            _logger.info("job of scene %s: %s", scene.name, error)
+
+
+def attach_later() -> None:
+    """Timer function: attach once Blender lets scripts see the open file."""
+    attach_open_file()
+
+
+@persistent
+def after_load(_arguments: object = None, _unused: object = None) -> None:
+    """``load_post``: find the jobs of the file that was opened."""
+    with contextlib.suppress(AttributeError):  # the add-on is being removed
+        attach_open_file()
+
+
+@persistent
+def after_undo(_scene: object = None, _unused: object = None) -> None:
+    """``undo_post``, ``redo_post``: a running job stays in its scene; undo knows nothing of it."""
+    for folder, job in _jobs.items():
+        scene = scene_of_uid(job.scene_uid) if job.status.active or job.waits_for_mode else None
+        if scene is not None and key_of(scene.gwrap.job_folder) != folder:
+            scene.gwrap.job_folder = folder

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The base of our operators: typed errors become one report with its next step."""
+
+from __future__ import annotations
+
+import logging
+
+import bpy
+
+from ..core.errors import WrapError
+
+_logger = logging.getLogger(__name__)
+
+
+class ReportsErrors:
+    """Mixin: ``execute`` calls ``work`` and reports what it raises."""
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        """Do what the operator is for."""
+        raise NotImplementedError
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Run :meth:`work`; Blender calls this."""
+        try:
+            return self.work(context)
+        except WrapError as error:
+            _logger.info("%s: %s", type(self).__name__, error)
+            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+        except OSError as error:
+            _logger.exception("%s", type(self).__name__)
+            self.report({"ERROR"}, f"{error.strerror}: {error.filename}")  # type: ignore[attr-defined]
+        return {"CANCELLED"}

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A worker that obeys the job folder protocol without torch; ``GWRAP_FAKE`` says how it behaves.
+
+Run as ``PYTHON ... jobs.worker FOLDER PARENT`` in place of the worker's Python.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from gaussian_wrapping_addon.core.jobs.job_file import read_job
+from gaussian_wrapping_addon.core.jobs.job_folder import (
+    JobFolder,
+    JobStatus,
+    process_start_ticks,
+)
+from tests.blender.synthetic_result import write_region_result, write_result
+
+
+def main() -> int:
+    folder = JobFolder(Path(sys.argv[-2]))
+    mode = os.environ.get("GWRAP_FAKE", "quick")
+
+    def say(state: str, fraction: float, **more: object) -> None:
+        folder.write_status(
+            JobStatus(
+                state=state,
+                stage="train",
+                fraction=fraction,
+                message="step",
+                seconds_left=(1.0 - fraction) * 90.0,
+                pid=os.getpid(),
+                pid_started=process_start_ticks(os.getpid()),
+                heartbeat_s=time.time(),
+                **more,  # type: ignore[arg-type]
+            )
+        )
+
+    folder.lock()
+    say("RUNNING", 0.25)
+    if mode == "crash":
+        print("the fake has crashed")
+        os.abort()
+    if mode == "refuse":
+        say("FAILED", 0.25, error="There are no photos.", hint="Choose another folder.")
+        return 3
+    if mode == "hang":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        time.sleep(60)
+    while mode == "slow":
+        time.sleep(0.02)
+        if folder.cancel_path.exists():
+            say("CANCELLED", 0.25, hint="Resume continues from the last checkpoint.")
+            folder.unlock()
+            return 5
+        if (folder.root / "finish").exists():
+            break
+    job = read_job(folder.job_path)
+    if job.command == "wrap":
+        write_result(folder.root)
+        trained = folder.stages / "train-abc"
+        trained.mkdir(exist_ok=True)
+        (trained / "done.json").write_text(json.dumps({"seconds": 1.0}))
+    for body in job.region_bodies.values():
+        name = body["blender_object_name"].replace(" ", "_").replace(".", "_")
+        write_region_result(folder.result / name, half=0.3)
+    say("DONE", 1.0, result=str(folder.result), exit_code=0)
+    folder.unlock()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
