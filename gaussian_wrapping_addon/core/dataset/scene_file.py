@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Save and load a :class:`~.scene.Scene`: ``scene.json`` and ``points.npz``, no pickles."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import limits
+from ..errors import DatasetError, ParseError
+from ..files import read_json, write_bytes, write_json
+from .camera import Camera
+from .scene import Scene, View
+from .similarity import Similarity
+
+VERSION = 1
+SCENE_NAME = "scene.json"
+POINTS_NAME = "points.npz"
+_AGAIN = "Run the cameras stage again."
+
+
+def save_scene(scene: Scene, folder: Path) -> None:
+    """Write ``scene.json`` and ``points.npz`` into ``folder``."""
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        points=np.asarray(scene.points, np.float64),
+        point_colors=np.asarray(scene.point_colors, np.uint8),
+    )
+    write_bytes(folder / POINTS_NAME, buffer.getvalue())
+    write_json(folder / SCENE_NAME, scene_to_json(scene, folder))
+
+
+def load_saved_scene(folder: Path) -> Scene:
+    """Read what :func:`save_scene` wrote.
+
+    Raises
+    ------
+    ParseError
+        A file is missing, cut or of another version.
+    DatasetError
+        A photo is no longer where it was.
+    """
+    path = folder / SCENE_NAME
+    if not path.is_file():
+        raise ParseError(path, "whole file", "the file is missing.", _AGAIN)
+    return scene_from_json(read_json(path), folder)
+
+
+def scene_to_json(scene: Scene, folder: Path | None = None) -> dict[str, Any]:
+    """Return the scene without its points as plain JSON values.
+
+    Paths inside ``folder`` are written relative to it, so that a job folder can be moved.
+    """
+    return {
+        "version": VERSION,
+        "world_from_scene": scene.world_from_scene.to_json(),
+        "warnings": list(scene.warnings),
+        "facts": scene.facts,
+        "views": [
+            {
+                "camera": view.camera.to_json(),
+                "photo": _written(view.photo_path, folder),
+                "mask": None if view.mask_path is None else _written(view.mask_path, folder),
+            }
+            for view in scene.views
+        ],
+    }
+
+
+def scene_from_json(values: Any, folder: Path) -> Scene:
+    """Build a scene from :func:`scene_to_json`'s values and ``points.npz`` of ``folder``.
+
+    Raises
+    ------
+    ParseError, DatasetError
+    """
+    path = folder / SCENE_NAME
+    if not isinstance(values, dict) or values.get("version") != VERSION:
+        raise ParseError(path, "version", f"version {VERSION} was expected.", _AGAIN)
+    try:
+        views = tuple(
+            View(
+                Camera.from_json(entry["camera"]),
+                folder / entry["photo"],
+                None if entry["mask"] is None else folder / entry["mask"],
+            )
+            for entry in values["views"]
+        )
+        world_from_scene = Similarity.from_json(values["world_from_scene"])
+        warnings, facts = tuple(values["warnings"]), dict(values["facts"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ParseError(path, "views", f"not as expected ({error}).", _AGAIN) from None
+    for view in views:
+        for file in (view.photo_path, view.mask_path):
+            if file is not None and not file.is_file():
+                raise DatasetError(
+                    f"Photo {file} is no longer there.", "Put it back, or start the job anew."
+                )
+    points, colors = _read_points(folder / POINTS_NAME)
+    return Scene(views, points, colors, world_from_scene, warnings, facts)
+
+
+def _written(path: Path, folder: Path | None) -> str:
+    if folder is not None and path.is_relative_to(folder):
+        return path.relative_to(folder).as_posix()
+    return str(path)
+
+
+def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size_bytes = sum(entry.file_size for entry in archive.infolist())
+        # 24 bytes of position and 3 of colour a point, and two headers.
+        if size_bytes > 27 * limits.MAX_POINTS + 4096:
+            raise ParseError(path, "whole file", "the points are too many.", _AGAIN)
+        with np.load(path, allow_pickle=False) as arrays:
+            points, colors = arrays["points"], arrays["point_colors"]
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ParseError(path, "whole file", f"cannot be read ({error}).", _AGAIN) from None
+    good = (
+        points.dtype == np.float64
+        and colors.dtype == np.uint8
+        and points.ndim == 2
+        and points.shape[1:] == (3,)
+        and points.shape == colors.shape
+        and bool(np.isfinite(points).all())
+    )
+    if not good:
+        raise ParseError(path, "arrays", "not (n, 3) finite points and colours.", _AGAIN)
+    return points, colors
