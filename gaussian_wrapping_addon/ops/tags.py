@@ -98,4 +98,13 @@ def figures_of(frame: bpy.types.Object) -> dict[str, Any]:
         values = json.loads(frame.get(FIGURES, "{}"))
     except (TypeError, ValueError, RecursionError):
         return {}
-    return values if isinstance(values, dict) else {}
+    figures = _numbers(values)
+    regions = values.get("regions") if isinstance(values, dict) else None
+    if isinstance(regions, dict):
+        figures["regions"] = {name: _numbers(region) for name, region in regions.items()}
+    return figures
+
+
+def _numbers(values: Any) -> dict[str, Any]:
+    pairs = values.items() if isinstance(values, dict) else ()
+    return {key: value for key, value in pairs if isinstance(value, (int, float))}

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every panel draws in every state, with calls that Blender's layouts really have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import bpy
+import pytest
+
+from gaussian_wrapping_addon.core.jobs.doctor import Diagnosis
+from gaussian_wrapping_addon.core.jobs.job_folder import STATES, JobStatus
+from gaussian_wrapping_addon.ops import doctor, job_timer, tags
+from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.ui import panels, preferences
+from gaussian_wrapping_addon.ui.text import progress_text, time_span
+from tests.blender.fake_layout import FakeLayout, draw
+from tests.blender.synthetic_result import write_result
+
+pytestmark = pytest.mark.usefixtures("addon")
+
+
+class FakeClient:
+    """Answers with one status."""
+
+    def __init__(self, status: JobStatus) -> None:
+        self.status = status
+
+    def poll(self) -> JobStatus:
+        return self.status
+
+
+@pytest.fixture(autouse=True)
+def _no_jobs() -> None:
+    job_timer.forget_all()
+
+
+def show(status: JobStatus, command: str = "WRAP") -> None:
+    scene = bpy.context.scene
+    scene.gwrap.job_command = command
+    job_timer.watch(scene, Path("/tmp/gwrap-none"), FakeClient(status), imports=False)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("panel", panels.CLASSES)
+def test_every_panel_draws_in_an_empty_file(panel: type) -> None:
+    layout = draw(panel)
+    assert layout.log
+    assert not [t for t in layout.texts.split() if t.isupper() and len(t) > 4], "no ALL CAPS"
+
+
+@pytest.mark.parametrize("state", STATES)
+@pytest.mark.parametrize("command", ["WRAP", "MESH"])
+@pytest.mark.parametrize("left", [None, 0.0, 75.0, 1e6])
+def test_job_states(state: str, command: str, left: float | None) -> None:
+    error = "It broke." if state in ("FAILED", "LOST") else ""
+    hint = "Do that." if state in ("FAILED", "LOST", "CANCELLED") else ""
+    show(JobStatus(state, "train", 1.0000001, "step 5", left, error, hint), command)
+    texts = {p.bl_label: draw(p).texts for p in panels.CLASSES}
+    operators = {p.bl_label: draw(p).operators for p in panels.CLASSES}
+    here, other = ("Wrap", "Mesh") if command == "WRAP" else ("Mesh", "Wrap")
+    running = state in ("NEW", "RUNNING", "CANCELLING")
+    assert ("gwrap.cancel_job" in operators[here]) == running
+    assert "gwrap.cancel_job" not in operators[other]
+    assert ("Train · 100 %" in texts[here]) == running
+    assert ("Cancelling…" in texts[here]) == (state == "CANCELLING")
+    assert error in texts[here]
+    assert hint in texts[here]
+    assert ("gwrap.resume_job" in operators[here]) == (state in ("FAILED", "LOST", "CANCELLED"))
+    assert error == "" or error not in texts[other]
+
+
+def test_a_first_wrap_can_be_started_at_one_glance() -> None:
+    layout = draw(panels.GWRAP_PT_wrap)
+    assert layout.operators == ["gwrap.wrap_scene"]
+    assert [a[1] for name, a, _ in layout.log if name == "prop"] == [
+        "preset",
+        "texture_size",
+        "output",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("resolution", "shown"),
+    [("AUTOMATIC", set()), ("EDGE_LENGTH", {"edge_length"}), ("POINTS", {"points"})],
+)
+def test_mesh_panel_shows_what_decides(resolution: str, shown: set[str]) -> None:
+    bpy.context.scene.gwrap.resolution = resolution
+    properties = {a[1] for name, a, _ in draw(panels.GWRAP_PT_mesh).log if name == "prop"}
+    assert properties == {"resolution"} | shown
+
+
+def test_region_and_result_panels_with_a_result(tmp_path: Path) -> None:
+    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
+    bpy.context.view_layer.update()
+    assert "auto region" in draw(panels.GWRAP_PT_region).texts
+    layout = draw(panels.GWRAP_PT_result)
+    assert "PSNR, Held-Out Photos" in layout.texts
+    assert layout.operators.count("gwrap.set_shading") == 2
+    assert "gwrap.view_photo" not in layout.operators
+    bpy.context.view_layer.objects.active = imported.cameras[0]
+    assert "gwrap.view_photo" in draw(panels.GWRAP_PT_result).operators
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{", "[" * 5000, "3", '{"psnr": "x", "regions": {"a": 3}}']
+)
+def test_result_panel_survives_edited_properties(tmp_path: Path, text: str) -> None:
+    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
+    imported.frame[tags.FIGURES] = text
+    imported.frame[tags.RESULT] = 5
+    imported.meshes[0].data.materials.clear()
+    for panel in panels.CLASSES:
+        draw(panel)
+
+
+def test_preferences_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [Diagnosis("torch", False, "cannot be imported", "pip install torch")]
+    monkeypatch.setattr(doctor, "_findings", [*found, Diagnosis("numpy", True, "1.26.4")])
+    layout = FakeLayout()
+    names = preferences.GWRAP_preferences.__annotations__
+    owner = SimpleNamespace(properties=set(names))
+    fake = SimpleNamespace(layout=layout, bl_rna=SimpleNamespace(properties=owner.properties))
+    preferences.GWRAP_preferences.draw(fake, bpy.context)
+    assert "pip install torch" in layout.texts
+    assert {a[1] for name, a, _ in layout.log if name == "prop"} == set(names)
+    assert doctor.as_text().splitlines()[0].startswith("BAD  torch: cannot be imported")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0, "0 s"),
+        (59.4, "59 s"),
+        (59.6, "1 min 00 s"),
+        (599, "9 min 59 s"),
+        (600, "10 min"),
+        (3599, "1 h 00 min"),
+        (7260, "2 h 01 min"),
+        (-5, "0 s"),
+    ],
+)
+def test_time_span(seconds: float, text: str) -> None:
+    assert time_span(seconds) == text
+
+
+def test_progress_text() -> None:
+    assert progress_text("train", 0.256, 90) == "Train · 26 % · 1 min 30 s left"
+    assert progress_text("", 0.0, None) == "Starting · 0 %"

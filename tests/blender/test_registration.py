@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Registering is symmetric, repeatable, and survives its own failures."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import pytest
+
+import gaussian_wrapping_addon
+from gaussian_wrapping_addon import registration
+from gaussian_wrapping_addon.ops import doctor, job_timer
+
+REPOSITORY = Path(gaussian_wrapping_addon.__file__).resolve().parents[1]
+
+
+def left_behind() -> list[str]:
+    found = [name for name in dir(bpy.types) if name.upper().startswith("GWRAP")]
+    found += [o.__name__ for o in (bpy.types.Scene, bpy.types.Object) if hasattr(o, "gwrap")]
+    for name in dir(bpy.app.handlers):
+        handlers = getattr(bpy.app.handlers, name)
+        if isinstance(handlers, list):
+            found += [name for h in handlers if "gaussian_wrapping" in h.__module__]
+    for function in (job_timer.tick, job_timer.attach_later, doctor.show):
+        if bpy.app.timers.is_registered(function):
+            found.append(function.__name__)
+    return found
+
+
+def test_register_and_unregister_twice() -> None:
+    assert left_behind() == []
+    for _ in range(2):
+        gaussian_wrapping_addon.register()
+        assert all(cls.is_registered for cls in registration.CLASSES)
+        for name, handler in registration.HANDLERS:
+            assert getattr(bpy.app.handlers, name).count(handler) == 1
+        job_timer.start_timer()
+        gaussian_wrapping_addon.unregister()
+        assert left_behind() == []
+    gaussian_wrapping_addon.unregister()
+
+
+def test_register_after_register_doubles_nothing() -> None:
+    gaussian_wrapping_addon.register()
+    gaussian_wrapping_addon.register()
+    assert bpy.app.handlers.load_post.count(job_timer.after_load) == 1
+    gaussian_wrapping_addon.unregister()
+    assert left_behind() == []
+
+
+def test_a_failure_half_way_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    class GwrapBroken(bpy.types.Operator):
+        bl_idname = "not.a.valid.id"
+        bl_label = "Broken"
+
+    classes = (*registration.CLASSES[:7], GwrapBroken, *registration.CLASSES[7:])
+    with monkeypatch.context() as patch:
+        patch.setattr(registration, "CLASSES", classes)
+        with pytest.raises((ValueError, RuntimeError)):
+            gaussian_wrapping_addon.register()
+        assert left_behind() == []
+    gaussian_wrapping_addon.register()
+    gaussian_wrapping_addon.unregister()
+
+
+def test_names_follow_blenders_convention() -> None:
+    for cls in registration.CLASSES:
+        if issubclass(cls, bpy.types.Operator):
+            assert cls.__name__.replace("GWRAP_OT_", "gwrap.") == cls.bl_idname
+            assert cls.bl_description
+            assert not cls.bl_description.endswith(".")
+        elif issubclass(cls, bpy.types.Panel):
+            assert cls.__name__.startswith("GWRAP_PT_")
+            assert cls.bl_category == "Gaussian Wrapping"
+
+
+def test_blender_never_loads_what_only_workers_have(tmp_path: Path) -> None:
+    """Register, draw and import in a fresh Blender: torch and its kind stay out."""
+    code = f"""
+import os, sys
+os.environ["BLENDER_USER_RESOURCES"] = {str(tmp_path)!r}
+sys.path.insert(0, {str(REPOSITORY)!r})
+import bpy
+from pathlib import Path
+import gaussian_wrapping_addon
+from tests.blender.synthetic_result import write_result
+from tests.blender.fake_layout import draw
+gaussian_wrapping_addon.register()
+from gaussian_wrapping_addon.ui import panels
+bpy.ops.gwrap.import_result(directory=str(write_result(Path({str(tmp_path)!r}) / "job")))
+for panel in panels.CLASSES:
+    draw(panel)
+gaussian_wrapping_addon.unregister()
+heavy = {{"torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "embreex", "PIL"}}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_package_imports_without_bpy() -> None:
+    code = (
+        "import sys\n"
+        "class Refuse:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('bpy', 'mathutils', 'bmesh'):\n"
+        "            raise ModuleNotFoundError(name)\n"
+        "sys.meta_path.insert(0, Refuse())\n"
+        f"sys.path.insert(0, {str(REPOSITORY)!r})\n"
+        "import gaussian_wrapping_addon, gaussian_wrapping_addon.ops, gaussian_wrapping_addon.ui\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+
+
+def test_no_program_path_comes_from_a_file() -> None:
+    """The worker's Python is read from preferences only, never from scene or object properties."""
+    tree = ast.parse((REPOSITORY / "gaussian_wrapping_addon/ui/properties.py").read_text())
+    names = [n.target.id for n in ast.walk(tree) if isinstance(n, ast.AnnAssign)]  # type: ignore[union-attr]
+    assert "source" in names
+    assert not [n for n in names if "python" in n or "program" in n or "executable" in n]
