@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The first Gaussians: from sparse points, more along the cameras' rays where these are few."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from .. import tolerances
+from ..dataset.camera import Camera
+from ..dataset.scene import Scene
+from ..errors import DatasetError
+from .model import OrientedGaussians
+
+Photograph = Callable[[int], tuple[Camera, np.ndarray]]
+"""Gives camera and (h, w, 3) uint8 photo of a view, at a small size."""
+
+FIRST_OPACITY = 0.1
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic."""
+
+FEW_POINTS = 5000
+"""With fewer sparse points, more are added until there are this many."""
+
+MAX_DISTANCE = 20.0 * tolerances.SCENE_RADIUS
+"""Points farther from the cameras' middle are pulled in along their direction, which hardly moves
+them on any photo: outliers of the reconstruction reach 1e6 units and would waste float32."""
+
+MIN_SPACING_SQ = 1e-7
+"""Squared distances between neighbours are clamped to this (method.md 1.3)."""
+
+MAX_SPACING_SHARE = 0.1
+"""A first Gaussian is no larger than this share of its distance to the nearest camera."""
+
+_DEPTH_NEIGHBOURS = 4
+_DEPTH_JITTER = 0.05
+"""Spread of the filled-up points around the depth of the nearest sparse points, share of it."""
+
+_TRIES = 8
+
+
+def initial_gaussians(
+    scene: Scene,
+    view_indices: list[int],
+    photograph: Photograph,
+    *,
+    max_gaussians: int,
+    sh_degree: int,
+    seed: int,
+) -> OrientedGaussians:
+    """Return the Gaussians that training starts from (method.md 1.3).
+
+    One per sparse point: round, as large as the mean distance to its three nearest neighbours,
+    opacity 0.1, orientation zero. Where there are fewer than :data:`FEW_POINTS`, random pixels are
+    lifted to the depth of the nearest sparse points; where there are none, to a random depth,
+    keeping the positions that most cameras see.
+
+    Parameters
+    ----------
+    scene : Scene
+    view_indices : list of int
+        Views that may be looked at (not the held-out ones).
+    photograph : callable
+        Gives camera and photo of a view; only called where points are few.
+    max_gaussians : int
+        Never exceeded; a random choice of the points is taken.
+    sh_degree : int
+        Of the harmonics to make room for.
+    seed : int
+
+    Returns
+    -------
+    OrientedGaussians
+        float32, with ``filter_3d`` zero.
+
+    Raises
+    ------
+    DatasetError
+        If there are neither points nor views.
+    """
+    if not view_indices:
+        raise DatasetError("There is no view to train on.", "Add photos.")
+    random = np.random.default_rng([seed, 1])
+    finite = np.isfinite(scene.points).all(axis=1) if len(scene.points) else np.zeros(0, bool)
+    points = np.asarray(scene.points, np.float64).reshape(-1, 3)[finite]
+    colors = np.asarray(scene.point_colors).reshape(-1, 3)[finite] / 255.0
+    cameras = [scene.views[i].camera for i in view_indices]
+    if len(points) > max_gaussians:
+        chosen = np.sort(random.choice(len(points), max_gaussians, replace=False))
+        points, colors = points[chosen], colors[chosen]
+    wanted = min(FEW_POINTS, max_gaussians) - len(points)
+    if wanted > 0:
+        more_points, more_colors = _fill_up(points, wanted, view_indices, photograph, random)
+        points = np.concatenate([points, more_points])
+        colors = np.concatenate([colors, more_colors])
+    points = pull_in(points)
+    return _gaussians_at(points, colors, _spacing(points, cameras), sh_degree)
+
+
+def pull_in(points: np.ndarray) -> np.ndarray:
+    """Return points with their distance from the scene's middle capped at :data:`MAX_DISTANCE`."""
+    distance = np.linalg.norm(points, axis=1, keepdims=True)
+    return points * np.minimum(1.0, MAX_DISTANCE / np.maximum(distance, MAX_DISTANCE))
+
+
+def _spacing(points: np.ndarray, cameras: list[Camera]) -> np.ndarray:
+    """(n,) root mean squared distance to the three nearest neighbours, capped by what is seen."""
+    neighbours = min(3, len(points) - 1)
+    if neighbours > 0:
+        distance, _ = cKDTree(points).query(points, k=neighbours + 1)
+        mean_sq = np.maximum((distance[:, 1:] ** 2).mean(axis=1), MIN_SPACING_SQ)
+    else:
+        mean_sq = np.full(len(points), math.inf)
+    centers = np.stack([camera.center for camera in cameras])
+    to_camera, _ = cKDTree(centers).query(points)
+    cap = np.maximum(MAX_SPACING_SHARE * to_camera, math.sqrt(MIN_SPACING_SQ))
+    return np.minimum(np.sqrt(mean_sq), cap)
+
+
+def _gaussians_at(
+    points: np.ndarray, colors: np.ndarray, spacing: np.ndarray, sh_degree: int
+) -> OrientedGaussians:
+    count = len(points)
+    sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
+    sh[:, 0] = (colors - 0.5) / SH_C0
+    quats = np.zeros((count, 4), np.float32)
+    quats[:, 0] = 1.0
+    logit = math.log(FIRST_OPACITY / (1.0 - FIRST_OPACITY))
+    arrays = {
+        "means": points,
+        "log_scales": np.repeat(np.log(spacing)[:, None], 3, axis=1),
+        "quats": quats,
+        "opacity_logits": np.full(count, logit),
+        "sh": sh,
+        "orientation": np.zeros((count, 4)),
+        "filter_3d": np.zeros(count),
+    }
+    return OrientedGaussians(
+        **{name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}
+    )
+
+
+def _fill_up(
+    points: np.ndarray,
+    wanted: int,
+    view_indices: list[int],
+    photograph: Photograph,
+    random: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``wanted`` more points with colours in [0, 1], taken from pixels of the photos."""
+    views = [photograph(i) for i in view_indices]
+    cameras = [camera for camera, _ in views]
+    share = np.full(len(views), wanted // len(views))
+    share[: wanted - int(share.sum())] += 1
+    found_points, found_colors = [], []
+    for (camera, photo), count in zip(views, share.tolist(), strict=True):
+        if count == 0:
+            continue
+        pixels = random.uniform((0.0, 0.0), (camera.width, camera.height), (count, 2))
+        depth = _depth_near_points(points, camera, pixels, random)
+        if depth is None:
+            depth = _most_seen_depth(camera, pixels, cameras, random)
+        rays = np.ones((count, 3))
+        rays[:, 0] = (pixels[:, 0] - camera.cx) / camera.fx
+        rays[:, 1] = (pixels[:, 1] - camera.cy) / camera.fy
+        found_points.append((rays * depth[:, None]) @ camera.rotation + camera.center)
+        column = pixels[:, 0].astype(int).clip(0, camera.width - 1)
+        row = pixels[:, 1].astype(int).clip(0, camera.height - 1)
+        found_colors.append(photo[row, column] / 255.0)
+    return np.concatenate(found_points), np.concatenate(found_colors)
+
+
+def _depth_near_points(
+    points: np.ndarray, camera: Camera, pixels: np.ndarray, random: np.random.Generator
+) -> np.ndarray | None:
+    """(m,) depth of one of the sparse points nearest on the photo, or ``None`` without points."""
+    if len(points) == 0:
+        return None
+    where, depth = camera.project(points)
+    inside = (depth > tolerances.NEAR_Z) & (where >= 0).all(axis=1)
+    inside &= (where[:, 0] < camera.width) & (where[:, 1] < camera.height)
+    if inside.sum() < _DEPTH_NEIGHBOURS:
+        return None
+    _, nearest = cKDTree(where[inside]).query(pixels, k=_DEPTH_NEIGHBOURS)
+    pick = random.integers(0, _DEPTH_NEIGHBOURS, len(pixels))
+    chosen = depth[inside][nearest[np.arange(len(pixels)), pick]]
+    return np.maximum(
+        chosen * (1.0 + _DEPTH_JITTER * random.normal(size=len(pixels))), tolerances.NEAR_Z
+    )
+
+
+def _most_seen_depth(
+    camera: Camera, pixels: np.ndarray, cameras: list[Camera], random: np.random.Generator
+) -> np.ndarray:
+    """(m,) of several random depths the one whose position most cameras see."""
+    near, far = 0.1 * tolerances.SCENE_RADIUS, 4.0 * tolerances.SCENE_RADIUS
+    best = np.zeros(len(pixels))
+    most = np.full(len(pixels), -1)
+    rays = np.stack(
+        [
+            (pixels[:, 0] - camera.cx) / camera.fx,
+            (pixels[:, 1] - camera.cy) / camera.fy,
+            np.ones(len(pixels)),
+        ],
+        axis=1,
+    )
+    for _ in range(_TRIES):
+        # Uniform in inverse depth: as many positions near the cameras as a photo can tell apart.
+        depth = 1.0 / random.uniform(1.0 / far, 1.0 / near, len(pixels))
+        places = (rays * depth[:, None]) @ camera.rotation + camera.center
+        seen = np.zeros(len(pixels), int)
+        for other in cameras:
+            where, z = other.project(places)
+            seen += (
+                (z > tolerances.NEAR_Z)
+                & (where >= 0).all(axis=1)
+                & (where[:, 0] < other.width)
+                & (where[:, 1] < other.height)
+            )
+        better = seen > most
+        best[better], most[better] = depth[better], seen[better]
+    return best

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The 3D filter: no Gaussian is smaller than what the closest camera can resolve."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from .. import tolerances
+from ..compiled import kernel
+from ..dataset.camera import Camera
+from ..parallel import default_threads, even_bounds, run_chunks
+
+FILTER_VARIANCE_PX = 0.2
+"""Variance of the filter in squared pixels of the closest camera (method.md 1.5)."""
+
+IMAGE_MARGIN = 0.15
+"""The image is enlarged by this share on each side when asking which camera sees a Gaussian."""
+
+
+@kernel(fast=False)
+def _nearest_depth_rows(begin, end, means, cameras, near_z, out):  # type: ignore[no-untyped-def]
+    """out[i] = smallest z-depth over the cameras that see mean i, or inf."""
+    for i in range(begin, end):
+        x, y, z = means[i, 0], means[i, 1], means[i, 2]
+        nearest = math.inf
+        for c in range(cameras.shape[0]):
+            cam = cameras[c]
+            depth = cam[6] * x + cam[7] * y + cam[8] * z + cam[11]
+            if not depth > near_z or depth >= nearest:
+                continue
+            u = cam[12] * (cam[0] * x + cam[1] * y + cam[2] * z + cam[9]) / depth + cam[14]
+            v = cam[13] * (cam[3] * x + cam[4] * y + cam[5] * z + cam[10]) / depth + cam[15]
+            if cam[16] <= u <= cam[17] and cam[18] <= v <= cam[19]:
+                nearest = depth
+        out[i] = nearest
+
+
+def mip_filter(
+    means: np.ndarray,
+    cameras: Sequence[Camera],
+    *,
+    near_z: float = tolerances.NEAR_Z,
+    threads: int = 0,
+) -> np.ndarray:
+    """Return the filter's standard deviation of each Gaussian (method.md 1.5).
+
+    ``f = z_min / focal_max * sqrt(0.2)``, with ``z_min`` the smallest z-depth over the cameras
+    whose image, enlarged by 15 % on each side, holds the mean.
+
+    Parameters
+    ----------
+    means : (n, 3)
+        Scene units.
+    cameras : sequence of Camera
+        Training cameras at the resolution that is trained on, scene frame.
+    near_z : float
+        Smaller z-depths do not count, scene units.
+
+    Returns
+    -------
+    (n,) float64
+        Scene units. Gaussians that no camera sees receive the largest filter of the others.
+    """
+    if len(cameras) == 0 or len(means) == 0:
+        return np.zeros(len(means))
+    packed = np.array([_pack(camera) for camera in cameras])
+    points = np.ascontiguousarray(means, np.float64)
+    depth = np.empty(len(points))
+    threads = threads or default_threads()
+
+    def run(begin: int, end: int) -> None:
+        _nearest_depth_rows(begin, end, points, packed, near_z, depth)
+
+    run_chunks(run, even_bounds(len(points), threads), threads)
+    seen = np.isfinite(depth)
+    depth[~seen] = depth[seen].max() if seen.any() else near_z
+    focal_px = max(max(camera.fx, camera.fy) for camera in cameras)
+    return depth / focal_px * math.sqrt(FILTER_VARIANCE_PX)
+
+
+def _pack(camera: Camera) -> list[float]:
+    wide, high = IMAGE_MARGIN * camera.width, IMAGE_MARGIN * camera.height
+    return [
+        *camera.rotation.reshape(-1).tolist(), *camera.cam_from_world[:, 3].tolist(),
+        camera.fx, camera.fy, camera.cx, camera.cy,
+        -wide, camera.width + wide, -high, camera.height + high,
+    ]  # fmt: skip

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a training gives back."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from ..gaussians.model import OrientedGaussians
+
+
+@dataclass(frozen=True)
+class HeldOutFigure:
+    """How well one photo that was never trained on is reproduced."""
+
+    name: str
+    psnr: float
+    """dB, at the finest training size."""
+    ssim: float
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """Trained Gaussians and what was measured of them."""
+
+    gaussians: OrientedGaussians
+    iterations: int
+    history: tuple[dict[str, float], ...]
+    """Loss, PSNR of the trained photos and number of Gaussians along the way."""
+    held_out: tuple[HeldOutFigure, ...]
+    seconds: float
+    warnings: tuple[str, ...]
+
+    @property
+    def held_out_psnr(self) -> float:
+        """Mean over the held-out photos, dB; NaN without any."""
+        return _mean([figure.psnr for figure in self.held_out])
+
+    @property
+    def held_out_ssim(self) -> float:
+        """Mean over the held-out photos; NaN without any."""
+        return _mean([figure.ssim for figure in self.held_out])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values for the report; the Gaussians are only counted."""
+        values: dict[str, Any] = {
+            "gaussians": len(self.gaussians),
+            "iterations": self.iterations,
+            "seconds_training": round(self.seconds, 3),
+            "held_out": [dataclasses.asdict(figure) for figure in self.held_out],
+            "history": [dict(entry) for entry in self.history],
+            "warnings": list(self.warnings),
+        }
+        if self.held_out:
+            values["held_out_psnr"] = self.held_out_psnr
+            values["held_out_ssim"] = self.held_out_ssim
+        return values
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values) if values else math.nan

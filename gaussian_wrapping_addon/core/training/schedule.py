@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What happens when: image resolution, harmonics, losses, densification, learning rates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import tolerances
+from ..settings import TrainingSettings
+
+POSITION_RATE = (1.6e-4, 1.6e-6)
+"""First and last learning rate of the means per scene radius (method.md 1.4)."""
+
+RATES = {
+    "sh_dc": 2.5e-3,
+    "sh_rest": 1.25e-4,
+    "opacity_logits": 0.05,
+    "log_scales": 5e-3,
+    "quats": 1e-3,
+    "orientation": 0.025,
+}
+"""Learning rates of method.md 1.4, for :data:`REFERENCE_ITERATIONS` iterations."""
+
+REFERENCE_ITERATIONS = 30_000
+
+PYRAMID = ((4, 0.0), (2, 0.1), (1, 0.3))
+"""Divisor of the image size, and the share of the iterations from which it is used."""
+
+SMALLEST_SIDE_PX = 96
+"""A level whose long side would be smaller than this is skipped."""
+
+DEGREE_SHARE = 1.0 / 6.0
+"""The harmonics' degree rises by one whenever this share of the iterations has passed."""
+
+RESET_EVERY = 3000
+"""Iterations between opacity resets (method.md 4.1); a run too short for recovery has none."""
+
+FILTER_EVERY = 100
+"""Iterations between two computations of the 3D filter."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The plan of one training run. Milestones of the settings are fractions of the iterations.
+
+    Parameters
+    ----------
+    settings : TrainingSettings
+    long_side_px : int
+        Long side of the largest training image.
+    """
+
+    settings: TrainingSettings
+    long_side_px: int
+
+    def _share(self, iteration: int) -> float:
+        return iteration / self.settings.iterations
+
+    def _at(self, share: float) -> int:
+        return round(share * self.settings.iterations)
+
+    def divisor(self, iteration: int) -> int:
+        """Return the divisor of the image size."""
+        chosen = 1
+        for divisor, start in PYRAMID:
+            large_enough = self.long_side_px / divisor >= SMALLEST_SIDE_PX or divisor == 1
+            if self._share(iteration) >= start and large_enough:
+                chosen = divisor
+        return chosen
+
+    def sh_degree(self, iteration: int) -> int:
+        """Return the degree of the harmonics in use."""
+        return min(self.settings.sh_degree, int(self._share(iteration) / DEGREE_SHARE))
+
+    def uses_depth(self, iteration: int) -> bool:
+        """Tell whether the depth-normal loss is on."""
+        return iteration >= self._at(self.settings.depth_from)
+
+    def is_oriented(self, iteration: int) -> bool:
+        """Tell whether the orientation is learned."""
+        return iteration >= self._at(self.settings.orient_from)
+
+    def starts_orientation(self, iteration: int) -> bool:
+        """Tell whether this is the first iteration that learns the orientation."""
+        return iteration == self._at(self.settings.orient_from)
+
+    def gathers_statistics(self, iteration: int) -> bool:
+        """Tell whether the renders of this iteration feed density control."""
+        return iteration < self._at(self.settings.densify_until)
+
+    def densifies(self, iteration: int) -> bool:
+        """Tell whether Gaussians are added and removed after this iteration's step."""
+        begin, end = self._at(self.settings.densify_from), self._at(self.settings.densify_until)
+        return begin < iteration <= end and iteration % self.settings.densify_every == 0
+
+    def growth_limit(self) -> int:
+        """Return the number of Gaussians that density control may reach.
+
+        The wrapping rounds keep their part of ``max_gaussians``.
+        """
+        growth = (1.0 + self.settings.wrap_share) ** self.settings.wrap_rounds
+        return max(1, math.floor(self.settings.max_gaussians / growth))
+
+    def resets_opacity(self, iteration: int) -> bool:
+        """Tell whether opacities are reset after this iteration's step."""
+        until = self._at(self.settings.densify_until)
+        return iteration % RESET_EVERY == 0 and 0 < iteration <= until - RESET_EVERY
+
+    def wraps(self, iteration: int) -> bool:
+        """Tell whether a wrapping round runs after this iteration's step."""
+        s = self.settings
+        shares = np.linspace(s.wrap_from, s.wrap_until, s.wrap_rounds)
+        return iteration > 0 and iteration in {self._at(float(share)) for share in shares}
+
+    def refilters(self, iteration: int) -> bool:
+        """Tell whether the 3D filter is computed anew after this iteration's step."""
+        return iteration % FILTER_EVERY == 0
+
+    def rates(self, iteration: int, factor: float = 1.0) -> dict[str, np.ndarray]:
+        """Return the learning rate of each column of each tensor.
+
+        Parameters
+        ----------
+        factor : float
+            Multiplies all of them (lowered after a restart).
+        """
+        first, last = POSITION_RATE
+        share = min(1.0, self._share(iteration))
+        position = tolerances.SCENE_RADIUS * first * (last / first) ** share
+        coefficients = (self.settings.sh_degree + 1) ** 2
+        sh = np.full((coefficients, 3), RATES["sh_rest"])
+        sh[0] = RATES["sh_dc"]
+        columns = {
+            "means": np.full(3, position),
+            "log_scales": np.full(3, RATES["log_scales"]),
+            "quats": np.full(4, RATES["quats"]),
+            "opacity_logits": np.full(1, RATES["opacity_logits"]),
+            "sh": sh.reshape(-1),
+        }
+        if self.is_oriented(iteration):
+            columns["orientation"] = np.full(4, RATES["orientation"])
+        return {name: (factor * rate).astype(np.float32) for name, rate in columns.items()}

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Everything that the next iteration of a training depends on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..gaussians.model import OrientedGaussians
+from .density_control import DensityStatistics
+from .optimizer import TRAINED, Adam
+
+_STATISTICS = ("gradient", "gradient_abs", "views")
+
+
+@dataclass
+class TrainingState:
+    """Parameters, moments, statistics, randomness and view order of a run."""
+
+    adam: Adam
+    statistics: DensityStatistics
+    random: np.random.Generator
+    iteration: int = 0
+    """Finished iterations."""
+    order: list[int] = field(default_factory=list)
+    """Views still to come in this round, last first."""
+    rate_factor: float = 1.0
+    """Lowered after a restart from numbers that were not finite."""
+    restarts: int = 0
+    error_average: float = 0.0
+    """Moving average of the mean squared colour error, for the progress message."""
+    loss_average: float = 0.0
+    history: list[dict[str, float]] = field(default_factory=list)
+    seconds: float = 0.0
+    """Time spent until the last checkpoint."""
+
+    @classmethod
+    def start(cls, gaussians: OrientedGaussians, seed: int) -> TrainingState:
+        """Return the state before the first iteration."""
+        random = np.random.Generator(np.random.PCG64([seed, 2]))
+        return cls(Adam(gaussians), DensityStatistics.zeros(len(gaussians)), random)
+
+    def next_view(self, views: list[int]) -> int:
+        """Draw the next view: all of them in random order, then again (method.md 1.4)."""
+        if not self.order:
+            self.order = self.random.permutation(views).tolist()
+        return self.order.pop()
+
+    def clear_statistics(self) -> None:
+        """Forget the statistics; also after the number of Gaussians has changed."""
+        self.statistics = DensityStatistics.zeros(len(self.adam))
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of all arrays, by name."""
+        adam, arrays = self.adam, {}
+        for name in adam.values:
+            arrays[f"value.{name}"] = adam.array(name).copy()
+        for name in TRAINED:
+            arrays[f"first.{name}"] = adam.first[name].copy()
+            arrays[f"second.{name}"] = adam.second[name].copy()
+        arrays["steps"] = adam.steps.copy()
+        for name in _STATISTICS:
+            arrays[f"statistics.{name}"] = getattr(self.statistics, name).copy()
+        return arrays
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything else as plain JSON values."""
+        return {
+            "random": self.random.bit_generator.state,
+            "iteration": self.iteration,
+            "order": list(self.order),
+            "rate_factor": self.rate_factor,
+            "restarts": self.restarts,
+            "error_average": self.error_average,
+            "loss_average": self.loss_average,
+            "history": [dict(entry) for entry in self.history],
+            "seconds": self.seconds,
+        }
+
+    @classmethod
+    def restore(cls, arrays: dict[str, np.ndarray], values: dict[str, Any]) -> TrainingState:
+        """Build from :meth:`to_arrays` and :meth:`to_json`; the arrays are copied.
+
+        Raises
+        ------
+        KeyError, ValueError, TypeError
+            Something is missing or does not fit together.
+        """
+        tensors = {
+            name.removeprefix("value."): torch.from_numpy(array.copy())
+            for name, array in arrays.items()
+            if name.startswith("value.")
+        }
+        count = len(arrays["steps"])
+        state = cls.start(OrientedGaussians(**tensors), 0)
+        adam = state.adam
+        for name in adam.values:
+            _require(adam.array(name), arrays[f"value.{name}"], count)
+        for name in TRAINED:
+            for kind, moments in (("first", adam.first), ("second", adam.second)):
+                moments[name] = _require(moments[name], arrays[f"{kind}.{name}"], count).copy()
+        adam.steps = _require(adam.steps, arrays["steps"], count).copy()
+        for name in _STATISTICS:
+            old = getattr(state.statistics, name)
+            setattr(
+                state.statistics, name, _require(old, arrays[f"statistics.{name}"], count).copy()
+            )
+        generator = np.random.PCG64()
+        generator.state = values["random"]
+        state.random = np.random.Generator(generator)
+        state.iteration = int(values["iteration"])
+        state.order = [int(i) for i in values["order"]]
+        state.rate_factor = float(values["rate_factor"])
+        state.restarts = int(values["restarts"])
+        state.error_average = float(values["error_average"])
+        state.loss_average = float(values["loss_average"])
+        state.history = [{k: float(v) for k, v in entry.items()} for entry in values["history"]]
+        state.seconds = float(values["seconds"])
+        return state
+
+
+def _require(like: np.ndarray, array: np.ndarray, count: int) -> np.ndarray:
+    if array.shape != like.shape or array.dtype != like.dtype or len(array) != count:
+        raise ValueError(f"an array is {array.dtype} {array.shape}, not {like.dtype} {like.shape}")
+    return array

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The first Gaussians: from points, from few points, from none, from bad ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_wrapping_addon.core.dataset.scene import Scene, View
+from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.gaussians.initialisation import (
+    FEW_POINTS,
+    MAX_DISTANCE,
+    SH_C0,
+    initial_gaussians,
+)
+from tests.core.render.scenes import look_at
+
+
+def ring(count: int = 8) -> tuple[View, ...]:
+    angles = 2 * np.pi * np.arange(count) / count
+    return tuple(
+        View(look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), name=f"{i}"), Path(f"{i}.png"))
+        for i, a in enumerate(angles.tolist())
+    )
+
+
+def scene(points: np.ndarray, colors: np.ndarray | None = None) -> Scene:
+    if colors is None:
+        colors = np.full(points.shape, 128, np.uint8)
+    return Scene(ring(), points, colors, Similarity())
+
+
+def start(given: Scene, cap: int = 20_000, seed: int = 0, degree: int = 2):  # type: ignore[no-untyped-def]
+    asked = []
+
+    def photograph(index: int):  # type: ignore[no-untyped-def]
+        asked.append(index)
+        camera = given.views[index].camera
+        photo = np.zeros((camera.height, camera.width, 3), np.uint8)
+        photo[..., 0] = 10 * (index + 1)
+        return camera, photo
+
+    gaussians = initial_gaussians(
+        given, [0, 1, 2, 3, 5], photograph, max_gaussians=cap, sh_degree=degree, seed=seed
+    )
+    return gaussians, asked
+
+
+def test_many_points_become_gaussians_one_by_one() -> None:
+    random = np.random.default_rng(0)
+    points = random.uniform(-1, 1, (FEW_POINTS, 3))
+    colors = random.integers(0, 256, points.shape, dtype=np.uint8)
+    gaussians, asked = start(scene(points, colors))
+    assert asked == []
+    assert len(gaussians) == FEW_POINTS
+    assert np.abs(gaussians.means.numpy() - points).max() < 1e-6
+    assert gaussians.sh.shape == (FEW_POINTS, 9, 3)
+    assert np.abs(0.5 + SH_C0 * gaussians.sh[:, 0].numpy() - colors / 255).max() < 1e-6
+    assert not gaussians.sh[:, 1:].any()
+    assert not gaussians.orientation.any()
+    assert torch.sigmoid(gaussians.opacity_logits).numpy() == pytest.approx(0.1, abs=1e-6)
+    assert torch.equal(gaussians.quats[0], torch.tensor([1.0, 0, 0, 0]))
+    # Size against all pairs, for some of them.
+    for i in range(0, FEW_POINTS, 500):
+        nearest = np.sort(((points - points[i]) ** 2).sum(1))[1:4].mean() ** 0.5
+        assert np.exp(gaussians.log_scales[i].numpy()) == pytest.approx(nearest, rel=1e-5)
+
+
+def test_the_cap_holds_and_the_seed_decides() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (3000, 3))
+    one, _ = start(scene(points), cap=700, seed=1)
+    same, _ = start(scene(points), cap=700, seed=1)
+    other, _ = start(scene(points), cap=700, seed=2)
+    assert len(one) == len(other) == 700
+    assert torch.equal(one.means, same.means)
+    assert not torch.equal(one.means, other.means)
+    few, _ = start(scene(points[:10]), cap=300)
+    assert len(few) == 300
+
+
+def test_few_points_are_filled_up_at_their_depth_with_the_photos_colours() -> None:
+    random = np.random.default_rng(3)
+    sphere = random.normal(size=(400, 3))
+    sphere *= 0.7 / np.linalg.norm(sphere, axis=1, keepdims=True)
+    gaussians, asked = start(scene(sphere))
+    assert asked == [0, 1, 2, 3, 5]
+    assert len(gaussians) == FEW_POINTS
+    assert np.abs(gaussians.means[:400].numpy() - sphere).max() < 1e-6
+    added = gaussians.means[400:].numpy()
+    # Camera depth of the points lies in [3.4, 4.9]; 5 % jitter around it.
+    assert np.linalg.norm(added, axis=1).max() < 4.0
+    reds = 0.5 + SH_C0 * gaussians.sh[400:, 0, 0].numpy()
+    values, counts = np.unique(np.round(255 * reds), return_counts=True)
+    assert values.tolist() == [10, 20, 30, 40, 60]
+    assert counts.max() - counts.min() <= 1
+
+
+def test_without_points_most_cameras_see_the_gaussians() -> None:
+    given = scene(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    gaussians, _ = start(given)
+    assert len(gaussians) == FEW_POINTS
+    means = gaussians.means.double().numpy()
+    seen = np.zeros(len(means), int)
+    for view in given.views:
+        pixels, depth = view.camera.project(means)
+        inside = (pixels >= 0).all(1) & (pixels[:, 0] < 40) & (pixels[:, 1] < 30)
+        seen += inside & (depth > 0)
+    # Uniform random positions along the rays would be seen by 1 to 2 of the 8 cameras.
+    assert np.median(seen) >= 5
+    assert seen.min() >= 1
+
+
+def test_outliers_are_pulled_in_and_bad_points_left_out() -> None:
+    random = np.random.default_rng(0)
+    points = random.uniform(-1, 1, (FEW_POINTS + 2, 3))
+    points[7] = (3e6, 4e6, 0.0)
+    points[8] = (np.nan, 0.0, 0.0)
+    points[9] = (0.0, -np.inf, 0.0)
+    gaussians, _ = start(scene(points))
+    assert len(gaussians) == FEW_POINTS
+    assert all(torch.isfinite(t).all() for _, t in gaussians.tensors())
+    far = gaussians.means[7].double().numpy()
+    assert far == pytest.approx(MAX_DISTANCE * np.array([0.6, 0.8, 0.0]), abs=1e-3)
+    # No first Gaussian covers the scene, however lonely its point is.
+    assert float(gaussians.log_scales.exp()[7].max()) <= 0.1 * (MAX_DISTANCE + 5)
+    assert float(np.delete(gaussians.log_scales.exp().numpy(), 7, axis=0).max()) < 1.0
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_very_few_points_and_coincident_ones(count: int) -> None:
+    gaussians, _ = start(scene(np.zeros((count, 3))), cap=count)
+    assert len(gaussians) == count
+    assert all(torch.isfinite(t).all() for _, t in gaussians.tensors())
+
+
+def test_no_view_is_refused() -> None:
+    with pytest.raises(DatasetError):
+        initial_gaussians(
+            scene(np.zeros((5, 3))), [], lambda i: None, max_gaussians=9, sh_degree=0, seed=0
+        )
