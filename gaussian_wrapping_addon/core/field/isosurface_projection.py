@@ -305,7 +305,9 @@ class _Walk:
         self.status[rows[done & newton]] = ProjectionStatus.CONVERGED
         self.status[rows[done & ~newton]] = ProjectionStatus.BISECTED
 
-        crossed = seen & ((v > tolerances.ISO_LEVEL) != (self.v[rows] > tolerances.ISO_LEVEL))
+        crossed = (v > tolerances.ISO_LEVEL) != (self.v[rows] > tolerances.ISO_LEVEL)
+        # A long march may step over the surface into the unseen; a Newton step is halved there.
+        crossed &= seen | march
         opened = newton & crossed & ~done
         self._open_bracket(rows[opened], self.x, self.v, trial[opened], v[opened])
         opened = march & crossed & ~done

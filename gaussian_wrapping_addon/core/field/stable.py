@@ -51,10 +51,12 @@ def log_one_minus(log_g: np.ndarray) -> np.ndarray:
         ``-inf`` where ``log_g`` is 0 (method.md 5.4).
     """
     log_g = np.asarray(log_g, np.float64)
+    # Both forms are computed and one is chosen: where G is small, 1 - G rounds, and log1p does not
+    # need it; where G is near 1, exp(log G) rounds, and expm1 keeps the difference.
     with np.errstate(divide="ignore"):
+        near_zero = np.log1p(-np.exp(log_g))
         near_one = np.log(-np.expm1(log_g))
-    # Where G is small, 1 - G rounds; log1p does not need it.
-    return np.where(log_g < LOG_HALF, np.log1p(-np.exp(log_g)), near_one)
+    return np.where(log_g < LOG_HALF, near_zero, near_one)
 
 
 def odds(log_g: np.ndarray) -> np.ndarray:
@@ -70,4 +72,5 @@ def odds(log_g: np.ndarray) -> np.ndarray:
         ``inf`` where ``log_g`` is 0, 0 where G underflows (method.md 5.4).
     """
     with np.errstate(divide="ignore", over="ignore"):
-        return 1.0 / np.expm1(-np.asarray(log_g, np.float64))
+        # abs, not minus: -0.0 would give minus infinity.
+        return 1.0 / np.expm1(np.abs(np.asarray(log_g, np.float64)))

@@ -46,10 +46,12 @@ class VacancyField:
 
     The transmittance is that of training (method.md 2.4, 5.1): exact in three dimensions, with a
     Gaussian dropped outside its footprint ``alpha >= 1/255``. Where the tails of m Gaussians that
-    were dropped overlap, vacancy is too large by at most ``1 - (1 - 1/255)^m``; about 0.01 at
-    worst in dense scenes (measured by the tests). In depth, tails below 1e-5 are dropped. Gaussians
-    whose centre is not deeper than ``near_z`` do not count, as in training. A camera sees a point
-    that lies in its image and deeper than ``near_z``.
+    were dropped overlap, vacancy is too large by at most ``1 - (1 - 1/255)^m``: on a dense shell by
+    0.0045 (median) to 0.012 (largest) near the surface, and up to 0.018 where vacancy is 0.9. In
+    depth, only tails below 1e-5 are dropped. Gaussians whose centre is not deeper than ``near_z``
+    do not count, as in training. A camera sees a point that lies in its image and deeper than
+    ``near_z``. Pixels and depths are float32: a Gaussian thinner than about 1e-6 of its distance
+    blurs to that.
 
     Results do not depend on ``threads``. They depend on earlier calls only where vacancy exceeds
     0.999, as cameras that won most often are asked first.
