@@ -59,7 +59,7 @@ class LineField:
         V = np.zeros((len(points), 3))
         V[:, 0] = self.slope(points[:, 0])
         outward = np.zeros((len(points), 3))
-        outward[:, 0] = np.sign(V[:, 0]) if V.any() else self.outward
+        outward[:, 0] = np.nan_to_num(np.sign(V[:, 0])) if V.any() else self.outward
         return VectorFieldResult(
             V, np.full(len(points), self.sigma), np.zeros(len(points), np.int32), outward
         )
