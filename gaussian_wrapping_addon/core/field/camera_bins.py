@@ -28,13 +28,34 @@ MAX_PAIRS = 2**31 - 1
 
 
 @dataclass(frozen=True)
+class VirtualScreen:
+    """A camera resampled so that its longer side has :data:`VIRTUAL_SIDE_PX` pixels."""
+
+    camera: Camera
+    packed: np.ndarray
+    """(22,) float64, as in ``render.projection.pack_camera``."""
+    tiles_x: int
+    tiles_y: int
+
+    @classmethod
+    def of(cls, camera: Camera, near_z: float) -> VirtualScreen:
+        """Return the screen of a camera of any resolution."""
+        scale = VIRTUAL_SIDE_PX / max(camera.width, camera.height)
+        width, height = round(camera.width * scale), round(camera.height * scale)
+        virtual = camera.resized(max(1, width), max(1, height))
+        tiles_x, tiles_y = -(-virtual.width // TILE_PX), -(-virtual.height // TILE_PX)
+        return cls(virtual, pack_camera(virtual, near_z), tiles_x, tiles_y)
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles."""
+        return self.tiles_x * self.tiles_y
+
+
+@dataclass(frozen=True)
 class CameraBins:
     """What :func:`..vacancy_kernels.transmittance_of_cells` reads for one camera."""
 
-    packed: np.ndarray
-    """(22,) float64 camera of the virtual screen."""
-    tiles_x: int
-    tiles_y: int
     rows: np.ndarray
     """(m, 16) float32, nearest first."""
     bounds: np.ndarray
@@ -49,12 +70,6 @@ class CameraBins:
     def size_bytes(self) -> int:
         """Memory held."""
         return sum(a.nbytes for a in (self.rows, self.bounds, self.tile_start, self.tile_ids))
-
-
-def virtual_camera(camera: Camera) -> Camera:
-    """Return the camera with its longer side resampled to :data:`VIRTUAL_SIDE_PX`."""
-    scale = VIRTUAL_SIDE_PX / max(camera.width, camera.height)
-    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
 def region_window(
@@ -74,7 +89,8 @@ def region_window(
     """
     corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), -1).reshape(-1, 3)  # (8, 3)
     pixels, depth = camera.project(corners)
-    if depth.max() <= near_z:
+    # A little less than near_z: a point on the box's far corner may round to the other side.
+    if depth.max() <= near_z * (1.0 - 1e-9):
         return None
     x0, y0, x1, y1 = 0.0, 0.0, float(camera.width), float(camera.height)
     if depth.min() > 1e-6 * depth.max():
@@ -123,7 +139,7 @@ def footprint_bounds(boxes: np.ndarray, skews: np.ndarray) -> np.ndarray:
 
 def bin_camera(
     arrays: GaussianArrays,
-    camera: Camera,
+    virtual: VirtualScreen,
     near_z: float,
     bounds: np.ndarray | None,
     threads: int,
@@ -135,11 +151,11 @@ def bin_camera(
     ResourceError
         If the tile lists do not fit.
     """
-    virtual = virtual_camera(camera)
-    window = None if bounds is None else region_window(virtual, bounds, near_z)
+    camera = virtual.camera
+    window = None if bounds is None else region_window(camera, bounds, near_z)
     if bounds is not None and window is None:
         return None
-    screen = project_arrays(arrays, virtual, near_z, threads=threads)
+    screen = project_arrays(arrays, camera, near_z, threads=threads)
     kept = screen.visible.copy()
     log_opacity = arrays.log_opacities
     reach = np.maximum(2.0 * (log_opacity - math.log(tolerances.ALPHA_MIN)), 0.0)  # (n,)
@@ -163,8 +179,8 @@ def bin_camera(
         # Lists of tiles outside the window are never read.
         footprints[:, :2] = np.maximum(footprints[:, :2], np.array([x0, y0], np.float32))
         footprints[:, 2:4] = np.minimum(footprints[:, 2:4], np.array([x1, y1], np.float32))
-    tiles_x, tiles_y = -(-virtual.width // TILE_PX), -(-virtual.height // TILE_PX)
-    start = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    tiles_x, tiles_y = virtual.tiles_x, virtual.tiles_y
+    start = np.zeros(virtual.tiles + 1, np.int64)
     tile_ids = np.empty(0, np.int32)
     tile_px = np.float32(TILE_PX)
     list_tiles(footprints, tile_px, tiles_x, tiles_y, start[1:], tile_ids, False)
@@ -177,5 +193,4 @@ def bin_camera(
         )
     tile_ids = np.empty(start[-1], np.int32)
     list_tiles(footprints, tile_px, tiles_x, tiles_y, start[:-1].copy(), tile_ids, True)
-    packed = pack_camera(virtual, near_z)
-    return CameraBins(packed, tiles_x, tiles_y, rows, footprints, start, tile_ids, longest)
+    return CameraBins(rows, footprints, start, tile_ids, longest)

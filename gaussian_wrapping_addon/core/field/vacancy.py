@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -15,13 +16,15 @@ from ..errors import UsageError
 from ..gaussians.model import GaussianArrays
 from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
 from ..progress import Progress
-from .camera_bins import TILE_PX, CameraBins, bin_camera
+from .camera_bins import TILE_PX, CameraBins, VirtualScreen, bin_camera
 from .vacancy_kernels import project_points, sort_by_cell, transmittance_of_cells
 
 SETTLED = 1.0 - 1e-3
 """A point this vacant is not looked at from further cameras."""
 POINTS_PER_PASS = 1 << 21
-CACHE_BYTES = 1 << 30
+CACHE_SHARE = 0.25
+"""Share of the machine's memory that prepared cameras may take."""
+CACHE_BYTES_UNKNOWN = 1 << 30
 POINTS_PER_CELL = 40
 """Cells are made as small as leaves about this many points in each: fewer waste lanes, more widen
 the lists of Gaussians."""
@@ -39,6 +42,14 @@ class VacancyResult:
     bounds, values below 1e-4 are 0."""
     camera: np.ndarray
     """(n,) int32: the camera that sees the point best, or -1 where none sees it."""
+
+
+def default_cache_bytes() -> int:
+    """Return how much memory prepared cameras may take on this machine."""
+    try:
+        return int(CACHE_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):  # not on Windows
+        return CACHE_BYTES_UNKNOWN
 
 
 class VacancyField:
@@ -71,9 +82,9 @@ class VacancyField:
         and changes no value. Points outside it count as unseen.
     near_z : float
         Scene units.
-    cache_bytes : int
-        Cameras are kept projected and binned up to this much memory; the others are prepared anew
-        in each call.
+    cache_bytes : int, optional
+        Cameras are kept projected and binned up to this much memory, by default a quarter of the
+        machine's; the others are prepared anew in each call (about 120 bytes a Gaussian).
 
     Raises
     ------
@@ -90,7 +101,7 @@ class VacancyField:
         unseen: Unseen = "empty",
         region_bounds: np.ndarray | None = None,
         near_z: float = tolerances.NEAR_Z,
-        cache_bytes: int = CACHE_BYTES,
+        cache_bytes: int | None = None,
     ) -> None:
         if len(cameras) == 0:
             raise UsageError("Vacancy needs at least one camera.", "Check the scene's views.")
@@ -111,8 +122,9 @@ class VacancyField:
         """How often each camera was the arg-max so far."""
         self.evaluations = 0
         """Points asked for so far."""
+        self._screens = [VirtualScreen.of(camera, near_z) for camera in self.cameras]
         self._cache: dict[int, CameraBins | None] = {}
-        self._cache_left = cache_bytes
+        self._cache_left = default_cache_bytes() if cache_bytes is None else cache_bytes
 
     def vacancy(self, points: np.ndarray, progress: Progress | None = None) -> VacancyResult:
         """Evaluate vacancy and its arg-max camera at (n, 3) float64 scene points."""
@@ -212,7 +224,7 @@ class VacancyField:
         if index in self._cache:
             return self._cache[index]
         bins = bin_camera(
-            self.arrays, self.cameras[index], self.near_z, self.region_bounds, self.threads
+            self.arrays, self._screens[index], self.near_z, self.region_bounds, self.threads
         )
         size = 0 if bins is None else bins.size_bytes
         # Nothing is ever evicted: cameras are asked in cycles, where the oldest is needed next.
@@ -246,20 +258,22 @@ class VacancyField:
         winner: np.ndarray,
         seen: np.ndarray | None = None,
     ) -> None:
-        bins = self._bins(index)
-        if bins is None or len(points) == 0:
+        if len(points) == 0:
             return
-        tiles = bins.tiles_x * bins.tiles_y
+        view = self._screens[index]
         shift = 0
-        while shift < MAX_CELL_SHIFT and tiles << (2 * shift + 2) <= len(points) // POINTS_PER_CELL:
+        while (
+            shift < MAX_CELL_SHIFT
+            and view.tiles << (2 * shift + 2) <= len(points) // POINTS_PER_CELL
+        ):
             shift += 1
         screen = np.empty((len(points), 3), np.float32)
         cells = np.empty(len(points), np.int32)
 
         def project(begin: int, end: int) -> None:
             project_points(
-                begin, end, points, bins.packed, np.float32(settled), best, TILE_PX, shift,
-                bins.tiles_x, bins.tiles_y, screen, cells,
+                begin, end, points, view.packed, np.float32(settled), best, TILE_PX, shift,
+                view.tiles_x, view.tiles_y, screen, cells,
             )  # fmt: skip
 
         run_chunks(project, even_bounds(len(points), self.threads), self.threads)
@@ -267,15 +281,17 @@ class VacancyField:
             cells[~inside] = -1
         if seen is not None:
             seen |= cells >= 0
-        start = np.zeros((tiles << (2 * shift)) + 2, np.int64)
+        start = np.zeros((view.tiles << (2 * shift)) + 2, np.int64)
         order = np.empty(len(points), np.int32)
         if sort_by_cell(cells, start, order) == 0:
             return
+        bins = self._bins(index)
+        assert bins is not None, "a camera that sees a point of the region sees the region"
 
         def evaluate(begin: int, end: int) -> None:
             transmittance_of_cells(
                 begin, end, start, order, screen, bins.rows, bins.bounds, bins.tile_start,
-                bins.tile_ids, bins.longest_list, np.float32(TILE_PX), shift, bins.tiles_x,
+                bins.tile_ids, bins.longest_list, np.float32(TILE_PX), shift, view.tiles_x,
                 index, best, winner,
             )  # fmt: skip
 
