@@ -40,6 +40,7 @@ class _Job:
     imports: bool
     """Whether its result is still wanted in the scene."""
     cancel_asked_s: float | None = None
+    command: str = "WRAP"
     waits_for_mode: bool = False
     """Finished, but Blender is in a mode in which nothing can be imported."""
 
@@ -55,9 +56,17 @@ def key_of(folder: str) -> str:
 def watch(scene: bpy.types.Scene, folder: Path, client: JobClient, *, imports: bool = True) -> None:
     """Show a job in a scene and follow it to its end."""
     known_jobs.remember(folder)
-    scene.gwrap.job_folder = str(folder)
-    _jobs[key_of(str(folder))] = _Job(client, client.poll(), scene.session_uid, imports)
+    _show(scene, folder, _Job(client, client.poll(), scene.session_uid, imports))
     start_timer()
+
+
+def _show(scene: bpy.types.Scene, folder: Path, job: _Job) -> None:
+    properties = scene.gwrap
+    properties.job_folder = str(folder)
+    job.command = properties.job_command
+    key = key_of(properties.job_folder)
+    _jobs.pop(key, None)  # the newest job of a scene is the last
+    _jobs[key] = job
 
 
 def status_of(folder: str) -> JobStatus | None:
@@ -231,8 +240,7 @@ def attach(scene: bpy.types.Scene, folder: Path) -> JobStatus:
     """
     client = JobClient.attach(folder)
     status = client.poll()
-    scene.gwrap.job_folder = str(folder)
-    _jobs[key_of(str(folder))] = _Job(client, status, scene.session_uid, status.active)
+    _show(scene, folder, _Job(client, status, scene.session_uid, status.active))
     if status.active:
         start_timer()
     return status
@@ -274,8 +282,10 @@ def after_load(_arguments: object = None, _unused: object = None) -> None:
 
 @persistent
 def after_undo(_scene: object = None, _unused: object = None) -> None:
-    """``undo_post``, ``redo_post``: a running job stays in its scene; undo knows nothing of it."""
-    for folder, job in _jobs.items():
-        scene = scene_of_uid(job.scene_uid) if job.status.active or job.waits_for_mode else None
+    """``undo_post``, ``redo_post``: a scene keeps its job; starting one is no undo step."""
+    newest = {job.scene_uid: folder for folder, job in _jobs.items() if job.scene_uid}
+    for uid, folder in newest.items():
+        scene = scene_of_uid(uid)
         if scene is not None and key_of(scene.gwrap.job_folder) != folder:
             scene.gwrap.job_folder = folder
+            scene.gwrap.job_command = _jobs[folder].command

@@ -22,6 +22,7 @@ from .result_files import RegionResult, ResultFiles, read_result
 _logger = logging.getLogger(__name__)
 
 FRAME_NAME = "blender_from_scene"
+CAMERAS_NAME = "Photo Cameras"
 
 # Camera frusta this share of the scene's radius are visible and do not hide the mesh.
 _CAMERA_SIZE_SHARE = 0.03
@@ -183,6 +184,11 @@ def _update_region(
     return thing
 
 
+def cameras_of(collection: bpy.types.Collection) -> bpy.types.Collection | None:
+    """Return the collection of the photo cameras of a result, if it is there."""
+    return next((c for c in collection.children if c.name.startswith(CAMERAS_NAME)), None)
+
+
 def _update_cameras(
     files: ResultFiles,
     children: list[bpy.types.Object],
@@ -190,13 +196,14 @@ def _update_cameras(
     collection: bpy.types.Collection,
 ) -> tuple[bpy.types.Object, ...]:
     known = {c.get(tags.PHOTO): c for c in children if tags.kind_of(c) == "camera"}
-    folder = next((c for c in collection.children if c.name.startswith("Photo Cameras")), None)
+    folder = cameras_of(collection)
     cameras = []
     for camera, photo in files.cameras:
         thing = known.get(photo)
         if thing is None:
             if folder is None:
-                folder = bpy.data.collections.new("Photo Cameras")
+                folder = bpy.data.collections.new(CAMERAS_NAME)
+                folder.hide_viewport = True  # a hundred cameras would hide what was wrapped
                 collection.children.link(folder)
             thing = create_camera(camera, photo, _CAMERA_SIZE_SHARE * files.radius, folder)
             thing.parent = frame

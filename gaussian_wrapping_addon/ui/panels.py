@@ -8,6 +8,7 @@ import bpy
 from ..ops import job_timer, tags
 from ..ops.import_operators import materials_of
 from ..ops.materials import shading_of
+from ..ops.scene_objects import cameras_of
 from .text import characters_of, progress_text, time_span, wrapped_label
 
 _FINDING_ICONS: Final = {"error": "CANCEL", "warning": "ERROR", "fact": "INFO", "info": "INFO"}
@@ -186,6 +187,11 @@ class GWRAP_PT_result(_Panel, bpy.types.Panel):
                 for value, text in (("LIT", "Lit"), ("UNLIT", "Unlit")):
                     button = row.operator("gwrap.set_shading", text=text, depress=shading == value)
                     button.shading = value
+            cameras = cameras_of(frame.users_collection[0]) if frame.users_collection else None
+            if cameras is not None:
+                layout.prop(
+                    cameras, "hide_viewport", text="Show Photo Cameras", invert_checkbox=True
+                )
             if tags.kind_of(active) == "camera":
                 layout.operator("gwrap.view_photo", icon="CAMERA_DATA")
         column = layout.column(align=True)
@@ -195,7 +201,7 @@ class GWRAP_PT_result(_Panel, bpy.types.Panel):
     def _figures(self, layout: Any, figures: dict[str, Any]) -> None:
         rows = []
         if "psnr" in figures:
-            rows.append(("PSNR, Held-Out Photos", f"{figures['psnr']:.1f} dB"))
+            rows.append(("Held-Out PSNR", f"{figures['psnr']:.1f} dB"))
         if "gaussians" in figures:
             rows.append(("Gaussians", f"{figures['gaussians']:,}"))
         if "seconds" in figures:

@@ -51,7 +51,7 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     """What a scene is made of and which job works for it."""
 
     source: StringProperty(  # type: ignore[valid-type]
-        name="Photos",
+        name="Folder",
         description="Folder of photos, of a COLMAP project, or with a transforms.json",
         subtype="DIR_PATH",
         update=_source_changed,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A worker that obeys the job folder protocol without torch; ``GWRAP_FAKE`` says how it behaves.
+"""A worker that obeys the job folder protocol without torch; ``GW_FAKE`` says how it behaves.
 
 Run as ``PYTHON ... jobs.worker FOLDER PARENT`` in place of the worker's Python.
 """
@@ -26,7 +26,7 @@ from tests.blender.synthetic_result import write_region_result, write_result
 
 def main() -> int:
     folder = JobFolder(Path(sys.argv[-2]))
-    mode = os.environ.get("GWRAP_FAKE", "quick")
+    mode = os.environ.get("GW_FAKE", "quick")
 
     def say(state: str, fraction: float, **more: object) -> None:
         folder.write_status(

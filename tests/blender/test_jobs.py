@@ -57,7 +57,7 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], N
     monkeypatch.setenv(PYTHON_VARIABLE, str(script))
 
     def behave(mode: str) -> None:
-        monkeypatch.setenv("GWRAP_FAKE", mode)
+        monkeypatch.setenv("GW_FAKE", mode)
 
     behave("quick")
     return behave
@@ -390,6 +390,16 @@ def test_undo_does_not_lose_a_running_job(photos: Path, worker: Callable[[str], 
     assert job_timer.after_undo in bpy.app.handlers.undo_post
     job_timer.after_undo(bpy.context.scene)
     assert bpy.context.scene.gwrap.job_folder == folder
+
+
+def test_undo_of_an_import_keeps_the_job(photos: Path, worker: object) -> None:
+    start_wrap(photos)
+    wait_for("DONE")
+    properties = bpy.context.scene.gwrap
+    folder = properties.job_folder
+    properties.job_folder, properties.job_command = "", "MESH"
+    job_timer.after_undo(bpy.context.scene)
+    assert (properties.job_folder, properties.job_command) == (folder, "WRAP")
 
 
 def test_disabling_the_addon_leaves_the_job_to_be_found(

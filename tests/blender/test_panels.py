@@ -95,7 +95,7 @@ def test_region_and_result_panels_with_a_result(tmp_path: Path) -> None:
     bpy.context.view_layer.update()
     assert "auto region" in draw(panels.GWRAP_PT_region).texts
     layout = draw(panels.GWRAP_PT_result)
-    assert "PSNR, Held-Out Photos" in layout.texts
+    assert "Held-Out PSNR" in layout.texts
     assert layout.operators.count("gwrap.set_shading") == 2
     assert "gwrap.view_photo" not in layout.operators
     bpy.context.view_layer.objects.active = imported.cameras[0]

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Takes the picture of the panel in the documentation, of a real result.
+
+``blender --addons bl_ext.user_default.gaussian_wrapping_addon -P picture_of_panel.py`` with
+``GW_PICTURE_RESULT`` (a result folder), ``GW_PICTURE_SOURCE`` (what to show as the photo folder)
+and ``GW_PICTURE`` (the file to write).
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+
+
+def steps() -> Iterator[float]:
+    """Import, arrange, photograph."""
+    window = bpy.context.window_manager.windows[0]
+    area = next(a for a in window.screen.areas if a.type == "VIEW_3D")
+    region = next(r for r in area.regions if r.type == "WINDOW")
+    for thing in list(bpy.data.objects):
+        bpy.data.objects.remove(thing)
+    space = area.spaces.active
+    space.show_region_ui = True
+    yield 0.5
+    panel = next(r for r in area.regions if r.type == "UI")
+    panel.active_panel_category = "Gaussian Wrapping"
+    scene = bpy.context.scene
+    scene.gwrap.source = os.environ["GW_PICTURE_SOURCE"]
+    scene.gwrap.resolution = "EDGE_LENGTH"
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.gwrap.import_result(directory=os.environ["GW_PICTURE_RESULT"])
+        space.shading.color_type = "TEXTURE"
+        yield 0.5
+    meshes = [o for o in bpy.data.objects if o.get("gwrap_kind") == "mesh"]
+    view_layer = bpy.context.view_layer
+    for thing in view_layer.objects:
+        thing.select_set(thing in meshes)
+    view_layer.objects.active = meshes[0]
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.view3d.view_selected()
+        boxes = [o for o in bpy.data.objects if o.get("gwrap_kind") == "region"]
+        bpy.ops.gwrap.select_region(name=boxes[0].name)
+    yield 1.5
+    subprocess.run(["import", "-window", "root", os.environ["GW_PICTURE"]], check=True)
+
+
+_run = steps()
+
+
+def advance() -> float | None:
+    """Timer: the next step, or the end."""
+    try:
+        return next(_run)
+    except StopIteration:
+        pass
+    except Exception:  # Blender must end, and tell why
+        Path(os.environ["GW_PICTURE"]).with_suffix(".txt").write_text(traceback.format_exc())
+    bpy.ops.wm.quit_blender()
+    return None
+
+
+bpy.context.preferences.view.show_splash = False
+bpy.app.timers.register(advance, first_interval=1.5)
