@@ -26,6 +26,15 @@ DECIDED_MARGIN = 0.3
 """A mean vacancy this far from 0.5 needs no further samples ..."""
 LONELY_NEIGHBOURS = 3
 """... unless so many neighbours carry the other label."""
+MIXED_DEVIATION = 0.1
+"""Samples that agree this well, near 0.5, come from a sliver on the surface: more of them tell
+nothing, and the minimum cut decides."""
+
+SHEET_COSINE = 0.5
+SHEET_SLOPE = 0.4
+SHEET_EDGE = 12.0
+"""Normals at all corners of a flat tetrahedron agree at least this well, its edges rise at most so
+much along them, and are at most this many spacings long."""
 
 FIXED_MARGIN = 0.25
 """Tetrahedra at least this far from 0.5 after all rounds keep their label."""
@@ -60,11 +69,18 @@ def classify(
     tetrahedra: np.ndarray,
     neighbours: np.ndarray,
     outer: np.ndarray,
+    sheet: Sheet,
     vacancy: Vacancy,
     rng: np.random.Generator,
     progress: Progress,
 ) -> Classification:
     """Label tetrahedra by the vacancy of interior points (method.md 7.5).
+
+    A tetrahedron whose corners lie on one smooth sheet is flat: inside or outside, the surface
+    stays the same up to the spacing squared. Those are labelled by the side of the sheet on which
+    their circumcentre lies, which yields the Delaunay triangulation restricted to the surface,
+    with well-shaped triangles. By interior points, a cylinder would get the long edges of a convex
+    hull.
 
     Parameters
     ----------
@@ -74,11 +90,17 @@ def classify(
         Tetrahedron behind the face opposite each corner, -1 on the hull.
     outer : (m,) bool
         Outside by definition (beyond the region); never sampled.
+    sheet : Sheet
+        From :func:`on_one_sheet`.
     """
     count = len(tetrahedra)
-    total, samples = np.zeros(count), np.zeros(count, np.int64)
+    total, squares = np.zeros(count), np.zeros(count)
+    samples = np.zeros(count, np.int64)
     total[outer], samples[outer] = 1.0, 1
-    rows = np.flatnonzero(~outer)
+    flat = np.zeros(count, np.bool_)
+    flat[sheet.rows] = True
+    total[sheet.rows], samples[sheet.rows] = 0.5 + 0.5 * sheet.side, 1
+    rows = np.flatnonzero(~outer & ~flat)
     for turn, extra in enumerate(ROUNDS):
         span = progress.span(0.8 * turn / len(ROUNDS), 0.8 * (turn + 1) / len(ROUNDS))
         for step in range(extra):
@@ -89,20 +111,71 @@ def classify(
                 )
                 weights = _interior_weights(len(part), turn == 0, rng)
                 where = np.einsum("kc,kcx->kx", weights, points[tetrahedra[part]])
-                total[part] += vacancy(where)
+                value = vacancy(where).astype(np.float64)
+                total[part] += value
+                squares[part] += value**2
                 samples[part] += 1
         mean = total / np.maximum(samples, 1)
         inside = (mean <= tolerances.ISO_LEVEL) & ~outer
         near = np.abs(mean - tolerances.ISO_LEVEL) < DECIDED_MARGIN
         lonely = _disagreeing(inside, neighbours) >= LONELY_NEIGHBOURS
-        rows = np.flatnonzero((near | lonely) & ~outer)
+        mixed = squares > samples * (mean**2 + MIXED_DEVIATION**2)
+        rows = np.flatnonzero(((near & (mixed | (samples == 1))) | lonely) & ~outer & ~flat)
     progress.update(0.85, "smoothing labels")
-    free = (np.abs(mean - tolerances.ISO_LEVEL) < FIXED_MARGIN) & ~outer
+    free = flat | (np.abs(mean - tolerances.ISO_LEVEL) < FIXED_MARGIN) & ~outer
     areas = face_areas(points, tetrahedra)
     smooth = regularised(inside, mean, free, neighbours, areas)
     progress.update(1.0, "smoothing labels")
     flipped = int((smooth != inside).sum())
     return Classification(smooth, mean, samples, int(free.sum()), flipped)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Tetrahedra whose corners lie on one smooth sheet of the surface."""
+
+    rows: np.ndarray
+    """(k,) int64 indices."""
+    side: np.ndarray
+    """(k,) float64 from -1 to 1: how far the circumcentre lies on the empty side, in spacings."""
+
+
+def on_one_sheet(
+    points: np.ndarray, tetrahedra: np.ndarray, normals: np.ndarray, outer: np.ndarray, radius: float
+) -> Sheet:
+    """Find flat tetrahedra: normals agree at all corners, and the edges run across them.
+
+    Parameters
+    ----------
+    normals : (k, 3) float64
+        Of the first k points; tetrahedra with other corners are ``outer``.
+    radius : float
+        The spacing.
+    """
+    rows = np.flatnonzero(~outer)
+    corners = tetrahedra[rows]
+    pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+    for i, j in pairs:
+        agree = (normals[corners[:, i]] * normals[corners[:, j]]).sum(1) > SHEET_COSINE
+        rows, corners = rows[agree], corners[agree]
+    up = normals[corners].sum(1)  # (k, 3)
+    up /= np.linalg.norm(up, axis=1)[:, None]
+    for i, j in pairs:
+        edge = points[corners[:, i]] - points[corners[:, j]]
+        length = np.linalg.norm(edge, axis=1)
+        flat = np.abs((edge * up).sum(1)) < SHEET_SLOPE * length
+        flat &= length < SHEET_EDGE * radius
+        rows, corners, up = rows[flat], corners[flat], up[flat]
+    base = points[corners[:, 0]]
+    a, b, c = (points[corners[:, k]] - base for k in (1, 2, 3))
+    cross = np.cross(b, c), np.cross(c, a), np.cross(a, b)
+    volume = 2.0 * (a * cross[0]).sum(1)  # 12 times the tetrahedron's
+    squares = [(edge**2).sum(1)[:, None] for edge in (a, b, c)]
+    # Where all four are coplanar the circumcentre is infinitely far; either side will do.
+    safe = np.where(np.abs(volume) > 1e-12 * radius**3, volume, 1e-12 * radius**3)
+    offset = sum(s * x for s, x in zip(squares, cross, strict=True)) / safe[:, None]
+    height = ((offset - (a + b + c) / 4) * up).sum(1)
+    return Sheet(rows, np.clip(height / radius, -1.0, 1.0))
 
 
 def _interior_weights(count: int, centroid: bool, rng: np.random.Generator) -> np.ndarray:

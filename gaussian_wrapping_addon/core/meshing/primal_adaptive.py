@@ -16,7 +16,7 @@ from ..gaussians.model import GaussianArrays
 from ..progress import Progress
 from ..settings import MeshingSettings
 from .candidate_surface import candidate_surface
-from .classification import classify
+from .classification import classify, on_one_sheet
 from .components import compacted, without_floaters
 from .convex_region import Region
 from .degenerate import remove_degenerate
@@ -29,6 +29,9 @@ from .surface_mesh import SurfaceMesh
 from .surface_points import KIND_CAP, KIND_JUMP, KIND_SURFACE, SurfacePoints, SurfaceSampler
 
 _logger = logging.getLogger(__name__)
+
+KIND_SPLIT = 3
+"""Moved slightly off the isosurface, to keep parts apart that would touch."""
 
 DEGENERATE_SHARE = 1e-4
 """Faces narrower than this share of the spacing are removed; far below what the field resolves."""
@@ -135,6 +138,7 @@ def _connect(
         tetrahedra,
         neighbours,
         outer,
+        on_one_sheet(points, tetrahedra, cloud.normals, outer, cloud.radius),
         lambda where: vacancy.vacancy(where).vacancy,
         rng,
         progress.span(0.65, 0.9),
@@ -150,7 +154,9 @@ def _connect(
     )
     vertices, kept, source = compacted(repaired.vertices, kept)
     origin = repaired.origin[source]
-    kind = np.where(origin >= 0, cloud.kind[np.clip(origin, 0, len(cloud.kind) - 1)], KIND_CAP)
+    kind = np.where(origin >= 0, cloud.kind[np.maximum(origin, 0)], KIND_SPLIT)
+    copies = np.bincount(repaired.origin[repaired.origin >= 0], minlength=len(cloud.kind))
+    kind[(origin >= 0) & (copies[np.maximum(origin, 0)] > 1)] = KIND_SPLIT
     figures = {
         "tetrahedra": len(tetrahedra),
         "interior_samples": int(labels.samples[~outer].sum()),
@@ -166,6 +172,7 @@ def _connect(
         "vertices_on_surface": int((kind == KIND_SURFACE).sum()),
         "vertices_on_region_boundary": int((kind == KIND_CAP).sum()),
         "vertices_at_end_of_sight": int((kind == KIND_JUMP).sum()),
+        "vertices_moved_apart": int((kind == KIND_SPLIT).sum()),
     }
     progress.update(0.95, "repairing")
     return vertices, kept, kind, figures

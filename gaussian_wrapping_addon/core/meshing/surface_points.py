@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from .. import tolerances
 from ..field.isosurface_projection import TOLERANCE, project_to_isosurface
@@ -16,7 +17,7 @@ from .convex_region import Region
 from .marching_tetrahedra import bisect
 from .region_caps import cap_points
 from .resolution import Request, thinning_radius
-from .sampling import curvature, local_radii, sample_triangles, thin, triangle_normals
+from .sampling import POINTS_PER_SQUARE, curvature, local_radii, sample_triangles, thin, triangle_normals
 
 KIND_SURFACE, KIND_CAP, KIND_JUMP = 0, 1, 2
 """On the isosurface; on the region's boundary; where vacancy jumps over 0.5 (the end of what the
@@ -25,12 +26,14 @@ cameras see)."""
 PRIORITY_SURFACE = 3.0
 """Between the rims and the inner part of the caps; see region_caps."""
 
-OVERSAMPLING = 9.0
+OVERSAMPLING = 20.0
 """Candidates per point, before the first thinning."""
-FIRST_THINNING = 0.55
-"""Candidates closer than this share of the radius are not worth projecting."""
+FIRST_THINNING = 0.4
+"""Candidates closer than this share of the radius are not worth projecting. These two decide how
+even the points become (and sampling.POINTS_PER_SQUARE)."""
 SCOUTS = 20_000
 """Candidates from which curvature, and so the local radius, is estimated."""
+SCOUTS_PER_FACE = 5
 MOST_DENSE = 2.0
 """Curvature may multiply the number of points by this at most."""
 
@@ -46,6 +49,8 @@ class SurfacePoints:
 
     points: np.ndarray
     """(n, 3) float64."""
+    normals: np.ndarray
+    """(n, 3) float64 unit vectors towards the empty side; 0 on edges of the region."""
     kind: np.ndarray
     """(n,) uint8."""
     radius: float
@@ -79,14 +84,17 @@ class SurfaceSampler:
         ResourceError
             The request needs more points than the cap.
         """
-        radius, density = self._scout(request, rng)
+        radius, density, share = self._scout(request, rng)
         progress.update(0.05, "spreading points")
-        count = int(OVERSAMPLING * density * 0.7 * self.area / radius**2) + 64
-        points, face = sample_triangles(self._vertices, self._faces, count, rng)
+        expected = POINTS_PER_SQUARE * density * self.area / radius**2
+        points, face = sample_triangles(
+            self._vertices, self._faces, int(OVERSAMPLING * expected) + 64, rng, share**-2.0
+        )
+        radii = radius * share[face]
+        priority = rng.random(len(points))
+        kept = thin(points, self._normals[face], FIRST_THINNING * radii, priority)
+        points, face, radii = points[kept], face[kept], radii[kept]
         normals = self._normals_at(points, self._normals[face])
-        radii = local_radii(curvature(points, normals, 1.3 * radius, self._threads), radius, MOST_DENSE)
-        kept = thin(points, normals, FIRST_THINNING * radii, rng.random(count))
-        points, normals, radii = points[kept], normals[kept], radii[kept]
         progress.update(0.2, f"moving {len(points)} points onto the surface")
         found = project_to_isosurface(
             points, self._vacancy, self._vectors, progress.span(0.2, 0.7), tolerance=TOLERANCE
@@ -108,9 +116,10 @@ class SurfaceSampler:
         # Jumps last among surface points: where both are near, the isosurface is the better one.
         priority = PRIORITY_SURFACE + 0.5 * (rng.random(len(moved)) + (kind == KIND_JUMP))
         everything = np.concatenate([caps.points, moved])
+        normals = np.concatenate([caps.normals, normals])
         kept = thin(
             everything,
-            np.concatenate([caps.normals, normals]),
+            normals,
             np.concatenate([np.full(len(caps.points), radius), radii]),
             np.concatenate([caps.priority, priority]),
         )
@@ -123,25 +132,40 @@ class SurfaceSampler:
             "cap_points": int((kinds == KIND_CAP).sum()),
             "projection_evaluations": int(found.vacancy_evaluations),
         }
-        return SurfacePoints(everything[kept], kinds, radius, figures)
+        return SurfacePoints(everything[kept], normals[kept], kinds, radius, figures)
 
-    def _scout(self, request: Request, rng: np.random.Generator) -> tuple[float, float]:
-        """Return the thinning radius and the expected density relative to a uniform one."""
+    def _scout(
+        self, request: Request, rng: np.random.Generator
+    ) -> tuple[float, float, np.ndarray]:
+        """Find where the surface turns quickly, and with that the radius.
+
+        Returns
+        -------
+        radius : float
+            The largest thinning radius.
+        density : float
+            Expected number of points relative to the same radius everywhere.
+        share : (f,) float64
+            Local radius of each face, as a share of ``radius``.
+        """
         radius = thinning_radius(request, self.area, 1.0, self._region)
         points, face = sample_triangles(self._vertices, self._faces, SCOUTS, rng)
         normals = self._normals_at(points, self._normals[face])
-        density = 1.0
+        # Far enough that a scout has about a dozen neighbours.
+        reach = float(np.sqrt(4.0 * self.area / SCOUTS))
+        shares, density = np.ones(SCOUTS), 1.0
         for _ in range(3):  # density depends on the radius, which depends on the density
-            turning = curvature(points, normals, max(1.3 * radius, self._reach()), self._threads)
-            density = float(np.mean((local_radii(turning, radius, MOST_DENSE) / radius) ** -2.0))
-            if request.edge_length > 0:
+            turning = curvature(points, normals, max(1.3 * radius, reach), self._threads)
+            shares = local_radii(turning, radius, MOST_DENSE) / radius
+            density = float(np.mean(shares**-2.0))
+            wanted = thinning_radius(request, self.area, density, self._region)
+            if abs(wanted - radius) < 0.02 * radius:
                 break
-            radius = thinning_radius(request, self.area, density, self._region)
-        return thinning_radius(request, self.area, density, self._region), density
-
-    def _reach(self) -> float:
-        """Distance within which a scout has about a dozen neighbours."""
-        return float(np.sqrt(4.0 * self.area / SCOUTS))
+            radius = wanted
+        # Each face takes the median of a few scouts: single ones are noisy.
+        centers = self._vertices[self._faces].mean(1)
+        nearest = cKDTree(points).query(centers, k=SCOUTS_PER_FACE)[1]  # (f, k)
+        return radius, density, np.median(shares[nearest], axis=1)
 
     def _normals_at(self, points: np.ndarray, fallback: np.ndarray) -> np.ndarray:
         """Unit vectors of the vector field, or the triangle's normal where that has none."""
