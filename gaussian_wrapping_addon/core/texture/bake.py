@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Colours of surface points from the photos: best views, occlusion-tested, robustly blended."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..compiled import kernel
+from ..dataset.camera import Camera
+from ..parallel import even_bounds, run_chunks
+from ..progress import Progress
+from .exposure import solve_gains
+from .photo_samples import PhotoView, SurfaceArrays, SurfacePoints, sample_photo
+from .sampling import pyramid
+from .visibility import photo_visibility
+
+KEPT_VIEWS = 5
+"""An odd number, so that the median of the views is one of them."""
+SHARPNESS = 3.0
+"""Weights are raised to this power: the best view leads, which keeps detail."""
+OUTLIER_FLOOR = 20.0
+"""Views within this many of 255 levels of the median are never outliers."""
+OUTLIER_FACTOR = 2.5
+POINTS_PER_BLOCK = 8_000_000
+"""Points held with their views at once (47 bytes each)."""
+EXPOSURE_POINTS = 8_000
+EXPOSURE_CELLS = 4_000_000
+"""Bound on points x photos of the exposure step."""
+COARSE_LONG_SIDE_PX = 480
+
+
+class Photos(Protocol):
+    """What baking needs of :class:`~..dataset.photos.PhotoStore`."""
+
+    def camera(self, index: int, divisor: int = 1) -> Camera:
+        """Camera of a photo at a level."""
+        ...
+
+    def photo(self, index: int, divisor: int = 1) -> np.ndarray:
+        """(h, w, 3) uint8."""
+        ...
+
+    def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
+        """(h, w) bool or None."""
+        ...
+
+
+@dataclass(frozen=True)
+class Baked:
+    """Colours of the points."""
+
+    colors: np.ndarray
+    """(n, 3) uint8; 0 where no photo sees the point."""
+    views: np.ndarray
+    """(n,) uint8 number of views blended, 0 where unseen."""
+    photos_used: int
+    """Photos that gave at least a depth sample of the mesh."""
+    gain_spread: float
+    """Standard deviation of the log gains between photos."""
+    gains_applied: bool
+    rejected_share: float
+    """Share of kept views that were outliers."""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    index: int
+    divisor: int
+
+
+def bake(
+    points: SurfacePoints,
+    surface: SurfaceArrays,
+    photos: Photos,
+    count: int,
+    progress: Progress,
+    *,
+    threads: int,
+) -> Baked:
+    """Give each point the robust mean of its best views.
+
+    Parameters
+    ----------
+    points : SurfacePoints
+        Points in texture order.
+    photos : Photos
+        Read one at a time, at the level that the texel size needs.
+    count : int
+        Number of photos.
+
+    Notes
+    -----
+    A view's weight is (cosine x useful pixels per texel)^2, faded near silhouettes and the
+    image border. The best ``KEPT_VIEWS`` are kept; with three or more, those far from their
+    weighted median are dropped (method.md 8).
+    """
+    plans, gains, spread = _exposure(
+        points, surface, photos, count, progress.span(0.0, 0.25), threads
+    )
+    colors = np.zeros((len(points), 3), np.uint8)
+    views = np.zeros(len(points), np.uint8)
+    rejected = np.zeros(len(points), np.uint8)
+    blocks = max(1, math.ceil(len(points) / POINTS_PER_BLOCK))
+    bounds = np.linspace(0, len(points), blocks + 1).astype(int).tolist()
+    steps = max(1, blocks * len(plans))
+    for block, (begin, end) in enumerate(pairwise(bounds)):
+        part = points.part(slice(begin, end))
+        weights = np.zeros((end - begin, KEPT_VIEWS), np.float32)
+        kept = np.zeros((end - begin, KEPT_VIEWS, 3), np.uint8)
+        for step, plan in enumerate(plans):
+            fraction = 0.25 + 0.7 * (block * len(plans) + step) / steps
+            progress.update(fraction, f"texture: photo {step + 1} of {len(plans)}")
+            view = _view(photos, plan.index, plan.divisor, surface, threads)
+            sample_photo(part, surface, view, gains[plan.index], weights, kept, threads)
+        progress.update(0.25 + 0.7 * (block + 1) / blocks, "blending views")
+        _blend_block(
+            weights, kept, colors[begin:end], views[begin:end], rejected[begin:end], threads
+        )
+    offered = int(views.sum(dtype=np.int64) + rejected.sum(dtype=np.int64))
+    return Baked(
+        colors,
+        views,
+        len(plans),
+        spread,
+        bool((gains != 1.0).any()),
+        float(rejected.sum(dtype=np.int64)) / max(offered, 1),
+    )
+
+
+def _view(
+    photos: Photos, index: int, divisor: int, surface: SurfaceArrays, threads: int
+) -> PhotoView:
+    camera = photos.camera(index, divisor)
+    mask = photos.mask(index, divisor)
+    return PhotoView(
+        camera,
+        photos.camera(index, 1).fx,
+        pyramid(photos.photo(index, divisor)),
+        np.ones((1, 1), np.bool_) if mask is None else mask,
+        photo_visibility(surface.vertices, surface.faces, camera, threads),
+    )
+
+
+def _exposure(
+    points: SurfacePoints,
+    surface: SurfaceArrays,
+    photos: Photos,
+    count: int,
+    progress: Progress,
+    threads: int,
+) -> tuple[list[_Plan], np.ndarray, float]:
+    """Look at every photo coarsely: which see the mesh, at what level, with what exposure."""
+    wanted = max(1, min(EXPOSURE_POINTS, EXPOSURE_CELLS // max(count, 1), len(points)))
+    part = points.part(np.linspace(0, len(points) - 1, wanted).astype(np.int64))
+    colors = np.zeros((wanted, count, 3), np.uint8)
+    valid = np.zeros((wanted, count), np.bool_)
+    plans = []
+    for index in range(count):
+        progress.update(index / count, f"texture: looking at photo {index + 1} of {count}")
+        full = photos.camera(index, 1)
+        coarse = max(1, math.ceil(max(full.width, full.height) / COARSE_LONG_SIDE_PX))
+        coarse = min(coarse, full.width, full.height)
+        view = _view(photos, index, coarse, surface, threads)
+        hit = view.visibility.depth[np.isfinite(view.visibility.depth)]
+        if len(hit) == 0:
+            continue
+        # At this level a texel near the camera still has one pixel.
+        near = float(np.percentile(hit, 2.0))
+        divisor = max(1, int(full.fx * surface.texel_size / near))
+        plans.append(_Plan(index, min(divisor, full.width, full.height)))
+        weights = np.zeros((wanted, 1), np.float32)
+        one = np.zeros((wanted, 1, 3), np.uint8)
+        sample_photo(part, surface, view, np.ones(3), weights, one, threads)
+        valid[:, index] = weights[:, 0] > 0
+        colors[:, index] = one[:, 0]
+    gains, spread = solve_gains(colors, valid)
+    return plans, gains, spread
+
+
+def _blend_block(
+    weights: np.ndarray,
+    kept: np.ndarray,
+    colors: np.ndarray,
+    views: np.ndarray,
+    rejected: np.ndarray,
+    threads: int,
+) -> None:
+    def chunk(begin: int, end: int) -> None:
+        _blend(weights, kept, begin, end, colors, views, rejected)
+
+    run_chunks(chunk, even_bounds(len(weights), threads, 16), threads)
+
+
+@kernel(fast=False)
+def _blend(
+    weights: Any, kept: Any, begin: int, end: int, colors: Any, views: Any, rejected: Any
+) -> None:
+    slots = weights.shape[1]
+    order = np.empty(slots, np.int64)
+    share = np.empty(slots)
+    distance = np.empty(slots)
+    sorted_distance = np.empty(slots)
+    median = np.empty(3)
+    values, ranked, mass = np.empty(slots), np.empty(slots), np.empty(slots)
+    for i in range(begin, end):
+        count = 0
+        best = 0.0
+        for k in range(slots):
+            if weights[i, k] > 0.0:
+                order[count] = k
+                count += 1
+                best = max(best, float(weights[i, k]))
+        if count == 0:
+            continue
+        for j in range(count):
+            share[j] = weights[i, order[j]] / best
+        limit = np.inf
+        if count >= 3:
+            for channel in range(3):
+                for j in range(count):
+                    values[j] = kept[i, order[j], channel]
+                median[channel] = _weighted_median(values, share, count, ranked, mass)
+            for j in range(count):
+                far = 0.0
+                for channel in range(3):
+                    far = max(far, abs(kept[i, order[j], channel] - median[channel]))
+                distance[j] = far
+                place = j
+                while place > 0 and sorted_distance[place - 1] > far:
+                    sorted_distance[place] = sorted_distance[place - 1]
+                    place -= 1
+                sorted_distance[place] = far
+            limit = max(OUTLIER_FLOOR, OUTLIER_FACTOR * sorted_distance[(count - 1) // 2])
+        red, green, blue, total = 0.0, 0.0, 0.0, 0.0
+        used = 0
+        for j in range(count):
+            if count >= 3 and distance[j] > limit:
+                rejected[i] += 1
+                continue
+            weight = share[j] ** SHARPNESS
+            red += weight * kept[i, order[j], 0]
+            green += weight * kept[i, order[j], 1]
+            blue += weight * kept[i, order[j], 2]
+            total += weight
+            used += 1
+        colors[i, 0] = int(red / total + 0.5)
+        colors[i, 1] = int(green / total + 0.5)
+        colors[i, 2] = int(blue / total + 0.5)
+        views[i] = used
+
+
+@kernel(fast=False)
+def _weighted_median(values: Any, share: Any, count: int, ranked: Any, mass: Any) -> float:
+    """Insertion sort into the scratch arrays, then the value at half of the weight."""
+    total = 0.0
+    for j in range(count):
+        value, weight = values[j], share[j]
+        total += weight
+        place = j
+        while place > 0 and ranked[place - 1] > value:
+            ranked[place] = ranked[place - 1]
+            mass[place] = mass[place - 1]
+            place -= 1
+        ranked[place] = value
+        mass[place] = weight
+    running = 0.0
+    for j in range(count):
+        running += mass[j]
+        if running >= 0.5 * total:
+            return ranked[j]
+    return ranked[count - 1]

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Write textured meshes: arrays for Blender, PLY, OBJ, GLB, and where their coordinates lie.
+
+| file | coordinates |
+|---|---|
+| ``mesh.npz`` | scene frame, float64 |
+| ``mesh.ply`` | world, double |
+| ``mesh.obj`` | world minus ``offset``, world axes |
+| ``mesh.glb`` | world minus ``offset``, turned from Z up to Y up (x, z, -y), float32 |
+
+``offset`` is 0 unless the mesh lies so far from the origin that float32 would show; it is written
+to ``transform.json`` and into the GLB's node.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..dataset.similarity import Similarity
+from ..errors import MeshingError, ResourceError, UsageError
+from ..files import write_bytes, write_json
+from .glb import glb_bytes
+from .textured_mesh import TexturedMesh
+
+FORMATS = ("glb", "obj", "ply")
+FAR_FROM_ORIGIN = 100.0
+"""Further than this many sizes from the origin, float32 rounding passes 1e-5 of the size."""
+
+
+def write_mesh_ply(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None = None
+) -> None:
+    """Write a binary little-endian PLY with double coordinates.
+
+    Parameters
+    ----------
+    path : Path
+        Its folder must exist.
+    vertices : (v, 3) float64
+        World coordinates; stored without loss.
+    faces : (f, 3) int32
+    colors : (v, 3) uint8 or None
+
+    Raises
+    ------
+    MeshingError
+        Not finite, no faces, or an index out of range.
+    ResourceError
+        The file cannot be written.
+    """
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+    _check(vertices, faces)
+    fields = [(axis, "<f8") for axis in "xyz"]
+    names = ["property double x", "property double y", "property double z"]
+    if colors is not None:
+        fields += [(channel, "u1") for channel in ("red", "green", "blue")]
+        names += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    rows = np.empty(len(vertices), np.dtype(fields))
+    for column, axis in enumerate("xyz"):
+        rows[axis] = vertices[:, column]
+    if colors is not None:
+        for column, channel in enumerate(("red", "green", "blue")):
+            rows[channel] = colors[:, column]
+    triangles = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", (3,))]))
+    triangles["count"] = 3
+    triangles["corners"] = faces
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *names,
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    ]
+    data = "\n".join(header).encode() + rows.tobytes() + triangles.tobytes()
+    with _writing(path):
+        write_bytes(path, data)
+
+
+def write_obj(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, image_name: str
+) -> None:
+    """Write ``path`` and its ``.mtl`` beside it, which names an image in the same folder.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+    faces : (f, 3) int32
+    corner_uvs : (f, 3, 2) float32
+        v upwards, as OBJ wants it.
+    image_name : str
+        Without spaces, which OBJ readers do not agree on.
+    """
+    _check(vertices, faces)
+    if any(c.isspace() for c in image_name + path.name):
+        raise UsageError(f"OBJ files cannot name {image_name!r}.", "Use a name without spaces.")
+    uvs, corner = np.unique(corner_uvs.reshape(-1, 2), axis=0, return_inverse=True)
+    corner = corner.reshape(-1, 3) + 1
+    table = np.stack([faces + 1, corner], axis=2).reshape(-1, 6)
+    text = io.StringIO()
+    text.write(f"mtllib {path.stem}.mtl\no {path.stem}\n")
+    np.savetxt(text, vertices, fmt="v %.9g %.9g %.9g")
+    np.savetxt(text, uvs, fmt="vt %.7f %.7f")
+    text.write("usemtl albedo\n")
+    np.savetxt(text, table, fmt="f %d/%d %d/%d %d/%d")
+    material = f"newmtl albedo\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {image_name}\n"
+    with _writing(path):
+        write_bytes(path.with_suffix(".mtl"), material.encode())
+        write_bytes(path, text.getvalue().encode())
+
+
+def write_glb(
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    corner_uvs: np.ndarray,
+    png: bytes,
+    offset: np.ndarray,
+) -> None:
+    """Write a binary glTF with the image inside; see :func:`.glb.glb_bytes`."""
+    _check(vertices, faces)
+    with _writing(path):
+        write_bytes(path, glb_bytes(vertices, faces, corner_uvs, png, offset))
+
+
+def write_textured(
+    textured: TexturedMesh,
+    folder: Path,
+    formats: tuple[str, ...],
+    world_from_scene: Similarity,
+) -> None:
+    """Write ``mesh.npz``, ``albedo.png``, ``mesh.ply``, ``transform.json`` and the formats asked.
+
+    Parameters
+    ----------
+    textured : TexturedMesh
+        Scene frame.
+    folder : Path
+        Made when missing.
+    formats : tuple of str
+        Among ``"glb"``, ``"obj"``, ``"ply"`` (always written).
+    world_from_scene : Similarity
+        Leads to the world frame of the input.
+
+    Raises
+    ------
+    MeshingError
+        The mesh is empty or not finite.
+    UsageError
+        A format that is not written here.
+    ResourceError
+        The folder cannot be written.
+    """
+    unknown = sorted(set(formats) - set(FORMATS))
+    if unknown:
+        raise UsageError(f"There is no export {unknown[0]!r} here.", f"Use {', '.join(FORMATS)}.")
+    mesh = textured.mesh
+    _check(mesh.vertices, mesh.faces)
+    if not np.isfinite(textured.corner_uvs).all():
+        raise MeshingError("The mesh has UVs that are not finite.", "Texture the region again.")
+    world = world_from_scene.points(mesh.vertices)
+    offset = file_offset(world)
+    png = png_bytes(textured.albedo)
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        stream = io.BytesIO()
+        np.savez(
+            stream,
+            vertices=np.asarray(mesh.vertices, np.float64),
+            faces=np.asarray(mesh.faces, np.int32),
+            corner_uvs=np.asarray(textured.corner_uvs, np.float32),
+        )
+        write_bytes(folder / "mesh.npz", stream.getvalue())
+        write_bytes(folder / "albedo.png", png)
+        write_json(
+            folder / "transform.json",
+            {
+                "version": 1,
+                "offset": offset.tolist(),
+                "world_from_scene": world_from_scene.to_json(),
+                "frames": {
+                    "mesh.npz": "scene",
+                    "mesh.ply": "world",
+                    "mesh.obj": "world = file + offset",
+                    "mesh.glb": "world = (x, -z, y) of the file + offset",
+                },
+            },
+        )
+    write_mesh_ply(folder / "mesh.ply", world, mesh.faces, vertex_colors(textured))
+    local = world - offset
+    if "obj" in formats:
+        write_obj(folder / "mesh.obj", local, mesh.faces, textured.corner_uvs, "albedo.png")
+    if "glb" in formats:
+        write_glb(folder / "mesh.glb", local, mesh.faces, textured.corner_uvs, png, offset)
+
+
+def file_offset(world: np.ndarray) -> np.ndarray:
+    """Return the (3,) float64 that files in float32 leave out: 0, or whole units near the centre."""
+    low, high = world.min(axis=0), world.max(axis=0)
+    size = float((high - low).max())
+    centre = 0.5 * (low + high)
+    if np.abs(centre).max() <= FAR_FROM_ORIGIN * size:
+        return np.zeros(3)
+    return np.round(centre) if size > 1.0 else centre
+
+
+def vertex_colors(textured: TexturedMesh) -> np.ndarray:
+    """Return (v, 3) uint8 means of the texture at the corners of each vertex."""
+    size = textured.albedo.shape[0]
+    texels = np.asarray(textured.corner_uvs, np.float64).reshape(-1, 2) * size
+    column = np.floor(texels[:, 0]).clip(0, size - 1).astype(np.int64)
+    row = np.floor(size - texels[:, 1]).clip(0, size - 1).astype(np.int64)
+    values = textured.albedo[row, column].astype(np.float64)  # (3 f, 3)
+    corner = np.asarray(textured.mesh.faces).ravel()
+    count = np.bincount(corner, minlength=len(textured.mesh.vertices))
+    sums = [np.bincount(corner, values[:, c], len(count)) for c in range(3)]
+    return np.rint(np.stack(sums, axis=1) / np.maximum(count, 1)[:, None]).astype(np.uint8)
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """Encode (h, w, 3) uint8 as PNG."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, format="PNG", compress_level=4)
+    return stream.getvalue()
+
+
+def _check(vertices: np.ndarray, faces: np.ndarray) -> None:
+    if len(faces) == 0 or len(vertices) == 0:
+        raise MeshingError("The mesh to write has no faces.", "Choose a region with a surface.")
+    if not np.isfinite(vertices).all():
+        first = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        raise MeshingError(
+            f"Vertex {first} of the mesh to write is not finite.", "Mesh the region again."
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshingError("A face names a vertex that does not exist.", "Mesh the region again.")
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ResourceError(
+            f"{path} cannot be written: {error.strerror or error}.",
+            "Check that the folder exists, is not read-only, and that the disk has room.",
+        ) from error

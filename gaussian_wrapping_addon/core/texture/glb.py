@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One textured mesh as binary glTF 2.0 (Y up, image embedded, shadeless)."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+from .face_graph import vertex_normals
+
+_MAGIC = 0x46546C67
+_JSON_CHUNK = 0x4E4F534A
+_BINARY_CHUNK = 0x004E4942
+_FLOAT, _UINT32 = 5126, 5125
+_ARRAY_BUFFER, _INDEX_BUFFER = 34962, 34963
+
+
+def glb_bytes(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    corner_uvs: np.ndarray,
+    png: bytes,
+    offset: np.ndarray,
+) -> bytes:
+    """Build the file.
+
+    Photos hold their own light, so the material is ``KHR_materials_unlit``, with an ordinary
+    rough material for readers that do not know it.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+        Z up, near the origin; written as (x, z, -y).
+    faces : (f, 3) int32
+    corner_uvs : (f, 3, 2) float32
+        v upwards; glTF's v points down.
+    png : bytes
+        The texture.
+    offset : (3,) float64
+        What was taken off the world coordinates; kept in the node's extras.
+    """
+    corner_vertex = np.asarray(faces, np.int64).ravel()
+    uvs = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
+    # One glTF vertex for each pair of vertex and UV.
+    key = np.empty(len(uvs), np.dtype([("vertex", "<i8"), ("uv", "<u8")]))
+    key["vertex"] = corner_vertex
+    key["uv"] = np.ascontiguousarray(uvs).view(np.uint64)[:, 0]
+    _, first, index = np.unique(key, return_index=True, return_inverse=True)
+    owner = corner_vertex[first]
+    positions = _y_up(vertices)[owner].astype("<f4")
+    normals = _unit(_y_up(vertex_normals(vertices, faces)))[owner].astype("<f4")
+    coordinates = np.stack([uvs[first, 0], 1.0 - uvs[first, 1]], axis=1).astype("<f4")
+    parts = [positions.tobytes(), normals.tobytes(), coordinates.tobytes()]
+    parts += [index.astype("<u4").tobytes(), png]
+    views: list[dict[str, Any]] = []
+    binary = bytearray()
+    targets = (_ARRAY_BUFFER, _ARRAY_BUFFER, _ARRAY_BUFFER, _INDEX_BUFFER, None)
+    for part, target in zip(parts, targets, strict=True):
+        view = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(part)}
+        views.append(view if target is None else {**view, "target": target})
+        binary += part + b"\0" * (-len(part) % 4)
+    count = len(first)
+    document = {
+        "asset": {"version": "2.0", "generator": "Gaussian Wrapping for Blender"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"mesh": 0, "name": "mesh", "extras": {"world_offset": np.asarray(offset).tolist()}}
+        ],
+        "meshes": [
+            {
+                "name": "mesh",
+                "primitives": [
+                    {
+                        "attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2},
+                        "indices": 3,
+                        "material": 0,
+                    }
+                ],
+            }
+        ],
+        "materials": [
+            {
+                "name": "albedo",
+                "pbrMetallicRoughness": {
+                    "baseColorTexture": {"index": 0},
+                    "metallicFactor": 0.0,
+                    "roughnessFactor": 1.0,
+                },
+                "extensions": {"KHR_materials_unlit": {}},
+            }
+        ],
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
+        "images": [{"name": "albedo", "mimeType": "image/png", "bufferView": 4}],
+        "accessors": [
+            {
+                **_accessor(0, _FLOAT, count, "VEC3"),
+                "min": positions.min(axis=0).tolist(),
+                "max": positions.max(axis=0).tolist(),
+            },
+            _accessor(1, _FLOAT, count, "VEC3"),
+            _accessor(2, _FLOAT, count, "VEC2"),
+            _accessor(3, _UINT32, len(index), "SCALAR"),
+        ],
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(binary)}],
+    }
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    length = 12 + 8 + len(text) + 8 + len(binary)
+    return b"".join(
+        [
+            struct.pack("<III", _MAGIC, 2, length),
+            struct.pack("<II", len(text), _JSON_CHUNK),
+            text,
+            struct.pack("<II", len(binary), _BINARY_CHUNK),
+            bytes(binary),
+        ]
+    )
+
+
+def _y_up(values: np.ndarray) -> np.ndarray:
+    return np.stack([values[:, 0], values[:, 2], -values[:, 1]], axis=1)
+
+
+def _unit(normals: np.ndarray) -> np.ndarray:
+    """glTF wants unit length everywhere: vertices without a normal get one."""
+    missing = np.linalg.norm(normals, axis=1) < 0.5
+    return np.where(missing[:, None], [0.0, 1.0, 0.0], normals)
+
+
+def _accessor(view: int, component: int, count: int, kind: str) -> dict[str, Any]:
+    return {"bufferView": view, "componentType": component, "count": count, "type": kind}

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Sample one photo at many surface points: facing, in the image, not masked, not hidden."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..compiled import inline, kernel
+from ..dataset.camera import Camera
+from ..parallel import even_bounds, run_chunks
+from .face_graph import vertex_normals
+from .sampling import Pyramid, trilinear
+from .visibility import PhotoVisibility, is_hidden
+
+MIN_COSINE = 0.2
+"""Views more grazing than 78 degrees are not used."""
+CLEAR_PX = 4.0
+"""Views count in full from this distance to a silhouette, where pose errors mix two surfaces."""
+CLEAR_FLOOR = 0.02
+"""Things thinner than that still take the best there is."""
+BORDER_SHARE = 0.04
+"""Weights fade over this share of the image side towards its border."""
+BORDER_FLOOR = 0.02
+MAX_USEFUL_PX = 1.5
+"""A photo with more pixels a texel than this is no better."""
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points on faces of a mesh."""
+
+    face: np.ndarray
+    """(n,) int32."""
+    bary: np.ndarray
+    """(n, 2) float32 weights of the first two corners."""
+
+    def __len__(self) -> int:
+        return len(self.face)
+
+    def part(self, rows: Any) -> SurfacePoints:
+        """Return some of the points."""
+        return SurfacePoints(self.face[rows], self.bary[rows])
+
+
+@dataclass(frozen=True)
+class SurfaceArrays:
+    """What kernels need of a mesh."""
+
+    vertices: np.ndarray
+    """(v, 3) float64."""
+    faces: np.ndarray
+    """(f, 3) int32."""
+    face_normals: np.ndarray
+    """(f, 3) float64."""
+    vertex_normals: np.ndarray
+    """(v, 3) float64."""
+    texel_size: float
+    """Side of a texel on the surface, scene units."""
+
+    @classmethod
+    def of(
+        cls, vertices: np.ndarray, faces: np.ndarray, face_normals: np.ndarray, texel_size: float
+    ) -> SurfaceArrays:
+        """Fill in the vertex normals."""
+        return cls(vertices, faces, face_normals, vertex_normals(vertices, faces), texel_size)
+
+
+@dataclass(frozen=True)
+class PhotoView:
+    """One photo at one level, ready to be sampled."""
+
+    camera: Camera
+    focal_px: float
+    """Focal length at full resolution, which decides how good the photo can be."""
+    image: Pyramid
+    mask: np.ndarray
+    """(h, w) bool; (1, 1) true where there is none."""
+    visibility: PhotoVisibility
+
+
+def sample_photo(
+    points: SurfacePoints,
+    surface: SurfaceArrays,
+    view: PhotoView,
+    gain: np.ndarray,
+    weights: np.ndarray,
+    colors: np.ndarray,
+    threads: int,
+) -> None:
+    """Offer the photo's colours to every point; each keeps the k best.
+
+    Parameters
+    ----------
+    gain : (3,) float64
+        Factors of the photo's channels.
+    weights : (n, k) float32
+        Changed in place; 0 marks a free place.
+    colors : (n, k, 3) uint8
+        Changed in place.
+    """
+    camera = view.camera
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    pose = np.ascontiguousarray(camera.cam_from_world, np.float64)
+
+    def chunk(begin: int, end: int) -> None:
+        _sample(
+            points.face,
+            points.bary,
+            begin,
+            end,
+            surface.vertices,
+            surface.faces,
+            surface.face_normals,
+            surface.vertex_normals,
+            surface.texel_size,
+            pose,
+            intrinsics,
+            view.focal_px,
+            view.visibility.depth,
+            view.visibility.clearance,
+            view.mask,
+            view.image.pixels,
+            view.image.levels,
+            gain,
+            weights,
+            colors,
+        )
+
+    run_chunks(chunk, even_bounds(len(points), threads, 16), threads)
+
+
+@inline
+def _fade(distance: float, width: float, floor: float) -> float:
+    return min(max(distance / width, floor), 1.0)
+
+
+@kernel(fast=False)
+def _sample(
+    point_face: Any,
+    point_bary: Any,
+    begin: int,
+    end: int,
+    vertices: Any,
+    faces: Any,
+    face_normals: Any,
+    corner_normals: Any,
+    texel_size: float,
+    pose: Any,
+    intrinsics: Any,
+    focal_px: float,
+    depth: Any,
+    clearance: Any,
+    mask: Any,
+    pixels: Any,
+    levels: Any,
+    gain: Any,
+    weights: Any,
+    colors: Any,
+) -> None:
+    height, width = depth.shape
+    has_mask = mask.shape[0] == height and mask.shape[1] == width
+    kept = weights.shape[1]
+    for i in range(begin, end):
+        face = point_face[i]
+        l0, l1 = np.float64(point_bary[i, 0]), np.float64(point_bary[i, 1])
+        l2 = 1.0 - l0 - l1
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        wx = l0 * vertices[a, 0] + l1 * vertices[b, 0] + l2 * vertices[c, 0]
+        wy = l0 * vertices[a, 1] + l1 * vertices[b, 1] + l2 * vertices[c, 1]
+        wz = l0 * vertices[a, 2] + l1 * vertices[b, 2] + l2 * vertices[c, 2]
+        z = pose[2, 0] * wx + pose[2, 1] * wy + pose[2, 2] * wz + pose[2, 3]
+        if not z > 0.0:
+            continue
+        x = pose[0, 0] * wx + pose[0, 1] * wy + pose[0, 2] * wz + pose[0, 3]
+        y = pose[1, 0] * wx + pose[1, 1] * wy + pose[1, 2] * wz + pose[1, 3]
+        u = intrinsics[0] * x / z + intrinsics[2]
+        v = intrinsics[1] * y / z + intrinsics[3]
+        if not (u >= 0.5 and v >= 0.5 and u <= width - 0.5 and v <= height - 0.5):
+            continue
+        # Facing: the face itself gates, the smooth normal keeps noise out of the weight.
+        fx, fy, fz = face_normals[face, 0], face_normals[face, 1], face_normals[face, 2]
+        nx = pose[0, 0] * fx + pose[0, 1] * fy + pose[0, 2] * fz
+        ny = pose[1, 0] * fx + pose[1, 1] * fy + pose[1, 2] * fz
+        nz = pose[2, 0] * fx + pose[2, 1] * fy + pose[2, 2] * fz
+        distance = np.sqrt(x * x + y * y + z * z)
+        cosine = -(nx * x + ny * y + nz * z) / distance
+        if cosine < MIN_COSINE:
+            continue
+        sx = l0 * corner_normals[a, 0] + l1 * corner_normals[b, 0] + l2 * corner_normals[c, 0]
+        sy = l0 * corner_normals[a, 1] + l1 * corner_normals[b, 1] + l2 * corner_normals[c, 1]
+        sz = l0 * corner_normals[a, 2] + l1 * corner_normals[b, 2] + l2 * corner_normals[c, 2]
+        gx = pose[0, 0] * sx + pose[0, 1] * sy + pose[0, 2] * sz
+        gy = pose[1, 0] * sx + pose[1, 1] * sy + pose[1, 2] * sz
+        gz = pose[2, 0] * sx + pose[2, 1] * sy + pose[2, 2] * sz
+        length = np.sqrt(gx * gx + gy * gy + gz * gz)
+        smooth = -(gx * x + gy * y + gz * z) / (distance * length) if length > 1e-12 else cosine
+        angle = 0.5 * (cosine + max(smooth, 0.0))
+        useful = min(focal_px * texel_size / z, MAX_USEFUL_PX)
+        weight = (angle * useful) ** 2
+        ix, iy = int(u), int(v)
+        weight *= _fade(np.float64(clearance[iy, ix]), CLEAR_PX, CLEAR_FLOOR)
+        border = min(min(u, width - u) / width, min(v, height - v) / height)
+        weight *= _fade(border, BORDER_SHARE, BORDER_FLOOR)
+        # The worst of the kept views goes; a tie keeps the earlier photo.
+        slot = 0
+        for k in range(1, kept):
+            if weights[i, k] < weights[i, slot]:
+                slot = k
+        if np.float32(weight) <= weights[i, slot]:
+            continue
+        plane = nx * x + ny * y + nz * z
+        if is_hidden(depth, u, v, intrinsics, nx, ny, nz, plane, z):
+            continue
+        if has_mask:
+            jx, jy = int(u - 0.5), int(v - 0.5)
+            kx, ky = min(jx + 1, width - 1), min(jy + 1, height - 1)
+            if not (mask[jy, jx] and mask[jy, kx] and mask[ky, jx] and mask[ky, kx]):
+                continue
+        level = np.log2(max(intrinsics[0] * texel_size / z, 1.0))
+        red, green, blue = trilinear(pixels, levels, level, u, v)
+        weights[i, slot] = weight
+        colors[i, slot, 0] = int(min(red * gain[0], 255.0) + 0.5)
+        colors[i, slot, 1] = int(min(green * gain[1], 255.0) + 0.5)
+        colors[i, slot, 2] = int(min(blue * gain[2], 255.0) + 0.5)

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From a mesh and photos to a textured mesh: unwrap, bake, fill, count."""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import limits
+from ..dataset.scene import Scene
+from ..errors import MeshingError, UsageError
+from ..meshing.surface_mesh import SurfaceMesh
+from ..progress import Progress
+from ..settings import TextureSettings
+from .atlas_raster import AtlasRaster, raster_atlas
+from .bake import Baked, Photos, bake
+from .face_graph import face_graph
+from .fill import (
+    RING_TEXELS,
+    continue_over_surface,
+    fill_background,
+    grow,
+    surface_positions,
+)
+from .photo_samples import SurfaceArrays, SurfacePoints
+from .texture_size import automatic_size
+from .textured_mesh import TexturedMesh
+from .unwrap import Unwrap, unwrap
+
+_logger = logging.getLogger(__name__)
+
+
+def texture_mesh(
+    mesh: SurfaceMesh,
+    scene: Scene,
+    photos: Photos,
+    settings: TextureSettings,
+    work_folder: Path,
+    progress: Progress,
+    *,
+    threads: int,
+) -> TexturedMesh:
+    """Unwrap a mesh and bake its texture from the photos (method.md 8).
+
+    Parameters
+    ----------
+    mesh : SurfaceMesh
+        In the scene frame.
+    scene : Scene
+        Whose views the photos are.
+    photos : PhotoStore
+        Anything with ``camera``, ``photo`` and ``mask`` by index and divisor.
+    settings : TextureSettings
+        ``size_px = 0`` chooses the size from the photos' footprint.
+    work_folder : Path
+        For a temporary sub-folder of the unwrap.
+    progress : Progress
+        Span of this step.
+    threads : int
+        Threads to use; the result does not depend on it.
+
+    Raises
+    ------
+    MeshingError
+        The mesh has no face with area, a vertex that is not finite, or an index out of range.
+    UsageError
+        The size is out of range.
+    """
+    check_mesh(mesh)
+    if settings.size_px < 0 or settings.size_px > limits.MAX_TEXTURE_SIDE_PX:
+        raise UsageError(
+            f"A texture of {settings.size_px} pixels is out of range.",
+            f"Give 0 (automatic) or up to {limits.MAX_TEXTURE_SIDE_PX}.",
+        )
+    graph = face_graph(mesh.vertices, mesh.faces)
+    count = len(scene.views)
+    size_px = settings.size_px or automatic_size(graph, photos, count)
+    progress.update(0.0, f"unwrapping for {size_px} x {size_px} texels")
+    unwrapped = unwrap(
+        mesh, size_px, settings.gutter_px, work_folder, progress.span(0.0, 0.3), threads=threads
+    )
+    raster = raster_atlas(unwrapped.corner_uvs, size_px, threads)
+    texels = np.flatnonzero(raster.face.ravel() >= 0)
+    points = SurfacePoints(
+        raster.face.ravel()[texels], raster.bary.reshape(-1, 2)[texels].astype(np.float32)
+    )
+    texel_size = math.sqrt(float(graph.areas.sum()) / max(int(raster.inside.sum()), 1))
+    surface = SurfaceArrays.of(
+        np.ascontiguousarray(mesh.vertices, np.float64),
+        np.ascontiguousarray(mesh.faces, np.int32),
+        graph.normals,
+        texel_size,
+    )
+    baked = bake(points, surface, photos, count, progress.span(0.3, 0.9), threads=threads)
+    progress.update(0.9, "filling what no photo saw")
+    albedo = _image(size_px, texels, points, surface, baked, raster, unwrapped, settings.gutter_px)
+    statistics = _statistics(size_px, settings, unwrapped, raster, points, baked, graph.areas)
+    if statistics["texels_seen"] == 0:
+        _logger.warning("no photo sees the mesh: its texture is plain grey")
+    progress.update(1.0, f"texture: {100 * statistics['coverage']:.1f} % seen by photos")
+    return TexturedMesh(mesh, unwrapped.corner_uvs, albedo, statistics)
+
+
+def check_mesh(mesh: SurfaceMesh) -> None:
+    """Refuse what cannot be unwrapped or written (conventions.md D.5, 46 and 49)."""
+    hint = "Mesh the region again, or report the job."
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if len(faces) == 0 or len(vertices) == 0:
+        raise MeshingError("The mesh has no faces.", "Choose a region that holds a surface.")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshingError("A face of the mesh names a vertex that does not exist.", hint)
+    finite = np.isfinite(vertices).all(axis=1)
+    if not finite.all():
+        first = int(np.flatnonzero(~finite)[0])
+        raise MeshingError(
+            f"{int((~finite).sum())} vertices of the mesh are not finite, the first is {first}.",
+            hint,
+        )
+    corners = vertices[faces].astype(np.float64)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if not (np.abs(cross).max() > 0 and np.isfinite(cross).all()):
+        raise MeshingError("No face of the mesh has an area.", hint)
+
+
+def _image(
+    size_px: int,
+    texels: np.ndarray,
+    points: SurfacePoints,
+    surface: SurfaceArrays,
+    baked: Baked,
+    raster: AtlasRaster,
+    unwrapped: Unwrap,
+    gutter_px: int,
+) -> np.ndarray:
+    """Put the colours into the image; fill unseen texels, gutters and the rest."""
+    seen = baked.views > 0
+    image = np.zeros((size_px, size_px, 3), np.uint8)
+    image.reshape(-1, 3)[texels] = baked.colors
+    chart = np.where(raster.face >= 0, unwrapped.charts[raster.face], -1).astype(np.int32)
+    ring = np.full((size_px, size_px), -1, np.int16)
+    ring.ravel()[texels[seen]] = 0
+    if not seen.all():
+        grow(image, ring, chart, RING_TEXELS, inside=True)
+        unseen = texels[~seen]
+        far = continue_over_surface(surface_positions(points, surface), baked.colors, seen)
+        number = ring.ravel()[unseen].astype(np.float32)
+        share = np.where(number < 0, 1.0, number / (RING_TEXELS + 1.0))[:, None]
+        near = image.reshape(-1, 3)[unseen]
+        image.reshape(-1, 3)[unseen] = np.rint(near + share * (far - near)).astype(np.uint8)
+    ring.ravel()[texels] = 0
+    grow(image, ring, chart, gutter_px, inside=False)
+    fill_background(image, ring >= 0)
+    return image
+
+
+def _statistics(
+    size_px: int,
+    settings: TextureSettings,
+    unwrapped: Unwrap,
+    raster: AtlasRaster,
+    points: SurfacePoints,
+    baked: Baked,
+    areas: np.ndarray,
+) -> dict[str, Any]:
+    seen = baked.views > 0
+    with_texel = np.zeros(len(areas), np.bool_)
+    with_texel[points.face] = True
+    face_seen = np.zeros(len(areas), np.bool_)
+    face_seen[points.face[seen]] = True
+    used, texels_seen = len(points), int(seen.sum())
+    return {
+        "size_px": size_px,
+        "size_automatic": settings.size_px == 0,
+        "unwrap": unwrapped.method,
+        "unwrap_fallback_reason": unwrapped.reason,
+        "charts": int(unwrapped.charts.max()) + 1,
+        "gutter_px": round(unwrapped.gutter_px, 2),
+        "utilisation": used / size_px**2,
+        "texels_used": used,
+        "texels_seen": texels_seen,
+        "texels_filled": used - texels_seen,
+        "texels_overlapping": raster.overlaps,
+        "coverage": texels_seen / max(used, 1),
+        "faces_seen_share": float(face_seen.sum()) / max(int(with_texel.sum()), 1),
+        "area_seen_share": float(areas[face_seen].sum() / areas.sum()),
+        "faces_without_texel": int((~with_texel).sum()),
+        "views_per_seen_texel": float(baked.views[seen].mean()) if texels_seen else 0.0,
+        "views_rejected_share": baked.rejected_share,
+        "photos_used": baked.photos_used,
+        "exposure_spread": baked.gain_spread,
+        "exposure_corrected": baked.gains_applied,
+    }
