@@ -16,12 +16,14 @@ RADIUS_MARGIN = 1.1
 """The largest camera distance times this becomes ``SCENE_RADIUS`` (method.md 1.7)."""
 FAR_CAMERA_FACTOR = 30.0
 """A camera this many median distances from the median position was solved wrongly."""
-_SAME_PLACE = 1e-9
+_SAME_PLACE = 1e-12
 """Share of the coordinates' size below which positions cannot be told apart in float64."""
 _LEVEL_TILT = 0.15
 """Mean |sin| of the angle between level camera axes and the horizon: about 9 degrees."""
-_SPREAD = 0.1
-"""Smallest share of the middle eigenvalue that makes two horizontal directions of one."""
+_SPREAD = 0.03
+"""Smallest share of the middle eigenvalue in the largest: directions fan out by 20 degrees."""
+_CLEAR = 0.2
+"""Largest share of the smallest eigenvalue in the middle one: the plane is clear of the noise."""
 _FLAT = 0.05
 """Thickness over width of a camera path that counts as plane."""
 _AGREE = np.cos(np.radians(50.0))
@@ -128,7 +130,8 @@ def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray
     rights = rotations[:, 0, :]  # (n, 3)
     level, values = _least_aligned(rights)
     tilt = float(np.median(np.abs(rights @ level)))
-    if values[1] > _SPREAD * values[2] and tilt < _LEVEL_TILT and abs(level @ guess) > _AGREE:
+    fans_out = values[1] > _SPREAD * values[2] and values[0] < _CLEAR * values[1]
+    if fans_out and tilt < _LEVEL_TILT and abs(level @ guess) > _AGREE:
         return _signed(level, guess), "level cameras"
     if len(offsets) >= 8:
         normal, values = _least_aligned(offsets)

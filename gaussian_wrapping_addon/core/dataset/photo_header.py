@@ -164,8 +164,10 @@ def _read_other(path: Path) -> PhotoHeader | None:
         return None
     try:
         with Image.open(path) as image:
-            orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
             width, height = image.size
+            if image.format == "TIFF":  # Pillow turns these upright itself, size included
+                return PhotoHeader(width, height)
+            orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
     except (UnidentifiedImageError, Image.DecompressionBombError):
         raise ValueError("no image format that is known") from None
     valid = isinstance(orientation, int) and 1 <= orientation <= 8

@@ -187,17 +187,18 @@ def _triangulate(folder: Path, task: dict[str, Any]) -> None:
     import pycolmap
 
     database = folder / "database.db"
+    photos_of_lens: dict[tuple[float, ...], list[str]] = {}
+    for photo in task["photos"]:
+        lens = (photo["width"], photo["height"], *photo["params"])
+        photos_of_lens.setdefault(lens, []).append(photo["name"])
     names_of_camera: dict[int, list[str]] = {}
     with pycolmap.Database.open(database) as db:
-        for photo in task["photos"]:
+        for (width, height, *params), names in photos_of_lens.items():
             camera = pycolmap.Camera(
-                model="PINHOLE",
-                width=photo["width"],
-                height=photo["height"],
-                params=photo["params"],
+                model="PINHOLE", width=int(width), height=int(height), params=params
             )
             camera.has_prior_focal_length = True
-            names_of_camera[db.write_camera(camera)] = [photo["name"]]
+            names_of_camera[db.write_camera(camera)] = names
     _extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES_POSED)
     _match(folder, database, task)
     pose_of_name = {p["name"]: np.array(p["cam_from_world"]) for p in task["photos"]}
