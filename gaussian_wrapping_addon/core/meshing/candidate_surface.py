@@ -100,9 +100,7 @@ def _probes(region: Region, margin: float, seed: int) -> np.ndarray:
     return points[region.distance(points) <= margin]
 
 
-def _near(
-    points: np.ndarray, tetrahedra: np.ndarray, region: Region, margin: float
-) -> np.ndarray:
+def _near(points: np.ndarray, tetrahedra: np.ndarray, region: Region, margin: float) -> np.ndarray:
     """Leave out tetrahedra that lie wholly beyond one face of the region."""
     normals, offsets = region.half_spaces
     kept = np.ones(len(tetrahedra), np.bool_)

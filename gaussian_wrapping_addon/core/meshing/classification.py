@@ -103,18 +103,17 @@ def classify(
     rows = np.flatnonzero(~outer & ~flat)
     for turn, extra in enumerate(ROUNDS):
         span = progress.span(0.8 * turn / len(ROUNDS), 0.8 * (turn + 1) / len(ROUNDS))
-        for step in range(extra):
-            for begin in range(0, len(rows), POINTS_PER_CHUNK):
-                part = rows[begin : begin + POINTS_PER_CHUNK]
-                span.update(
-                    (step + begin / len(rows)) / extra, f"classifying {len(rows)} tetrahedra"
-                )
-                weights = _interior_weights(len(part), turn == 0, rng)
-                where = np.einsum("kc,kcx->kx", weights, points[tetrahedra[part]])
-                value = vacancy(where).astype(np.float64)
-                total[part] += value
-                squares[part] += value**2
-                samples[part] += 1
+        size = max(1, POINTS_PER_CHUNK // extra)
+        for begin in range(0, len(rows), size):
+            span.update(begin / len(rows), f"classifying {len(rows)} tetrahedra")
+            part = rows[begin : begin + size]
+            weights = _interior_weights((extra, len(part)), turn == 0, rng)
+            where = np.einsum("ekc,kcx->ekx", weights, points[tetrahedra[part]])
+            # One call for all samples: it looks from every camera, however few the points.
+            value = vacancy(where.reshape(-1, 3)).reshape(extra, -1).astype(np.float64)
+            total[part] += value.sum(0)
+            squares[part] += (value**2).sum(0)
+            samples[part] += extra
         mean = total / np.maximum(samples, 1)
         inside = (mean <= tolerances.ISO_LEVEL) & ~outer
         near = np.abs(mean - tolerances.ISO_LEVEL) < DECIDED_MARGIN
@@ -141,7 +140,11 @@ class Sheet:
 
 
 def on_one_sheet(
-    points: np.ndarray, tetrahedra: np.ndarray, normals: np.ndarray, outer: np.ndarray, radius: float
+    points: np.ndarray,
+    tetrahedra: np.ndarray,
+    normals: np.ndarray,
+    outer: np.ndarray,
+    radius: float,
 ) -> Sheet:
     """Find flat tetrahedra: normals agree at all corners, and the edges run across them.
 
@@ -178,12 +181,14 @@ def on_one_sheet(
     return Sheet(rows, np.clip(height / radius, -1.0, 1.0))
 
 
-def _interior_weights(count: int, centroid: bool, rng: np.random.Generator) -> np.ndarray:
-    """Barycentric weights, (count, 4): the centroid, or uniform ones (Dirichlet(1, 1, 1, 1))."""
+def _interior_weights(
+    shape: tuple[int, int], centroid: bool, rng: np.random.Generator
+) -> np.ndarray:
+    """Barycentric weights, (*shape, 4): the centroid, or uniform ones (Dirichlet(1, 1, 1, 1))."""
     if centroid:
-        return np.full((count, 4), 0.25)
-    weights = rng.standard_exponential((count, 4))
-    return weights / weights.sum(1, keepdims=True)
+        return np.full((*shape, 4), 0.25)
+    weights = rng.standard_exponential((*shape, 4))
+    return weights / weights.sum(-1, keepdims=True)
 
 
 def _disagreeing(inside: np.ndarray, neighbours: np.ndarray) -> np.ndarray:

@@ -33,8 +33,9 @@ _logger = logging.getLogger(__name__)
 KIND_SPLIT = 3
 """Moved slightly off the isosurface, to keep parts apart that would touch."""
 
-DEGENERATE_SHARE = 1e-4
-"""Faces narrower than this share of the spacing are removed; far below what the field resolves."""
+DEGENERATE_SHARE = 1e-3
+"""Faces narrower than this share of the spacing are removed: collinear points on the region's edges
+have them, of either orientation."""
 
 
 def mesh_region(

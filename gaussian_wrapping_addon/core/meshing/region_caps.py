@@ -20,6 +20,9 @@ OVERSAMPLING = 5.0
 RIM_TOLERANCE_SHARE = 1e-3
 """Length of the bracket around the rim of a cap, in edge lengths."""
 
+INNER_RADII = 2.0
+"""Spacing inside a cap, in radii: it is flat."""
+
 # Corners first, then edges, rims, the inner part: what defines the shape stays.
 PRIORITY_CORNER, PRIORITY_EDGE, PRIORITY_RIM, PRIORITY_INNER = 0.0, 1.0, 2.0, 4.0
 
@@ -32,8 +35,10 @@ class Caps:
     """(n, 3) float64."""
     normals: np.ndarray
     """(n, 3) float64: outward normal of the face; zero on edges and corners."""
-    priority: np.ndarray
+    radii: np.ndarray
     """(n,) float64 for :func:`.sampling.thin`."""
+    priority: np.ndarray
+    """(n,) float64 for the same."""
 
 
 def cap_points(
@@ -80,8 +85,9 @@ def cap_points(
     all_points = np.concatenate([g[0] for g in groups])
     all_normals = np.concatenate([np.zeros_like(g[0]) if g[1] is None else g[1] for g in groups])
     priority = np.concatenate([np.full(len(g[0]), g[2]) for g in groups])
-    kept = thin(all_points, all_normals, np.full(len(all_points), radius), priority)
-    return Caps(all_points[kept], all_normals[kept], priority[kept])
+    radii = np.where(priority == PRIORITY_INNER, INNER_RADII * radius, radius)
+    kept = thin(all_points, all_normals, radii, priority)
+    return Caps(all_points[kept], all_normals[kept], radii[kept], priority[kept])
 
 
 def _face_samples(

@@ -78,9 +78,11 @@ def _parse_vertices(rows: Any, path: Path, hint: str) -> np.ndarray:
         raise ParseError(path, "vertices", "is missing or not a list.", hint)
     if len(rows) > limits.MAX_REGION_VERTICES:
         raise ParseError(
-            path, "vertices", f"holds {len(rows)} corners; {limits.MAX_REGION_VERTICES} is the most.",
+            path,
+            "vertices",
+            f"holds {len(rows)} corners; {limits.MAX_REGION_VERTICES} is the most.",
             "Use a simpler body, such as a box.",
-        )  # fmt: skip
+        )
     for index, row in enumerate(rows):
         if not isinstance(row, list) or len(row) != 3 or not all(map(_is_coordinate, row)):
             raise ParseError(path, f"vertices[{index}]", "is not three finite numbers.", hint)

@@ -128,7 +128,8 @@ def _wedges(
     # Seen along the axis (low -> high), a face that runs forward has the solid on the clockwise
     # side of its arm, so a wedge ends at it and begins at a backward one: pair each backward face
     # with the next forward one, like brackets, cyclically.
-    pairs, waiting = [], []
+    pairs: list[tuple[int, int]] = []
+    waiting: list[int] = []
     for slot in [*order, *order]:
         if len(pairs) * 2 == len(group):
             break
@@ -179,7 +180,8 @@ def _crowded(faces: np.ndarray) -> np.ndarray:
 
 def _one_per_face(bad: np.ndarray, partner: np.ndarray) -> np.ndarray:
     """Choose pairs (by their first half-edge) so that no face is split twice in one pass."""
-    chosen, busy = [], set()
+    chosen: list[int] = []
+    busy: set[int] = set()
     for h in np.flatnonzero(bad).tolist():
         other = int(partner[h])
         if h < other and h // 3 not in busy and other // 3 not in busy:

@@ -17,7 +17,14 @@ from .convex_region import Region
 from .marching_tetrahedra import bisect
 from .region_caps import cap_points
 from .resolution import Request, thinning_radius
-from .sampling import POINTS_PER_SQUARE, curvature, local_radii, sample_triangles, thin, triangle_normals
+from .sampling import (
+    POINTS_PER_SQUARE,
+    curvature,
+    local_radii,
+    sample_triangles,
+    thin,
+    triangle_normals,
+)
 
 KIND_SURFACE, KIND_CAP, KIND_JUMP = 0, 1, 2
 """On the isosurface; on the region's boundary; where vacancy jumps over 0.5 (the end of what the
@@ -36,6 +43,9 @@ SCOUTS = 20_000
 SCOUTS_PER_FACE = 5
 MOST_DENSE = 2.0
 """Curvature may multiply the number of points by this at most."""
+
+MAX_PROJECTION_STEPS = 14
+"""Nearly all points need two or three; each further batch looks from all cameras again."""
 
 SEARCH_SHARES = (0.25, -0.25, 0.5, -0.5, 1.0, -1.0)
 """Distances along the normal, in radii, at which a point without a crossing looks for one."""
@@ -97,7 +107,11 @@ class SurfaceSampler:
         normals = self._normals_at(points, self._normals[face])
         progress.update(0.2, f"moving {len(points)} points onto the surface")
         found = project_to_isosurface(
-            points, self._vacancy, self._vectors, progress.span(0.2, 0.7), tolerance=TOLERANCE
+            points,
+            self._vacancy,
+            self._vectors,
+            progress.span(0.2, 0.7),
+            max_steps=MAX_PROJECTION_STEPS,
         )
         kind = np.full(len(points), KIND_SURFACE, np.uint8)
         lost = np.flatnonzero(~found.on_surface)
@@ -120,7 +134,7 @@ class SurfaceSampler:
         kept = thin(
             everything,
             normals,
-            np.concatenate([np.full(len(caps.points), radius), radii]),
+            np.concatenate([caps.radii, radii]),
             np.concatenate([caps.priority, priority]),
         )
         kinds = np.concatenate([np.full(len(caps.points), KIND_CAP, np.uint8), kind])[kept]
@@ -134,9 +148,7 @@ class SurfaceSampler:
         }
         return SurfacePoints(everything[kept], normals[kept], kinds, radius, figures)
 
-    def _scout(
-        self, request: Request, rng: np.random.Generator
-    ) -> tuple[float, float, np.ndarray]:
+    def _scout(self, request: Request, rng: np.random.Generator) -> tuple[float, float, np.ndarray]:
         """Find where the surface turns quickly, and with that the radius.
 
         Returns
