@@ -40,7 +40,7 @@ def register() -> None:
         for name, handler in HANDLERS:
             getattr(bpy.app.handlers, name).append(handler)
         # While Blender starts, scripts may not see the open file yet.
-        bpy.app.timers.register(job_timer.attach_later, first_interval=0.1)
+        bpy.app.timers.register(job_timer.attach_later, first_interval=0.1, persistent=True)
     except Exception:
         unregister()
         raise

@@ -64,6 +64,7 @@ class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
 
         properties = context.scene.gwrap
         properties.findings.clear()
+        properties.checked_source = properties.source
         for finding in check_input(job_actions.source_of(context.scene)):
             row = properties.findings.add()
             row.severity = finding.severity

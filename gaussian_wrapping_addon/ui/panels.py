@@ -35,6 +35,8 @@ class GWRAP_PT_photos(_Panel, bpy.types.Panel):
         _plain(layout)
         layout.prop(properties, "source")
         layout.operator("gwrap.check_photos", icon="VIEWZOOM")
+        if properties.checked_source != properties.source:
+            return  # the findings are about another folder
         characters = characters_of(context)
         for finding in properties.findings[:_MAX_FINDINGS]:
             box = layout.box()

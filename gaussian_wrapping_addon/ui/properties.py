@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the panels edit: ``Scene.gwrap`` and ``Object.gwrap``."""
+"""What the panels edit: ``Scene.gwrap``.
+
+Objects carry plain custom properties (``ops/tags.py``), which also exist where the add-on is not
+enabled. No property has a callback: in Blender 4.2 one that ever had crashes the process at exit.
+"""
 
 from typing import Final
 
 import bpy
 from bpy.props import (
-    BoolProperty,
     CollectionProperty,
     EnumProperty,
     FloatProperty,
@@ -13,8 +16,6 @@ from bpy.props import (
     PointerProperty,
     StringProperty,
 )
-
-from ..ops import tags
 
 _PRESETS: Final = (
     ("DRAFT", "Draft", "A first look: small images, few Gaussians"),
@@ -35,10 +36,6 @@ _TEXTURE_SIZES: Final = (
 )
 
 
-def _source_changed(self: "GWRAP_PG_scene", _context: bpy.types.Context) -> None:
-    self.findings.clear()
-
-
 class GWRAP_PG_finding(bpy.types.PropertyGroup):
     """One line of the photo check."""
 
@@ -54,7 +51,6 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
         name="Folder",
         description="Folder of photos, of a COLMAP project, or with a transforms.json",
         subtype="DIR_PATH",
-        update=_source_changed,
     )
     output: StringProperty(  # type: ignore[valid-type]
         name="Output",
@@ -95,43 +91,19 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     job_command: EnumProperty(  # type: ignore[valid-type]
         items=(("WRAP", "Wrap", ""), ("MESH", "Mesh", "")), options={"HIDDEN"}
     )
+    checked_source: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     findings: CollectionProperty(type=GWRAP_PG_finding, options={"HIDDEN"})  # type: ignore[valid-type]
 
 
-def _get_is_region(self: "GWRAP_PG_object") -> bool:
-    return tags.kind_of(self.id_data) == "region"
-
-
-def _set_is_region(self: "GWRAP_PG_object", value: bool) -> None:
-    thing = self.id_data
-    if value and not tags.kind_of(thing):
-        thing[tags.KIND] = "region"
-    elif not value and tags.kind_of(thing) == "region":
-        del thing[tags.KIND]
-
-
-class GWRAP_PG_object(bpy.types.PropertyGroup):
-    """A view of our custom properties, which also exist where the add-on is not enabled."""
-
-    is_region: BoolProperty(  # type: ignore[valid-type]
-        name="Region",
-        description="Whether this object is a region that can be meshed",
-        get=_get_is_region,
-        set=_set_is_region,
-    )
-
-
-CLASSES: Final = (GWRAP_PG_finding, GWRAP_PG_scene, GWRAP_PG_object)
+CLASSES: Final = (GWRAP_PG_finding, GWRAP_PG_scene)
 
 
 def add_pointers() -> None:
-    """Give scenes and objects their properties."""
+    """Give scenes their properties."""
     bpy.types.Scene.gwrap = PointerProperty(type=GWRAP_PG_scene)
-    bpy.types.Object.gwrap = PointerProperty(type=GWRAP_PG_object)
 
 
 def remove_pointers() -> None:
-    """Take them away, as far as they are there."""
-    for owner in (bpy.types.Scene, bpy.types.Object):
-        if hasattr(owner, "gwrap"):
-            del owner.gwrap
+    """Take them away, where they are there."""
+    if hasattr(bpy.types.Scene, "gwrap"):
+        del bpy.types.Scene.gwrap

@@ -452,7 +452,7 @@ def test_check_photos_lists_findings(photos: Path, monkeypatch: pytest.MonkeyPat
     assert "Take more." in texts
     assert max(len(line) for line in texts.splitlines()) < 60
     bpy.context.scene.gwrap.source = str(photos.parent)
-    assert len(bpy.context.scene.gwrap.findings) == 0, "old findings speak of another folder"
+    assert "Only 1 photo." not in draw(panels.GWRAP_PT_photos).texts
 
 
 def test_job_status_of_a_half_written_file_is_survived(

@@ -124,7 +124,7 @@ def test_a_mesh_region_is_its_hull_with_modifiers(result: ImportedResult) -> Non
     array.count = 2
     array.relative_offset_displace = (2, 0, 0)
     assert bpy.ops.gwrap.use_as_region() == {"FINISHED"}
-    assert thing.gwrap.is_region
+    assert tags.kind_of(thing) == "region"
     assert thing.parent == result.frame
     world = region_from_object(thing)
     scene = WORLD_FROM_SCENE.inverse().points(world)
@@ -299,14 +299,14 @@ def test_a_cube_shown_flat_gets_no_negative_scale() -> None:
     assert list(thing.rotation_euler) == pytest.approx([0, 0, 0], abs=1e-6)
 
 
-def test_select_region_and_is_region_property(result: ImportedResult) -> None:
+def test_select_region(result: ImportedResult) -> None:
     box = result.regions[0]
-    assert box.gwrap.is_region
     assert bpy.ops.gwrap.select_region(name=box.name) == {"FINISHED"}
     assert bpy.context.view_layer.objects.active == box
     with pytest.raises(RuntimeError, match="not in this view layer"):
         bpy.ops.gwrap.select_region(name="nobody")
-    box.gwrap.is_region = False
-    assert tags.kind_of(box) == ""
-    result.meshes[0].gwrap.is_region = True
-    assert tags.kind_of(result.meshes[0]) == "mesh", "a result is not turned into a region"
+
+
+def test_a_result_is_not_used_as_a_region(result: ImportedResult) -> None:
+    bpy.context.view_layer.objects.active = result.meshes[0]
+    assert not bpy.ops.gwrap.use_as_region.poll()

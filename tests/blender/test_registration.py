@@ -20,7 +20,7 @@ REPOSITORY = Path(gaussian_wrapping_addon.__file__).resolve().parents[1]
 
 def left_behind() -> list[str]:
     found = [name for name in dir(bpy.types) if name.upper().startswith("GWRAP")]
-    found += [o.__name__ for o in (bpy.types.Scene, bpy.types.Object) if hasattr(o, "gwrap")]
+    found += [o.__name__ for o in (bpy.types.Scene,) if hasattr(o, "gwrap")]
     for name in dir(bpy.app.handlers):
         handlers = getattr(bpy.app.handlers, name)
         if isinstance(handlers, list):
@@ -117,6 +117,16 @@ def test_the_package_imports_without_bpy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert done.returncode == 0, done.stderr.decode()
+
+
+def test_no_property_has_a_callback() -> None:
+    """One that ever had crashes Blender 4.2 at exit, even when it was unregistered."""
+    for name in ("properties", "preferences"):
+        tree = ast.parse((REPOSITORY / f"gaussian_wrapping_addon/ui/{name}.py").read_text())
+        calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
+        assert calls
+        used = {k.arg for call in calls for k in call.keywords}
+        assert not used & {"update", "get", "set", "poll", "search"}
 
 
 def test_no_program_path_comes_from_a_file() -> None:

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
+from mathutils import Vector
 
 
 def steps() -> Iterator[float]:
@@ -43,6 +44,10 @@ def steps() -> Iterator[float]:
     view_layer.objects.active = meshes[0]
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.view3d.view_selected()
+        # The side panel covers the right of the view.
+        view = space.region_3d
+        view.view_distance *= 1.7
+        view.view_location += 0.22 * view.view_distance * (view.view_rotation @ Vector((1, 0, 0)))
         boxes = [o for o in bpy.data.objects if o.get("gwrap_kind") == "region"]
         bpy.ops.gwrap.select_region(name=boxes[0].name)
     yield 1.5
