@@ -3,19 +3,42 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 
 # Before the first import of bpy: no test may touch the profile of the person who runs it.
-os.environ.setdefault("BLENDER_USER_RESOURCES", tempfile.mkdtemp(prefix="gwrap-profile-"))
+if "BLENDER_USER_RESOURCES" not in os.environ:
+    _profile = tempfile.mkdtemp(prefix="gwrap-profile-")
+    os.environ["BLENDER_USER_RESOURCES"] = _profile
+    atexit.register(shutil.rmtree, _profile, ignore_errors=True)
 
-bpy = pytest.importorskip("bpy", reason="needs the bpy wheel (pip install bpy==5.0.1)")
+try:
+    import bpy
+except ModuleNotFoundError:
+    bpy = None
 
 HERE = Path(__file__).parent
+
+
+class _SkippedModule(pytest.Module):
+    """A test module that cannot even be imported here."""
+
+    def collect(self) -> Iterable[pytest.Item]:
+        pytest.skip("needs the bpy wheel (pip install bpy==5.0.1)", allow_module_level=True)
+
+
+def pytest_pycollect_makemodule(
+    module_path: Path, parent: pytest.Collector
+) -> pytest.Module | None:
+    if bpy is None and module_path.is_relative_to(HERE):
+        return _SkippedModule.from_parent(parent, path=module_path)
+    return None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

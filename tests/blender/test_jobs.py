@@ -455,6 +455,16 @@ def test_check_photos_lists_findings(photos: Path, monkeypatch: pytest.MonkeyPat
     assert "Only 1 photo." not in draw(panels.GWRAP_PT_photos).texts
 
 
+def test_check_photos_of_a_folder_that_is_no_data_set(photos: Path) -> None:
+    (photos / "notes.txt").write_text("no photo")
+    bpy.context.scene.gwrap.source = str(photos)
+    assert bpy.ops.gwrap.check_photos() == {"FINISHED"}
+    found = list(bpy.context.scene.gwrap.findings)
+    assert [f.severity for f in found].count("error") >= 1
+    assert found[0].message
+    assert all(f.hint for f in found if f.severity == "error")
+
+
 def test_job_status_of_a_half_written_file_is_survived(
     photos: Path, worker: Callable[[str], None]
 ) -> None:
