@@ -79,8 +79,8 @@ def similarity(
 ) -> Similarity:
     """Return the mean SSIM over windows and colours, with its gradient where asked for.
 
-    The window is 11 x 11, Gaussian with sigma 1.5, "valid" padding. With a mask, pixels outside
-    it are taken from the photo in both images, and only windows centred inside it are counted.
+    The window is 11 x 11, Gaussian with sigma 1.5, "valid" padding. With a mask, both images
+    are black outside of it, and only windows centred inside it are counted.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def similarity(
     if min(height, width) < WINDOW:
         return Similarity(1.0, 0, np.zeros_like(image) if gradient else None)
     if mask is not None:
-        image = np.where(mask[..., None], image, photo)
+        image, photo = (x * mask[..., None].astype(x.dtype) for x in (image, photo))
     flat_image = np.ascontiguousarray(image).reshape(height, 3 * width)
     flat_photo = np.ascontiguousarray(photo).reshape(height, 3 * width)
     out_rows, out_values = height - 2 * RADIUS, 3 * (width - 2 * RADIUS)

@@ -16,8 +16,8 @@ from ..dataset.scene import Scene
 from ..errors import DatasetError
 from .model import OrientedGaussians
 
-Photograph = Callable[[int], tuple[Camera, np.ndarray]]
-"""Gives camera and (h, w, 3) uint8 photo of a view, at a small size."""
+Photograph = Callable[[int], tuple[Camera, np.ndarray, np.ndarray | None]]
+"""Gives camera, (h, w, 3) uint8 photo and (h, w) bool mask or ``None``, at a small size."""
 
 FIRST_OPACITY = 0.1
 SH_C0 = 0.28209479177387814
@@ -65,7 +65,7 @@ def initial_gaussians(
     view_indices : list of int
         Views that may be looked at (not the held-out ones).
     photograph : callable
-        Gives camera and photo of a view; only called where points are few.
+        Gives camera, photo and mask of a view; only called where points are few.
     max_gaussians : int
         Never exceeded; a random choice of the points is taken.
     sh_degree : int
@@ -80,7 +80,7 @@ def initial_gaussians(
     Raises
     ------
     DatasetError
-        If there are neither points nor views.
+        If there is no view, or points are few and masks leave nothing of all photos.
     """
     if not view_indices:
         raise DatasetError("There is no view to train on.", "Add photos.")
@@ -153,14 +153,21 @@ def _fill_up(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``wanted`` more points with colours in [0, 1], taken from pixels of the photos."""
     views = [photograph(i) for i in view_indices]
-    cameras = [camera for camera, _ in views]
+    views = [view for view in views if view[2] is None or view[2].any()]
+    if not views:
+        raise DatasetError("The masks leave nothing of any photo.", "Check the masks.")
+    cameras = [camera for camera, _, _ in views]
     share = np.full(len(views), wanted // len(views))
     share[: wanted - int(share.sum())] += 1
     found_points, found_colors = [], []
-    for (camera, photo), count in zip(views, share.tolist(), strict=True):
+    for (camera, photo, mask), count in zip(views, share.tolist(), strict=True):
         if count == 0:
             continue
-        pixels = random.uniform((0.0, 0.0), (camera.width, camera.height), (count, 2))
+        allowed = np.arange(photo.shape[0] * photo.shape[1])
+        if mask is not None:
+            allowed = np.nonzero(mask.reshape(-1))[0]
+        row, column = np.divmod(random.choice(allowed, count), photo.shape[1])  # (count,)
+        pixels = np.stack([column, row], axis=1) + random.uniform(size=(count, 2))
         depth = _depth_near_points(points, camera, pixels, random)
         if depth is None:
             depth = _most_seen_depth(camera, pixels, cameras, random)
@@ -168,8 +175,6 @@ def _fill_up(
         rays[:, 0] = (pixels[:, 0] - camera.cx) / camera.fx
         rays[:, 1] = (pixels[:, 1] - camera.cy) / camera.fy
         found_points.append((rays * depth[:, None]) @ camera.rotation + camera.center)
-        column = pixels[:, 0].astype(int).clip(0, camera.width - 1)
-        row = pixels[:, 1].astype(int).clip(0, camera.height - 1)
         found_colors.append(photo[row, column] / 255.0)
     return np.concatenate(found_points), np.concatenate(found_colors)
 

@@ -220,7 +220,11 @@ class _Trainer:
         gaussians = initial_gaussians(
             self.scene,
             self.views,
-            lambda i: (self.photos.camera(i, small), self.photos.photo(i, small)),
+            lambda i: (
+                self.photos.camera(i, small),
+                self.photos.photo(i, small),
+                self.photos.mask(i, small),
+            ),
             max_gaussians=self.schedule.growth_limit(),
             sh_degree=self.settings.sh_degree,
             seed=self.seed,

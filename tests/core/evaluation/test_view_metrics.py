@@ -24,7 +24,7 @@ def naive_ssim(image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = N
     window = np.exp(-(axis[:, None] ** 2 + axis[None] ** 2) / (2 * 1.5**2))
     window = (window / window.sum())[..., None]
     if mask is not None:
-        image = np.where(mask[..., None], image, photo)
+        image, photo = image * mask[..., None], photo * mask[..., None]
     found = []
     for i in range(image.shape[0] - 10):
         for j in range(image.shape[1] - 10):

@@ -43,7 +43,11 @@ def start(given: Scene, cap: int = 20_000, seed: int = 0, degree: int = 2):  # t
         camera = given.views[index].camera
         photo = np.zeros((camera.height, camera.width, 3), np.uint8)
         photo[..., 0] = 10 * (index + 1)
-        return camera, photo
+        # Only the left half counts: the right one is green.
+        photo[:, camera.width // 2 :] = (0, 255, 0)
+        mask = np.ones(photo.shape[:2], bool)
+        mask[:, camera.width // 2 :] = False
+        return camera, photo, mask
 
     gaussians = initial_gaussians(
         given, [0, 1, 2, 3, 5], photograph, max_gaussians=cap, sh_degree=degree, seed=seed
@@ -98,6 +102,7 @@ def test_few_points_are_filled_up_at_their_depth_with_the_photos_colours() -> No
     values, counts = np.unique(np.round(255 * reds), return_counts=True)
     assert values.tolist() == [10, 20, 30, 40, 60]
     assert counts.max() - counts.min() <= 1
+    assert np.abs(0.5 + SH_C0 * gaussians.sh[400:, 0, 1].numpy()).max() < 1e-6
 
 
 def test_without_points_most_cameras_see_the_gaussians() -> None:

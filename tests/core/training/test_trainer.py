@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Whole training runs on a tiny scene: quality, resuming, cancelling, masks, broken numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, UsageError, WrapError
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.training import trainer
+from gaussian_wrapping_addon.core.training.trainer import held_out_views, train
+from tests.core.training.small_scene import PhotosInMemory, sphere_scene
+
+SETTINGS = TrainingSettings(
+    iterations=40, max_gaussians=400, max_image_px=32, sh_degree=1, densify_every=5,
+    wrap_rounds=2, checkpoint_every_s=1e9,
+)  # fmt: skip
+
+
+def assert_same(a: OrientedGaussians, b: OrientedGaussians) -> None:
+    for name, tensor in a.tensors():
+        assert torch.equal(tensor, getattr(b, name)), name
+
+
+class StopAt:
+    """Progress that cancels once an iteration was reported."""
+
+    def __init__(self, iteration: int) -> None:
+        self.iteration, self.reached = iteration, False
+        self.events: list[ProgressEvent] = []
+
+    def sink(self, event: ProgressEvent) -> None:
+        self.events.append(event)
+        self.reached |= event.figures.get("iteration", 0.0) >= self.iteration
+
+    def progress(self) -> Progress:
+        return Progress("train", self.sink, lambda: self.reached)
+
+
+def test_training_learns_the_photos_it_never_saw(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=16, size_px=24)
+    settings = dataclasses.replace(SETTINGS, iterations=400, densify_every=20)
+    watch = StopAt(10**9)
+    result = train(scene, photos, settings, tmp_path, watch.progress(), seed=1, threads=2)
+    assert [f.name for f in result.held_out] == ["000.png", "008.png"]
+    assert result.held_out_psnr > 24.0
+    assert result.held_out_ssim > 0.85
+    assert len(result.gaussians) <= settings.max_gaussians
+    assert result.gaussians.sh_degree == 1
+    assert all(torch.isfinite(t).all() for _, t in result.gaussians.tensors())
+    values = result.to_json()
+    json.dumps(values, allow_nan=False)
+    assert values["held_out_psnr"] == result.held_out_psnr
+    assert "iteration 20/400 · loss 0." in " ".join(e.message for e in watch.events)
+    # The oriented normals of what is seen point away from the sphere's middle.
+    normals = result.gaussians.normals().numpy()
+    means = result.gaussians.means.numpy()
+    strong = np.linalg.norm(normals, axis=1) > 0.3
+    opaque = result.gaussians.log_opacities().exp().numpy() > 0.5
+    outward = (normals * means).sum(1)[strong & opaque] > 0
+    assert outward.size > 30
+    assert outward.mean() > 0.75
+
+
+def test_killed_and_resumed_is_bit_for_bit_the_same(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    whole = train(scene, photos, SETTINGS, tmp_path / "a", Progress(), seed=3, threads=1)
+    for stop in (10, 20, 30):
+        with pytest.raises(Cancelled):
+            train(
+                scene, photos, SETTINGS, tmp_path / "b", StopAt(stop).progress(),
+                seed=3, threads=2,
+            )  # fmt: skip
+    assert len(list((tmp_path / "b").glob("checkpoint-*.json"))) == 2
+    # The newest is broken: the one before it leads to the same end.
+    newest = sorted((tmp_path / "b").glob("checkpoint-*.npz"))[-1]
+    newest.write_bytes(newest.read_bytes()[:-100])
+    resumed = train(scene, photos, SETTINGS, tmp_path / "b", Progress(), seed=3, threads=2)
+    assert_same(whole.gaussians, resumed.gaussians)
+    assert whole.held_out == resumed.held_out
+    other = train(scene, photos, SETTINGS, tmp_path / "a", Progress(), seed=4, threads=1)
+    assert not torch.equal(other.gaussians.means[:50], whole.gaussians.means[:50])
+
+
+def test_a_checkpoint_of_something_else_is_refused(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    with pytest.raises(Cancelled):
+        train(scene, photos, SETTINGS, tmp_path, StopAt(10).progress(), threads=1)
+    changed = dataclasses.replace(SETTINGS, iterations=50)
+    with pytest.raises(UsageError):
+        train(scene, photos, changed, tmp_path, Progress(), threads=1)
+    moved = dataclasses.replace(scene, points=scene.points + 0.1)
+    with pytest.raises(UsageError):
+        train(moved, photos, SETTINGS, tmp_path, Progress(), threads=1)
+
+
+def test_masked_pixels_teach_nothing(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    mask = np.ones((24, 24), bool)
+    mask[:, 14:] = False
+    painted = [p.copy() for p in photos.photos]
+    for photo in painted:
+        photo[:, 14:] = (255, 0, 255)
+    settings = dataclasses.replace(SETTINGS, iterations=15, holdout_every=0)
+    results = []
+    for i, shown in enumerate((photos.photos, painted)):
+        (tmp_path / str(i)).mkdir()
+        store = PhotosInMemory(scene, shown, [mask] * 9)
+        results.append(train(scene, store, settings, tmp_path / str(i), Progress(), threads=1))
+    assert results[0].held_out == ()
+    assert_same(results[0].gaussians, results[1].gaussians)
+    black = PhotosInMemory(scene, painted, [np.zeros((24, 24), bool)] * 9)
+    with pytest.raises(DatasetError):
+        train(scene, black, settings, tmp_path, Progress(), threads=1)
+
+
+def test_numbers_that_break_down_are_recovered_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    settings = dataclasses.replace(SETTINGS, iterations=20)
+    honest, bad = trainer.color_loss, {7}
+    calls = [0]
+
+    def sometimes_nan(*arguments, **named):  # type: ignore[no-untyped-def]
+        calls[0] += 1
+        loss, figures = honest(*arguments, **named)
+        return (loss * float("nan") if calls[0] in bad else loss), figures
+
+    monkeypatch.setattr(trainer, "color_loss", sometimes_nan)
+    result = train(scene, photos, settings, tmp_path, Progress(), threads=1)
+    assert any("went back from iteration 6 to 0" in w for w in result.warnings)
+    assert all(torch.isfinite(t).all() for _, t in result.gaussians.tensors())
+    calls[0], bad = 0, {7, 12}
+    with pytest.raises(WrapError, match="twice"):
+        train(scene, photos, settings, tmp_path, Progress(), threads=1)
+
+
+def test_held_out_photos_are_every_nth_of_the_sorted_names() -> None:
+    scene, _ = sphere_scene(views=9, size_px=24)
+    assert held_out_views(scene, 8) == [0, 8]
+    assert held_out_views(scene, 4) == [0, 4, 8]
+    backwards = dataclasses.replace(scene, views=scene.views[::-1])
+    assert held_out_views(backwards, 3) == [2, 5, 8]
+    assert held_out_views(scene, 0) == []
+    few = dataclasses.replace(scene, views=scene.views[:5])
+    assert held_out_views(few, 2) == [0]
