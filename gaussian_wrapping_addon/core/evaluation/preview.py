@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ LONG_SIDE_PX = 900
 GAP_PX = 12
 CHOICE_LONG_SIDE_PX = 120
 MAX_CHOICES = 64
+CROP_MARGIN = 0.15
+MIN_MARGIN_SHARE = 0.02
 
 
 def render_textured(textured: TexturedMesh, camera: Camera, size: tuple[int, int]) -> np.ndarray:
@@ -156,6 +159,21 @@ def choose_view(textured: TexturedMesh, photos: Photos, count: int) -> int:
     return best
 
 
+def _crop(textured: TexturedMesh, camera: Camera) -> tuple[int, int, int, int]:
+    """Return left, top, right, bottom of the part of the photo that is worth showing."""
+    factor = max(1, max(camera.width, camera.height) // (2 * CHOICE_LONG_SIDE_PX))
+    coarse = camera.resized(max(1, camera.width // factor), max(1, camera.height // factor))
+    hit = depth_buffer(textured.mesh.vertices, textured.mesh.faces, coarse).face >= 0
+    if not hit.any():
+        return 0, 0, camera.width, camera.height
+    bounds = []
+    for axis, side in ((0, camera.width), (1, camera.height)):
+        covered = np.flatnonzero(hit.any(axis=axis)) / hit.shape[1 - axis] * side
+        margin = CROP_MARGIN * (covered[-1] - covered[0]) + MIN_MARGIN_SHARE * side
+        bounds.append((max(0, int(covered[0] - margin)), min(side, int(covered[-1] + margin) + 1)))
+    return bounds[0][0], bounds[1][0], bounds[0][1], bounds[1][1]
+
+
 def write_preview(
     textured: TexturedMesh,
     scene: Scene,
@@ -164,7 +182,7 @@ def write_preview(
     *,
     view: int | None = None,
 ) -> None:
-    """Write a PNG: left a photo, right the textured mesh from its camera.
+    """Write a PNG: left the part of a photo that shows the mesh, right the mesh from its camera.
 
     Parameters
     ----------
@@ -187,11 +205,16 @@ def write_preview(
 
     index = choose_view(textured, photos, len(scene.views)) if view is None else view
     full = photos.camera(index, 1)
-    scale = min(1.0, LONG_SIDE_PX / max(full.width, full.height))
-    width, height = max(1, round(full.width * scale)), max(1, round(full.height * scale))
+    left, top, right, bottom = _crop(textured, full)
+    part = dataclasses.replace(
+        full, width=right - left, height=bottom - top, cx=full.cx - left, cy=full.cy - top
+    )
+    scale = min(1.0, LONG_SIDE_PX / max(part.width, part.height))
+    width, height = max(1, round(part.width * scale)), max(1, round(part.height * scale))
+    pixels = photos.photo(index, 1)[top:bottom, left:right]
     resampling = Image.Resampling.LANCZOS
-    photo = Image.fromarray(photos.photo(index, 1)).resize((width, height), resampling)
-    rendered = render_textured(textured, full, (width, height))
+    photo = Image.fromarray(np.ascontiguousarray(pixels)).resize((width, height), resampling)
+    rendered = render_textured(textured, part, (width, height))
     canvas = np.empty((height, 2 * width + GAP_PX, 3), np.uint8)
     canvas[:] = BACKGROUND
     canvas[:, :width] = np.asarray(photo)

@@ -26,8 +26,12 @@ SHARPNESS = 3.0
 OUTLIER_FLOOR = 20.0
 """Views within this many of 255 levels of the median are never outliers."""
 OUTLIER_FACTOR = 2.5
+CLEAR_PX = 2
+"""Nearer to a silhouette, a pixel's colour is partly that of something else."""
+MEDIAN_POWER = 0.25
+"""Weights of the median: so even that one leading view cannot outvote the others."""
 POINTS_PER_BLOCK = 8_000_000
-"""Points held with their views at once (47 bytes each)."""
+"""Points held with their views at once (48 bytes each)."""
 EXPOSURE_POINTS = 8_000
 EXPOSURE_CELLS = 4_000_000
 """Bound on points x photos of the exposure step."""
@@ -58,6 +62,8 @@ class Baked:
     """(n, 3) uint8; 0 where no photo sees the point."""
     views: np.ndarray
     """(n,) uint8 number of views blended, 0 where unseen."""
+    clear: np.ndarray
+    """(n,) bool: some view sees the point away from silhouettes, where two surfaces mix."""
     photos_used: int
     """Photos that gave at least a depth sample of the mesh."""
     gain_spread: float
@@ -97,7 +103,7 @@ def bake(
     -----
     A view's weight is (cosine x useful pixels per texel)^2, faded near silhouettes and the
     image border. The best ``KEPT_VIEWS`` are kept; with three or more, those far from their
-    weighted median are dropped (method.md 8).
+    median are dropped (method.md 8).
     """
     plans, gains, spread = _exposure(
         points, surface, photos, count, progress.span(0.0, 0.25), threads
@@ -105,6 +111,7 @@ def bake(
     colors = np.zeros((len(points), 3), np.uint8)
     views = np.zeros(len(points), np.uint8)
     rejected = np.zeros(len(points), np.uint8)
+    clearance = np.zeros(len(points), np.uint8)
     blocks = max(1, math.ceil(len(points) / POINTS_PER_BLOCK))
     bounds = np.linspace(0, len(points), blocks + 1).astype(int).tolist()
     steps = max(1, blocks * len(plans))
@@ -116,7 +123,9 @@ def bake(
             fraction = 0.25 + 0.7 * (block * len(plans) + step) / steps
             progress.update(fraction, f"texture: photo {step + 1} of {len(plans)}")
             view = _view(photos, plan.index, plan.divisor, surface, threads)
-            sample_photo(part, surface, view, gains[plan.index], weights, kept, threads)
+            sample_photo(
+                part, surface, view, gains[plan.index], weights, kept, clearance[begin:end], threads
+            )
         progress.update(0.25 + 0.7 * (block + 1) / blocks, "blending views")
         _blend_block(
             weights, kept, colors[begin:end], views[begin:end], rejected[begin:end], threads
@@ -125,6 +134,7 @@ def bake(
     return Baked(
         colors,
         views,
+        clearance >= CLEAR_PX,
         len(plans),
         spread,
         bool((gains != 1.0).any()),
@@ -175,7 +185,8 @@ def _exposure(
         plans.append(_Plan(index, min(divisor, full.width, full.height)))
         weights = np.zeros((wanted, 1), np.float32)
         one = np.zeros((wanted, 1, 3), np.uint8)
-        sample_photo(part, surface, view, np.ones(3), weights, one, threads)
+        unused = np.zeros(wanted, np.uint8)
+        sample_photo(part, surface, view, np.ones(3), weights, one, unused, threads)
         valid[:, index] = weights[:, 0] > 0
         colors[:, index] = one[:, 0]
     gains, spread = solve_gains(colors, valid)
@@ -207,6 +218,7 @@ def _blend(
     sorted_distance = np.empty(slots)
     median = np.empty(3)
     values, ranked, mass = np.empty(slots), np.empty(slots), np.empty(slots)
+    vote = np.empty(slots)
     for i in range(begin, end):
         count = 0
         best = 0.0
@@ -224,7 +236,8 @@ def _blend(
             for channel in range(3):
                 for j in range(count):
                     values[j] = kept[i, order[j], channel]
-                median[channel] = _weighted_median(values, share, count, ranked, mass)
+                    vote[j] = share[j] ** MEDIAN_POWER
+                median[channel] = _weighted_median(values, vote, count, ranked, mass)
             for j in range(count):
                 far = 0.0
                 for channel in range(3):

@@ -202,7 +202,7 @@ def write_textured(
 
 
 def file_offset(world: np.ndarray) -> np.ndarray:
-    """Return the (3,) float64 that files in float32 leave out: 0, or whole units near the centre."""
+    """Return the (3,) float64 offset that files leave out: 0, or whole units near the centre."""
     low, high = world.min(axis=0), world.max(axis=0)
     size = float((high - low).max())
     centre = 0.5 * (low + high)

@@ -36,7 +36,7 @@ def surface_positions(points: SurfacePoints, surface: SurfaceArrays) -> np.ndarr
 
 
 def continue_over_surface(
-    positions: np.ndarray, colors: np.ndarray, seen: np.ndarray
+    positions: np.ndarray, colors: np.ndarray, seen: np.ndarray, unseen: np.ndarray
 ) -> np.ndarray:
     """Colour unseen points by the harmonic continuation of the seen ones.
 
@@ -46,13 +46,15 @@ def continue_over_surface(
     colors : (n, 3) uint8
         Valid where ``seen``.
     seen : (n,) bool
+        Points whose colours are to be trusted.
+    unseen : (n,) bool
+        Points that want a colour.
 
     Returns
     -------
     (m, 3) float32
         Colours of the unseen points, in order; mid grey when nothing is seen at all.
     """
-    unseen = ~seen
     if not seen.any():
         return np.full((int(unseen.sum()), 3), UNKNOWN_GREY, np.float32)
     low = positions.min(axis=0)

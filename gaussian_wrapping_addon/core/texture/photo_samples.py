@@ -88,6 +88,7 @@ def sample_photo(
     gain: np.ndarray,
     weights: np.ndarray,
     colors: np.ndarray,
+    best_clearance: np.ndarray,
     threads: int,
 ) -> None:
     """Offer the photo's colours to every point; each keeps the k best.
@@ -100,6 +101,8 @@ def sample_photo(
         Changed in place; 0 marks a free place.
     colors : (n, k, 3) uint8
         Changed in place.
+    best_clearance : (n,) uint8
+        Changed in place to the largest distance to a silhouette of any view kept, pixels.
     """
     camera = view.camera
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
@@ -127,6 +130,7 @@ def sample_photo(
             gain,
             weights,
             colors,
+            best_clearance,
         )
 
     run_chunks(chunk, even_bounds(len(points), threads, 16), threads)
@@ -159,6 +163,7 @@ def _sample(
     gain: Any,
     weights: Any,
     colors: Any,
+    best_clearance: Any,
 ) -> None:
     height, width = depth.shape
     has_mask = mask.shape[0] == height and mask.shape[1] == width
@@ -222,6 +227,7 @@ def _sample(
         level = np.log2(max(intrinsics[0] * texel_size / z, 1.0))
         red, green, blue = trilinear(pixels, levels, level, u, v)
         weights[i, slot] = weight
+        best_clearance[i] = max(best_clearance[i], clearance[iy, ix])
         colors[i, slot, 0] = int(min(red * gain[0], 255.0) + 0.5)
         colors[i, slot, 1] = int(min(green * gain[1], 255.0) + 0.5)
         colors[i, slot, 2] = int(min(blue * gain[2], 255.0) + 0.5)

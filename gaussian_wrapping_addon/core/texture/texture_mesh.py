@@ -33,6 +33,9 @@ from .unwrap import Unwrap, unwrap
 
 _logger = logging.getLogger(__name__)
 
+OUTLINE_TEXELS = 8
+"""Texels seen only at silhouettes take their neighbours' colour within this distance."""
+
 
 def texture_mesh(
     mesh: SurfaceMesh,
@@ -139,19 +142,29 @@ def _image(
     """Put the colours into the image; fill unseen texels, gutters and the rest."""
     seen = baked.views > 0
     image = np.zeros((size_px, size_px, 3), np.uint8)
-    image.reshape(-1, 3)[texels] = baked.colors
+    pixels = image.reshape(-1, 3)
+    pixels[texels] = baked.colors
     chart = np.where(raster.face >= 0, unwrapped.charts[raster.face], -1).astype(np.int32)
     ring = np.full((size_px, size_px), -1, np.int16)
-    ring.ravel()[texels[seen]] = 0
+    flat_ring = ring.ravel()
+    # Seen at silhouettes only: the neighbours' colour is cleaner, where there are neighbours.
+    clear = seen & baked.clear
+    flat_ring[texels[clear]] = 0
+    grow(image, ring, chart, OUTLINE_TEXELS, inside=True)
+    trusted = seen & (flat_ring[texels] >= 0)
+    trusted = trusted if trusted.any() else seen
+    flat_ring[texels[~seen]] = -1
+    flat_ring[texels[seen]] = 0
     if not seen.all():
         grow(image, ring, chart, RING_TEXELS, inside=True)
         unseen = texels[~seen]
-        far = continue_over_surface(surface_positions(points, surface), baked.colors, seen)
-        number = ring.ravel()[unseen].astype(np.float32)
+        positions = surface_positions(points, surface)
+        far = continue_over_surface(positions, pixels[texels], trusted, ~seen)
+        number = flat_ring[unseen].astype(np.float32)
         share = np.where(number < 0, 1.0, number / (RING_TEXELS + 1.0))[:, None]
-        near = image.reshape(-1, 3)[unseen]
-        image.reshape(-1, 3)[unseen] = np.rint(near + share * (far - near)).astype(np.uint8)
-    ring.ravel()[texels] = 0
+        near = pixels[unseen]
+        pixels[unseen] = np.rint(near + share * (far - near)).astype(np.uint8)
+    flat_ring[texels] = 0
     grow(image, ring, chart, gutter_px, inside=False)
     fill_background(image, ring >= 0)
     return image
@@ -183,6 +196,7 @@ def _statistics(
         "texels_used": used,
         "texels_seen": texels_seen,
         "texels_filled": used - texels_seen,
+        "texels_seen_at_outlines_only": int((seen & ~baked.clear).sum()),
         "texels_overlapping": raster.overlaps,
         "coverage": texels_seen / max(used, 1),
         "faces_seen_share": float(face_seen.sum()) / max(int(with_texel.sum()), 1),

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Unwrap: chunks, xatlas in its helper, the fallback, and what both promise."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError
+from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.texture import unwrap as unwrap_module
+from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.chunks import MAX_CHUNK_FACES, split_into_chunks
+from gaussian_wrapping_addon.core.texture.face_graph import components, face_graph
+from gaussian_wrapping_addon.core.texture.unwrap import Unwrap, unwrap
+from tests.core.texture.texture_scenes import box, joined, sphere
+
+
+def noisy_sphere() -> SurfaceMesh:
+    mesh = sphere(4)
+    noise = np.random.default_rng(1).normal(size=mesh.vertices.shape)
+    return SurfaceMesh(mesh.vertices + 0.004 * noise, mesh.faces)
+
+
+def with_flat_faces() -> SurfaceMesh:
+    mesh = sphere(2)
+    flat = [[0, 0, 1], [5, 5, 5], [int(mesh.faces[0, 0]), int(mesh.faces[0, 1]), 0]]
+    vertices = np.concatenate([mesh.vertices, mesh.vertices[:1] + 1e-12])
+    last = len(vertices) - 1
+    flat[2] = [int(mesh.faces[0, 0]), int(mesh.faces[0, 1]), int(mesh.faces[0, 0])]
+    return SurfaceMesh(
+        vertices, np.concatenate([mesh.faces, [*flat, [0, last, 1]]]).astype(np.int32)
+    )
+
+
+def fan() -> SurfaceMesh:
+    """Five faces on one edge: not a manifold."""
+    angles = np.arange(5) * 2 * np.pi / 5
+    rim = np.stack([np.cos(angles), np.sin(angles), np.zeros(5)], axis=1)
+    vertices = np.concatenate([[[0, 0, -1], [0, 0, 1]], rim])
+    return SurfaceMesh(vertices, np.array([[0, 1, 2 + k] for k in range(5)], np.int32))
+
+
+def helix() -> SurfaceMesh:
+    """A ramp of three turns: all faces look up, and cover each other from above."""
+    steps = np.linspace(0, 6 * np.pi, 120)
+    inner = np.stack([np.cos(steps), np.sin(steps), 0.1 * steps], axis=1)
+    outer = inner * [2, 2, 1]
+    k = np.arange(len(steps) - 1)
+    n = len(steps)
+    faces = np.concatenate([np.stack([k, k + n, k + 1], 1), np.stack([k + n, k + n + 1, k + 1], 1)])
+    return SurfaceMesh(np.concatenate([inner, outer]), faces.astype(np.int32))
+
+
+MESHES = {
+    "cube": lambda: box([0, 0, 0], [1, 1, 1], 0),
+    "noisy sphere": noisy_sphere,
+    "two pieces": lambda: joined(sphere(2), box([3, 0, 0], [4, 1, 1], 2)),
+    "flat faces": with_flat_faces,
+    "five faces on an edge": fan,
+    "helix": helix,
+    "one triangle": lambda: SurfaceMesh(np.eye(3), np.array([[0, 1, 2]], np.int32)),
+    "huge coordinates": lambda: SurfaceMesh(
+        sphere(2).vertices * 1e-3 + [5e5, 4e6, 100.0], sphere(2).faces
+    ),
+}
+
+
+def assert_usable(mesh: SurfaceMesh, unwrapped: Unwrap, size_px: int, gutter_px: int) -> None:
+    uvs = unwrapped.corner_uvs
+    assert uvs.shape == (len(mesh.faces), 3, 2)
+    assert uvs.dtype == np.float32
+    assert np.isfinite(uvs).all()
+    assert uvs.min() >= 0.0
+    assert uvs.max() <= 1.0
+    raster = raster_atlas(uvs, size_px, 2)
+    assert raster.overlaps == 0
+    areas = face_graph(mesh.vertices, mesh.faces).areas
+    edge1, edge2 = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
+    signed = edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]
+    solid = areas > 1e-6 * areas.max()
+    assert (signed[solid] != 0).all()
+    assert unwrapped.gutter_px >= gutter_px
+    assert smallest_gap(raster.face, raster.inside, unwrapped.charts) >= gutter_px - 1.5
+
+
+def smallest_gap(face: np.ndarray, inside: np.ndarray, charts: np.ndarray) -> float:
+    """Smallest distance between texel centres of different charts, up to 8 texels."""
+    label = np.where(inside, charts[face], -1)
+    smallest = 8.0
+    for dy in range(8):
+        for dx in range(-7, 8):
+            distance = float(np.hypot(dx, dy))
+            if distance >= smallest or (dy == 0 and dx <= 0):
+                continue
+            moved = np.roll(label, (-dy, -dx), axis=(0, 1))
+            moved[label.shape[0] - dy :] = -1
+            moved[:, : max(-dx, 0)] = -1
+            if dx > 0:
+                moved[:, -dx:] = -1
+            if ((label >= 0) & (moved >= 0) & (label != moved)).any():
+                smallest = distance
+    return smallest
+
+
+@pytest.mark.parametrize("method", ["xatlas", "box"])
+@pytest.mark.parametrize("name", MESHES)
+def test_uvs_are_finite_inside_and_without_overlap(
+    name: str, method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh = MESHES[name]()
+    if method == "box":
+        monkeypatch.setattr(unwrap_module, "HELPER_MODULE", "texture.no_such_helper")
+    unwrapped = unwrap(mesh, 512, 4, tmp_path, Progress(), threads=2)
+    assert unwrapped.method == method
+    assert_usable(mesh, unwrapped, 512, 4)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_82k_faces_do_not_crash(tmp_path: Path) -> None:
+    mesh = sphere(6)
+    assert len(mesh.faces) == 81_920
+    begun_s = time.monotonic()
+    unwrapped = unwrap(mesh, 1024, 8, tmp_path, Progress(), threads=2)
+    assert time.monotonic() - begun_s < 15
+    assert unwrapped.method == "xatlas"
+    raster = raster_atlas(unwrapped.corner_uvs, 1024, 2)
+    assert raster.overlaps == 0
+    assert raster.inside.mean() > 0.3
+
+
+def test_a_failed_helper_is_said_and_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(unwrap_module, "HELPER_MODULE", "texture.no_such_helper")
+    with caplog.at_level(logging.WARNING):
+        unwrapped = unwrap(sphere(2), 256, 4, tmp_path, Progress())
+    assert unwrapped.method == "box"
+    assert "no_such_helper" in unwrapped.reason
+    assert any("box projection" in record.message for record in caplog.records)
+
+
+@pytest.mark.parametrize("bad", ["overlap", "nan", "outside", "missing", "silent"])
+def test_bad_answers_of_xatlas_are_refused(
+    bad: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the helper says is checked, not believed."""
+
+    def helper(module: str, folder: Path, progress: Progress, **options: object) -> None:
+        if bad == "silent":
+            return
+        with np.load(folder / "input.npz", allow_pickle=False) as task:
+            count = len(task["corners"])
+        uvs = np.tile(np.array([[10, 10], [200, 10], [10, 200]], np.float32), (count, 1, 1))
+        if bad == "nan":
+            uvs[:] = np.nan
+        if bad == "outside":
+            uvs += 500
+        if bad == "missing":
+            uvs[count // 2 :] = np.nan
+        np.savez(folder / "output.npz", corner_uvs=uvs, side_px=256, padding_px=8, charts=1)
+
+    monkeypatch.setattr(unwrap_module, "run_helper", helper)
+    mesh = box([0, 0, 0], [1, 1, 1], 2)
+    unwrapped = unwrap(mesh, 256, 4, tmp_path, Progress())
+    assert unwrapped.method == "box"
+    assert_usable(mesh, unwrapped, 256, 4)
+
+
+def test_cancelling_leaves_nothing_behind(tmp_path: Path) -> None:
+    calls = []
+
+    def cancelled() -> bool:
+        calls.append(1)
+        return len(calls) > 3
+
+    with pytest.raises(Cancelled):
+        unwrap(sphere(5), 512, 4, tmp_path, Progress(is_cancelled=cancelled))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_mesh_without_area_is_not_given_to_xatlas(tmp_path: Path) -> None:
+    line = SurfaceMesh(
+        np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), np.array([[0, 1, 2]], np.int32)
+    )
+    graph = face_graph(line.vertices, line.faces)
+    with pytest.raises(DatasetError, match="area"):
+        unwrap_module._xatlas(line, graph, 64, 2, tmp_path, Progress(), 1)
+
+
+def test_chunks_are_connected_and_bounded() -> None:
+    mesh = noisy_sphere()
+    graph = face_graph(mesh.vertices, mesh.faces)
+    labels = split_into_chunks(graph)
+    sizes = np.bincount(labels)
+    assert sizes.min() > 0
+    assert sizes.max() <= 1.3 * MAX_CHUNK_FACES
+    assert len(sizes) <= 2 * len(mesh.faces) / MAX_CHUNK_FACES
+    other = np.where(graph.opposite >= 0, graph.opposite // 3, 0)
+    parts = components(graph, labels[other] == labels[:, None])
+    assert parts.max() + 1 == len(sizes)
+
+
+def test_many_small_pieces_share_chunks() -> None:
+    dust = joined(*[box([3 * k, 0, 0], [3 * k + 1, 1, 1], 0) for k in range(400)])
+    labels = split_into_chunks(face_graph(dust.vertices, dust.faces))
+    assert labels.max() + 1 <= 5
+    assert np.bincount(labels).max() <= MAX_CHUNK_FACES
+
+
+def test_a_texture_too_small_for_the_gutter_keeps_what_it_can(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    dust = joined(*[box([3 * k, 0, 0], [3 * k + 1, 1, 1], 0) for k in range(60)])
+    with caplog.at_level(logging.WARNING):
+        unwrapped = unwrap(dust, 96, 16, tmp_path, Progress())
+    assert unwrapped.gutter_px < 16
+    assert any("too small" in record.message for record in caplog.records)
+    assert np.isfinite(unwrapped.corner_uvs).all()
+    assert unwrapped.corner_uvs.min() >= 0
+    assert unwrapped.corner_uvs.max() <= 1
