@@ -222,13 +222,15 @@ def _follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     """Show progress until the worker ends; then write the Blender files."""
     from .core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
 
-    shown_s, shown_stage, interrupted_s = 0.0, "", 0.0
+    shown_s, shown, interrupted_s = 0.0, ("", ""), 0.0
     while True:
         try:
             status = client.poll()
             now_s = time.monotonic()
-            if status.stage and (status.stage != shown_stage or now_s - shown_s > LINE_EVERY_S):
-                shown_s, shown_stage = now_s, status.stage
+            news = (status.stage, status.message)
+            due = status.stage != shown[0] or now_s - shown_s > LINE_EVERY_S
+            if status.stage and due and news != shown:
+                shown_s, shown = now_s, news
                 left = (
                     "" if status.seconds_left is None else f" · {_span(status.seconds_left)} left"
                 )

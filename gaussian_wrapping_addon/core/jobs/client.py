@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -126,13 +126,11 @@ class JobClient:
         return status
 
     def _failed(self, status: JobStatus, error: str) -> JobStatus:
-        return JobStatus(
-            **{
-                **asdict(status),
-                "state": "FAILED" if status.state == "NEW" else "LOST",
-                "error": error,
-                "hint": f"See {self.folder.log_path.name} in the job folder, then resume.",
-            }
+        return replace(
+            status,
+            state="FAILED" if status.state == "NEW" else "LOST",
+            error=error,
+            hint=f"See {self.folder.log_path.name} in the job folder, then resume.",
         )
 
     def last_words(self) -> str:

@@ -11,7 +11,7 @@ import contextlib
 import os
 import sys
 import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -173,22 +173,29 @@ class JobFolder:
 
     def read_status(self) -> JobStatus:
         """Return the status; a running job whose process is gone is reported as LOST."""
+        status = self._read_file()
+        if self._gone(status):
+            # The worker may have written its last words and ended between our two looks.
+            status = self._read_file()
+        if not self._gone(status):
+            return status
+        return replace(
+            status,
+            state="LOST",
+            error="The worker process has ended without a word.",
+            hint="Resume the job; it continues from the last checkpoint.",
+        )
+
+    def _read_file(self) -> JobStatus:
         try:
-            status = JobStatus.from_json(read_json(self.status_path))
+            return JobStatus.from_json(read_json(self.status_path))
         except (OSError, ParseError, TypeError, ValueError):
             return JobStatus()
-        if status.state in ("RUNNING", "CANCELLING") and not process_alive(
-            status.pid, status.pid_started
-        ):
-            return JobStatus(
-                **{
-                    **asdict(status),
-                    "state": "LOST",
-                    "error": "The worker process has ended without a word.",
-                    "hint": "Resume the job; it continues from the last checkpoint.",
-                }
-            )
-        return status
+
+    @staticmethod
+    def _gone(status: JobStatus) -> bool:
+        running = status.state in ("RUNNING", "CANCELLING")
+        return running and not process_alive(status.pid, status.pid_started)
 
     def write_status(self, status: JobStatus) -> None:
         """Write the status atomically."""

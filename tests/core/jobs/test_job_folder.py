@@ -13,6 +13,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.jobs import job_folder
 from gaussian_wrapping_addon.core.jobs.job_folder import (
     JobFolder,
     JobStatus,
@@ -54,6 +55,20 @@ def test_status_of_a_dead_worker_is_lost(tmp_path: Path) -> None:
     status = folder.read_status()
     assert status.state == "LOST"
     assert "resume" in status.hint.lower()
+
+
+def test_a_worker_that_ends_between_two_looks_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = JobFolder(tmp_path)
+    folder.write_status(JobStatus(state="RUNNING", pid=1234))
+
+    def ends_now(pid: int, started: int) -> bool:
+        folder.write_status(JobStatus(state="DONE", pid=pid, exit_code=0))
+        return False
+
+    monkeypatch.setattr(job_folder, "process_alive", ends_now)
+    assert folder.read_status().state == "DONE"
 
 
 def test_status_of_a_living_worker_stays(tmp_path: Path) -> None:
