@@ -106,6 +106,14 @@ def _extract(
     done = 0
     for camera_id, names in names_of_camera.items():
         reader.existing_camera_id = camera_id
+        # Entered in order first: extraction would number the photos as its threads finish.
+        pycolmap.import_images(
+            database,
+            folder / "images",
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=names,
+            options=reader,
+        )
         for begin in range(0, len(names), 2 * threads):
             block = names[begin : begin + 2 * threads]
             emit(
@@ -152,14 +160,23 @@ def _match(folder: Path, database: Path, task: dict[str, Any]) -> None:
         )
 
 
+def _mapping_options(seed: int) -> Any:
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    for part in (options, options.mapper, options.triangulation):
+        part.random_seed = seed
+    # One thread: the order of sums in bundle adjustment, and so the result, stays the same.
+    options.num_threads = 1
+    options.mapper.num_threads = 1
+    return options
+
+
 def _map(folder: Path, database: Path, task: dict[str, Any], total: int) -> Any:
     """Return the largest reconstruction, or ``None``."""
     import pycolmap
 
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = task["seed"]
-    # One thread: the order of sums in bundle adjustment, and so the result, stays the same.
-    options.num_threads = 1
+    options = _mapping_options(task["seed"])
     options.min_model_size = 3
     placed = 2
 
@@ -213,9 +230,7 @@ def _triangulate(folder: Path, task: dict[str, Any]) -> None:
             pose = pycolmap.Rigid3d(pose_of_name[stored.name])
             posed.add_image_with_trivial_frame(image, pose)
     emit(fraction=_MATCH_END, message="triangulating points")
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = task["seed"]
-    options.num_threads = 1
+    options = _mapping_options(task["seed"])
     # Poses must stay what the input says: bundle adjustment may move points only.
     solved = pycolmap.triangulate_points(
         posed, database, folder / "images", folder, clear_points=True, options=options

@@ -65,7 +65,7 @@ def ring_model(
         observed = [(10.5 + j, 20.25, j + 1) for j in range(2)]
         images.append(ImageRecord(i + 1, quaternion, pose[:, 3], 1, f"p{i:02d}.png", observed))
     cloud = [
-        (rng.normal(size=3).tolist(), [10 * j, 20, 30], 0.5 + j, [(1, j), (2, j)])
+        (rng.normal(size=3).tolist(), [10 * j % 256, 20, 30], 0.5 + j, [(1, j), (2, j)])
         for j in range(points)
     ]
     params = params or [60.0, 61.0, WIDTH / 2, HEIGHT / 2]
