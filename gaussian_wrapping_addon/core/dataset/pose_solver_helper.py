@@ -19,6 +19,8 @@ DEFAULT_FOCAL_FACTORS = (1.2, 0.85, 1.7, 2.5)
 """Focal lengths over the long side that are tried where EXIF gives none, the commonest first."""
 _ENOUGH_PLACED = 0.8
 """Share of placed photos at which no other focal length is tried."""
+_LENIENT_BELOW = 0.5
+"""Share of placed photos below which weaker evidence is accepted for a first pair and for poses."""
 _MAX_FEATURES = 8192
 _MAX_FEATURES_POSED = 4096
 _MATCHING_BLOCKS = 3
@@ -66,18 +68,22 @@ def _solve(folder: Path, task: dict[str, Any]) -> None:
     _extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES)
     _match(folder, database, task)
     best, total = None, sum(len(names) for names in names_of_camera.values())
-    for factor in DEFAULT_FOCAL_FACTORS if guessed else DEFAULT_FOCAL_FACTORS[:1]:
+    factors = DEFAULT_FOCAL_FACTORS if guessed else DEFAULT_FOCAL_FACTORS[:1]
+    attempts = [(factor, False) for factor in factors] + [(factors[0], True)]
+    for factor, lenient in attempts:
+        if best is not None and best.num_reg_images() >= total * (
+            _LENIENT_BELOW if lenient else _ENOUGH_PLACED
+        ):
+            break
         with pycolmap.Database.open(database) as db:
             for camera_id in guessed:
                 camera = db.read_camera(camera_id)
                 start_px = factor * max(camera.width, camera.height)
                 camera.params = [start_px, camera.width / 2, camera.height / 2, 0.0]
                 db.update_camera(camera)
-        found = _map(folder, database, task, total)
+        found = _map(folder, database, task, total, lenient=lenient)
         if found is not None and (best is None or found.num_reg_images() > best.num_reg_images()):
             best = found
-        if best is not None and best.num_reg_images() >= _ENOUGH_PLACED * total:
-            break
     if best is None:
         raise DatasetError(
             f"No two of the {total} photos could be placed relative to each other.",
@@ -172,12 +178,16 @@ def _mapping_options(seed: int) -> Any:
     return options
 
 
-def _map(folder: Path, database: Path, task: dict[str, Any], total: int) -> Any:
+def _map(folder: Path, database: Path, task: dict[str, Any], total: int, *, lenient: bool) -> Any:
     """Return the largest reconstruction, or ``None``."""
     import pycolmap
 
     options = _mapping_options(task["seed"])
     options.min_model_size = 3
+    if lenient:
+        options.mapper.init_min_num_inliers = 40
+        options.mapper.init_min_tri_angle = 5.0
+        options.mapper.abs_pose_min_num_inliers = 15
     placed = 2
 
     def next_photo() -> None:

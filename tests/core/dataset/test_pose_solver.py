@@ -23,11 +23,11 @@ from tests.core.dataset.model_writers import ring_model, write_binary
 from tests.synthetic import look_at
 
 BANANAS = Path(__file__).parents[3] / "examples" / "bananas"
-NAMES = ("DSC_0423", "DSC_0424", "DSC_0425", "DSC_0426", "DSC_0427")
+NAMES = ("DSC_0423", "DSC_0424", "DSC_0425", "DSC_0438")
 
 
-def small_bananas(folder: Path, long_side: int = 640) -> Path:
-    """Write five neighbouring photos, scaled down, with the EXIF that tells the focal length."""
+def small_bananas(folder: Path, long_side: int = 400) -> Path:
+    """Write four neighbouring photos, scaled down, with the EXIF that tells the focal length."""
     folder.mkdir()
     for name in NAMES:
         with Image.open(BANANAS / f"{name}.JPG") as image:
@@ -94,13 +94,13 @@ def test_photos_alone_are_solved_with_progress(tmp_path: Path) -> None:
     assert (tmp_path / "work" / "cameras" / "images.bin").is_file()
 
 
-def textured_plane(folder: Path, count: int = 5) -> list[Camera]:
+def textured_plane(folder: Path, count: int = 4) -> list[Camera]:
     """Write photos of a noisy plane z = 0 and their poses, as a COLMAP model without points."""
     rng = np.random.default_rng(7)
     noise = rng.uniform(size=(700, 700, 3))
     texture = sum(ndimage.gaussian_filter(noise, (s, s, 0)) * s for s in (1, 2, 4, 8))
     texture = (texture - texture.min()) / np.ptp(texture) * 255
-    width, height, focal_px = 320, 240, 300.0
+    width, height, focal_px = 240, 180, 225.0
     model = ring_model(count)
     model.cameras = [(1, "PINHOLE", width, height, [focal_px, focal_px, width / 2, height / 2])]
     model.points = []
