@@ -127,7 +127,7 @@ def test_points_are_triangulated_from_posed_photos(tmp_path: Path) -> None:
     """A model without points: the poses stay, the points come from the photos, on the plane."""
     pytest.importorskip("pycolmap")
     cameras = textured_plane(tmp_path / "set")
-    scene = load_scene(tmp_path / "set", tmp_path / "work", Progress(), seed=1)
+    scene = load_scene(tmp_path / "set", tmp_path / "work", Progress(), seed=1, threads=1)
     for camera, moved in zip(cameras, scene.cameras, strict=True):
         center = scene.world_from_scene.points(moved.center[None])[0]
         np.testing.assert_allclose(center, camera.center, atol=1e-9)
@@ -136,7 +136,7 @@ def test_points_are_triangulated_from_posed_photos(tmp_path: Path) -> None:
     world = scene.world_from_scene.points(scene.points)
     assert np.percentile(np.abs(world[:, 2]), 90) < 0.02  # cameras are 2.8 away
     assert scene.point_colors.std(0).min() > 5
-    again = load_scene(tmp_path / "set", tmp_path / "work2", Progress(), seed=1)
+    again = load_scene(tmp_path / "set", tmp_path / "work2", Progress(), seed=1, threads=1)
     np.testing.assert_array_equal(again.points, scene.points)
 
 
