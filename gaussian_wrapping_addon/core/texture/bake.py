@@ -30,7 +30,7 @@ CLEAR_PX = 2
 """Nearer to a silhouette, a pixel's colour is partly that of something else."""
 MEDIAN_POWER = 0.25
 """Weights of the median: so even that one leading view cannot outvote the others."""
-POINTS_PER_BLOCK = 8_000_000
+POINTS_PER_BLOCK = 12_000_000
 """Points held with their views at once (48 bytes each)."""
 EXPOSURE_POINTS = 8_000
 EXPOSURE_CELLS = 4_000_000

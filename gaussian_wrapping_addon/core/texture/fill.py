@@ -35,42 +35,40 @@ def surface_positions(points: SurfacePoints, surface: SurfaceArrays) -> np.ndarr
     return np.einsum("nc,ncx->nx", weights, corners)
 
 
-def continue_over_surface(
-    positions: np.ndarray, colors: np.ndarray, seen: np.ndarray, unseen: np.ndarray
-) -> np.ndarray:
-    """Colour unseen points by the harmonic continuation of the seen ones.
+def continue_over_surface(known: np.ndarray, colors: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Colour points by the harmonic continuation of others over the surface.
 
     Parameters
     ----------
-    positions : (n, 3) float64
+    known : (n, 3) float64
+        Positions with colours; may be empty.
     colors : (n, 3) uint8
-        Valid where ``seen``.
-    seen : (n,) bool
-        Points whose colours are to be trusted.
-    unseen : (n,) bool
-        Points that want a colour.
+    wanted : (m, 3) float64
+        Positions that want a colour, at least one.
 
     Returns
     -------
     (m, 3) float32
-        Colours of the unseen points, in order; mid grey when nothing is seen at all.
+        Mid grey when nothing is known.
     """
-    if not seen.any():
-        return np.full((int(unseen.sum()), 3), UNKNOWN_GREY, np.float32)
-    low = positions.min(axis=0)
-    cell = max(float((positions.max(axis=0) - low).max()), 1e-12) / CELLS_PER_SIDE
-    coordinates = ((positions - low) / cell).astype(np.int64)
-    keys, inverse = np.unique(_key(coordinates), return_inverse=True)
-    count = np.bincount(inverse[seen], minlength=len(keys))
-    known = count > 0
+    if len(known) == 0:
+        return np.full((len(wanted), 3), UNKNOWN_GREY, np.float32)
+    low = np.minimum(known.min(axis=0), wanted.min(axis=0))
+    extent = np.maximum(known.max(axis=0), wanted.max(axis=0)) - low
+    cell = max(float(extent.max()), 1e-12) / CELLS_PER_SIDE
+    key_known, key_wanted = (_key(((p - low) / cell).astype(np.int64)) for p in (known, wanted))
+    keys = np.union1d(key_known, key_wanted)
+    place = np.searchsorted(keys, key_known)
+    count = np.bincount(place, minlength=len(keys))
+    has = count > 0
     values = np.empty((len(keys), 3))
     for channel in range(3):
-        total = np.bincount(inverse[seen], colors[seen, channel], len(keys))
+        total = np.bincount(place, colors[:, channel], len(keys))
         values[:, channel] = total / np.maximum(count, 1)
     centres = np.stack([keys >> (2 * CELL_BITS), (keys >> CELL_BITS), keys], axis=1)
     centres = centres & ((1 << CELL_BITS) - 1)  # (cells, 3)
-    values[~known] = _harmonic(keys, centres, known, values[known])
-    return _interpolate(keys, values, (positions[unseen] - low) / cell)
+    values[~has] = _harmonic(keys, centres, has, values[has])
+    return _interpolate(keys, values, (wanted - low) / cell)
 
 
 def _key(coordinates: np.ndarray) -> np.ndarray:

@@ -33,6 +33,8 @@ from .unwrap import Unwrap, unwrap
 
 _logger = logging.getLogger(__name__)
 
+CONTINUED_POINTS = 1_000_000
+"""As many seen texels are enough for the cells from which colours are continued."""
 OUTLINE_TEXELS = 8
 """Texels seen only at silhouettes take their neighbours' colour within this distance."""
 
@@ -158,8 +160,13 @@ def _image(
     if not seen.all():
         grow(image, ring, chart, RING_TEXELS, inside=True)
         unseen = texels[~seen]
-        positions = surface_positions(points, surface)
-        far = continue_over_surface(positions, pixels[texels], trusted, ~seen)
+        known = np.flatnonzero(trusted)
+        known = known[:: max(1, len(known) // CONTINUED_POINTS)]
+        far = continue_over_surface(
+            surface_positions(points.part(known), surface),
+            pixels[texels[known]],
+            surface_positions(points.part(~seen), surface),
+        )
         number = flat_ring[unseen].astype(np.float32)
         share = np.where(number < 0, 1.0, number / (RING_TEXELS + 1.0))[:, None]
         near = pixels[unseen]

@@ -16,7 +16,7 @@ from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 
 Pattern = Callable[[np.ndarray], np.ndarray]
-SUPERSAMPLING = 3
+SUPERSAMPLING = 2
 
 
 def waves(points: np.ndarray) -> np.ndarray:
