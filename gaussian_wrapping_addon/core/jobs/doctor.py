@@ -23,7 +23,7 @@ DOCTOR_DEADLINE_S = 120.0
 
 REQUIRED = {
     "numpy": "numpy", "torch": "torch", "numba": "numba", "scipy": "scipy", "shull": "shull",
-    "trimesh": "trimesh", "embreex": "embreex", "pycolmap": "pycolmap", "xatlas": "xatlas",
+    "pycolmap": "pycolmap", "xatlas": "xatlas",
     "PIL": "pillow",
 }  # fmt: skip
 

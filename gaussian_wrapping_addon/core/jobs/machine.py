@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 PACKAGES = (
-    "numpy", "torch", "numba", "scipy", "pycolmap", "xatlas", "shull", "trimesh", "embreex",
+    "numpy", "torch", "numba", "scipy", "pycolmap", "xatlas", "shull",
 )  # fmt: skip
 
 
