@@ -205,13 +205,16 @@ def _ramp(share: np.ndarray) -> np.ndarray:
 
 
 def _weighted_quantiles(values: np.ndarray, weight: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return weighted quantiles of each column of (n, k) values, (len(shares), k)."""
+    """Return weighted quantiles of each column of (n, k) values, (len(shares), k).
+
+    Nothing is interpolated: the gap to an outlier of hardly any weight would count.
+    """
     result = np.empty((len(shares), values.shape[1]))
     for column in range(values.shape[1]):
         order = np.argsort(values[:, column], kind="stable")
         total = np.cumsum(weight[order])
-        middle = (total - weight[order] / 2) / total[-1]
-        result[:, column] = np.interp(shares, middle, values[order, column])
+        place = np.searchsorted(total, shares * total[-1])
+        result[:, column] = values[order[np.minimum(place, len(order) - 1)], column]
     return result
 
 

@@ -23,7 +23,7 @@ def main(folder: Path) -> int:
     points = np.load(folder / "points.npy", allow_pickle=False)
     try:
         tetrahedra = Delaunay(points, qhull_options="QJ Qbb Qc").simplices
-    except QhullError as error:
+    except (QhullError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise MeshingError(
             f"{len(points)} points could not be connected ({reason}).", "Choose another region."

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from .. import tolerances
 from ..field.isosurface_projection import TOLERANCE, project_to_isosurface
+from ..parallel import balanced_bounds
 from ..progress import Progress
 from .candidate_surface import CandidateSurface
 from .convex_region import Region
@@ -38,6 +40,8 @@ OVERSAMPLING = 20.0
 FIRST_THINNING = 0.4
 """Candidates closer than this share of the radius are not worth projecting. These two decide how
 even the points become (and sampling.POINTS_PER_SQUARE)."""
+MAX_BLOCK = 2_000_000
+"""Candidates drawn at a time (memory)."""
 SCOUTS = 20_000
 """Candidates from which curvature, and so the local radius, is estimated."""
 SCOUTS_PER_FACE = 5
@@ -97,13 +101,8 @@ class SurfaceSampler:
         radius, density, share = self._scout(request, rng)
         progress.update(0.05, "spreading points")
         expected = POINTS_PER_SQUARE * density * self.area / radius**2
-        points, face = sample_triangles(
-            self._vertices, self._faces, int(OVERSAMPLING * expected) + 64, rng, share**-2.0
-        )
+        points, face = self._candidates(radius, share, int(OVERSAMPLING * expected) + 64, rng)
         radii = radius * share[face]
-        priority = rng.random(len(points))
-        kept = thin(points, self._normals[face], FIRST_THINNING * radii, priority)
-        points, face, radii = points[kept], face[kept], radii[kept]
         normals = self._normals_at(points, self._normals[face])
         progress.update(0.2, f"moving {len(points)} points onto the surface")
         found = project_to_isosurface(
@@ -148,6 +147,41 @@ class SurfaceSampler:
         }
         return SurfacePoints(everything[kept], normals[kept], kinds, radius, figures)
 
+    def _candidates(
+        self, radius: float, share: np.ndarray, count: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draw ``count`` points and thin them to what is worth projecting, block by block.
+
+        Returns
+        -------
+        points : (n, 3) float64
+        face : (n,) int64
+        """
+        _, areas = triangle_normals(self._vertices, self._faces)
+        weight = areas * share**-2.0  # (f,)
+        blocks = -(-count // MAX_BLOCK)
+        bounds = balanced_bounds(weight, blocks)
+        points, face = [], []
+        for begin, end in itertools.pairwise(bounds.tolist()):
+            part = int(count * weight[begin:end].sum() / weight.sum()) + 1
+            drawn, where = sample_triangles(
+                self._vertices, self._faces[begin:end], part, rng, share[begin:end] ** -2.0
+            )
+            kept = self._thinned(drawn, where + begin, radius * share, rng)
+            points.append(drawn[kept])
+            face.append(where[kept] + begin)
+        all_points, all_faces = np.concatenate(points), np.concatenate(face)
+        if len(points) > 1:  # blocks touch
+            kept = self._thinned(all_points, all_faces, radius * share, rng)
+            all_points, all_faces = all_points[kept], all_faces[kept]
+        return all_points, all_faces
+
+    def _thinned(
+        self, points: np.ndarray, face: np.ndarray, radii: np.ndarray, rng: np.random.Generator
+    ) -> np.ndarray:
+        priority = rng.random(len(points))
+        return thin(points, self._normals[face], FIRST_THINNING * radii[face], priority)
+
     def _scout(self, request: Request, rng: np.random.Generator) -> tuple[float, float, np.ndarray]:
         """Find where the surface turns quickly, and with that the radius.
 
@@ -180,13 +214,11 @@ class SurfaceSampler:
         return radius, density, np.median(shares[nearest], axis=1)
 
     def _normals_at(self, points: np.ndarray, fallback: np.ndarray) -> np.ndarray:
-        """Unit vectors of the vector field, or the triangle's normal where that has none."""
-        V = self._vectors.evaluate(points).V
-        length = np.linalg.norm(V, axis=1)
-        good = np.isfinite(length) & (length > 0)
-        unit = np.where(good[:, None], V, fallback) / np.where(good, length, 1.0)[:, None]
-        opposed = (unit * fallback).sum(1) < 0
-        return np.where(opposed[:, None], fallback, unit)
+        """Outward directions of the field, or the triangle's normal where none is known or the
+        two disagree (the far side of a thin wall, a Gaussian that was oriented wrongly)."""
+        outward = self._vectors.evaluate(points).outward  # (n, 3) unit or 0
+        agree = (outward * fallback).sum(1) > 0  # false for NaN
+        return np.where(agree[:, None], outward, fallback)
 
     def _search(
         self, points: np.ndarray, normals: np.ndarray, radius: float, progress: Progress

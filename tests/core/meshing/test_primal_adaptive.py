@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Primal adaptive meshing of known shapes."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError, ResourceError, UsageError
+from gaussian_wrapping_addon.core.meshing import surface_points
+from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
+from gaussian_wrapping_addon.core.meshing.region import Region
+from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from tests.core.meshing.meshing_scenes import (
+    Distance,
+    ShapeField,
+    assert_closed_manifold,
+    cube,
+    gaussians_on,
+    rounded_box,
+    settings,
+    some_cameras,
+    sphere,
+    torus,
+)
+
+
+def mesh_shape(
+    distance: Distance,
+    region: Region,
+    *,
+    points: int = 0,
+    edge: float = 0.0,
+    sigma: float = 0.02,
+    share: float = 0.01,
+    seed: int = 0,
+    threads: int = 1,
+) -> SurfaceMesh:
+    field = ShapeField(distance, sigma)
+    arrays = gaussians_on(distance, region, 800, sigma)
+    return mesh_region(
+        field, field, arrays, some_cameras(), region, settings(points, share), Progress(),
+        seed=seed, threads=threads, edge_length_scene=edge,
+    )  # fmt: skip
+
+
+def test_sphere_is_closed_of_genus_0_and_on_the_surface() -> None:
+    mesh = mesh_shape(sphere(), cube(1.3), points=2500)
+    figures = assert_closed_manifold(mesh)
+    assert (figures.components, figures.genus, figures.euler) == (1, 0, 2)
+    # 0.01 of vacancy is 0.04 sigma of distance for a logistic flank.
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.045 * 0.02
+    centres = np.linalg.norm(mesh.vertices[mesh.faces].mean(1), axis=1)
+    assert centres.max() < 1 + 0.045 * 0.02
+    assert centres.min() > 1 - mesh.provenance["edge_length_scene"] ** 2
+    assert figures.volume == pytest.approx(4 / 3 * np.pi, rel=0.01)
+    assert 0.7 * 2500 < figures.vertices < 1.3 * 2500
+    assert mesh.provenance["level_error_max"] <= 0.01 + 1e-6
+    normals = np.cross(
+        mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]],
+        mesh.vertices[mesh.faces[:, 2]] - mesh.vertices[mesh.faces[:, 0]],
+    )
+    assert ((normals * mesh.vertices[mesh.faces].mean(1)).sum(1) > 0).all()
+
+
+def test_torus_has_genus_1_and_even_triangles() -> None:
+    mesh = mesh_shape(torus(), cube(1.5), edge=0.08)
+    figures = assert_closed_manifold(mesh)
+    assert (figures.components, figures.genus) == (1, 1)
+    assert figures.volume == pytest.approx(2 * np.pi**2 * 0.35**2, rel=0.02)
+    assert figures.mean_edge == pytest.approx(0.08, rel=0.12)
+    corners = mesh.vertices[mesh.faces]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    assert edges.max() < 4 * 0.08
+    assert np.median(edges.min(1) / edges.max(1)) > 0.6
+
+
+def test_thin_plate_keeps_both_sides_at_edges_longer_than_its_thickness() -> None:
+    thickness = 0.04
+    mesh = mesh_shape(
+        rounded_box((0.8, 0.8, thickness / 2), 0.019), cube(1.0), edge=0.1, sigma=0.004
+    )
+    figures = assert_closed_manifold(mesh)
+    assert (figures.components, figures.genus) == (1, 0)
+    assert figures.volume == pytest.approx(1.6 * 1.6 * thickness, rel=0.06)
+
+
+def test_wire_thinner_than_the_edge_length_is_one_piece() -> None:
+    mesh = mesh_shape(rounded_box((0.9, 0.03, 0.03), 0.0299), cube(1.0), edge=0.06, sigma=0.004)
+    figures = assert_closed_manifold(mesh)
+    assert (figures.components, figures.genus) == (1, 0)
+    exact = np.pi * 0.03**2 * 1.74 + 4 / 3 * np.pi * 0.03**3
+    assert figures.volume == pytest.approx(exact, rel=0.2)
+
+
+def test_region_that_cuts_the_solid_closes_it() -> None:
+    region = Region.box("cut", [-1.3, -1.3, -1.3], [1.3, 1.3, 0.4])
+    mesh = mesh_shape(sphere(), region, points=2500)
+    figures = assert_closed_manifold(mesh)
+    assert (figures.components, figures.genus) == (1, 0)
+    assert region.contains(mesh.vertices, 1e-9).all()
+    cap = 0.6**2 * (3 - 0.6) * np.pi / 3  # the cap above z = 0.4 is missing
+    assert figures.volume == pytest.approx(4 / 3 * np.pi - cap, rel=0.01)
+    assert mesh.provenance["vertices_on_region_boundary"] > 50
+    on_plane = mesh.vertices[np.abs(mesh.vertices[:, 2] - 0.4) < 1e-9]
+    # The rim runs along the exact circle.
+    assert np.hypot(*on_plane[:, :2].T).max() == pytest.approx(np.sqrt(1 - 0.4**2), abs=2e-3)
+
+
+def test_turned_region_inside_the_solid_gives_the_region() -> None:
+    rotation = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
+    region = Region.box("corner", [0.2, 0.2, 0.2], [0.8, 0.9, 1.0], rotation)
+    mesh = mesh_shape(sphere(1.2), region, edge=0.06)
+    figures = assert_closed_manifold(mesh)
+    assert (figures.components, figures.genus) == (1, 0)
+    rng = np.random.default_rng(0)
+    samples = rng.uniform([0.2, 0.2, 0.2], [0.8, 0.9, 1.0], (400_000, 3))
+    share = (np.linalg.norm(samples, axis=1) < 1.2).mean()
+    assert figures.volume == pytest.approx(share * 0.6 * 0.7 * 0.8, rel=0.01)
+
+
+def test_two_touching_solids_and_a_floater() -> None:
+    def distance(p: np.ndarray) -> np.ndarray:
+        shifted = [np.linalg.norm(p - [x, 0, 0], axis=1) - 0.5 for x in (-0.49, 0.49)]
+        floater = np.linalg.norm(p - [0, 0, 0.9], axis=1) - 0.04
+        return np.minimum(np.minimum(*shifted), floater)
+
+    arguments = {"edge": 0.05, "sigma": 0.01}
+    mesh = mesh_shape(distance, cube(1.1), **arguments, share=0.05)
+    figures = assert_closed_manifold(mesh)
+    assert figures.components == 1
+    assert mesh.provenance["removed_solids"] == 1
+    whole = mesh_shape(distance, cube(1.1), **arguments, share=0.0)
+    assert assert_closed_manifold(whole).components == 2
+    assert whole.provenance["removed_solids"] == 0
+
+
+@functools.lru_cache(maxsize=1)
+def small_torus() -> SurfaceMesh:
+    return mesh_shape(torus(), cube(1.5), points=800)
+
+
+def test_same_seed_gives_the_same_mesh_for_any_threads() -> None:
+    again = mesh_shape(torus(), cube(1.5), points=800, threads=2)
+    np.testing.assert_array_equal(again.vertices, small_torus().vertices)
+    np.testing.assert_array_equal(again.faces, small_torus().faces)
+    assert again.provenance == small_torus().provenance
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e4])
+def test_scale_invariance(scale: float) -> None:
+    region = Region.box("cube", np.full(3, -1.5 * scale), np.full(3, 1.5 * scale))
+    field = ShapeField(lambda p: scale * torus()(p / scale), 0.02 * scale)
+    arrays = gaussians_on(torus(), cube(1.5), 800, 0.02)
+    arrays = dataclasses.replace(arrays, means=scale * arrays.means, scales=scale * arrays.scales)
+    other = mesh_region(
+        field, field, arrays, some_cameras(), region, settings(800), Progress(), seed=0, threads=1
+    )
+    figures, small = assert_closed_manifold(other), assert_closed_manifold(small_torus())
+    assert (figures.genus, figures.components) == (small.genus, small.components) == (1, 1)
+    # Which samples are drawn hangs on the last bit; the surface does not.
+    assert np.abs(torus()(other.vertices / scale)).max() < 1e-4 * cube(1.5).diagonal * 2
+    assert figures.vertices == pytest.approx(small.vertices, rel=0.05)
+    assert figures.volume / scale**3 == pytest.approx(small.volume, rel=5e-3)
+
+
+def test_automatic_density_gives_tens_of_thousands_of_faces() -> None:
+    mesh = mesh_shape(sphere(), cube(1.3))
+    figures = assert_closed_manifold(mesh)
+    assert 30_000 < figures.faces < 60_000
+    assert figures.genus == 0
+
+
+def test_candidates_drawn_in_blocks_give_as_good_a_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface_points, "MAX_BLOCK", 3000)
+    figures = assert_closed_manifold(mesh_shape(torus(), cube(1.5), points=800))
+    whole = assert_closed_manifold(small_torus())
+    assert figures.genus == 1
+    assert figures.vertices == pytest.approx(whole.vertices, rel=0.05)
+    assert figures.mean_edge == pytest.approx(whole.mean_edge, rel=0.03)
+
+
+def test_empty_region_and_region_without_gaussians() -> None:
+    nowhere = Region.box("air", np.full(3, 5.0), np.full(3, 6.0))
+    arrays = gaussians_on(sphere(), cube(1.3), 200, 0.02)
+    for region, distance, text in (
+        (nowhere, sphere(), "No Gaussian reaches region 'air'"),
+        (cube(1.3), lambda p: np.ones(len(p)), "no surface"),
+    ):
+        field = ShapeField(distance, 0.02)
+        with pytest.raises(MeshingError, match=text) as caught:
+            mesh_region(
+                field, field, arrays, some_cameras(), region, settings(500), Progress(), seed=0,
+                threads=1,
+            )  # fmt: skip
+        assert caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("edge", "points", "error"),
+    [
+        (-1.0, 0, UsageError),
+        (float("nan"), 0, UsageError),
+        (float("inf"), 0, UsageError),
+        (0.1, 100, UsageError),
+        (1e-9, 0, ResourceError),
+        (1e-4, 0, ResourceError),
+        (0.0, 10**9, ResourceError),
+    ],
+)
+def test_absurd_requests_are_refused(edge: float, points: int, error: type[Exception]) -> None:
+    with pytest.raises(error) as caught:
+        mesh_shape(sphere(), cube(1.3), edge=edge, points=points)
+    assert caught.value.hint  # type: ignore[attr-defined]
+
+
+def test_edge_longer_than_the_region_is_reduced_and_said() -> None:
+    mesh = mesh_shape(sphere(), cube(1.3), edge=100.0)
+    assert_closed_manifold(mesh)
+    assert any("reduced" in note for note in mesh.provenance["notes"])
+    assert mesh.provenance["edge_length_scene"] == pytest.approx(cube(1.3).diagonal / 8)
+
+
+def test_progress_grows_and_cancelling_stops() -> None:
+    events: list[ProgressEvent] = []
+    field = ShapeField(sphere(), 0.02)
+    arrays = gaussians_on(sphere(), cube(1.3), 500, 0.02)
+    run = lambda progress: mesh_region(  # noqa: E731
+        field, field, arrays, some_cameras(), cube(1.3), settings(500), progress, seed=0, threads=1
+    )
+    run(Progress("mesh", events.append))
+    fractions = [e.fraction for e in events]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    seen = []
+    stop = Progress("mesh", seen.append, lambda: len(seen) >= 5)
+    with pytest.raises(Cancelled):
+        run(stop)
+    assert len(seen) == 5

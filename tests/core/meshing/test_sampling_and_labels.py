@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Sampling of triangles, thinning, pivots, and the minimum cut against exhaustive search."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from gaussian_wrapping_addon.core.meshing.classification import _sweeps, regularised
+from gaussian_wrapping_addon.core.meshing.pivots import (
+    directional_sigma,
+    reaching,
+    representative,
+    two_pivots,
+)
+from gaussian_wrapping_addon.core.meshing.sampling import (
+    curvature,
+    local_radii,
+    sample_triangles,
+    thin,
+)
+from tests.core.field.field_scenes import make_arrays, random_arrays, unit_sphere
+from tests.core.meshing.meshing_scenes import cube
+
+
+def test_samples_are_uniform_over_triangles() -> None:
+    vertices = np.array([[0, 0, 0], [3, 0, 0], [0, 1, 0], [0, 0, 5], [1, 0, 5], [0, 1, 5.0]])
+    faces = np.array([[0, 1, 2], [3, 4, 5]])
+    rng = np.random.default_rng(0)
+    points, face = sample_triangles(vertices, faces, 200_000, rng)
+    assert (face == 0).mean() == pytest.approx(0.75, abs=1e-4)
+    local = points[face == 0] / [3, 1, 1]
+    # Uniform on the unit right triangle: mean 1/3, variance 1/18, covariance -1/36.
+    np.testing.assert_allclose(local[:, :2].mean(0), 1 / 3, atol=2e-3)
+    covariance = np.cov(local[:, :2].T)
+    np.testing.assert_allclose(covariance, [[1 / 18, -1 / 36], [-1 / 36, 1 / 18]], atol=6e-4)
+    _, weighted = sample_triangles(vertices, faces, 10_000, rng, np.array([1.0, 3.0]))
+    assert (weighted == 0).mean() == pytest.approx(0.5, abs=1e-3)
+
+
+def test_thinning_keeps_a_maximal_set_a_radius_apart() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(size=(6000, 3)) * [1, 1, 0.05]
+    normals = np.zeros((6000, 3))
+    kept = thin(points, normals, np.full(6000, 0.06), rng.random(6000))
+    tree = cKDTree(points[kept])
+    assert tree.query(points[kept], k=2)[0][:, 1].min() >= 0.06
+    assert tree.query(points)[0].max() < 0.06
+    assert thin(points[:0], normals[:0], np.zeros(0), np.zeros(0)).shape == (0,)
+
+
+def test_thinning_obeys_priority_and_keeps_both_sides_of_a_wall() -> None:
+    points = np.array([[0, 0, 0], [0.05, 0, 0], [0, 0, -0.02], [0, 0, -0.0001]])
+    normals = np.array([[0, 0, 1], [0, 0, 1], [0, 0, -1], [0, 0, -1.0]])
+    radii = np.full(4, 0.1)
+    assert thin(points, normals, radii, np.array([0, 1, 2, 3.0])).tolist() == [1, 0, 1, 0]
+    assert thin(points, normals, radii, np.array([1, 0, 3, 2.0])).tolist() == [0, 1, 0, 1]
+
+
+def test_thinning_with_local_radii() -> None:
+    rng = np.random.default_rng(2)
+    points = np.c_[rng.uniform(size=(8000, 2)), np.zeros(8000)]
+    radii = np.where(points[:, 0] < 0.5, 0.02, 0.08)
+    kept = thin(points, np.zeros((8000, 3)), radii, rng.random(8000))
+    left = kept[points[:, 0] < 0.48].sum()
+    right = kept[points[:, 0] > 0.52].sum()
+    assert 9 < left / right < 20  # areas of the discs differ by 16
+
+
+def test_curvature_of_a_sphere() -> None:
+    points = 0.5 * unit_sphere(4000)
+    values = curvature(points, points / 0.5, 0.1, 2)
+    np.testing.assert_allclose(values, 2.0, rtol=0.01)
+    np.testing.assert_array_equal(values, curvature(points, points / 0.5, 0.1, 1))
+    assert (local_radii(values, 0.05, 4.0) == 0.05).all()
+    coarse = local_radii(values, 0.4, 100.0)
+    assert (coarse < 0.4).all()
+    assert np.mean((local_radii(values, 0.4, 1.5) / 0.4) ** -2.0) <= 1.5
+
+
+def test_outer_pivots_lie_three_sigmas_out() -> None:
+    arrays = random_arrays(300, 3)
+    arrays.normals[:50] *= 1e-3  # not oriented
+    index = np.arange(300)
+    pivots = two_pivots(arrays, index)
+    unoriented = int((np.linalg.norm(arrays.normals, axis=1) < 0.05).sum())
+    assert unoriented >= 50
+    assert len(pivots) == 600 + unoriented
+    offset = pivots[300:600] - arrays.means
+    white = np.einsum("nij,ni->nj", arrays.rotations, offset) / arrays.scales
+    assert np.linalg.norm(white, axis=1).min() > 3 - 1e-9
+    oriented = np.linalg.norm(arrays.normals, axis=1) >= 0.05
+    assert ((offset * arrays.normals).sum(1)[oriented] > 0).all()
+    np.testing.assert_allclose(
+        pivots[600:], 2 * arrays.means[~oriented] - pivots[300:600][~oriented]
+    )
+
+
+def test_gaussians_that_reach_a_region() -> None:
+    means = np.array([[0, 0, 0], [1.2, 0, 0], [1.4, 0, 0], [9, 0, 0], [0.5, 0, 0], [0, 0, 1.25]])
+    scales = np.tile([0.1, 0.01, 0.01], (6, 1))
+    alphas = np.array([0.9, 0.9, 0.9, 0.9, 0.003, 0.9])
+    arrays = make_arrays(means, scales, alphas)
+    assert reaching(arrays, cube(1.0), 0.0).tolist() == [0, 1]
+    assert reaching(arrays, cube(1.0), 0.25).tolist() == [0, 1, 2, 5]
+    np.testing.assert_allclose(
+        directional_sigma(arrays, np.array([0]), np.array([[0.6, 0.8, 0.0]])),
+        np.hypot(0.06, 0.008),
+    )
+
+
+def test_representatives_are_few_and_cover_space() -> None:
+    arrays = random_arrays(5000, 4)
+    index = representative(arrays, np.arange(5000), 800)
+    assert 300 < len(index) <= 800
+    far = cKDTree(arrays.means[index]).query(arrays.means)[0]
+    assert np.quantile(far, 0.99) < 1.0
+    np.testing.assert_array_equal(representative(arrays, np.arange(700), 800), np.arange(700))
+
+
+def energy(
+    label: np.ndarray, start: np.ndarray, vacancy: np.ndarray, links: np.ndarray, areas: np.ndarray
+) -> float:
+    """The energy that ``regularised`` promises to minimise, over all tetrahedra."""
+    theirs = np.where(links >= 0, label[links], False)
+    total = 0.0
+    for i in range(len(label)):
+        for k in range(4):
+            if links[i, k] < 0:
+                total += areas[i, k] * label[i]
+            elif links[i, k] > i:
+                total += areas[i, k] * (theirs[i, k] != label[i])
+        if label[i] != start[i]:
+            total += 2 * abs(vacancy[i] - 0.5) * areas[i].mean()
+    return total
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_minimum_cut_is_the_best_of_all_labels(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = 14
+    links = np.full((count, 4), -1)
+    areas = rng.uniform(0.2, 1.0, (count, 4))
+    slots = [(i, k) for i in range(count) for k in range(4)]
+    rng.shuffle(slots)
+    for (i, k), (j, m) in itertools.pairwise(slots[:44]):
+        if i != j and links[i, k] < 0 and links[j, m] < 0 and j not in links[i]:
+            links[i, k], links[j, m] = j, i
+            areas[j, m] = areas[i, k]
+    vacancy = rng.random(count)
+    start = vacancy < 0.5
+    free = np.zeros(count, bool)
+    free[:10] = True
+    best = regularised(start, vacancy, free, links, areas)
+    np.testing.assert_array_equal(best[~free], start[~free])
+    energies = []
+    for bits in itertools.product([False, True], repeat=10):
+        label = start.copy()
+        label[:10] = bits
+        energies.append(energy(label, start, vacancy, links, areas))
+    assert energy(best, start, vacancy, links, areas) == pytest.approx(min(energies), abs=2e-2)
+
+
+def test_sweeps_remove_a_lonely_label() -> None:
+    links = np.array([[1, 2, 3, -1], [0, -1, -1, -1], [0, -1, -1, -1], [0, -1, -1, -1]])
+    start = np.array([True, False, False, False])
+    outside = np.array([0.0, 1, 1, 1])
+    label = _sweeps(start, links, np.ones((4, 4)), np.zeros(4), outside)
+    assert not label.any()
