@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError, ResourceError, UsageError
+from gaussian_wrapping_addon.core.field.vacancy import VacancyResult
 from gaussian_wrapping_addon.core.meshing import surface_points
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.meshing.region import Region
@@ -122,6 +123,32 @@ def test_turned_region_inside_the_solid_gives_the_region() -> None:
     samples = rng.uniform([0.2, 0.2, 0.2], [0.8, 0.9, 1.0], (400_000, 3))
     share = (np.linalg.norm(samples, axis=1) < 1.2).mean()
     assert figures.volume == pytest.approx(share * 0.6 * 0.7 * 0.8, rel=0.01)
+
+
+class HalfSeen(ShapeField):
+    """No camera sees anything beyond x = 0.3."""
+
+    def vacancy(self, points: np.ndarray) -> VacancyResult:
+        found = super().vacancy(points)
+        unseen = points[:, 0] > 0.3
+        return VacancyResult(
+            np.where(unseen, np.float32(1), found.vacancy), np.where(unseen, -1, found.camera)
+        )
+
+
+def test_solid_ends_with_a_flat_wall_where_sight_ends() -> None:
+    field = HalfSeen(sphere(), 0.02)
+    arrays = gaussians_on(sphere(), cube(1.3), 800, 0.02)
+    mesh = mesh_region(
+        field, field, arrays, some_cameras(), cube(1.3), settings(2000), Progress(), seed=0,
+        threads=1,
+    )  # fmt: skip
+    figures = assert_closed_manifold(mesh)
+    assert (figures.components, figures.genus) == (1, 0)
+    missing = 0.7**2 * (3 - 0.7) * np.pi / 3
+    assert figures.volume == pytest.approx(4 / 3 * np.pi - missing, rel=0.02)
+    assert mesh.vertices[:, 0].max() < 0.3 + 0.01
+    assert mesh.provenance["vertices_at_end_of_sight"] > 50
 
 
 def test_two_touching_solids_and_a_floater() -> None:
