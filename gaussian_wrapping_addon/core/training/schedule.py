@@ -30,7 +30,7 @@ PYRAMID = ((4, 0.0), (2, 0.1), (1, 0.3))
 """Divisor of the image size, and the share of the iterations from which it is used."""
 
 SMALLEST_SIDE_PX = 96
-"""A level whose long side would be smaller than this is skipped."""
+"""Where the long side of a level would be smaller than this, a finer one is used."""
 
 DEGREE_SHARE = 1.0 / 6.0
 """The harmonics' degree rises by one whenever this share of the iterations has passed."""
@@ -66,9 +66,10 @@ class Schedule:
         """Return the divisor of the image size."""
         chosen = 1
         for divisor, start in PYRAMID:
-            large_enough = self.long_side_px / divisor >= SMALLEST_SIDE_PX or divisor == 1
-            if self._share(iteration) >= start and large_enough:
+            if self._share(iteration) >= start:
                 chosen = divisor
+        while chosen > 1 and self.long_side_px / chosen < SMALLEST_SIDE_PX:
+            chosen //= 2
         return chosen
 
     def sh_degree(self, iteration: int) -> int:
