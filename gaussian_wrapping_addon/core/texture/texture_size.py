@@ -17,15 +17,16 @@ MIN_SIZE_PX = 256
 MAX_AUTOMATIC_SIZE_PX = 4096
 EXPECTED_UTILISATION = 0.5
 """Share of texels that charts cover; 0.4 to 0.65 were measured on ordinary meshes."""
-FOOTPRINT_PERCENTILE = 30.0
+ENOUGH = 0.8
+"""A texture of this share of the photos' resolution is enough: the next size costs four times."""
 
 
 def automatic_size(graph: FaceGraph, photos: Photos, count: int, seed: int = 0) -> int:
     """Return the side in pixels, a power of two from 256 to 4096.
 
     The footprint of a photo's pixel on the surface is ``z / focal``; each sampled face takes its
-    best photo, and the surface the 30 % finest of its faces (by area). Occlusion is not tested:
-    a size needs no more than the order.
+    best photo, and the surface their median (by area). Occlusion is not tested: a size needs no
+    more than the order.
     """
     area = float(graph.areas.sum())
     generator = np.random.default_rng(seed)
@@ -43,8 +44,8 @@ def automatic_size(graph: FaceGraph, photos: Photos, count: int, seed: int = 0) 
     best = best[np.isfinite(best)]
     if len(best) == 0:
         return MIN_SIZE_PX
-    footprint = float(np.percentile(best, FOOTPRINT_PERCENTILE))
-    wanted = math.sqrt(area / EXPECTED_UTILISATION) / footprint
+    footprint = float(np.median(best))
+    wanted = ENOUGH * math.sqrt(area / EXPECTED_UTILISATION) / footprint
     exponent = math.ceil(math.log2(max(wanted, 1.0)))
     largest = min(MAX_AUTOMATIC_SIZE_PX, limits.MAX_TEXTURE_SIDE_PX)
     return int(min(max(2**exponent, MIN_SIZE_PX), largest))

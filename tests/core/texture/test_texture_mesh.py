@@ -265,7 +265,7 @@ def test_the_automatic_size_follows_the_photos() -> None:
         ]
         photos = FakePhotos(cameras, [])
         sizes[focal] = automatic_size(graph, photos, len(cameras))
-    # 4 pi area; footprint about 2.5 / focal: sqrt(4 pi / 0.5) * focal / 2.5 = 2 focal.
+    # 4 pi area; footprint about 2.3 / focal: 0.8 sqrt(4 pi / 0.5) focal / 2.3 = 1.7 focal.
     assert sizes == {85.0: 256, 170.0: 512, 340.0: 1024, 1e5: 4096}
     assert automatic_size(graph, FakePhotos([], []), 0) == 256
 
