@@ -29,6 +29,8 @@ from .raster_math import (
     LIVENESS_EVERY,
     ONE,
     PLANE,
+    PREFETCH_AHEAD,
+    ROW_VALUES,
     TILE,
     TRANSMITTANCE_MIN,
     TWO,
@@ -36,9 +38,9 @@ from .raster_math import (
     exp_short,
     exp_wide,
     max_run,
+    prefetch_row,
 )
 
-PAIR_COLUMNS = 24
 ABS_U, ABS_V = 22, 23
 """Columns of the pair gradients that hold sums of absolute values, not gradients of params."""
 
@@ -62,7 +64,7 @@ _S3, _S4, _S5 = _SUMS + 13 * TILE, _SUMS + 14 * TILE, _SUMS + 15 * TILE
 _S6, _S7, _S8 = _SUMS + 16 * TILE, _SUMS + 17 * TILE, _SUMS + 18 * TILE
 _SIZE_U, _SIZE_V = _SUMS + 19 * TILE, _SUMS + 20 * TILE
 _SUM_ROWS = 21
-_SCRATCH = _SUMS + _SUM_ROWS * TILE
+BACKWARD_SCRATCH = _SUMS + _SUM_ROWS * TILE
 
 
 @inline
@@ -259,10 +261,10 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
         g_geometric: np.ndarray,
         g_alpha: np.ndarray,
         g_depth: np.ndarray,
+        m: np.ndarray,
         pairs: np.ndarray,
     ) -> None:
         """Write the gradients of all pairs of the tiles at their slots of ``pairs (p, 24)``."""
-        m = np.zeros(_SCRATCH, np.float32)
         deepest = np.zeros(TILE, np.float32)
         for tile in range(first_tile, end_tile):
             begin = start[tile]
@@ -307,11 +309,14 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
                 deepest[row] = reach
             low, high = 0, live_rows - 1
             for k in range(count):
+                ahead = begin + min(k + PREFETCH_AHEAD, count - 1)
+                prefetch_row(params, np.int64(gaussian_ids[ahead]))
+                prefetch_row(pairs, np.int64(pair_slots[ahead]))
                 first = max(np.int64(rows[begin + k, 0]), low)
                 last = min(np.int64(rows[begin + k, 1]), high)
                 out = pairs[pair_slots[begin + k]]
                 if first > last:
-                    for column in range(PAIR_COLUMNS):
+                    for column in range(ROW_VALUES):
                         out[column] = ZERO
                 else:
                     i = gaussian_ids[begin + k]
@@ -324,23 +329,29 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
                     last_half = min(np.int64(ranges[i, 3]) - tile_x, TILE - 1) // lanes
                     for p in range(_SUM_ROWS * TILE):
                         m[_SUMS + p] = ZERO
+                    reach = ZERO
                     for row in range(first, last + 1):
-                        dy = np.float32(row) - v
-                        near = depth and front < deepest[row]
-                        for half in range(first_half, last_half + 1):
-                            # The masks prove to LLVM that the index is not negative.
-                            c = (half & (halves - 1)) * lanes
-                            b = (row & (TILE - 1)) * TILE + c
-                            left = u - np.float32(c)
-                            if near:
+                        reach = max(reach, deepest[row & (TILE - 1)])
+                    if depth and front < reach:
+                        for row in range(first, last + 1):
+                            dy = np.float32(row) - v
+                            for half in range(first_half, last_half + 1):
+                                # The masks prove to LLVM that the index is not negative.
+                                c = (half & (halves - 1)) * lanes
                                 _gradient_run(
-                                    lanes, True, absolute, m, b, c, left, dy,
+                                    lanes, True, absolute, m, (row & (TILE - 1)) * TILE + c, c,
+                                    u - np.float32(c), dy,
                                     q[2], q[3], q[4], q[5], q[6], q[7], q[8], q[9], z, q[11], q[12],
                                     q[13], q[14], q[15], q[16], q[17], q[18], q[19], q[20], q[21],
                                 )  # fmt: skip
-                            else:
+                    else:
+                        for row in range(first, last + 1):
+                            dy = np.float32(row) - v
+                            for half in range(first_half, last_half + 1):
+                                c = (half & (halves - 1)) * lanes
                                 _gradient_run(
-                                    lanes, False, absolute, m, b, c, left, dy,
+                                    lanes, False, absolute, m, (row & (TILE - 1)) * TILE + c, c,
+                                    u - np.float32(c), dy,
                                     q[2], q[3], q[4], q[5], q[6], q[7], q[8], q[9], z, q[11], q[12],
                                     q[13], q[14], q[15], q[16], q[17], q[18], q[19], q[20], q[21],
                                 )  # fmt: skip
@@ -373,17 +384,17 @@ def sum_pairs(
     Columns 22 and 23 become 0; ``grad_px (n,)`` and ``grad_abs_px (n,)`` receive the lengths of
     the gradient on (u, v) and of its sum of absolute values.
     """
-    total = np.zeros(PAIR_COLUMNS, np.float32)
+    total = np.zeros(ROW_VALUES, np.float32)
     for i in range(first, end):
         total[:] = ZERO
         for slot in range(pair_offsets[i], pair_offsets[i + 1]):
-            for column in range(PAIR_COLUMNS):
+            for column in range(ROW_VALUES):
                 total[column] += pairs[slot, column]
         grad_px[i] = math.sqrt(total[0] * total[0] + total[1] * total[1])
         grad_abs_px[i] = math.sqrt(total[ABS_U] * total[ABS_U] + total[ABS_V] * total[ABS_V])
         total[ABS_U] = ZERO
         total[ABS_V] = ZERO
-        for column in range(PAIR_COLUMNS):
+        for column in range(ROW_VALUES):
             grad_params[i, column] = total[column]
 
 

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Compiled blending of tiles, front to back: nine feature channels, transmittance, depth.
 
-For the depth, each run of pixels that a Gaussian contributes to is *recorded* (raw alpha, z-depth
-and sharpness of the peak per pixel) while the tile is blended, until the run lies wholly before the
-Gaussians that come; the isosurface is then solved from the records without evaluating any
-Gaussian again.
+For the depth, the contributors of each pixel (raw alpha, z-depth and sharpness of the peak) are
+listed while the tile is blended, until a run of pixels lies wholly before the Gaussians that come;
+the isosurface is then solved from the lists without evaluating any Gaussian again.
 """
 
 from __future__ import annotations
@@ -18,13 +17,16 @@ from ..compiled import inline, kernel
 from .isosurface import (
     ALPHA,
     DEPTH,
+    LIST_VALUES,
     PEAK,
     SHARPEST,
     SHARPNESS,
     SLOPE,
     SOLVER_END,
     TRANSMITTANCE,
-    solve_tile,
+    append_run,
+    solve_run_8,
+    solve_run_16,
 )
 from .raster_math import (
     ALPHA_MAX,
@@ -39,14 +41,16 @@ from .raster_math import (
     LIVENESS_EVERY,
     ONE,
     PLANE,
+    PREFETCH_AHEAD,
     REACH_SIGMAS,
     TILE,
     TRANSMITTANCE_MIN,
     TWO,
     ZERO,
-    copy_run,
     exp_short,
     max_run,
+    positive_run,
+    prefetch_row,
 )
 
 # Planes of the scratch array behind those of the solver: features, then the strongest Gaussian.
@@ -57,10 +61,7 @@ _BEST = _F0 + FEATURES * PLANE
 _BEST_AT = _BEST + PLANE
 _SUMS = _BEST_AT + PLANE
 _LARGEST = _SUMS + TILE
-_SCRATCH = _LARGEST + TILE
-
-RECORD_VALUES = 3
-"""Runs per record: alpha, peak, sharpness."""
+FORWARD_SCRATCH = _LARGEST + TILE
 
 
 @inline
@@ -69,14 +70,13 @@ def _blend_run(
     left: Any, dy: Any, qa: Any, qb: Any, qc: Any, px: Any, py: Any, r: Any, s: Any, t: Any,
     z: Any, opacity: Any, a0: Any,
     f0: Any, f1: Any, f2: Any, f3: Any, f4: Any, f5: Any, f6: Any, f7: Any, f8: Any,
-) -> Any:  # fmt: skip
-    """Blend one Gaussian into one run of pixels; return the sum of alphas that contributed."""
+) -> None:  # fmt: skip
+    """Blend one Gaussian into one run of pixels."""
     n1 = qb * dy
     n0 = qc * dy * dy
     d1 = TWO * px + s * dy
     d0 = ONE + (TWO * py + t * dy) * dy
     l0 = ONE + py * dy
-    top = ZERO
     for x in range(lanes):
         dx = COLUMN_OFFSETS[x] - left
         num = max((dx * qa + n1) * dx + n0, ZERO)
@@ -99,7 +99,6 @@ def _blend_run(
         m[_F8 + b + x] += weight * f8
         if depth:
             raw = raw if contributes else ZERO
-            top += raw
             sharpness = a0 * den
             m[ALPHA + b + x] = raw
             m[PEAK + b + x] = (dx * px + l0) * inverse * z
@@ -114,7 +113,6 @@ def _blend_run(
             m[_BEST_AT + b + x] = place if stronger else at
             m[_SUMS + x] += weight
             m[_LARGEST + x] = max(m[_LARGEST + x], weight)
-    return top
 
 
 @functools.cache
@@ -147,9 +145,8 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
         height: int,
         background: np.ndarray,
         limit: float,
-        records: np.ndarray,
-        record_runs: np.ndarray,
-        record_fronts: np.ndarray,
+        m: np.ndarray,
+        lists: np.ndarray,
         color: np.ndarray,
         normal: np.ndarray,
         geometric: np.ndarray,
@@ -159,11 +156,12 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
         pair_weights: np.ndarray,
         strongest: np.ndarray,
     ) -> int:
-        """Render tiles; return the first one that was not, where the records are too few."""
-        capacity = len(record_runs)
-        m = np.zeros(_SCRATCH, np.float32)
+        """Render tiles; return the first one that was not, where the lists are too short."""
+        capacity = len(lists) // (LIST_VALUES * PLANE)
         far = np.zeros(2 * TILE, np.float32)
         reach = np.zeros(2 * TILE, np.float32)
+        nearest = np.zeros(2 * TILE, np.float32)
+        counts = np.zeros(PLANE, np.uint32)
         for tile in range(first_tile, end_tile):
             begin = start[tile]
             count = start[tile + 1] - begin
@@ -173,7 +171,7 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
             origin_x = np.float32(tile_x) + HALF
             live_rows = min(height - tile_y, TILE)
             live_columns = min(width - tile_x, TILE)
-            for p in range(_SCRATCH):
+            for p in range(FORWARD_SCRATCH):
                 m[p] = ZERO
             # Pixels outside the image start opaque, so nothing contributes to them.
             for row in range(live_rows):
@@ -182,9 +180,13 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
             for p in range(2 * TILE):
                 far[p] = FAR
                 reach[p] = ZERO
-            recorded = 0
+                nearest[p] = FAR
+            for p in range(PLANE):
+                counts[p] = 0
             low, high = 0, live_rows - 1
             for k in range(count):
+                ahead = begin + min(k + PREFETCH_AHEAD, count - 1)
+                prefetch_row(params, np.int64(gaussian_ids[ahead]))
                 first = max(np.int64(rows[begin + k, 0]), low)
                 last = min(np.int64(rows[begin + k, 1]), high)
                 if weights:
@@ -207,22 +209,19 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                         # The masks prove to LLVM that the index is not negative.
                         b = (row & (TILE - 1)) * TILE + (half & (halves - 1)) * lanes
                         left = u - np.float32((half & (halves - 1)) * lanes)
-                        top = _blend_run(
+                        _blend_run(
                             lanes, depth, weights, m, b, place, left, dy,
                             q[2], q[3], q[4], q[5], q[6], q[7], q[8], q[9], z, q[11], q[12],
                             q[13], q[14], q[15], q[16], q[17], q[18], q[19], q[20], q[21],
                         )  # fmt: skip
-                        if depth and top > ZERO:
+                        if depth:
                             run = (row & (TILE - 1)) * halves + (half & (halves - 1))
-                            if front < far[run]:
-                                at = recorded * (RECORD_VALUES * lanes)
-                                copy_run(lanes, records, at, m, ALPHA + b)
-                                copy_run(lanes, records, at + lanes, m, PEAK + b)
-                                copy_run(lanes, records, at + 2 * lanes, m, SHARPNESS + b)
-                                record_runs[recorded] = run
-                                record_fronts[recorded] = front
+                            pixels = positive_run(lanes, m, ALPHA + b)
+                            if pixels != np.uint64(0) and front < far[run]:
+                                at = run * (capacity * LIST_VALUES * lanes)
+                                append_run(lanes, m, b, pixels, lists, counts, at)
+                                nearest[run] = min(nearest[run], front)
                                 reach[run] = max(reach[run], back)
-                                recorded += 1
                 if weights:
                     total = ZERO
                     largest = ZERO
@@ -234,7 +233,10 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                     pair_weights[slot, 1] = largest
                 if k % LIVENESS_EVERY == LIVENESS_EVERY - 1:
                     if depth:
-                        if recorded + 2 * TILE * LIVENESS_EVERY > capacity:
+                        longest = np.uint32(0)
+                        for p in range(PLANE):
+                            longest = max(longest, counts[p])
+                        if np.int64(longest) + LIVENESS_EVERY > capacity:
                             return tile
                         for run in range(TILE * halves):
                             b = (run & (2 * TILE - 1)) * lanes
@@ -251,10 +253,13 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                     if low > high and not weights:
                         break
             if depth:
-                solve_tile(
-                    lanes, m, records, record_runs, record_fronts, recorded,
-                    live_rows, live_columns, limit,
-                )  # fmt: skip
+                for run in range(live_rows * halves):
+                    b = (run & (2 * TILE - 1)) * lanes
+                    at = run * (capacity * LIST_VALUES * lanes)
+                    if lanes == 16:
+                        solve_run_16(m, b, lists, counts, at, nearest[run], limit)
+                    else:
+                        solve_run_8(m, b, lists, counts, at, nearest[run], limit)
             for row in range(live_rows):
                 y = tile_y + row
                 for column in range(live_columns):

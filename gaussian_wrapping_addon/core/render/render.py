@@ -14,6 +14,7 @@ from ..dataset.camera import Camera
 from ..errors import ResourceError
 from ..gaussians.model import OrientedGaussians
 from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
+from .isosurface import LIST_VALUES
 from .projection import (
     RawArrays,
     RawGradients,
@@ -21,26 +22,19 @@ from .projection import (
     project_backward,
     project_gaussians,
 )
-from .raster_backward import PAIR_COLUMNS, backward_kernel, sum_pairs, sum_weights
-from .raster_forward import RECORD_VALUES, forward_kernel
-from .raster_math import narrow_rows, vector_lanes
+from .raster_backward import BACKWARD_SCRATCH, backward_kernel, sum_pairs, sum_weights
+from .raster_forward import FORWARD_SCRATCH, forward_kernel
+from .raster_math import PLANE, ROW_VALUES, aligned_zeros, narrow_rows, vector_lanes
 from .tiles import TileLists, bin_gaussians
 from .types import Render, RenderOptions, RenderStatistics
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 # What a tile costs besides its pairs, in pairs: clearing and writing its pixels.
 _TILE_COST = 16
-_FIRST_RECORDS = 16384
-_MAX_RECORDS = 1 << 26
-
-
-class Records:
-    """Scratch of one thread for the isosurface solver; grows when a tile needs more."""
-
-    def __init__(self, capacity: int, lanes: int) -> None:
-        self.values = np.zeros(capacity * RECORD_VALUES * lanes, np.float32)
-        self.runs = np.zeros(capacity, np.uint8)
-        self.fronts = np.zeros(capacity, np.float32)
+# Contributors per pixel that the lists of one thread first have room for, and at most. One less
+# than a power of two, so that the lists of different runs do not compete for the same cache sets.
+_FIRST_SLOTS = 127
+_MAX_SLOTS = 1 << 20
 
 
 @dataclass
@@ -51,23 +45,31 @@ class RenderBuffers:
     threads never share one.
     """
 
-    records: list[Records] = field(default_factory=list)
+    scratch: list[np.ndarray] = field(default_factory=list)
+    lists: list[np.ndarray] = field(default_factory=list)
     pairs: list[np.ndarray] = field(default_factory=list)
 
-    def take_records(self, lanes: int) -> Records:
-        """Return scratch for one thread."""
+    def take_scratch(self) -> np.ndarray:
+        """Return the state of one thread's tile, with any content."""
         try:
-            return self.records.pop()
+            return self.scratch.pop()
         except IndexError:
-            return Records(_FIRST_RECORDS, lanes)
+            return aligned_zeros(max(FORWARD_SCRATCH, BACKWARD_SCRATCH))
+
+    def take_lists(self) -> np.ndarray:
+        """Return contributor lists for one thread, with any content."""
+        try:
+            return self.lists.pop()
+        except IndexError:
+            return aligned_zeros(_FIRST_SLOTS * LIST_VALUES * PLANE)
 
     def take_pairs(self, count: int) -> np.ndarray:
         """Return at least ``count`` rows of pair gradients with any content."""
         try:
             kept = self.pairs.pop()
         except IndexError:
-            kept = np.zeros((0, PAIR_COLUMNS), np.float32)
-        return kept if len(kept) >= count else np.zeros((count * 5 // 4, PAIR_COLUMNS), np.float32)
+            kept = np.zeros((0, ROW_VALUES), np.float32)
+        return kept if len(kept) >= count else np.zeros((count * 5 // 4, ROW_VALUES), np.float32)
 
 
 _shared_buffers = RenderBuffers()
@@ -131,7 +133,7 @@ def render(
     Raises
     ------
     ResourceError
-        If the tile lists or the isosurface's records grow beyond what can be addressed.
+        If the tile lists or the contributor lists grow beyond what can be addressed.
     """
     options = options or RenderOptions()
     collected = _empty_statistics(len(gaussians)) if options.statistics else None
@@ -242,7 +244,7 @@ def blend(view: _View, buffers: RenderBuffers) -> _Images:
     limit = np.float32(options.depth_valid_transmittance)
 
     def run(first: int, end: int) -> None:
-        records = buffers.take_records(lanes)
+        scratch, contributors = buffers.take_scratch(), buffers.take_lists()
         while True:
             first = forward(
                 first,
@@ -258,9 +260,8 @@ def blend(view: _View, buffers: RenderBuffers) -> _Images:
                 height,
                 background,
                 limit,
-                records.values,
-                records.runs,
-                records.fronts,
+                scratch,
+                contributors,
                 images.color,
                 images.normal,
                 images.geometric,
@@ -272,14 +273,15 @@ def blend(view: _View, buffers: RenderBuffers) -> _Images:
             )
             if first >= end:
                 break
-            capacity = 2 * len(records.runs)
-            if capacity > _MAX_RECORDS:
+            slots = 2 * (len(contributors) // (LIST_VALUES * PLANE)) + 1
+            if slots > _MAX_SLOTS:
                 raise ResourceError(
-                    f"A tile of view {camera.name!r} needs more than {_MAX_RECORDS} records.",
-                    "Use fewer Gaussians or a larger image.",
+                    f"A pixel of view {camera.name!r} sees over {_MAX_SLOTS // 2} Gaussians.",
+                    "Use fewer Gaussians.",
                 )
-            records = Records(capacity, lanes)
-        buffers.records.append(records)
+            contributors = aligned_zeros(slots * LIST_VALUES * PLANE)
+        buffers.scratch.append(scratch)
+        buffers.lists.append(contributors)
 
     run_chunks(run, view.bounds, view.threads)
     return images
@@ -301,6 +303,7 @@ def blend_backward(
     pairs = buffers.take_pairs(len(lists.gaussian_ids))
 
     def run(first: int, end: int) -> None:
+        scratch = buffers.take_scratch()
         backward(
             first,
             end,
@@ -324,11 +327,13 @@ def blend_backward(
             g_geometric,
             g_alpha,
             g_depth,
+            scratch,
             pairs,
         )
+        buffers.scratch.append(scratch)
 
     run_chunks(run, view.bounds, view.threads)
-    grad_params = np.zeros((count, PAIR_COLUMNS), np.float32)
+    grad_params = np.zeros((count, ROW_VALUES), np.float32)
     grad_px = np.zeros(count, np.float32)
     grad_abs_px = np.zeros(count, np.float32)
 
