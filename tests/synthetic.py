@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A small scene with exact ground truth: a patterned ball on a patterned floor, ray traced.
+"""A small scene with exact ground truth: a patterned ball on a floor under a dome, ray traced.
 
 The photos, cameras (COLMAP text model) and sparse points come from closed forms, so a test can
 compare a mesh with the true sphere.
@@ -17,7 +17,11 @@ from gaussian_wrapping_addon.core.dataset.camera import Camera
 
 BALL_RADIUS = 1.0
 FLOOR_Z = -1.0
-FLOOR_RADIUS = 3.0
+FLOOR_RADIUS = 8.0
+DOME_RADIUS = 9.0
+DOME_SCALE = 0.2
+"""The dome's pattern is this much coarser: a far background."""
+
 SAMPLES = 2
 """Rays per pixel and direction, for edges without stairs."""
 
@@ -45,28 +49,29 @@ def look_at(
 
 
 def _pattern(points: np.ndarray, seed: int) -> np.ndarray:
-    """Return (n, 3) colours in [0.1, 0.95]: a sum of waves with a few periods over the scene."""
+    """Return (n, 3) colours in [0.17, 0.88]: a sum of waves with a few periods over the scene."""
     generator = np.random.default_rng(seed)
-    waves = generator.normal(size=(12, 3)) * 4.0  # (12, 3) radians per unit
+    waves = generator.normal(size=(12, 3)) * 2.2  # (12, 3) radians per unit
     phases = generator.uniform(0, 2 * np.pi, size=(12, 3))
     amounts = generator.normal(size=(12, 3))
     angle = points @ waves.T  # (n, 12)
     value = (np.sin(angle[:, :, None] + phases[None]) * amounts[None]).sum(1)  # (n, 3)
-    return 0.525 + 0.425 * np.tanh(0.6 * value)
+    return 0.525 + 0.35 * np.tanh(0.4 * value)
 
 
 def trace(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Return (n, 3) colours of rays from one origin; (n, 3) directions need no unit length."""
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    color = np.full((len(unit), 3), 0.03)
+    outwards = unit @ origin
+    reach = -outwards + np.sqrt(outwards**2 - (origin @ origin - DOME_RADIUS**2))
+    color = _pattern((origin + reach[:, None] * unit) * DOME_SCALE, 4)
     below = np.where(unit[:, 2] < -1e-9, (FLOOR_Z - origin[2]) / unit[:, 2], np.inf)
     floor = origin + np.where(np.isfinite(below), below, 0.0)[:, None] * unit
     on_floor = np.isfinite(below) & (np.hypot(floor[:, 0], floor[:, 1]) < FLOOR_RADIUS)
     color[on_floor] = _pattern(floor[on_floor], 1)
-    along = unit @ origin
-    root = along**2 - (origin @ origin - BALL_RADIUS**2)
-    hit = (root > 0) & (along < 0)
-    ball = origin + (-along - np.sqrt(np.maximum(root, 0.0)))[:, None] * unit
+    root = outwards**2 - (origin @ origin - BALL_RADIUS**2)
+    hit = (root > 0) & (outwards < 0)
+    ball = origin + (-outwards - np.sqrt(np.maximum(root, 0.0)))[:, None] * unit
     color[hit] = _pattern(ball[hit], 2)
     return color
 
@@ -86,7 +91,7 @@ def photograph(camera: Camera) -> np.ndarray:
 def write_ball_scene(
     folder: Path,
     *,
-    photos: int = 20,
+    photos: int = 30,
     width: int = 96,
     height: int = 80,
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -108,7 +113,7 @@ def write_ball_scene(
     image_lines, focal_px = [], 1.15 * width
     for index in range(photos):
         angle = 2 * np.pi * index / photos
-        rise = 0.9 if index % 2 else 2.2
+        rise = 2.0 if index % 2 else 3.6
         center = np.array([4.0 * np.cos(angle), 4.0 * np.sin(angle), rise])
         local = look_at(center, np.array([0, 0, -0.2]), f"{index:03d}.png", width, height, focal_px)
         Image.fromarray(photograph(local)).save(folder / "images" / local.name)
@@ -124,7 +129,7 @@ def write_ball_scene(
         f"1 PINHOLE {width} {height} {focal_px} {focal_px} {width / 2} {height / 2}\n"
     )
     (model / "images.txt").write_text("\n".join(image_lines) + "\n")
-    points, colors = _surface_points(600)
+    points, colors = _surface_points(800)
     rows = [
         f"{i + 1} {x:.17g} {y:.17g} {z:.17g} {r} {g} {b} 0.5 1 0 2 0 3 0"
         for i, ((x, y, z), (r, g, b)) in enumerate(zip(scale * points + shift, colors, strict=True))
@@ -140,8 +145,12 @@ def _surface_points(count: int) -> tuple[np.ndarray, np.ndarray]:
     radius = FLOOR_RADIUS * np.sqrt(generator.uniform(size=count))
     angle = generator.uniform(0, 2 * np.pi, count)
     floor = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, FLOOR_Z)], 1)
-    points = np.concatenate([ball, floor])
-    colors = np.concatenate([_pattern(ball, 2), _pattern(floor, 1)])
+    dome = generator.normal(size=(count, 3))
+    dome[:, 2] = np.abs(dome[:, 2])
+    dome *= DOME_RADIUS / np.linalg.norm(dome, axis=1, keepdims=True)
+    points = np.concatenate([ball, floor, dome])
+    colors = [_pattern(ball, 2), _pattern(floor, 1), _pattern(DOME_SCALE * dome, 4)]
+    colors = np.concatenate(colors)
     return points, np.round(255 * colors).astype(int)
 
 
