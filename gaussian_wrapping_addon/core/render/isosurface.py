@@ -219,7 +219,7 @@ def _solve(
     lanes: Any, m: Any, b: Any, lists: Any, counts: Any, at: Any, nearest: Any, limit: Any
 ) -> None:  # fmt: skip
     """Solve one run; the body of :func:`solve_run_8` and :func:`solve_run_16`."""
-    slots = 0
+    slots: Any = 0
     for x in range(lanes):
         slots = max(slots, np.int64(counts[b + x]))
         m[_HIGH + x] = ZERO

@@ -312,8 +312,8 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
                 ahead = begin + min(k + PREFETCH_AHEAD, count - 1)
                 prefetch_row(params, np.int64(gaussian_ids[ahead]))
                 prefetch_row(pairs, np.int64(pair_slots[ahead]))
-                first = max(np.int64(rows[begin + k, 0]), low)
-                last = min(np.int64(rows[begin + k, 1]), high)
+                first: Any = max(np.int64(rows[begin + k, 0]), low)
+                last: Any = min(np.int64(rows[begin + k, 1]), high)
                 out = pairs[pair_slots[begin + k]]
                 if first > last:
                     for column in range(ROW_VALUES):
@@ -325,8 +325,8 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
                     v = q[1] - origin_y
                     z = q[10]
                     front = z - FRONT_SIGMAS * q[22]
-                    first_half = max(np.int64(ranges[i, 2]) - tile_x, 0) // lanes
-                    last_half = min(np.int64(ranges[i, 3]) - tile_x, TILE - 1) // lanes
+                    first_half: Any = max(np.int64(ranges[i, 2]) - tile_x, 0) // lanes
+                    last_half: Any = min(np.int64(ranges[i, 3]) - tile_x, TILE - 1) // lanes
                     for p in range(_SUM_ROWS * TILE):
                         m[_SUMS + p] = ZERO
                     reach = ZERO

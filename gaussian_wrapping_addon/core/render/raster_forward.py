@@ -51,6 +51,7 @@ from .raster_math import (
     max_run,
     positive_run,
     prefetch_row,
+    sum_columns,
 )
 
 # Planes of the scratch array behind those of the solver: features, then the strongest Gaussian.
@@ -187,8 +188,8 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
             for k in range(count):
                 ahead = begin + min(k + PREFETCH_AHEAD, count - 1)
                 prefetch_row(params, np.int64(gaussian_ids[ahead]))
-                first = max(np.int64(rows[begin + k, 0]), low)
-                last = min(np.int64(rows[begin + k, 1]), high)
+                first: Any = max(np.int64(rows[begin + k, 0]), low)
+                last: Any = min(np.int64(rows[begin + k, 1]), high)
                 if weights:
                     for x in range(TILE):
                         m[_SUMS + x] = ZERO
@@ -201,8 +202,8 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                 front = z - FRONT_SIGMAS * q[22]
                 back = z + REACH_SIGMAS * q[22]
                 place = np.float32(k)
-                first_half = max(np.int64(ranges[i, 2]) - tile_x, 0) // lanes
-                last_half = min(np.int64(ranges[i, 3]) - tile_x, TILE - 1) // lanes
+                first_half: Any = max(np.int64(ranges[i, 2]) - tile_x, 0) // lanes
+                last_half: Any = min(np.int64(ranges[i, 3]) - tile_x, TILE - 1) // lanes
                 for row in range(first, last + 1):
                     dy = np.float32(row) - v
                     for half in range(first_half, last_half + 1):
@@ -214,23 +215,22 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                             q[2], q[3], q[4], q[5], q[6], q[7], q[8], q[9], z, q[11], q[12],
                             q[13], q[14], q[15], q[16], q[17], q[18], q[19], q[20], q[21],
                         )  # fmt: skip
-                        if depth:
+                if depth:
+                    # Apart from the loop above, whose iterations would wait for its branches.
+                    for row in range(first, last + 1):
+                        for half in range(first_half, last_half + 1):
                             run = (row & (TILE - 1)) * halves + (half & (halves - 1))
-                            pixels = positive_run(lanes, m, ALPHA + b)
-                            if pixels != np.uint64(0) and front < far[run]:
+                            if front < far[run]:
+                                b = (row & (TILE - 1)) * TILE + (half & (halves - 1)) * lanes
+                                pixels = positive_run(lanes, m, ALPHA + b)
                                 at = run * (capacity * LIST_VALUES * lanes)
                                 append_run(lanes, m, b, pixels, lists, counts, at)
                                 nearest[run] = min(nearest[run], front)
                                 reach[run] = max(reach[run], back)
                 if weights:
-                    total = ZERO
-                    largest = ZERO
-                    for x in range(TILE):
-                        total += m[_SUMS + x]
-                        largest = max(largest, m[_LARGEST + x])
                     slot = pair_slots[begin + k]
-                    pair_weights[slot, 0] = total
-                    pair_weights[slot, 1] = largest
+                    pair_weights[slot, 0] = sum_columns(m, _SUMS)
+                    pair_weights[slot, 1] = max_run(TILE, m, _LARGEST)
                 if k % LIVENESS_EVERY == LIVENESS_EVERY - 1:
                     if depth:
                         longest = np.uint32(0)
@@ -250,7 +250,7 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                         if max_run(TILE, m, TRANSMITTANCE + high * TILE) >= TRANSMITTANCE_MIN:
                             break
                         high -= 1
-                    if low > high and not weights:
+                    if low > high:
                         break
             if depth:
                 for run in range(live_rows * halves):

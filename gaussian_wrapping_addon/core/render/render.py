@@ -149,7 +149,7 @@ class _Rasterize(torch.autograd.Function):
     """Projection, binning and blending as one differentiable step."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         means: Tensor,
         log_scales: Tensor,
@@ -182,7 +182,7 @@ class _Rasterize(torch.autograd.Function):
         )
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         _ = ctx.saved_tensors
         view, statistics = ctx.view, ctx.statistics
         incoming = [np.ascontiguousarray(grad.detach().numpy(), np.float32) for grad in grads]
