@@ -18,20 +18,8 @@ from typing import Any
 import numpy as np
 
 from ..compiled import inline, kernel
-from .raster_math import (
-    ALPHA_MAX,
-    HALF,
-    ISO_LEVEL,
-    ONE,
-    PLANE,
-    TILE,
-    TWO,
-    ZERO,
-    copy_run,
-    exp_wide,
-    lowest_bit,
-    max_run,
-)
+from .raster_math import ALPHA_MAX, HALF, ISO_LEVEL, ONE, PLANE, TILE, TWO, ZERO, exp_wide
+from .vector_runs import copy_run, lowest_bit, max_run
 
 LIST_VALUES = 3
 """Values per contributor: alpha before the cap, z-depth of the peak, sharpness (1 / sigma^2)."""

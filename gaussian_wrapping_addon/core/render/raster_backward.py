@@ -37,9 +37,8 @@ from .raster_math import (
     ZERO,
     exp_short,
     exp_wide,
-    max_run,
-    prefetch_row,
 )
+from .vector_runs import max_run, prefetch_row
 
 ABS_U, ABS_V = 22, 23
 """Columns of the pair gradients that hold sums of absolute values, not gradients of params."""
@@ -325,8 +324,10 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
                     v = q[1] - origin_y
                     z = q[10]
                     front = z - FRONT_SIGMAS * q[22]
-                    first_half: Any = max(np.int64(ranges[i, 2]) - tile_x, 0) // lanes
-                    last_half: Any = min(np.int64(ranges[i, 3]) - tile_x, TILE - 1) // lanes
+                    first_column: Any = max(np.int64(ranges[i, 2]) - tile_x, 0)
+                    last_column: Any = min(np.int64(ranges[i, 3]) - tile_x, TILE - 1)
+                    first_half = first_column // lanes
+                    last_half = last_column // lanes
                     for p in range(_SUM_ROWS * TILE):
                         m[_SUMS + p] = ZERO
                     reach = ZERO

@@ -48,11 +48,8 @@ from .raster_math import (
     TWO,
     ZERO,
     exp_short,
-    max_run,
-    positive_run,
-    prefetch_row,
-    sum_columns,
 )
+from .vector_runs import max_run, positive_run, prefetch_row, sum_columns
 
 # Planes of the scratch array behind those of the solver: features, then the strongest Gaussian.
 _F0 = SOLVER_END
@@ -202,8 +199,10 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                 front = z - FRONT_SIGMAS * q[22]
                 back = z + REACH_SIGMAS * q[22]
                 place = np.float32(k)
-                first_half: Any = max(np.int64(ranges[i, 2]) - tile_x, 0) // lanes
-                last_half: Any = min(np.int64(ranges[i, 3]) - tile_x, TILE - 1) // lanes
+                first_column: Any = max(np.int64(ranges[i, 2]) - tile_x, 0)
+                last_column: Any = min(np.int64(ranges[i, 3]) - tile_x, TILE - 1)
+                first_half = first_column // lanes
+                last_half = last_column // lanes
                 for row in range(first, last + 1):
                     dy = np.float32(row) - v
                     for half in range(first_half, last_half + 1):

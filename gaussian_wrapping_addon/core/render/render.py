@@ -15,6 +15,7 @@ from ..errors import ResourceError
 from ..gaussians.model import OrientedGaussians
 from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
 from .isosurface import LIST_VALUES
+from .pair_rows import narrow_rows
 from .projection import (
     RawArrays,
     RawGradients,
@@ -24,7 +25,7 @@ from .projection import (
 )
 from .raster_backward import BACKWARD_SCRATCH, backward_kernel, sum_pairs, sum_weights
 from .raster_forward import FORWARD_SCRATCH, forward_kernel
-from .raster_math import PLANE, ROW_VALUES, aligned_zeros, narrow_rows, vector_lanes
+from .raster_math import PLANE, ROW_VALUES, aligned_zeros, vector_lanes
 from .tiles import TileLists, bin_gaussians
 from .types import Render, RenderOptions, RenderStatistics
 
@@ -168,9 +169,7 @@ class _Rasterize(torch.autograd.Function):
         if statistics is not None:
             _fill_statistics(statistics, view, images)
         ctx.view, ctx.images, ctx.statistics, ctx.buffers = view, images, statistics, buffers
-        # Saved, so that autograd refuses a backward after one of them was changed in place.
-        ctx.save_for_backward(means, log_scales, quats, opacity_logits, sh, orientation)
-        return tuple(
+        outputs = tuple(
             torch.from_numpy(image)
             for image in (
                 images.color,
@@ -180,6 +179,10 @@ class _Rasterize(torch.autograd.Function):
                 images.depth,
             )
         )
+        # The backward pass reads their memory; saved, so that autograd refuses to run it after
+        # one of them was changed in place.
+        ctx.save_for_backward(means, log_scales, quats, opacity_logits, sh, orientation, *outputs)
+        return outputs
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
