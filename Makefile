@@ -7,7 +7,7 @@ prepare:
 	@bash tools/prepare.sh
 
 demo: prepare
-	$(PY) gaussian_wrapping_addon/batch.py wrap examples/bananas --out demo_out
+	$(PY) gaussian_wrapping_addon/batch.py wrap examples/bananas --out demo_out --preset draft
 
 test: lint
 	$(PY) -m pytest
