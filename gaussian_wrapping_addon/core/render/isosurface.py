@@ -39,13 +39,16 @@ _CROSS_BEFORE, _CROSS_SLOT, _GUESS = _RUNS + 11 * TILE, _RUNS + 12 * TILE, _RUNS
 _OPEN = _RUNS + 14 * TILE
 """1 where the pixel has not converged, else 0."""
 _TEST = _RUNS + 15 * TILE
-SOLVER_END = _RUNS + 16 * TILE
+_LAST_T, _LAST_SLOPE = _RUNS + 16 * TILE, _RUNS + 17 * TILE
+SOLVER_END = _RUNS + 18 * TILE
 
 _NEWTON_STEPS = 8
 """From here on every second step is a bisection, which bounds the number of steps."""
 _MAX_STEPS = 80
-# Converged: a Newton step below this share of the thinnest Gaussian's sigma along the ray ...
-_STEP_SIGMAS = np.float32(2e-5)
+# Converged: a Newton step below this share of the thinnest Gaussian's sigma along the ray, where
+# the slope can be extrapolated from the last step or need not be ...
+_STEP_SIGMAS, _STEP_SIGMAS_ALONE = np.float32(2e-4), np.float32(1e-5)
+_NEAR_SIGMAS = np.float32(0.1)
 # ... or below the rounding of the depth itself ...
 _STEP_SHARE = np.float32(2.5e-7)
 # ... or a transmittance equal to 0.5 within its own rounding.
@@ -185,8 +188,14 @@ def _step(lanes: Any, m: Any, bisect: Any) -> None:
         moved = t + step
         newton = (moved > low) & (moved < high) & (bisect == 0)
         size = abs(step)
+        between = t - m[_LAST_T + x]
+        apart = abs(between) * sharpest
+        smooth = (apart < _NEAR_SIGMAS) & (apart > _STEP_SIGMAS_ALONE)
+        bend = (slope - m[_LAST_SLOPE + x]) / (between if smooth else ONE)
+        bend = bend if smooth else ZERO
+        share = _STEP_SIGMAS if smooth else _STEP_SIGMAS_ALONE
         # Rounding may put a step this small on the bracket's end, hence no test for inside.
-        done = size <= max(_STEP_SIGMAS / sharpest, _STEP_SHARE * t)
+        done = size <= max(share / sharpest, _STEP_SHARE * t)
         done = done | (abs(excess) <= _LEVEL_MARGIN) | (high - low <= _STEP_SHARE * high)
         settled = min(max(moved, low), high)
         middle = HALF * (low + high)
@@ -196,7 +205,10 @@ def _step(lanes: Any, m: Any, bisect: Any) -> None:
         m[_HIGH + x] = high
         m[_T + x] = moved if is_open else t
         old = m[_SLOPE + x]
-        floored = max(slope, SLOPE_FLOOR * sharpest)
+        settled_slope = slope + bend * (settled - t)
+        floored = max(settled_slope, SLOPE_FLOOR * sharpest)
+        m[_LAST_T + x] = t
+        m[_LAST_SLOPE + x] = slope
         m[_SLOPE + x] = floored if is_open else old
         stays = is_open & (~done)
         m[_OPEN + x] = ONE if stays else ZERO
@@ -215,6 +227,7 @@ def _solve(
         m[_CROSS_SLOT + x] = ZERO
         m[_SLOPE + x] = ONE
         m[_T + x] = ZERO
+        m[_LAST_T + x] = -ONE
     for x in range(lanes):
         # Shorter lists are filled with Gaussians of no weight.
         for slot in range(np.int64(counts[b + x]), slots):

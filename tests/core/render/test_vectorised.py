@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The compiled kernels use packed arithmetic; a harmless-looking edit can turn it off silently."""
+
+from __future__ import annotations
+
+import functools
+import platform
+import re
+from typing import Any
+
+import llvmlite.binding
+import numba
+import numpy as np
+import pytest
+import torch
+
+from gaussian_wrapping_addon.core.render import isosurface, raster_backward, raster_forward
+from gaussian_wrapping_addon.core.render.raster_math import aligned_zeros, vector_lanes
+from gaussian_wrapping_addon.core.render.render import render
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+
+from .scenes import look_at, random_gaussians
+
+PACKED = re.compile(r"\bvfn?m(?:add|sub)\d+ps\b.*%[yz]mm")
+SINGLE = re.compile(r"\bvfn?m(?:add|sub)\d+ss\b")
+
+
+@functools.cache
+def listing_of(kernel: Any) -> str:
+    """Compile a kernel anew, since cached code keeps no listing; return its assembly."""
+    options = {k: v for k, v in kernel.targetoptions.items() if k != "nopython"}
+    fresh = numba.njit(**options)(kernel.py_func)
+    signature = kernel.signatures[0]
+    fresh.compile(signature)
+    return str(fresh.inspect_asm(signature))
+
+
+def fused_instructions(kernel: Any) -> tuple[int, int]:
+    """Count packed and single FMAs of a kernel."""
+    listing = listing_of(kernel)
+    return len(PACKED.findall(listing)), len(SINGLE.findall(listing))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled() -> None:
+    machine = platform.machine().lower()
+    if machine not in ("x86_64", "amd64"):
+        pytest.skip(f"packed FMA is looked for in x86 code; this machine is {machine}")
+    if not llvmlite.binding.get_host_cpu_features().get("fma"):
+        pytest.skip("this processor has no FMA instructions")
+    gaussians = random_gaussians(20, dtype=torch.float32)
+    gaussians = gaussians.replaced(means=gaussians.means.clone().requires_grad_())
+    camera = look_at((2.2, 1.0, 0.8), width=16, height=16)
+    for depth in (False, True):
+        out = render(gaussians, camera, RenderOptions(depth=depth, threads=1))
+        (out.color.sum() + out.depth.sum()).backward()
+
+
+def test_blending_is_packed() -> None:
+    packed, single = fused_instructions(raster_forward.forward_kernel(vector_lanes(), False, False))
+    # Nine channels, six for the exponential, four for the conic and the quadratic.
+    assert packed >= 19
+    assert single < packed
+
+
+def test_gradient_is_packed() -> None:
+    packed, single = fused_instructions(
+        raster_backward.backward_kernel(vector_lanes(), True, False)
+    )
+    # Twice (with and without depth) the blending's without its channels, nine products with the
+    # loss, and most of the sums.
+    assert packed >= 60
+    assert single < packed
+
+
+def test_isosurface_is_packed() -> None:
+    solver = isosurface.solve_run_16 if vector_lanes() == 16 else isosurface.solve_run_8
+    if not solver.signatures:
+        # Called from another kernel only, so never compiled for Python.
+        values = numba.float32[::1]
+        solver.compile(
+            (
+                values,
+                numba.int64,
+                values,
+                numba.uint32[::1],
+                numba.int64,
+                numba.float32,
+                numba.float32,
+            )
+        )
+    packed, single = fused_instructions(solver)
+    assert packed >= 14
+    assert single < packed
+
+
+def test_no_reference_is_counted_in_the_inner_loops() -> None:
+    # numba's reference counts are atomic and clobber all vector registers; a branch around an
+    # inlined helper is enough to bring them back into the loops.
+    listing = listing_of(raster_backward.backward_kernel(vector_lanes(), True, False))
+    blocks = re.split(r"^\.L\w+:|^\w+:", listing, flags=re.MULTILINE)
+    hot = [block for block in blocks if len(PACKED.findall(block)) >= 10]
+    assert len(hot) >= 2
+    assert not any("NRT_" in block for block in hot)
+
+
+def test_runs_are_aligned_to_cache_lines() -> None:
+    for count in (1, 15, 1000):
+        values = aligned_zeros(count)
+        assert len(values) == count
+        assert values.dtype == np.float32
+        assert values.ctypes.data % 64 == 0
