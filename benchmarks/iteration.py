@@ -10,10 +10,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+
+# Torch's idle threads otherwise spin for a while and take the cores from the renderer's.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np
 import torch
@@ -100,6 +104,7 @@ def render_parts(
     return [
         ("projection forward", lambda: project_gaussians(raw, camera, options)),
         ("binning", lambda: bin_gaussians(screen, camera.width, camera.height, threads)),
+        ("projection, binning, rows", lambda: project_view(raw, camera, options)),
         ("raster forward, no depth", lambda: blend(flat, buffers)),
         ("raster forward + isosurface", lambda: blend(prepared, buffers)),
         ("  the same with weights", lambda: blend(weighted, buffers)),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,7 +74,9 @@ class RenderBuffers:
         return kept if len(kept) >= count else np.zeros((count * 5 // 4, ROW_VALUES), np.float32)
 
 
-_shared_buffers = RenderBuffers()
+@functools.cache
+def _shared_buffers() -> RenderBuffers:
+    return RenderBuffers()
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ def render(
     collected = _empty_statistics(len(gaussians)) if options.statistics else None
     tensors = [getattr(gaussians, name) for name in _TRAINED]
     images = _Rasterize.apply(
-        *tensors, gaussians, camera, options, collected, buffers or _shared_buffers
+        *tensors, gaussians, camera, options, collected, buffers or _shared_buffers()
     )
     color, normal, geometric, alpha, depth = images
     return Render(color, normal, geometric, alpha, depth, collected)
