@@ -11,6 +11,7 @@ from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
 from gaussian_wrapping_addon.core.training.schedule import (
     POSITION_RATE,
     PYRAMID,
+    REFERENCE_ITERATIONS,
     RESET_EVERY,
     SMALLEST_SIDE_PX,
     Schedule,
@@ -62,14 +63,14 @@ def test_growth_leaves_room_for_the_wrapping_rounds() -> None:
 
 
 def test_position_rate_falls_log_linearly_and_orientation_waits() -> None:
-    settings = TrainingSettings(iterations=1000, sh_degree=1)
+    settings = TrainingSettings(iterations=REFERENCE_ITERATIONS, sh_degree=1)
     plan = Schedule(settings, 640)
-    first, middle, last = (float(plan.rates(i)["means"][0]) for i in (0, 500, 1000))
+    first, middle, last = (float(plan.rates(i)["means"][0]) for i in (0, 15_000, 30_000))
     assert first == pytest.approx(SCENE_RADIUS * POSITION_RATE[0], rel=1e-6)
     assert last == pytest.approx(SCENE_RADIUS * POSITION_RATE[1], rel=1e-6)
     assert middle == pytest.approx(np.sqrt(first * last), rel=1e-5)
-    assert "orientation" not in plan.rates(600)
-    assert plan.rates(700)["orientation"].shape == (4,)
+    assert "orientation" not in plan.rates(19_000)
+    assert plan.rates(21_000)["orientation"].shape == (4,)
     assert plan.rates(0)["sh"].shape == (12,)
     assert plan.rates(0)["sh"][0] > 5 * plan.rates(0)["sh"][3]
     assert float(plan.rates(0, 0.5)["means"][0]) == pytest.approx(0.5 * first)
@@ -82,3 +83,16 @@ def test_opacity_resets_only_where_there_is_time_to_recover() -> None:
     plan = Schedule(TrainingSettings(iterations=30_000), 640)
     resets = [i for i in range(30_000) if plan.resets_opacity(i)]
     assert resets == [RESET_EVERY * k for k in (1, 2, 3, 4)]
+
+
+def test_short_runs_take_larger_steps_and_long_ones_the_published() -> None:
+    published = Schedule(TrainingSettings(iterations=REFERENCE_ITERATIONS), 640).rates(0)
+    short = Schedule(TrainingSettings(iterations=1500), 640)
+    factor = short.short_run_factor
+    assert factor == pytest.approx(20**0.4)
+    rates = short.rates(0)
+    for name, power in (("means", 0.5), ("opacity_logits", 0.5), ("log_scales", 1), ("quats", 1)):
+        assert rates[name] == pytest.approx(published[name] * factor**power, rel=1e-5), name
+    assert rates["sh"][0] == pytest.approx(published["sh"][0] * factor, rel=1e-5)
+    assert rates["sh"][3] == pytest.approx(published["sh"][3] * factor**2, rel=1e-5)
+    assert Schedule(TrainingSettings(iterations=60_000), 640).short_run_factor == 1.0
