@@ -26,6 +26,7 @@ from tests.blender.synthetic_result import write_region_result, write_result
 
 def main() -> int:
     folder = JobFolder(Path(sys.argv[-2]))
+    parent = int(sys.argv[-1])
     mode = os.environ.get("GW_FAKE", "quick")
 
     def say(state: str, fraction: float, **more: object) -> None:
@@ -56,6 +57,8 @@ def main() -> int:
         time.sleep(60)
     while mode == "slow":
         time.sleep(0.02)
+        if parent and os.getppid() != parent:
+            return 5  # as the real worker: it does not outlive its parent
         if folder.cancel_path.exists():
             say("CANCELLED", 0.25, hint="Resume continues from the last checkpoint.")
             folder.unlock()

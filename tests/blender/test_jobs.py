@@ -31,13 +31,14 @@ pytestmark = pytest.mark.usefixtures("addon")
 
 
 @pytest.fixture(autouse=True)
-def _private_state(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _private_state(addon: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """End the workers before ``addon`` is unregistered, which forgets them on purpose."""
     monkeypatch.setattr(known_jobs, "_session", [])
     yield
-    for folder, job in job_timer._jobs.items():
+    for job in job_timer._jobs.values():
         if job.client.poll().active:
             job.client.kill()
-            assert folder
+            assert not job.client.poll().active, "a worker outlived its test"
     job_timer.forget_all()
 
 

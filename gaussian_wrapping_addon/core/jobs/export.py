@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
 from typing import Any
 
 from ..evaluation.report import write_report
@@ -86,8 +85,3 @@ def _region_figures(meshed: Stage, textured: Stage) -> dict[str, Any]:
 def _plain(values: Any) -> Any:
     """Return the values as JSON would read them back, so that a report is never half numpy."""
     return json.loads(json.dumps(values))
-
-
-def result_of(folder: Path) -> Path:
-    """Return the result folder of a job folder."""
-    return JobFolder(folder).result
