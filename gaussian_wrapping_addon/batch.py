@@ -83,9 +83,7 @@ def _parser() -> ArgumentParser:
 
     for command in (wrap, mesh):
         command.add_argument("--out", type=Path, required=True, metavar="DIR")
-        command.add_argument(
-            "--region", nargs="+", default=["auto"], metavar="auto|all|REGION.json"
-        )
+        command.add_argument("--region", nargs="+", action="extend", metavar="auto|all|REGION.json")
         size = command.add_mutually_exclusive_group()
         size.add_argument("--edge-length", type=float, default=0.0, help="world units of the input")
         size.add_argument("--points", type=int, default=0, help="number of surface points")
@@ -169,7 +167,7 @@ def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
     return replace(
         settings,
         threads=options.threads,
-        regions=tuple(options.region),
+        regions=tuple(dict.fromkeys(options.region or ["auto"])),
         export=tuple(dict.fromkeys(f for f in options.export.split(",") if f)),
         meshing=replace(settings.meshing, edge_length=options.edge_length, points=options.points),
         texture=replace(settings.texture, size_px=0 if size == "auto" else int(size)),

@@ -63,8 +63,13 @@ class JobClient:
             Let the worker go on when this process ends.
         """
         target = JobFolder(folder.resolve())
+        source = Path(job.source)
+        if source.is_dir() and target.root.is_relative_to(source):
+            raise UsageError(
+                f"{folder} lies inside the photos' folder.", "Choose a folder outside of it."
+            )
         target.create()
-        if target.read_status().active and target.is_job() and _lock_held(target):
+        if target.locked():
             raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
         write_job(target.job_path, job)
         return cls._launch(target, python, keep_running)
@@ -77,7 +82,7 @@ class JobClient:
         target = JobFolder(folder.resolve())
         if not target.is_job():
             raise UsageError(f"{folder} holds no job.", "Choose the folder given as --out.")
-        if _lock_held(target):
+        if target.locked():
             raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
         return cls._launch(target, python, keep_running)
 
@@ -112,15 +117,14 @@ class JobClient:
 
     def poll(self) -> JobStatus:
         """Return the job's status; cheap enough for a timer."""
+        code = None if self._process is None else self._process.poll()
+        # Read after the process was looked at: its last status may be its last deed.
         status = self.folder.read_status()
-        if self._process is None or self._process.poll() is None or not status.active:
-            if status.state == "NEW" and self._process is None and not _lock_held(self.folder):
+        if code is None:
+            if status.state == "NEW" and self._process is None and not self.folder.locked():
                 return self._failed(status, "The worker did not start.")
             return status
-        # The process has ended: its last status may have been written after our read.
-        status = self.folder.read_status()
         if status.active or status.state == "LOST":
-            code = self._process.returncode
             reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
             return self._failed(status, f"The worker {reason}. {self.last_words()}".strip())
         return status
@@ -172,13 +176,3 @@ class JobClient:
             raise WorkerError("This job was started by another process.", "Poll it instead.")
         self._process.wait(timeout_s)
         return self.poll()
-
-
-def _lock_held(folder: JobFolder) -> bool:
-    from ..files import read_json
-
-    try:
-        owner = read_json(folder.lock_path)
-        return process_alive(int(owner["pid"]), int(owner["started"]))
-    except (OSError, KeyError, TypeError, ValueError, WorkerError):
-        return False

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -84,8 +85,17 @@ def make_job(command: str, source: Path, settings: JobSettings) -> JobFile:
             raise DatasetError(f"Region file {region} does not exist.", "Check the path.")
         name = str(path.resolve())
         bodies[name] = read_json(path)
+        _check_region(bodies[name], path)
         names.append(name)
     return JobFile(command, str(source.resolve()), replace(settings, regions=tuple(names)), bodies)
+
+
+def _check_region(body: Any, path: Path) -> None:
+    """Refuse a bad region before anything starts; Blender may lack scipy, then the worker does."""
+    if importlib.util.find_spec("scipy") is not None:
+        from ..meshing.region import parse_region
+
+        parse_region(body, path)
 
 
 def read_job(path: Path) -> JobFile:

@@ -7,10 +7,8 @@ stop), ``stages/<name>-<hash>/`` (``done.json`` last), ``result/``.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
-import time
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -209,22 +207,40 @@ class JobFolder:
         UsageError
             Another process is at work here.
         """
-        with contextlib.suppress(OSError, ParseError, KeyError, TypeError):
+        mine = {"pid": os.getpid(), "started": process_start_ticks(os.getpid())}
+        owner = self._lock_owner()
+        if owner == (mine["pid"], mine["started"]):
+            return
+        if owner is not None and not process_alive(*owner):
+            self.lock_path.unlink(missing_ok=True)
+        # A hard link to a finished file appears whole or not at all, and for one process only.
+        ready = self.lock_path.with_name(f"lock.{os.getpid()}.json")
+        write_json(ready, mine)
+        try:
+            os.link(ready, self.lock_path)
+        except FileExistsError:
+            pid = (self._lock_owner() or (0, 0))[0]
+            raise UsageError(
+                f"Process {pid} is working in {self.root}.",
+                "Wait for it, cancel it, or choose another folder.",
+            ) from None
+        except OSError:
+            # A file system without hard links (exFAT): the best there is.
+            os.replace(ready, self.lock_path)
+        finally:
+            ready.unlink(missing_ok=True)
+
+    def _lock_owner(self) -> tuple[int, int] | None:
+        try:
             owner = read_json(self.lock_path)
-            pid, started = int(owner["pid"]), int(owner["started"])
-            if pid != os.getpid() and process_alive(pid, started):
-                raise UsageError(
-                    f"Process {pid} is working in {self.root}.",
-                    "Wait for it, cancel it, or choose another folder.",
-                )
-        write_json(
-            self.lock_path,
-            {
-                "pid": os.getpid(),
-                "started": process_start_ticks(os.getpid()),
-                "time_s": time.time(),
-            },
-        )
+            return int(owner["pid"]), int(owner["started"])
+        except (OSError, ParseError, KeyError, TypeError, ValueError):
+            return None
+
+    def locked(self) -> bool:
+        """Whether a living process works here."""
+        owner = self._lock_owner()
+        return owner is not None and process_alive(*owner)
 
     def unlock(self) -> None:
         """Give the folder free."""

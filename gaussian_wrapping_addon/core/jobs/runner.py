@@ -96,6 +96,13 @@ def run_job(
     threads = job.settings.threads or default_threads()
     overall = _Overall(sink, is_cancelled)
     begun_s = time.time()
+    from ..meshing.region import parse_region
+
+    for request, body in job.region_bodies.items():
+        parse_region(body, Path(request))
+    names = [region_name(r, job.region_bodies.get(r)) for r in job.settings.regions]
+    if len(set(names)) < len(names):
+        raise UsageError("Two regions have the same name.", "Give each region its own name.")
 
     cameras = _run_cameras(folder, job, overall, threads)
     if cameras.reused:
@@ -104,9 +111,6 @@ def run_job(
     if trained.reused:
         overall.skip_to(SHARES["cameras"] + SHARES["train"])
 
-    names = [region_name(r, job.region_bodies.get(r)) for r in job.settings.regions]
-    if len(set(names)) < len(names):
-        raise UsageError("Two regions have the same name.", "Give each region its own name.")
     begin = SHARES["cameras"] + SHARES["train"]
     share = (1.0 - SHARES["export"] - begin) / len(names)
     regions: list[tuple[str, Stage, Stage]] = []

@@ -16,6 +16,7 @@ from typing import Any
 from ..errors import ParseError
 from ..files import read_json, write_json
 from ..progress import Progress
+from .job_folder import MARKER
 
 _logger = logging.getLogger(__name__)
 
@@ -51,7 +52,10 @@ def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
     """
     root = source if source.is_dir() else source.parent
     found = []
-    for folder, subfolders, names in os.walk(root, followlinks=True):
+    for folder, subfolders, names in os.walk(root):
+        if MARKER in names:
+            subfolders.clear()  # a job folder beside a transforms.json is not input
+            continue
         subfolders[:] = sorted(s for s in subfolders if not s.startswith("."))
         for name in sorted(names):
             path = Path(folder) / name

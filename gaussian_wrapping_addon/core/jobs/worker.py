@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -107,6 +108,12 @@ def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGINT, ask_to_stop)
     try:
         folder.lock()
+    except WrapError as refused:
+        # Another worker owns the folder: its status and its lock are not ours to write.
+        _logger.error("%s", refused)
+        sys.stderr.write(f"{refused}\n")
+        return refused.exit_code
+    try:
         reporter.write()
         threading.Thread(target=reporter.beat, args=(parent,), daemon=True).start()
         from .runner import run_job

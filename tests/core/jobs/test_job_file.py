@@ -17,14 +17,21 @@ from gaussian_wrapping_addon.core.settings import JobSettings, preset
 
 def test_round_trip_keeps_settings_and_region_content(tmp_path: Path) -> None:
     region = tmp_path / "head.json"
-    region.write_text(json.dumps({"version": 1, "vertices": []}))
+    body = {
+        "class_name": "GaussianWrappingBoundingVolume",
+        "version": 1,
+        "blender_object_name": "head",
+        "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        "hull_simplices": None,
+    }
+    region.write_text(json.dumps(body))
     settings = preset("fine", regions=("auto", str(region)), export=("glb", "ply"), seed=7)
     job = make_job("wrap", tmp_path, settings)
     write_job(tmp_path / "job.json", job)
     region.unlink()
     again = read_job(tmp_path / "job.json")
     assert again == job
-    assert again.region_bodies[str(region.resolve())] == {"version": 1, "vertices": []}
+    assert again.region_bodies[str(region.resolve())] == body
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.errors import ParseError, UsageError
+from gaussian_wrapping_addon.core.files import read_json, write_json
+from gaussian_wrapping_addon.core.helper_process import child_command
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job
+from gaussian_wrapping_addon.core.jobs.job_folder import process_start_ticks
 from gaussian_wrapping_addon.core.settings import JobSettings
 
 BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"
@@ -50,15 +53,49 @@ def test_a_locked_folder_is_refused(tmp_path: Path) -> None:
     source.mkdir()
     job = make_job("wrap", source, JobSettings())
     JobClient.start(tmp_path / "out", job).wait(60)
-    from gaussian_wrapping_addon.core.files import write_json
-    from gaussian_wrapping_addon.core.jobs.job_folder import process_start_ticks
-
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
         lock = {"pid": other.pid, "started": process_start_ticks(other.pid)}
         write_json(tmp_path / "out" / "lock.json", lock)
         with pytest.raises(UsageError, match="running"):
             JobClient.resume(tmp_path / "out")
         other.kill()
+
+
+def test_a_worker_that_may_not_lock_leaves_the_owner_alone(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    source.mkdir()
+    first = JobClient.start(tmp_path / "out", make_job("wrap", source, JobSettings()))
+    first.wait(60)
+    folder = first.folder
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as owner:
+        lock = {"pid": owner.pid, "started": process_start_ticks(owner.pid)}
+        write_json(folder.lock_path, lock)
+        before = folder.status_path.read_bytes()
+        done = subprocess.run(
+            child_command("jobs.worker", str(folder.root), "0"), capture_output=True, check=False
+        )
+        assert done.returncode == 2
+        assert str(owner.pid).encode() in done.stderr
+        assert folder.status_path.read_bytes() == before
+        assert read_json(folder.lock_path) == lock
+        owner.kill()
+
+
+def test_results_inside_the_photo_folder_are_refused(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    source.mkdir()
+    with pytest.raises(UsageError, match="inside"):
+        JobClient.start(source / "out", make_job("wrap", source, JobSettings()))
+    assert list(source.iterdir()) == []
+
+
+@pytest.mark.parametrize("body", [{}, {"class_name": "x"}, {"version": 1, "vertices": [[0, 0, 0]]}])
+def test_a_bad_region_is_refused_before_anything_starts(tmp_path: Path, body: dict) -> None:
+    (tmp_path / "photos").mkdir()
+    write_json(tmp_path / "r.json", body)
+    settings = JobSettings(regions=(str(tmp_path / "r.json"),))
+    with pytest.raises(ParseError, match=r"r\.json"):
+        make_job("wrap", tmp_path / "photos", settings)
 
 
 def test_a_broken_job_file_is_reported_by_the_worker(tmp_path: Path) -> None:
