@@ -42,9 +42,8 @@ def export_results(
     progress.update(0.1, "writing the scene")
     write_scene_summary(result / "scene.json", cameras)
     scene = load_saved_scene(cameras.folder)
-    if not (trained.reused and (result / "gaussians.ply").exists()):
-        gaussians = load_gaussians(trained.folder / "gaussians.npz")
-        write_splat_ply(result / "gaussians.ply", gaussians, scene.world_from_scene)
+    gaussians = load_gaussians(trained.folder / "gaussians.npz")
+    write_splat_ply(result / "gaussians.ply", gaussians, scene.world_from_scene)
     for index, (name, meshed, textured) in enumerate(regions):
         progress.update(0.2 + 0.6 * index / len(regions), f"writing {name}")
         target = result / name
@@ -52,14 +51,14 @@ def export_results(
             shutil.rmtree(target)
         shutil.copytree(textured.folder / "files", target)
         shutil.copy2(meshed.folder / "region.json", target / "region.json")
-        write_json(target / "figures.json", _region_figures(meshed, textured))
+        write_json(target / "figures.json", _region_figures(trained, meshed, textured))
     shutil.copy2(regions[0][2].folder / "preview.png", result / "preview.png")
     for name, _, textured in regions:
         shutil.copy2(textured.folder / "preview.png", result / name / "preview.png")
     progress.update(0.9, "writing the report")
-    all_regions = {
-        path.parent.name: read_json(path) for path in sorted(result.glob("*/figures.json"))
-    }
+    figures = {path.parent.name: read_json(path) for path in sorted(result.glob("*/figures.json"))}
+    # Regions of an earlier training stay on disk; this report is about this training.
+    all_regions = {n: f for n, f in figures.items() if f.get("training") == trained.key}
     write_report(result, _plain({**summary, **_whole(cameras, trained, regions)}), all_regions)
 
 
@@ -76,8 +75,9 @@ def _whole(
     }
 
 
-def _region_figures(meshed: Stage, textured: Stage) -> dict[str, Any]:
+def _region_figures(trained: Stage, meshed: Stage, textured: Stage) -> dict[str, Any]:
     figures = {**meshed.done, **textured.done}
+    figures["training"] = trained.key
     figures["seconds"] = {"mesh": meshed.done["seconds"], "texture": textured.done["seconds"]}
     return _plain(figures)
 
