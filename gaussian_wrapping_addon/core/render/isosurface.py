@@ -49,6 +49,8 @@ _MAX_STEPS = 80
 # the slope can be extrapolated from the last step or need not be ...
 _STEP_SIGMAS, _STEP_SIGMAS_ALONE = np.float32(2e-4), np.float32(1e-5)
 _NEAR_SIGMAS = np.float32(0.1)
+_NO_LAST_T = np.float32(-1e30)
+"""So far before every depth that it is never near, however wide the Gaussians are."""
 # ... or below the rounding of the depth itself ...
 _STEP_SHARE = np.float32(2.5e-7)
 # ... or a transmittance equal to 0.5 within its own rounding.
@@ -227,7 +229,9 @@ def _solve(
         m[_CROSS_SLOT + x] = ZERO
         m[_SLOPE + x] = ONE
         m[_T + x] = ZERO
-        m[_LAST_T + x] = -ONE
+        # No step was taken yet: what the scratch holds of other pixels must not count as one.
+        m[_LAST_T + x] = _NO_LAST_T
+        m[_LAST_SLOPE + x] = ZERO
     for x in range(lanes):
         # Shorter lists are filled with Gaussians of no weight.
         for slot in range(np.int64(counts[b + x]), slots):
