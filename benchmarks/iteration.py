@@ -30,6 +30,12 @@ from benchmarks.workload import surface_gaussians, view
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.render.blend import (
+    Images,
+    RenderBuffers,
+    blend,
+    blend_backward,
+)
 from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     RawGradients,
@@ -37,13 +43,7 @@ from gaussian_wrapping_addon.core.render.projection import (
     project_gaussians,
 )
 from gaussian_wrapping_addon.core.render.raster_math import vector_lanes
-from gaussian_wrapping_addon.core.render.render import (
-    RenderBuffers,
-    blend,
-    blend_backward,
-    project_view,
-    render,
-)
+from gaussian_wrapping_addon.core.render.render import project_view, render
 from gaussian_wrapping_addon.core.render.tiles import bin_gaussians
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 
@@ -82,7 +82,8 @@ def render_parts(
     prepared = project_view(raw, camera, options)
     flat = dataclasses.replace(prepared, options=dataclasses.replace(options, depth=False))
     weighted = dataclasses.replace(prepared, options=dataclasses.replace(options, statistics=True))
-    images = blend(prepared, buffers)
+    images = Images.allocate(camera, weighted.options)
+    blend(prepared, images, buffers)
     random = np.random.default_rng(0)
     incoming = [
         random.normal(size=image.shape).astype(np.float32)
@@ -105,9 +106,9 @@ def render_parts(
         ("projection forward", lambda: project_gaussians(raw, camera, options)),
         ("binning", lambda: bin_gaussians(screen, camera.width, camera.height, threads)),
         ("projection, binning, rows", lambda: project_view(raw, camera, options)),
-        ("raster forward, no depth", lambda: blend(flat, buffers)),
-        ("raster forward + isosurface", lambda: blend(prepared, buffers)),
-        ("  the same with weights", lambda: blend(weighted, buffers)),
+        ("raster forward, no depth", lambda: blend(flat, images, buffers)),
+        ("raster forward + isosurface", lambda: blend(prepared, images, buffers)),
+        ("  the same with weights", lambda: blend(weighted, images, buffers)),
         (
             "raster backward, no depth",
             lambda: blend_backward(flat, images, incoming, buffers, absolute=False),

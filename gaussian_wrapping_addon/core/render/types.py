@@ -61,3 +61,20 @@ class Render:
     alpha: Tensor  # (h, w) 1 - final transmittance
     depth: Tensor  # (h, w) z-depth of the 0.5-isosurface, scene units; 0 where there is none
     statistics: RenderStatistics | None = None
+
+
+@dataclass(frozen=True)
+class VisibleGradients:
+    """Gradients of a scalar with respect to the raw parameters of the Gaussians that were seen.
+
+    Arrays are C-contiguous float32; row k belongs to Gaussian ``ids[k]``. They may be views of
+    scratch that the next rendering overwrites.
+    """
+
+    ids: np.ndarray  # (v,) int32, increasing
+    means: np.ndarray  # (v, 3)
+    log_scales: np.ndarray  # (v, 3)
+    quats: np.ndarray  # (v, 4)
+    opacity_logits: np.ndarray  # (v,)
+    sh: np.ndarray  # (v, k, 3)
+    orientation: np.ndarray  # (v, 4)

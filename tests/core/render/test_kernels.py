@@ -9,15 +9,18 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.render import blend as blend_module
 from gaussian_wrapping_addon.core.render import raster_math, reference
-from gaussian_wrapping_addon.core.render import render as render_module
+from gaussian_wrapping_addon.core.render.blend import (
+    Images,
+    RenderBuffers,
+    blend,
+    blend_backward,
+)
 from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.reference import render_reference
 from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
 from gaussian_wrapping_addon.core.render.render import (
-    RenderBuffers,
-    blend,
-    blend_backward,
     project_view,
     render,
 )
@@ -49,7 +52,8 @@ def depth_weights(
     by its slope, and pixels where T is all but flat at the crossing are left out.
     """
     view = project_view(RawArrays.from_gaussians(gaussians), camera, options)
-    images = blend(view, RenderBuffers())
+    images = Images.allocate(camera, options)
+    blend(view, images, RenderBuffers())
     slope = np.where(images.depth > 0, images.slope, 0.0)
     typical = np.median(slope[slope > 0])
     return torch.from_numpy(np.where(slope > 0.05 * typical, slope / typical, 0.0)).double()
@@ -85,7 +89,7 @@ def relative_l2(a: torch.Tensor, b: torch.Tensor) -> float:
 def test_images_equal_the_definition(
     count: int, width: int, height: int, lanes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(render_module, "vector_lanes", lambda: lanes)
+    monkeypatch.setattr(blend_module, "vector_lanes", lambda: lanes)
     gaussians = random_gaussians(count, seed=count, dtype=torch.float32)
     camera = look_at((2.2, 1.0, 0.8), width=width, height=height, focal=1.1 * width)
     options = RenderOptions(background=BACKGROUND, threads=1)
@@ -109,7 +113,7 @@ def test_images_equal_the_definition(
 def test_gradients_equal_the_definition(
     depth: bool, lanes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(render_module, "vector_lanes", lambda: lanes)
+    monkeypatch.setattr(blend_module, "vector_lanes", lambda: lanes)
     gaussians = random_gaussians(70, seed=3, dtype=torch.float32)
     camera = look_at((2.2, 1.0, 0.8), width=41, height=27)
     options = RenderOptions(depth=depth, background=BACKGROUND, threads=2)
@@ -237,7 +241,8 @@ def test_gradients_of_params_equal_the_definition() -> None:
     camera = look_at((2.2, 1.0, 0.8), width=20, height=18, focal=24.0)
     options = RenderOptions(background=BACKGROUND, threads=1)
     view = project_view(RawArrays.from_gaussians(gaussians), camera, options)
-    images = blend(view, RenderBuffers())
+    images = Images.allocate(camera, options)
+    blend(view, images, RenderBuffers())
     order = np.argsort(view.screen.depths, kind="stable")
     params = torch.tensor(view.screen.params[order], dtype=torch.float64).requires_grad_()
     background = torch.tensor(BACKGROUND, dtype=torch.float64)
