@@ -8,20 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..dataset.camera import Camera
-from ..errors import ResourceError
 from ..parallel import even_bounds, run_chunks
-from .isosurface import LIST_VALUES
+from .isosurface_steps import LIST_VALUES
 from .projection import RawArrays, ScreenGaussians
 from .raster_backward import BACKWARD_SCRATCH, backward_kernel, sum_pairs
 from .raster_forward import FORWARD_SCRATCH, forward_kernel
-from .raster_math import PLANE, ROW_VALUES, aligned_zeros, vector_lanes
+from .raster_math import ROW_VALUES, TILE, aligned_zeros
 from .tiles import TileLists
 from .types import RenderOptions
-
-# Contributors per pixel that the lists of one thread first have room for, and at most. One less
-# than a power of two, so that the lists of different runs do not compete for the same cache sets.
-_FIRST_SLOTS = 127
-_MAX_SLOTS = 1 << 20
 
 
 @dataclass
@@ -43,12 +37,14 @@ class RenderBuffers:
         except IndexError:
             return aligned_zeros(max(FORWARD_SCRATCH, BACKWARD_SCRATCH))
 
-    def take_lists(self) -> np.ndarray:
-        """Return contributor lists for one thread, with any content."""
+    def take_lists(self, entries: int) -> np.ndarray:
+        """Return room for the list of a block of one thread, with any content."""
+        values = entries * LIST_VALUES * TILE
         try:
-            return self.lists.pop()
+            kept = self.lists.pop()
         except IndexError:
-            return aligned_zeros(_FIRST_SLOTS * LIST_VALUES * PLANE)
+            kept = aligned_zeros(0)
+        return kept if len(kept) >= values else aligned_zeros(values * 5 // 4)
 
     def take_pairs(self, count: int) -> np.ndarray:
         """Return at least ``count`` rows of pair gradients with any content."""
@@ -68,7 +64,8 @@ class ScreenView:
     options: RenderOptions
     screen: ScreenGaussians
     lists: TileLists
-    rows: np.ndarray  # (pairs, 2) uint8
+    lanes: int
+    masks: np.ndarray  # (pairs,) uint32: blocks of the tile that the ellipse reaches
     bounds: np.ndarray  # tiles of about equal cost
     threads: int
 
@@ -112,50 +109,40 @@ def blend(view: ScreenView, images: Images, buffers: RenderBuffers) -> np.ndarra
     options, lists, camera = view.options, view.lists, view.camera
     depth, weights = options.depth, options.statistics
     pair_weights = np.zeros((len(lists.gaussian_ids) if weights else 0, 2), np.float32)
-    lanes = vector_lanes()
-    forward = forward_kernel(lanes, depth, weights)
+    forward = forward_kernel(view.lanes, depth, weights)
     background = np.asarray(options.background, np.float32)
     limit = np.float32(options.depth_valid_transmittance)
 
     def run(first: int, end: int) -> None:
-        scratch, contributors = buffers.take_scratch(), buffers.take_lists()
-        while True:
-            first = forward(
-                first,
-                end,
-                view.screen.params,
-                lists.start,
-                lists.gaussian_ids,
-                lists.pair_slots,
-                lists.pixel_ranges,
-                view.rows,
-                lists.tiles_x,
-                camera.width,
-                camera.height,
-                background,
-                limit,
-                scratch,
-                contributors,
-                images.color,
-                images.normal,
-                images.geometric,
-                images.alpha,
-                images.depth,
-                images.slope,
-                pair_weights,
-                images.strongest,
-            )
-            if first >= end:
-                break
-            slots = 2 * (len(contributors) // (LIST_VALUES * PLANE)) + 1
-            if slots > _MAX_SLOTS:
-                raise ResourceError(
-                    f"A pixel of view {camera.name!r} sees over {_MAX_SLOTS // 2} Gaussians.",
-                    "Use fewer Gaussians.",
-                )
-            contributors = aligned_zeros(slots * LIST_VALUES * PLANE)
+        scratch = buffers.take_scratch()
+        longest = int((lists.start[first + 1 : end + 1] - lists.start[first:end]).max())
+        entries = buffers.take_lists(longest if depth else 0)
+        forward(
+            first,
+            end,
+            view.screen.params,
+            lists.start,
+            lists.gaussian_ids,
+            lists.pair_slots,
+            view.masks,
+            lists.tiles_x,
+            camera.width,
+            camera.height,
+            background,
+            limit,
+            scratch,
+            entries,
+            images.color,
+            images.normal,
+            images.geometric,
+            images.alpha,
+            images.depth,
+            images.slope,
+            pair_weights,
+            images.strongest,
+        )
         buffers.scratch.append(scratch)
-        buffers.lists.append(contributors)
+        buffers.lists.append(entries)
 
     run_chunks(run, view.bounds, view.threads)
     return pair_weights
@@ -173,7 +160,7 @@ def blend_backward(
     lists, camera = view.lists, view.camera
     count = len(view.screen)
     g_color, g_normal, g_geometric, g_alpha, g_depth = grads
-    backward = backward_kernel(vector_lanes(), view.options.depth and bool(g_depth.any()), absolute)
+    backward = backward_kernel(view.lanes, view.options.depth and bool(g_depth.any()), absolute)
     pairs = buffers.take_pairs(len(lists.gaussian_ids))
 
     def run(first: int, end: int) -> None:
@@ -185,8 +172,7 @@ def blend_backward(
             lists.start,
             lists.gaussian_ids,
             lists.pair_slots,
-            lists.pixel_ranges,
-            view.rows,
+            view.masks,
             lists.tiles_x,
             camera.width,
             camera.height,

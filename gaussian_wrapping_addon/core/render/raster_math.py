@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What the raster kernels share: constants, exponentials and vector width.
 
-The kernels keep the state of a tile in *planes* of 256 values inside one float32 scratch array, and
-walk it in *runs* of 8 or 16 neighbouring pixels of one row with constant trip count. Constant
-offsets inside one array are what lets LLVM vectorise those loops (kernels.md 4.4 to 4.6).
+The kernels keep the state of a tile in *planes* of 256 values inside one float32 scratch array.
+A plane is ordered by *blocks* of 8 or 16 pixels, 4 wide and 2 or 4 high, each of which is one
+vector; blocks are numbered row by row, and so are the pixels of one.
 """
 
 from __future__ import annotations
 
 import functools
-import math
 from typing import Any
 
 import llvmlite.binding
@@ -21,9 +20,18 @@ from ..compiled import inline
 
 TILE = tolerances.TILE_PX
 PLANE = TILE * TILE
+STRIDE = PLANE + TILE
+"""From plane to plane. Not a divisor of 4096 bytes: loads would seem to hit earlier stores."""
+BLOCK_WIDTH = 4
+BLOCK_COLUMNS = TILE // BLOCK_WIDTH
 FEATURES = 9
 ROW_VALUES = 24
 """Columns of params and of pair gradients."""
+# Planes of the forward scratch array.
+TRANSMITTANCE, F0 = 0, 1
+DEPTH, SLOPE = F0 + FEATURES, F0 + FEATURES + 1
+BEST, BEST_AT = SLOPE + 1, SLOPE + 2
+FORWARD_PLANES = BEST_AT + 1
 PREFETCH_AHEAD = 8
 """Pairs between asking for a row and reading it."""
 
@@ -37,33 +45,43 @@ DENOMINATOR_MIN = np.float32(1e-20)
 FAR = np.float32(3e38)
 # Beyond this many sigma_z before a Gaussian's centre its density is below 3e-7.
 FRONT_SIGMAS = np.float32(5.5)
-# alpha >= 1/255 holds within sqrt(2 ln 255) standard deviations only.
-REACH_SIGMAS = np.float32(math.sqrt(2.0 * math.log(255.0)) + 0.01)
-# The live rows of a tile are looked at again after this many Gaussians (a power of two).
-LIVENESS_EVERY = 16
+LIVENESS_EVERY = 32
+"""Pairs between two looks at which blocks of a tile still let light through."""
 
 _LINE_VALUES = 16
-COLUMN_OFFSETS = np.arange(TILE, dtype=np.float32)
+# Pixels of a block relative to its first one.
+LANE_X = (np.arange(TILE) % BLOCK_WIDTH).astype(np.float32)
+LANE_Y = (np.arange(TILE) // BLOCK_WIDTH).astype(np.float32)
 
 # exp(-y) on [0, 0.7] to 1e-7, fitted at Chebyshev nodes with relative weights; the constant term is
 # exactly 1, so that exp(0) is 1.
-_C1, _C2 = np.float32(-0.9999997615814209), np.float32(0.4999943971633911)
-_C3, _C4 = np.float32(-0.16662052273750305), np.float32(0.04148262366652489)
-_C5, _C6 = np.float32(-0.00794854387640953), np.float32(0.0009744596900418401)
-_FIT_END = np.float32(0.7)
+FIT = np.array(
+    [
+        1.0,
+        -0.9999997615814209,
+        0.4999943971633911,
+        -0.16662052273750305,
+        0.04148262366652489,
+        -0.00794854387640953,
+        0.0009744596900418401,
+    ],
+    np.float32,
+)
+FIT_END = np.float32(0.7)
+_C0, _C1, _C2, _C3, _C4, _C5, _C6 = FIT
 _EIGHTH, _THIRTY_SECOND = np.float32(1.0 / 8.0), np.float32(1.0 / 32.0)
 
 
 @inline
 def _exp_fit(y: Any) -> Any:
     """Return exp(-y) for 0 <= y <= 0.7."""
-    return (((((_C6 * y + _C5) * y + _C4) * y + _C3) * y + _C2) * y + _C1) * y + ONE
+    return (((((_C6 * y + _C5) * y + _C4) * y + _C3) * y + _C2) * y + _C1) * y + _C0
 
 
 @inline
 def exp_short(x: Any) -> Any:
     """Return exp(-x) for 0 <= x <= 5.6, and less than 1/255 above (relative error 1.6e-6)."""
-    p = _exp_fit(min(x * _EIGHTH, _FIT_END))
+    p = _exp_fit(min(x * _EIGHTH, FIT_END))
     p = p * p
     p = p * p
     return p * p
@@ -72,7 +90,7 @@ def exp_short(x: Any) -> Any:
 @inline
 def exp_wide(x: Any) -> Any:
     """Return exp(-x) for 0 <= x <= 22.4, and 2e-10 above (relative error 7e-6)."""
-    p = _exp_fit(min(x * _THIRTY_SECOND, _FIT_END))
+    p = _exp_fit(min(x * _THIRTY_SECOND, FIT_END))
     p = p * p
     p = p * p
     p = p * p
@@ -82,7 +100,8 @@ def exp_wide(x: Any) -> Any:
 
 @functools.lru_cache(maxsize=1)
 def vector_lanes() -> int:
-    """Return the run length that suits the CPU numba compiles for: 16 with AVX-512, else 8."""
+    """Return the pixels of a block that suit the CPU numba compiles for: 16 or 8."""
+    # 16 where AVX-512 is compiled for.
     chosen = getattr(numba.config, "CPU_NAME", None)
     if chosen and chosen != llvmlite.binding.get_host_cpu_name():
         return 8

@@ -14,7 +14,7 @@ from ..dataset.camera import Camera
 from ..gaussians.model import OrientedGaussians
 from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
 from .blend import Images, RenderBuffers, ScreenView, blend, blend_backward
-from .pair_rows import narrow_rows
+from .block_masks import mask_kernel
 from .projection import (
     RawArrays,
     RawGradients,
@@ -22,6 +22,7 @@ from .projection import (
     project_gaussians,
 )
 from .raster_backward import sum_weights
+from .raster_math import vector_lanes
 from .tiles import bin_gaussians
 from .types import Render, RenderOptions, RenderStatistics
 
@@ -137,24 +138,25 @@ def project_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -
     threads = options.threads or default_threads()
     screen = project_gaussians(gaussians, camera, options)
     lists = bin_gaussians(screen, camera.width, camera.height, threads)
-    rows = np.zeros((len(lists.gaussian_ids), 2), np.uint8)
+    masks = np.zeros(len(lists.gaussian_ids), np.uint32)
     bounds = balanced_bounds(np.diff(lists.start) + _TILE_COST, threads * CHUNKS_PER_THREAD)
+    lanes = vector_lanes()
+    mask_range = mask_kernel(lanes)
 
-    def narrow(first: int, end: int) -> None:
-        narrow_rows(
+    def mark(first: int, end: int) -> None:
+        mask_range(
             first,
             end,
             lists.start,
             lists.gaussian_ids,
-            lists.pixel_ranges,
             screen.boxes,
             screen.skews,
             lists.tiles_x,
-            rows,
+            masks,
         )
 
-    run_chunks(narrow, bounds, threads)
-    return ScreenView(gaussians, camera, options, screen, lists, rows, bounds, threads)
+    run_chunks(mark, bounds, threads)
+    return ScreenView(gaussians, camera, options, screen, lists, lanes, masks, bounds, threads)
 
 
 def _empty_statistics(count: int) -> RenderStatistics:

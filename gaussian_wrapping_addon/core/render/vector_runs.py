@@ -110,8 +110,8 @@ def _prefetch_row(typingctx, rows, row):  # type: ignore[no-untyped-def]
 
 _copy_8, _copy_16 = _copy_intrinsic(8), _copy_intrinsic(16)
 _max_8, _max_16 = _reduce_intrinsic(8, "fmax"), _reduce_intrinsic(16, "fmax")
-_sum_16 = _reduce_intrinsic(16, "fadd")
 _positive_8, _positive_16 = _mask_intrinsic(8), _mask_intrinsic(16)
+_sum_8, _sum_16 = _reduce_intrinsic(8, "fadd"), _reduce_intrinsic(16, "fadd")
 
 
 @inline
@@ -146,9 +146,9 @@ def prefetch_row(rows: Any, row: Any) -> None:
 
 
 @inline
-def sum_columns(source: Any, source_at: Any) -> Any:
-    """Return the sum of 16 float32."""
-    return _sum_16(source, source_at)
+def sum_run(lanes: Any, source: Any, source_at: Any) -> Any:
+    """Return the sum of one run of 8 or 16 float32."""
+    return _sum_16(source, source_at) if lanes == 16 else _sum_8(source, source_at)
 
 
 @inline

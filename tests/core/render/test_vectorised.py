@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.render import isosurface, raster_backward, raster_forward
+from gaussian_wrapping_addon.core.render import raster_backward, raster_forward
 from gaussian_wrapping_addon.core.render.raster_math import aligned_zeros, vector_lanes
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
@@ -67,41 +67,31 @@ def test_gradient_is_packed() -> None:
     packed, single = fused_instructions(
         raster_backward.backward_kernel(vector_lanes(), True, False)
     )
-    # Twice (with and without depth) the blending's without its channels, nine products with the
-    # loss, and most of the sums.
-    assert packed >= 60
+    # Two exponentials, the conic, nine products with the loss, and most of the sums.
+    assert packed >= 40
     assert single < packed
 
 
 def test_isosurface_is_packed() -> None:
-    solver = isosurface.solve_run_16 if vector_lanes() == 16 else isosurface.solve_run_8
-    if not solver.signatures:
-        # Called from another kernel only, so never compiled for Python.
-        values = numba.float32[::1]
-        solver.compile(
-            (
-                values,
-                numba.int64,
-                values,
-                numba.uint32[::1],
-                numba.int64,
-                numba.float32,
-                numba.float32,
-            )
-        )
-    packed, single = fused_instructions(solver)
-    assert packed >= 14
+    blending, _ = fused_instructions(raster_forward.forward_kernel(vector_lanes(), False, False))
+    packed, single = fused_instructions(raster_forward.forward_kernel(vector_lanes(), True, False))
+    # Blending in three loops, and the solver's exponential and products.
+    assert packed >= 3 * 19 + 9
+    assert packed > blending
     assert single < packed
 
 
 def test_no_reference_is_counted_in_the_inner_loops() -> None:
     # numba's reference counts are atomic and clobber all vector registers; a branch around an
     # inlined helper is enough to bring them back into the loops.
-    listing = listing_of(raster_backward.backward_kernel(vector_lanes(), True, False))
-    blocks = re.split(r"^\.L\w+:|^\w+:", listing, flags=re.MULTILINE)
-    hot = [block for block in blocks if len(PACKED.findall(block)) >= 10]
-    assert len(hot) >= 2
-    assert not any("NRT_" in block for block in hot)
+    for kernel in (
+        raster_backward.backward_kernel(vector_lanes(), True, False),
+        raster_forward.forward_kernel(vector_lanes(), True, False),
+    ):
+        blocks = re.split(r"^\.L\w+:|^\w+:", listing_of(kernel), flags=re.MULTILINE)
+        hot = [block for block in blocks if len(PACKED.findall(block)) >= 10]
+        assert hot
+        assert not any("NRT_" in block for block in hot)
 
 
 def test_runs_are_aligned_to_cache_lines() -> None:
