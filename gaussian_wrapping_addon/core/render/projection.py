@@ -20,7 +20,7 @@ from .projection_kernels import (
     project_activated_range,
     project_raw_range,
 )
-from .types import RenderOptions
+from .types import RenderOptions, VisibleGradients
 
 
 @dataclass(frozen=True)
@@ -238,6 +238,93 @@ def project_backward(
     grads_out : RawGradients
         Accumulated into. A direction of length 0 and a degenerate quaternion receive 0.
     """
+    _backward(gaussians, camera, options, screen, grad_params, None, grads_out)
+
+
+def allocate_visible(gaussians: RawArrays, count: int) -> VisibleGradients:
+    """Return scratch for the gradients of up to ``count`` visible Gaussians."""
+    coefficients = gaussians.sh.shape[1]
+    return VisibleGradients(
+        np.zeros(count, np.int32),
+        np.zeros((count, 3), np.float32),
+        np.zeros((count, 3), np.float32),
+        np.zeros((count, 4), np.float32),
+        np.zeros(count, np.float32),
+        np.zeros((count, coefficients, 3), np.float32),
+        np.zeros((count, 4), np.float32),
+    )
+
+
+def project_backward_visible(
+    gaussians: RawArrays,
+    camera: Camera,
+    options: RenderOptions,
+    screen: ScreenGaussians,
+    grad_params: np.ndarray,
+    ids: np.ndarray,
+    out: VisibleGradients | None = None,
+) -> VisibleGradients:
+    """Write the gradient with respect to the raw parameters of some Gaussians, one row for each.
+
+    Parameters
+    ----------
+    gaussians, camera, options
+        What :func:`project_gaussians` was called with.
+    screen : ScreenGaussians
+        What it returned.
+    grad_params : (n, 24) float32 or float64
+        Gradient with respect to ``screen.params``; only the rows ``ids`` are read.
+    ids : (v,) int32
+        Gaussians wanted, increasing. Those that are not visible get rows of 0.
+    out : VisibleGradients, optional
+        Scratch of at least v rows (:func:`allocate_visible`); any content is overwritten.
+
+    Returns
+    -------
+    VisibleGradients
+        Views of the first v rows of ``out``. Coefficients above the degree used get 0.
+
+    Raises
+    ------
+    UsageError
+        If ``out`` holds fewer than v rows or another number of harmonics coefficients.
+    """
+    count = len(ids)
+    if out is None:
+        out = allocate_visible(gaussians, count)
+    if len(out.means) < count or out.sh.shape[1] != gaussians.sh.shape[1]:
+        raise UsageError(
+            f"The scratch holds {len(out.means)} rows of {out.sh.shape[1]} coefficients, not "
+            f"{count} of {gaussians.sh.shape[1]}.",
+            "Allocate it anew.",
+        )
+    part = VisibleGradients(
+        ids,
+        out.means[:count],
+        out.log_scales[:count],
+        out.quats[:count],
+        out.opacity_logits[:count],
+        out.sh[:count],
+        out.orientation[:count],
+    )
+    _backward(gaussians, camera, options, screen, grad_params, ids, part)
+    return part
+
+
+_NO_IDS = np.zeros(0, np.int32)
+
+
+def _backward(
+    gaussians: RawArrays,
+    camera: Camera,
+    options: RenderOptions,
+    screen: ScreenGaussians,
+    grad_params: np.ndarray,
+    ids: np.ndarray | None,
+    grads_out: RawGradients | VisibleGradients,
+) -> None:
+    """Run the backward kernel: rows of ``ids`` written, or those of all Gaussians added to."""
+    count = len(gaussians) if ids is None else len(ids)
     packed = pack_camera(camera, options.near_z)
     degree = used_degree(gaussians.sh.shape[1], options)
     threads = options.threads or default_threads()
@@ -246,6 +333,8 @@ def project_backward(
         backward_range(
             begin,
             end,
+            _NO_IDS if ids is None else ids,
+            ids is not None,
             gaussians.means,
             gaussians.log_scales,
             gaussians.quats,
@@ -265,7 +354,7 @@ def project_backward(
             grads_out.orientation,
         )
 
-    run_chunks(run, even_bounds(len(gaussians), threads), threads)
+    run_chunks(run, even_bounds(count, threads), threads)
 
 
 def _output(count: int, out: ScreenGaussians | None) -> ScreenGaussians:

@@ -155,6 +155,8 @@ def _shape_gradient(
 def backward_range(
     begin: int,
     end: int,
+    ids: np.ndarray,
+    compact: bool,
     means: np.ndarray,
     log_scales: np.ndarray,
     quats: np.ndarray,
@@ -173,7 +175,12 @@ def backward_range(
     grad_sh: np.ndarray,
     grad_orientation: np.ndarray,
 ) -> None:
-    """Add the gradients of the visible Gaussians ``begin .. end`` to the ``grad_`` arrays."""
+    """Write the gradients of the Gaussians ``begin .. end``, or of ``ids[begin .. end]``.
+
+    Those that are not visible have none. With ``compact`` row k of the ``grad_`` arrays is
+    overwritten with the gradient of ``ids[k]``; without, ``ids`` is not read and the gradient of
+    Gaussian i is added to row i.
+    """
     rotation = np.zeros((3, 3))
     axes = np.zeros((3, 3))
     grad_axes = np.zeros((3, 3))
@@ -186,7 +193,16 @@ def backward_range(
     grad_quat = np.zeros(4)
     harmonics = np.zeros(16)
     slopes = np.zeros((16, 3))
-    for i in range(begin, end):
+    for row_out in range(begin, end):
+        i = np.int64(row_out)
+        if compact:
+            i = np.int64(ids[row_out])
+            grad_means[row_out] = 0.0
+            grad_log_scales[row_out] = 0.0
+            grad_quats[row_out] = 0.0
+            grad_opacity_logits[row_out] = 0.0
+            grad_sh[row_out] = 0.0
+            grad_orientation[row_out] = 0.0
         if not visible[i]:
             continue
         for column in range(23):
@@ -224,10 +240,10 @@ def backward_range(
 
         _shape_gradient(x, y, z, variances, camera, axes, grad, grad_axes, grad_logs, grad_local)
         g_log_opacity = grad[11] * opacity
-        grad_opacity_logits[i] += g_log_opacity * fade
+        grad_opacity_logits[row_out] += g_log_opacity * fade
         for k in range(3):
             # d(effective log scale) = kept d(log scale); the filter also dims the opacity.
-            grad_log_scales[i, k] += kept[k] * grad_logs[k] + (1.0 - kept[k]) * g_log_opacity
+            grad_log_scales[row_out, k] += kept[k] * grad_logs[k] + (1.0 - kept[k]) * g_log_opacity
         if norm > 0.0:
             for row in range(3):
                 for k in range(3):
@@ -238,7 +254,7 @@ def backward_range(
                     )
             _quat_gradient(qw, qx, qy, qz, norm, grad_rotation, grad_quat)
             for k in range(4):
-                grad_quats[i, k] += grad_quat[k]
+                grad_quats[row_out, k] += grad_quat[k]
 
         # Colour, through the coefficients and through the viewing direction.
         d0, d1, d2 = m0 - camera[12], m1 - camera[13], m2 - camera[14]
@@ -257,7 +273,7 @@ def backward_range(
             g = grad[13 + channel]
             for k in range(count):
                 coefficient = g * np.float64(sh[i, k, channel])
-                grad_sh[i, k, channel] += g * harmonics[k]
+                grad_sh[row_out, k, channel] += g * harmonics[k]
                 g0 += coefficient * slopes[k, 0]
                 g1 += coefficient * slopes[k, 1]
                 g2 += coefficient * slopes[k, 2]
@@ -267,7 +283,7 @@ def backward_range(
         g2 = (g2 - along * d2) / distance
         for column in range(3):
             colour = g0 if column == 0 else (g1 if column == 1 else g2)
-            grad_means[i, column] += (
+            grad_means[row_out, column] += (
                 camera[column] * grad_local[0]
                 + camera[3 + column] * grad_local[1]
                 + camera[6 + column] * grad_local[2]
@@ -285,7 +301,7 @@ def backward_range(
             n0, n1, n2 = n0 / length, n1 / length, n2 / length
             gain = math.tanh(np.float64(orientation[i, 3]))
             along = grad[16] * n0 + grad[17] * n1 + grad[18] * n2
-            grad_orientation[i, 0] += gain * (grad[16] - along * n0) / length
-            grad_orientation[i, 1] += gain * (grad[17] - along * n1) / length
-            grad_orientation[i, 2] += gain * (grad[18] - along * n2) / length
-            grad_orientation[i, 3] += (1.0 - gain * gain) * along
+            grad_orientation[row_out, 0] += gain * (grad[16] - along * n0) / length
+            grad_orientation[row_out, 1] += gain * (grad[17] - along * n1) / length
+            grad_orientation[row_out, 2] += gain * (grad[18] - along * n2) / length
+            grad_orientation[row_out, 3] += (1.0 - gain * gain) * along

@@ -17,8 +17,10 @@ from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     RawGradients,
     ScreenGaussians,
+    allocate_visible,
     project_arrays,
     project_backward,
+    project_backward_visible,
     project_gaussians,
 )
 from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
@@ -334,3 +336,45 @@ def test_off_the_image_or_between_pixel_centres_is_not_visible() -> None:
     assert on_center.visible[0]
     between = dataclasses.replace(AXIS, cx=32.0)
     assert not project(single(means=[0.0, 0.0, 3.0], **tiny), between).visible[0]
+
+
+# -- gradients of the visible Gaussians only ------------------------------------------------------
+
+
+def test_compact_rows_are_the_dense_ones() -> None:
+    gaussians = random_gaussians(300, 4, dtype=torch.float32)
+    gaussians = gaussians.replaced(means=gaussians.means * 2.0)
+    raw = RawArrays.from_gaussians(gaussians)
+    options = RenderOptions(threads=1, sh_degree=1)
+    screen = project(gaussians, options=options)
+    grad_params = np.random.default_rng(0).normal(size=(300, 24)).astype(np.float32)
+    dense = RawGradients.zeros(raw)
+    project_backward(raw, CAMERA, options, screen, grad_params, dense)
+    seen = np.flatnonzero(screen.visible).astype(np.int32)
+    assert 50 < len(seen) < 290
+    scratch = allocate_visible(raw, 300)
+    for ids in (seen, seen[3:50], seen[:1], seen[:0], np.arange(300, dtype=np.int32)):
+        for name in NAMES:
+            getattr(scratch, name)[:] = np.nan
+        for threads in (1, 3):
+            chosen = dataclasses.replace(options, threads=threads)
+            part = project_backward_visible(raw, CAMERA, chosen, screen, grad_params, ids, scratch)
+            assert part.ids is ids
+            for name in NAMES:
+                got = getattr(part, name)
+                np.testing.assert_array_equal(got, getattr(dense, name)[ids], err_msg=name)
+                assert np.isnan(getattr(scratch, name)[len(ids) :]).all()
+                assert np.shares_memory(got, getattr(scratch, name)) or not len(ids)
+            # Coefficients above the degree used.
+            assert not part.sh[:, 4:].any()
+
+
+def test_scratch_of_another_shape_is_refused() -> None:
+    raw = RawArrays.from_gaussians(random_gaussians(9, 4, dtype=torch.float32))
+    screen = project_gaussians(raw, CAMERA, OPTIONS)
+    ids, grad = np.arange(9, dtype=np.int32), np.zeros((9, 24), np.float32)
+    small = allocate_visible(raw, 8)
+    other = allocate_visible(dataclasses.replace(raw, sh=raw.sh[:, :4]), 9)
+    for scratch in (small, other):
+        with pytest.raises(UsageError, match="scratch"):
+            project_backward_visible(raw, CAMERA, OPTIONS, screen, grad, ids, scratch)
