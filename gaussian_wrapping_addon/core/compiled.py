@@ -13,9 +13,11 @@ _logger = logging.getLogger(__name__)
 
 # Everything except what would let NaN tests be folded away in code that relies on them.
 FAST_MATH = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
+# Fused multiply-adds and nothing else: NaN tests and the order of operations stand.
+FUSED_MATH = {"contract"}
 
 
-def kernel(*, fast: bool) -> Callable[[Callable[..., Any]], Any]:
+def kernel(*, fast: bool, fused: bool = False) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function on first call, with the GIL released.
 
     Parameters
@@ -23,6 +25,8 @@ def kernel(*, fast: bool) -> Callable[[Callable[..., Any]], Any]:
     fast : bool
         Allow reassociation and fused operations (float32 raster loops). Geometry that needs exact
         comparisons passes ``False``.
+    fused : bool
+        With ``fast=False``: let a product and a sum become one fused operation.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -30,7 +34,7 @@ def kernel(*, fast: bool) -> Callable[[Callable[..., Any]], Any]:
             "nogil": True,
             "error_model": "numpy",
             "boundscheck": False,
-            "fastmath": FAST_MATH if fast else False,
+            "fastmath": FAST_MATH if fast else (FUSED_MATH if fused else False),
         }
         try:
             return numba.njit(cache=True, **options)(function)

@@ -71,19 +71,26 @@ class RawGradients:
 
 @dataclass(frozen=True)
 class ScreenGaussians:
-    """Gaussians on the screen of one camera; layout in ``docs/architecture.md``."""
+    """Gaussians on the screen of one camera; layout in ``docs/architecture.md``.
+
+    Of Gaussians that are not visible only ``visible`` and ``depths`` (inf) are written. Their other
+    rows hold whatever the arrays held before, which is finite: 0, or another view's values.
+    """
 
     params: np.ndarray
-    """(n, 24) float32; all zero where not visible."""
+    """(n, 24) float32; where not visible, anything."""
     boxes: np.ndarray
-    """(n, 4) float32: x0 y0 x1 y1 of the ellipse ``alpha >= 1/255``, pixels, rounded outwards."""
+    """(n, 4) float32: x0 y0 x1 y1 of the ellipse ``alpha >= 1/255``, pixels, rounded outwards;
+    where not visible, anything."""
     visible: np.ndarray
     """(n,) bool: the box holds a pixel centre of the image."""
     depths: np.ndarray
-    """(n,) float32: distance from the camera to the mean, what the blending order is sorted by."""
+    """(n,) float32: distance from the camera to the mean, what the blending order is sorted by;
+    inf where not visible."""
     skews: np.ndarray
     """(n,) float32: x offset from the box's centre to the ellipse's lowest point (largest y),
-    pixels; inf where the ellipse is unbounded and the box is the whole image."""
+    pixels; inf where the ellipse is unbounded and the box is the whole image; where not visible,
+    anything."""
 
     def __len__(self) -> int:
         return len(self.params)
@@ -95,7 +102,7 @@ class ScreenGaussians:
             np.zeros((count, PARAM_COLUMNS), np.float32),
             np.zeros((count, 4), np.float32),
             np.zeros(count, np.bool_),
-            np.zeros(count, np.float32),
+            np.full(count, np.inf, np.float32),
             np.zeros(count, np.float32),
         )
 
@@ -144,7 +151,7 @@ def project_gaussians(
     options : RenderOptions
         ``near_z``, ``sh_degree`` and ``threads`` are read.
     out : ScreenGaussians, optional
-        Arrays to write into, of the same length.
+        Arrays to write into, of the same length; nothing but a few kilobytes is allocated then.
 
     Returns
     -------
@@ -344,6 +351,7 @@ def _backward(
             gaussians.filter_3d,
             degree,
             packed,
+            screen.params,
             screen.visible,
             grad_params,
             grads_out.means,

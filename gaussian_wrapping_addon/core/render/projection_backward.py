@@ -7,151 +7,248 @@ With ``weight_k = 1 / scale_k^2`` everything the forward writes is built of
     B = sum_k (r0, r1)_k (r0, r1)_k^T weight_k,
     F = sum_k f_k f_k^T weight_i weight_j,   f_k = (r0 - u r2, r1 - v r2)_k,   (i, j) != k;
 
-the gradient is gathered on a0, h, B, F and (u, v, z) first, then on axes and log weights.
+the gradient is gathered on a0, h, B, F and (u, v, z) first, then on axes and log weights. Like the
+forward it works on blocks of Gaussians (``projection_math.py``).
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from .. import tolerances
-from ..compiled import kernel
-from .harmonics_kernels import basis, basis_gradient
-from .projection_kernels import rotation_from_quat
+from ..compiled import inline, kernel
+from .harmonics_kernels import BASIS_COUNT, direction_gradient
+from .projection_activation import (
+    ACTIVATED_PLANES,
+    BASIS,
+    KEPT,
+    MEAN,
+    OPACITY,
+    ORIENTATION,
+    QUAT,
+    RAY,
+    SCALE,
+    SLOPE,
+    TANH,
+    TRANSPARENCY,
+    TURN,
+    activate_block,
+    load_raw,
+)
+from .projection_kernels import in_camera, load_camera_axes
+from .projection_math import BLOCK, QUEUE, block_scratch
 
-_DIRECTION_MIN_NORM = tolerances.DIRECTION_MIN_NORM
+_QUATERNION_MIN_SQ = tolerances.QUATERNION_MIN_NORM**2
+_USED_COLUMNS = 23
 
-
-@kernel(fast=False)
-def _quat_gradient(
-    w: float, x: float, y: float, z: float, norm: float, g: np.ndarray, out: np.ndarray
-) -> None:
-    """Write the gradient on a raw quaternion of length ``norm`` from that on its rotation."""
-    w, x, y, z = w / norm, x / norm, y / norm, z / norm
-    out[0] = 2.0 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
-    out[1] = 2.0 * (
-        w * (g[2, 1] - g[1, 2])
-        + y * (g[0, 1] + g[1, 0])
-        + z * (g[0, 2] + g[2, 0])
-        - 2.0 * x * (g[1, 1] + g[2, 2])
-    )
-    out[2] = 2.0 * (
-        w * (g[0, 2] - g[2, 0])
-        + x * (g[0, 1] + g[1, 0])
-        + z * (g[1, 2] + g[2, 1])
-        - 2.0 * y * (g[0, 0] + g[2, 2])
-    )
-    out[3] = 2.0 * (
-        w * (g[1, 0] - g[0, 1])
-        + x * (g[0, 2] + g[2, 0])
-        + y * (g[1, 2] + g[2, 1])
-        - 2.0 * z * (g[0, 0] + g[1, 1])
-    )
-    along = out[0] * w + out[1] * x + out[2] * y + out[3] * z
-    out[0] = (out[0] - along * w) / norm
-    out[1] = (out[1] - along * x) / norm
-    out[2] = (out[2] - along * y) / norm
-    out[3] = (out[3] - along * z) / norm
+# Planes of the scratch array behind those of the activation: gradients on the columns of params, on
+# the basis functions, and on what is trained. The rotation's takes the rotation's place.
+_GRAD = ACTIVATED_PLANES * BLOCK
+_WEIGHT = _GRAD + _USED_COLUMNS * BLOCK
+_GRAD_MEAN = _WEIGHT + BASIS_COUNT * BLOCK
+_GRAD_SCALE = _GRAD_MEAN + 3 * BLOCK
+_GRAD_QUAT = _GRAD_SCALE + 3 * BLOCK
+_GRAD_ORIENTATION = _GRAD_QUAT + 4 * BLOCK
+_GRAD_LOGIT = _GRAD_ORIENTATION + 4 * BLOCK
+_PLANES = _GRAD_LOGIT // BLOCK + 1
 
 
-@kernel(fast=False)
-def _shape_gradient(
-    x: float,
-    y: float,
-    z: float,
-    variances: np.ndarray,
-    camera: np.ndarray,
-    axes: np.ndarray,
-    grad: np.ndarray,
-    grad_axes: np.ndarray,
-    grad_logs: np.ndarray,
-    grad_mean: np.ndarray,
-) -> None:
-    """From the gradient on one row of params to axes, log scales and mean, camera frame.
+@inline
+def _axis_gradient(
+    r: Any, e: Any, f0: Any, f1: Any, weight: Any, others: Any, spread: Any,
+    g_a0: Any, g_h: Any, g_b: Any, g_f: Any,
+) -> Any:  # fmt: skip
+    """Return one axis' gradients: on e, f0, f1, on its own r0 r1 r2 directly, on two log weights.
 
-    ``grad (24,)`` is read; ``grad_axes (3, 3)``, ``grad_logs (3,)`` (effective log scales) and
-    ``grad_mean (3,)`` are written.
+    ``g_h`` (3), ``g_b`` and ``g_f`` (xx, xy, yy) are on h, B and F; ``spread`` is the gradient on
+    ``cov_zz`` times the axis' variance.
     """
+    h_dot = g_h[0] * r[0] + g_h[1] * r[1] + g_h[2] * r[2]
+    scaled = weight * e
+    g_e = weight * h_dot + 2.0 * scaled * g_a0
+    b0, b1 = 2.0 * r[0] * g_b[0] + r[1] * g_b[1], r[0] * g_b[1] + 2.0 * r[1] * g_b[2]
+    k0, k1 = 2.0 * f0 * g_f[0] + f1 * g_f[1], f0 * g_f[1] + 2.0 * f1 * g_f[2]
+    along = r[2] * spread
+    # B and F are quadratic: half of position times slope is their share of the sum.
+    log_self = 2.0 * (r[2] * along - scaled * (h_dot + e * g_a0)) - weight * (r[0] * b0 + r[1] * b1)
+    log_others = -others * (f0 * k0 + f1 * k1)
+    return (
+        g_e, others * k0, others * k1,
+        scaled * g_h[0] + weight * b0, scaled * g_h[1] + weight * b1,
+        scaled * g_h[2] + 2.0 * along,
+        log_self, log_others,
+    )  # fmt: skip
+
+
+@kernel(fast=False, fused=True)
+def _shape_gradients(m: Any, camera: Any) -> None:
+    """From the gradients on columns 0-12 and 19-22 to those on mean, log scales and rotation."""
+    c = load_camera_axes(camera)
+    t0, t1, t2 = camera[9], camera[10], camera[11]
     fx, fy = camera[15], camera[16]
-    u, v = x / z, y / z
-    a0 = hx = hy = hz = bxx = bxy = byy = 0.0
-    fxx = fxy = fyy = cov_zz = 0.0
-    for k in range(3):
-        r0, r1, r2 = axes[0, k], axes[1, k], axes[2, k]
-        weight = 1.0 / variances[k]
-        weight_others = 1.0 / (variances[(k + 1) % 3] * variances[(k + 2) % 3])
-        e = r0 * u + r1 * v + r2
-        f0, f1 = r0 - u * r2, r1 - v * r2
-        a0 += e * e * weight
-        hx += r0 * e * weight
-        hy += r1 * e * weight
-        hz += r2 * e * weight
-        bxx += r0 * r0 * weight
-        bxy += r0 * r1 * weight
-        byy += r1 * r1 * weight
-        fxx += f0 * f0 * weight_others
-        fxy += f0 * f1 * weight_others
-        fyy += f1 * f1 * weight_others
-        cov_zz += r2 * r2 * variances[k]
-    ia = 1.0 / a0
-    zz = z * z
-
-    # Gradient on the sums.
-    g_u, g_v, g_z = grad[0] * fx, grad[1] * fy, grad[10]
-    scale_xx, scale_xy, scale_yy = ia / (fx * fx), ia / (fx * fy), ia / (fy * fy)
-    g_fyy = grad[2] * zz * scale_xx
-    g_fxy = -2.0 * grad[3] * zz * scale_xy
-    g_fxx = grad[4] * zz * scale_yy
-    conic = g_fyy * fyy + g_fxy * fxy + g_fxx * fxx
-    g_z += 2.0 * conic / z
-    g_hx, g_hy, g_hz = grad[5] * ia / fx, grad[6] * ia / fy, 0.0
-    g_bxx, g_bxy, g_byy = grad[7] * scale_xx, 2.0 * grad[8] * scale_xy, grad[9] * scale_yy
-    quotients = conic + g_hx * hx + g_hy * hy + g_bxx * bxx + g_bxy * bxy + g_byy * byy
-    g_a0 = grad[12] - quotients * ia
-    length = math.sqrt(hx * hx + hy * hy + hz * hz)
-    nx, ny, nz = -hx / length, -hy / length, -hz / length
-    gx = camera[0] * grad[19] + camera[1] * grad[20] + camera[2] * grad[21]
-    gy = camera[3] * grad[19] + camera[4] * grad[20] + camera[5] * grad[21]
-    gz = camera[6] * grad[19] + camera[7] * grad[20] + camera[8] * grad[21]
-    along = gx * nx + gy * ny + gz * nz
-    g_hx -= (gx - along * nx) / length
-    g_hy -= (gy - along * ny) / length
-    g_hz -= (gz - along * nz) / length
-    g_cov_zz = 0.5 * grad[22] / math.sqrt(cov_zz)
-
-    # Down to axes, weights and the ray through the mean.
-    grad_logs[0] = grad_logs[1] = grad_logs[2] = 0.0
-    for k in range(3):
-        r0, r1, r2 = axes[0, k], axes[1, k], axes[2, k]
-        weight = 1.0 / variances[k]
-        i, j = (k + 1) % 3, (k + 2) % 3
-        weight_others = 1.0 / (variances[i] * variances[j])
-        e = r0 * u + r1 * v + r2
-        f0, f1 = r0 - u * r2, r1 - v * r2
-        h_dot = g_hx * r0 + g_hy * r1 + g_hz * r2
-        g_e = weight * (h_dot + 2.0 * e * g_a0)
-        g_f0 = weight_others * (2.0 * f0 * g_fxx + f1 * g_fxy)
-        g_f1 = weight_others * (f0 * g_fxy + 2.0 * f1 * g_fyy)
-        grad_axes[0, k] = weight * (e * g_hx + 2.0 * r0 * g_bxx + r1 * g_bxy) + g_f0 + u * g_e
-        grad_axes[1, k] = weight * (e * g_hy + r0 * g_bxy + 2.0 * r1 * g_byy) + g_f1 + v * g_e
-        grad_axes[2, k] = (
-            weight * e * g_hz + g_e - u * g_f0 - v * g_f1 + 2.0 * r2 * variances[k] * g_cov_zz
+    ifx, ify = 1.0 / fx, 1.0 / fy
+    for lane in range(BLOCK):
+        x, y, z = in_camera(c, m[MEAN + lane], m[MEAN + BLOCK + lane], m[MEAN + 2 * BLOCK + lane])
+        x, y, z = x + t0, y + t1, z + t2
+        inverse_z = 1.0 / z
+        u, v = x * inverse_z, y * inverse_z
+        a = in_camera(c, m[TURN + lane], m[TURN + 3 * BLOCK + lane], m[TURN + 6 * BLOCK + lane])
+        b = in_camera(
+            c, m[TURN + BLOCK + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
         )
-        g_u += r0 * g_e - r2 * g_f0
-        g_v += r1 * g_e - r2 * g_f1
-        g_weight = e * (h_dot + e * g_a0) + r0 * (r0 * g_bxx + r1 * g_bxy) + r1 * r1 * g_byy
-        g_others = f0 * (f0 * g_fxx + f1 * g_fxy) + f1 * f1 * g_fyy
-        grad_logs[k] += 2.0 * (r2 * r2 * variances[k] * g_cov_zz - weight * g_weight)
-        grad_logs[i] -= 2.0 * weight_others * g_others
-        grad_logs[j] -= 2.0 * weight_others * g_others
-    grad_mean[0] = g_u / z
-    grad_mean[1] = g_v / z
-    grad_mean[2] = g_z - (g_u * u + g_v * v) / z
+        d = in_camera(
+            c, m[TURN + 2 * BLOCK + lane], m[TURN + 5 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
+        )
+        var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
+        w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
+        others0, others1, others2 = w1 * w2, w2 * w0, w0 * w1
+        e0 = a[0] * u + a[1] * v + a[2]
+        e1 = b[0] * u + b[1] * v + b[2]
+        e2 = d[0] * u + d[1] * v + d[2]
+        ew0, ew1, ew2 = e0 * w0, e1 * w1, e2 * w2
+        a0 = e0 * ew0 + e1 * ew1 + e2 * ew2
+        hx = a[0] * ew0 + b[0] * ew1 + d[0] * ew2
+        hy = a[1] * ew0 + b[1] * ew1 + d[1] * ew2
+        hz = a[2] * ew0 + b[2] * ew1 + d[2] * ew2
+        p0, p1, p2 = a[0] * w0, b[0] * w1, d[0] * w2
+        bxx = a[0] * p0 + b[0] * p1 + d[0] * p2
+        bxy = a[1] * p0 + b[1] * p1 + d[1] * p2
+        byy = a[1] * a[1] * w0 + b[1] * b[1] * w1 + d[1] * d[1] * w2
+        fa0, fb0, fd0 = a[0] - u * a[2], b[0] - u * b[2], d[0] - u * d[2]
+        fa1, fb1, fd1 = a[1] - v * a[2], b[1] - v * b[2], d[1] - v * d[2]
+        p0, p1, p2 = fa0 * others0, fb0 * others1, fd0 * others2
+        fxx = fa0 * p0 + fb0 * p1 + fd0 * p2
+        fxy = fa1 * p0 + fb1 * p1 + fd1 * p2
+        fyy = fa1 * fa1 * others0 + fb1 * fb1 * others1 + fd1 * fd1 * others2
+        cov_zz = a[2] * a[2] * var0 + b[2] * b[2] * var1 + d[2] * d[2] * var2
+
+        # Gradient on the sums.
+        ia = 1.0 / a0
+        zz = z * z
+        scale_xx, scale_xy, scale_yy = ia * ifx * ifx, ia * ifx * ify, ia * ify * ify
+        g_fyy = m[_GRAD + 2 * BLOCK + lane] * zz * scale_xx
+        g_fxy = -2.0 * m[_GRAD + 3 * BLOCK + lane] * zz * scale_xy
+        g_fxx = m[_GRAD + 4 * BLOCK + lane] * zz * scale_yy
+        conic = g_fyy * fyy + g_fxy * fxy + g_fxx * fxx
+        g_z = m[_GRAD + 10 * BLOCK + lane] + 2.0 * conic * inverse_z
+        g_hx = m[_GRAD + 5 * BLOCK + lane] * ia * ifx
+        g_hy = m[_GRAD + 6 * BLOCK + lane] * ia * ify
+        g_bxx = m[_GRAD + 7 * BLOCK + lane] * scale_xx
+        g_bxy = 2.0 * m[_GRAD + 8 * BLOCK + lane] * scale_xy
+        g_byy = m[_GRAD + 9 * BLOCK + lane] * scale_yy
+        quotients = conic + g_hx * hx + g_hy * hy + g_bxx * bxx + g_bxy * bxy + g_byy * byy
+        g_a0 = m[_GRAD + 12 * BLOCK + lane] - quotients * ia
+        flip = 1.0 / math.sqrt(hx * hx + hy * hy + hz * hz)
+        nx, ny, nz = hx * flip, hy * flip, hz * flip
+        gx, gy, gz = in_camera(
+            c,
+            m[_GRAD + 19 * BLOCK + lane],
+            m[_GRAD + 20 * BLOCK + lane],
+            m[_GRAD + 21 * BLOCK + lane],
+        )
+        along = gx * nx + gy * ny + gz * nz
+        g_h = (
+            g_hx - (gx - along * nx) * flip,
+            g_hy - (gy - along * ny) * flip,
+            (along * nz - gz) * flip,
+        )
+        g_b, g_f = (g_bxx, g_bxy, g_byy), (g_fxx, g_fxy, g_fyy)
+        g_cov = 0.5 * m[_GRAD + 22 * BLOCK + lane] / math.sqrt(cov_zz)
+
+        # Down to axes, weights and the ray through the mean.
+        ga = _axis_gradient(a, e0, fa0, fa1, w0, others0, var0 * g_cov, g_a0, g_h, g_b, g_f)
+        gb = _axis_gradient(b, e1, fb0, fb1, w1, others1, var1 * g_cov, g_a0, g_h, g_b, g_f)
+        gd = _axis_gradient(d, e2, fd0, fd1, w2, others2, var2 * g_cov, g_a0, g_h, g_b, g_f)
+        g_u = m[_GRAD + lane] * fx + a[0] * ga[0] + b[0] * gb[0] + d[0] * gd[0]
+        g_u -= a[2] * ga[1] + b[2] * gb[1] + d[2] * gd[1]
+        g_v = m[_GRAD + BLOCK + lane] * fy + a[1] * ga[0] + b[1] * gb[0] + d[1] * gd[0]
+        g_v -= a[2] * ga[2] + b[2] * gb[2] + d[2] * gd[2]
+        m[_GRAD_SCALE + lane] = ga[6] + gb[7] + gd[7]
+        m[_GRAD_SCALE + BLOCK + lane] = gb[6] + ga[7] + gd[7]
+        m[_GRAD_SCALE + 2 * BLOCK + lane] = gd[6] + ga[7] + gb[7]
+        gx, gy = g_u * inverse_z, g_v * inverse_z
+        gz = g_z - gx * u - gy * v
+        m[_GRAD_MEAN + lane] = c[0] * gx + c[3] * gy + c[6] * gz
+        m[_GRAD_MEAN + BLOCK + lane] = c[1] * gx + c[4] * gy + c[7] * gz
+        m[_GRAD_MEAN + 2 * BLOCK + lane] = c[2] * gx + c[5] * gy + c[8] * gz
+        # The rotation's columns are the axes in the scene frame.
+        x, y = ga[3] + ga[1] + u * ga[0], ga[4] + ga[2] + v * ga[0]
+        z = ga[5] + ga[0] - u * ga[1] - v * ga[2]
+        m[TURN + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[TURN + 3 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[TURN + 6 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+        x, y = gb[3] + gb[1] + u * gb[0], gb[4] + gb[2] + v * gb[0]
+        z = gb[5] + gb[0] - u * gb[1] - v * gb[2]
+        m[TURN + BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[TURN + 4 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[TURN + 7 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+        x, y = gd[3] + gd[1] + u * gd[0], gd[4] + gd[2] + v * gd[0]
+        z = gd[5] + gd[0] - u * gd[1] - v * gd[2]
+        m[TURN + 2 * BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[TURN + 5 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[TURN + 8 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
 
 
-@kernel(fast=False)
+@kernel(fast=False, fused=True)
+def _raw_gradients(m: Any) -> None:
+    """From the gradients on activated values to those on raw ones, and the viewing direction's."""
+    for lane in range(BLOCK):
+        w, x = m[QUAT + lane], m[QUAT + BLOCK + lane]
+        y, z = m[QUAT + 2 * BLOCK + lane], m[QUAT + 3 * BLOCK + lane]
+        square = w * w + x * x + y * y + z * z
+        degenerate = square <= _QUATERNION_MIN_SQ
+        inverse = 1.0 / math.sqrt(square)
+        inverse = 0.0 if degenerate else inverse
+        w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+        g00, g11, g22 = m[TURN + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
+        g01, g10 = m[TURN + BLOCK + lane], m[TURN + 3 * BLOCK + lane]
+        g02, g20 = m[TURN + 2 * BLOCK + lane], m[TURN + 6 * BLOCK + lane]
+        g12, g21 = m[TURN + 5 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
+        skew_x, skew_y, skew_z = g21 - g12, g02 - g20, g10 - g01
+        sum_xy, sum_xz, sum_yz = g01 + g10, g02 + g20, g12 + g21
+        gw = x * skew_x + y * skew_y + z * skew_z
+        gx = w * skew_x + y * sum_xy + z * sum_xz - 2.0 * x * (g11 + g22)
+        gy = w * skew_y + x * sum_xy + z * sum_yz - 2.0 * y * (g00 + g22)
+        gz = w * skew_z + x * sum_xz + y * sum_yz - 2.0 * z * (g00 + g11)
+        along = gw * w + gx * x + gy * y + gz * z
+        inverse = 2.0 * inverse
+        m[_GRAD_QUAT + lane] = (gw - along * w) * inverse
+        m[_GRAD_QUAT + BLOCK + lane] = (gx - along * x) * inverse
+        m[_GRAD_QUAT + 2 * BLOCK + lane] = (gy - along * y) * inverse
+        m[_GRAD_QUAT + 3 * BLOCK + lane] = (gz - along * z) * inverse
+    for lane in range(BLOCK):
+        # d(effective log scale) = kept d(log scale); the filter also dims the opacity.
+        g = m[_GRAD + 11 * BLOCK + lane] * m[OPACITY + lane]
+        m[_GRAD_LOGIT + lane] = g * m[TRANSPARENCY + lane]
+        k0, k1, k2 = m[KEPT + lane], m[KEPT + BLOCK + lane], m[KEPT + 2 * BLOCK + lane]
+        m[_GRAD_SCALE + lane] = k0 * m[_GRAD_SCALE + lane] + (1.0 - k0) * g
+        m[_GRAD_SCALE + BLOCK + lane] = k1 * m[_GRAD_SCALE + BLOCK + lane] + (1.0 - k1) * g
+        m[_GRAD_SCALE + 2 * BLOCK + lane] = k2 * m[_GRAD_SCALE + 2 * BLOCK + lane] + (1.0 - k2) * g
+        # Learned normal tanh(s) d / |d|.
+        n0, n1 = m[ORIENTATION + lane], m[ORIENTATION + BLOCK + lane]
+        n2 = m[ORIENTATION + 2 * BLOCK + lane]
+        g0, g1 = m[_GRAD + 16 * BLOCK + lane], m[_GRAD + 17 * BLOCK + lane]
+        g2 = m[_GRAD + 18 * BLOCK + lane]
+        along = g0 * n0 + g1 * n1 + g2 * n2
+        inverse = m[TANH + lane] * m[ORIENTATION + 3 * BLOCK + lane]
+        m[_GRAD_ORIENTATION + lane] = (g0 - along * n0) * inverse
+        m[_GRAD_ORIENTATION + BLOCK + lane] = (g1 - along * n1) * inverse
+        m[_GRAD_ORIENTATION + 2 * BLOCK + lane] = (g2 - along * n2) * inverse
+        m[_GRAD_ORIENTATION + 3 * BLOCK + lane] = m[SLOPE + lane] * along
+    for lane in range(BLOCK):
+        d0, d1 = m[RAY + lane], m[RAY + BLOCK + lane]
+        d2, inverse = m[RAY + 2 * BLOCK + lane], m[RAY + 3 * BLOCK + lane]
+        g0, g1, g2 = direction_gradient(m, _WEIGHT, lane, d0, d1, d2)
+        along = g0 * d0 + g1 * d1 + g2 * d2
+        m[_GRAD_MEAN + lane] += (g0 - along * d0) * inverse
+        m[_GRAD_MEAN + BLOCK + lane] += (g1 - along * d1) * inverse
+        m[_GRAD_MEAN + 2 * BLOCK + lane] += (g2 - along * d2) * inverse
+
+
+@kernel(fast=False, fused=True)
 def backward_range(
     begin: int,
     end: int,
@@ -166,6 +263,7 @@ def backward_range(
     filter_3d: np.ndarray,
     degree: int,
     camera: np.ndarray,
+    params: np.ndarray,
     visible: np.ndarray,
     grad_params: np.ndarray,
     grad_means: np.ndarray,
@@ -181,127 +279,84 @@ def backward_range(
     overwritten with the gradient of ``ids[k]``; without, ``ids`` is not read and the gradient of
     Gaussian i is added to row i.
     """
-    rotation = np.zeros((3, 3))
-    axes = np.zeros((3, 3))
-    grad_axes = np.zeros((3, 3))
-    grad_rotation = np.zeros((3, 3))
-    variances = np.zeros(3)
-    kept = np.zeros(3)
-    grad = np.zeros(24)
-    grad_logs = np.zeros(3)
-    grad_local = np.zeros(3)
-    grad_quat = np.zeros(4)
-    harmonics = np.zeros(16)
-    slopes = np.zeros((16, 3))
-    for row_out in range(begin, end):
-        i = np.int64(row_out)
-        if compact:
-            i = np.int64(ids[row_out])
-            grad_means[row_out] = 0.0
-            grad_log_scales[row_out] = 0.0
-            grad_quats[row_out] = 0.0
-            grad_opacity_logits[row_out] = 0.0
-            grad_sh[row_out] = 0.0
-            grad_orientation[row_out] = 0.0
-        if not visible[i]:
-            continue
-        for column in range(23):
-            grad[column] = grad_params[i, column]
-
-        # The activations of the forward pass again; cheaper than keeping them.
-        m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-        x = camera[0] * m0 + camera[1] * m1 + camera[2] * m2 + camera[9]
-        y = camera[3] * m0 + camera[4] * m1 + camera[5] * m2 + camera[10]
-        z = camera[6] * m0 + camera[7] * m1 + camera[8] * m2 + camera[11]
-        qw, qx, qy, qz = (
-            np.float64(quats[i, 0]),
-            np.float64(quats[i, 1]),
-            np.float64(quats[i, 2]),
-            np.float64(quats[i, 3]),
-        )
-        norm = rotation_from_quat(qw, qx, qy, qz, rotation)
-        for k in range(3):
-            for row in range(3):
-                axes[row, k] = (
-                    camera[3 * row] * rotation[0, k]
-                    + camera[3 * row + 1] * rotation[1, k]
-                    + camera[3 * row + 2] * rotation[2, k]
+    m = block_scratch(_PLANES)
+    m[_WEIGHT : _WEIGHT + BASIS_COUNT * BLOCK] = 0.0
+    queue = np.empty(QUEUE + BLOCK, np.int64)
+    coefficients = (degree + 1) * (degree + 1)
+    at = begin
+    while at < end:
+        count = 0
+        while at < end and count < QUEUE:
+            i = np.int64(ids[at]) if compact else np.int64(at)
+            if visible[i]:
+                queue[count] = at
+                count += 1
+            elif compact:
+                grad_means[at] = 0.0
+                grad_log_scales[at] = 0.0
+                grad_quats[at] = 0.0
+                grad_opacity_logits[at] = 0.0
+                grad_sh[at] = 0.0
+                grad_orientation[at] = 0.0
+            at += 1
+        for pad in range(count, (count + BLOCK - 1) // BLOCK * BLOCK):
+            queue[pad] = queue[count - 1]
+        for first in range(0, count, BLOCK):
+            for lane in range(BLOCK):
+                row = queue[first + lane]
+                i = np.int64(ids[row]) if compact else row
+                load_raw(
+                    m, lane, i, means, log_scales, quats, opacity_logits, orientation, filter_3d
                 )
-        filter_sq = np.float64(filter_3d[i]) * np.float64(filter_3d[i])
-        product = 1.0
-        for k in range(3):
-            raw = math.exp(2.0 * np.float64(log_scales[i, k]))
-            variances[k] = raw + filter_sq
-            kept[k] = raw / variances[k]
-            product *= kept[k]
-        sigmoid = 1.0 / (1.0 + math.exp(-np.float64(opacity_logits[i])))
-        fade = 1.0 / (1.0 + math.exp(np.float64(opacity_logits[i])))
-        opacity = math.sqrt(product) * sigmoid
-
-        _shape_gradient(x, y, z, variances, camera, axes, grad, grad_axes, grad_logs, grad_local)
-        g_log_opacity = grad[11] * opacity
-        grad_opacity_logits[row_out] += g_log_opacity * fade
-        for k in range(3):
-            # d(effective log scale) = kept d(log scale); the filter also dims the opacity.
-            grad_log_scales[row_out, k] += kept[k] * grad_logs[k] + (1.0 - kept[k]) * g_log_opacity
-        if norm > 0.0:
-            for row in range(3):
-                for k in range(3):
-                    grad_rotation[row, k] = (
-                        camera[row] * grad_axes[0, k]
-                        + camera[3 + row] * grad_axes[1, k]
-                        + camera[6 + row] * grad_axes[2, k]
+                for column in range(_USED_COLUMNS):
+                    m[_GRAD + column * BLOCK + lane] = grad_params[i, column]
+            activate_block(m, camera)
+            _shape_gradients(m, camera)
+            for lane in range(BLOCK):
+                row = queue[first + lane]
+                i = np.int64(ids[row]) if compact else row
+                # A colour clamped at 0 does not move.
+                red = m[_GRAD + 13 * BLOCK + lane] if params[i, 13] > 0.0 else 0.0
+                green = m[_GRAD + 14 * BLOCK + lane] if params[i, 14] > 0.0 else 0.0
+                blue = m[_GRAD + 15 * BLOCK + lane] if params[i, 15] > 0.0 else 0.0
+                written = first + lane < count
+                for k in range(coefficients):
+                    m[_WEIGHT + k * BLOCK + lane] = (
+                        red * np.float64(sh[i, k, 0])
+                        + green * np.float64(sh[i, k, 1])
+                        + blue * np.float64(sh[i, k, 2])
                     )
-            _quat_gradient(qw, qx, qy, qz, norm, grad_rotation, grad_quat)
-            for k in range(4):
-                grad_quats[row_out, k] += grad_quat[k]
-
-        # Colour, through the coefficients and through the viewing direction.
-        d0, d1, d2 = m0 - camera[12], m1 - camera[13], m2 - camera[14]
-        distance = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-        d0, d1, d2 = d0 / distance, d1 / distance, d2 / distance
-        count = (degree + 1) * (degree + 1)
-        basis(degree, d0, d1, d2, harmonics)
-        basis_gradient(degree, d0, d1, d2, slopes)
-        g0 = g1 = g2 = 0.0
-        for channel in range(3):
-            value = 0.5
-            for k in range(count):
-                value += harmonics[k] * np.float64(sh[i, k, channel])
-            if value < 0.0:
-                continue
-            g = grad[13 + channel]
-            for k in range(count):
-                coefficient = g * np.float64(sh[i, k, channel])
-                grad_sh[row_out, k, channel] += g * harmonics[k]
-                g0 += coefficient * slopes[k, 0]
-                g1 += coefficient * slopes[k, 1]
-                g2 += coefficient * slopes[k, 2]
-        along = g0 * d0 + g1 * d1 + g2 * d2
-        g0 = (g0 - along * d0) / distance
-        g1 = (g1 - along * d1) / distance
-        g2 = (g2 - along * d2) / distance
-        for column in range(3):
-            colour = g0 if column == 0 else (g1 if column == 1 else g2)
-            grad_means[row_out, column] += (
-                camera[column] * grad_local[0]
-                + camera[3 + column] * grad_local[1]
-                + camera[6 + column] * grad_local[2]
-                + colour
-            )
-
-        # Learned normal tanh(s) d / |d|.
-        n0, n1, n2 = (
-            np.float64(orientation[i, 0]),
-            np.float64(orientation[i, 1]),
-            np.float64(orientation[i, 2]),
-        )
-        length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-        if length > _DIRECTION_MIN_NORM:
-            n0, n1, n2 = n0 / length, n1 / length, n2 / length
-            gain = math.tanh(np.float64(orientation[i, 3]))
-            along = grad[16] * n0 + grad[17] * n1 + grad[18] * n2
-            grad_orientation[row_out, 0] += gain * (grad[16] - along * n0) / length
-            grad_orientation[row_out, 1] += gain * (grad[17] - along * n1) / length
-            grad_orientation[row_out, 2] += gain * (grad[18] - along * n2) / length
-            grad_orientation[row_out, 3] += (1.0 - gain * gain) * along
+                    if written:
+                        value = m[BASIS + k * BLOCK + lane]
+                        if compact:
+                            grad_sh[row, k, 0] = red * value
+                            grad_sh[row, k, 1] = green * value
+                            grad_sh[row, k, 2] = blue * value
+                        else:
+                            grad_sh[row, k, 0] += red * value
+                            grad_sh[row, k, 1] += green * value
+                            grad_sh[row, k, 2] += blue * value
+                if compact and written:
+                    for k in range(coefficients, sh.shape[1]):
+                        grad_sh[row, k, 0] = 0.0
+                        grad_sh[row, k, 1] = 0.0
+                        grad_sh[row, k, 2] = 0.0
+            _raw_gradients(m)
+            for lane in range(min(BLOCK, count - first)):
+                row = queue[first + lane]
+                if compact:
+                    grad_opacity_logits[row] = m[_GRAD_LOGIT + lane]
+                    for axis in range(3):
+                        grad_means[row, axis] = m[_GRAD_MEAN + axis * BLOCK + lane]
+                        grad_log_scales[row, axis] = m[_GRAD_SCALE + axis * BLOCK + lane]
+                    for axis in range(4):
+                        grad_quats[row, axis] = m[_GRAD_QUAT + axis * BLOCK + lane]
+                        grad_orientation[row, axis] = m[_GRAD_ORIENTATION + axis * BLOCK + lane]
+                else:
+                    grad_opacity_logits[row] += m[_GRAD_LOGIT + lane]
+                    for axis in range(3):
+                        grad_means[row, axis] += m[_GRAD_MEAN + axis * BLOCK + lane]
+                        grad_log_scales[row, axis] += m[_GRAD_SCALE + axis * BLOCK + lane]
+                    for axis in range(4):
+                        grad_quats[row, axis] += m[_GRAD_QUAT + axis * BLOCK + lane]
+                        grad_orientation[row, axis] += m[_GRAD_ORIENTATION + axis * BLOCK + lane]

@@ -10,17 +10,33 @@ projection is written as a sum of squares,
 so neither a grazing disc nor an anisotropy of 1e6 cancels. The screen box is that of the ellipse
 ``alpha >= 1/255``, from the dual conic of the ellipsoid: it is bounded exactly while the whole
 ellipsoid lies in front of the camera plane.
+
+A cheap first pass leaves out what is behind, too faint, or certainly off the image; what remains
+is projected in blocks (``projection_math.py``).
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from .. import tolerances
-from ..compiled import kernel
-from .harmonics_kernels import basis
+from ..compiled import inline, kernel
+from .projection_activation import (
+    ACTIVATED_PLANES,
+    BASIS,
+    MEAN,
+    OPACITY,
+    ORIENTATION,
+    SCALE,
+    TANH,
+    TURN,
+    activate_block,
+    load_raw,
+)
+from .projection_math import BLOCK, QUEUE, block_scratch, log_wide
 
 PARAM_COLUMNS = 24
 CAMERA_VALUES = 22
@@ -28,182 +44,212 @@ CAMERA_VALUES = 22
 19-20, near z 21."""
 
 _ALPHA_MIN = tolerances.ALPHA_MIN
-_QUATERNION_MIN_NORM = tolerances.QUATERNION_MIN_NORM
-_DIRECTION_MIN_NORM = tolerances.DIRECTION_MIN_NORM
 # An ellipsoid that touches the camera plane within rounding is treated as crossing it.
 _PLANE_MARGIN = 1e-12
 _FLOAT32_MAX = 3.0e38
 _FLOAT32_STEP = 2.0**-23
 # Boxes end here so that pixel ranges always fit an int32.
 _FARTHEST_PX = 1.0e9
+# Whatever its scales, a Gaussian with a smaller logit is fainter than 1/255; 1e-3 below the limit.
+_FAINT_LOGIT = -math.log(1.0 / _ALPHA_MIN - 1.0) - 1e-3
+# Half axes of the ellipsoid at 1/255 in standard deviations, at most; with a margin for rounding.
+_REACH = math.sqrt(-2.0 * math.log(_ALPHA_MIN)) * (1.0 + 1e-6)
+
+# Planes of the scratch array behind those of the activation: columns of params, boxes, the rest.
+_PARAM = ACTIVATED_PLANES * BLOCK
+_BOX = _PARAM + PARAM_COLUMNS * BLOCK
+_DEPTH = _BOX + 4 * BLOCK
+_SKEW = _DEPTH + BLOCK
+_SEEN = _SKEW + BLOCK
+_PLANES = _SEEN // BLOCK + 1
 
 
-@kernel(fast=False)
-def rotation_from_quat(w: float, x: float, y: float, z: float, out: np.ndarray) -> float:
-    """Write the (3, 3) rotation of a quaternion; return its norm, or 0 where it is degenerate."""
-    norm = math.sqrt(w * w + x * x + y * y + z * z)
-    if norm <= _QUATERNION_MIN_NORM:
-        w, x, y, z = 1.0, 0.0, 0.0, 0.0
-        norm = 0.0
-    else:
-        w, x, y, z = w / norm, x / norm, y / norm, z / norm
-    out[0, 0] = 1.0 - 2.0 * (y * y + z * z)
-    out[0, 1] = 2.0 * (x * y - w * z)
-    out[0, 2] = 2.0 * (x * z + w * y)
-    out[1, 0] = 2.0 * (x * y + w * z)
-    out[1, 1] = 1.0 - 2.0 * (x * x + z * z)
-    out[1, 2] = 2.0 * (y * z - w * x)
-    out[2, 0] = 2.0 * (x * z - w * y)
-    out[2, 1] = 2.0 * (y * z + w * x)
-    out[2, 2] = 1.0 - 2.0 * (x * x + y * y)
-    return norm
+@inline
+def load_camera_axes(camera: Any) -> Any:
+    """Return the nine values of the packed camera's rotation, row by row."""
+    return (
+        camera[0], camera[1], camera[2], camera[3], camera[4], camera[5],
+        camera[6], camera[7], camera[8],
+    )  # fmt: skip
 
 
-@kernel(fast=False)
-def _outward(value: float, side: float) -> float:
-    """Move a box edge one float32 step outwards (``side`` -1 or 1), so that rounding is safe."""
-    value = min(max(value, -_FARTHEST_PX), _FARTHEST_PX)
-    return value + side * _FLOAT32_STEP * abs(value)
+@inline
+def in_camera(c: Any, a: Any, b: Any, d: Any) -> Any:
+    """Return the vector (a, b, d) turned by the rotation ``c``."""
+    return (
+        c[0] * a + c[1] * b + c[2] * d,
+        c[3] * a + c[4] * b + c[5] * d,
+        c[6] * a + c[7] * b + c[8] * d,
+    )
 
 
-@kernel(fast=False)
-def _hide(
-    i: int, params: np.ndarray, boxes: np.ndarray, depths: np.ndarray, skews: np.ndarray
-) -> None:
-    """Leave an invisible row without stale values."""
-    params[i] = 0.0
-    boxes[i, 0] = boxes[i, 1] = 0.0
-    boxes[i, 2] = boxes[i, 3] = -1.0
-    depths[i] = np.inf
-    skews[i] = 0.0
+@inline
+def _outward(value: Any, side: Any) -> Any:
+    """Move a box edge one float32 step outwards (``side`` -1 or 1) and round it."""
+    value = -_FARTHEST_PX if value < -_FARTHEST_PX else value
+    value = _FARTHEST_PX if value > _FARTHEST_PX else value
+    return np.float64(np.float32(value + side * _FLOAT32_STEP * abs(value)))
 
 
-@kernel(fast=False)
-def _project_shape(
-    i: int,
-    x: float,
-    y: float,
-    z: float,
-    rotation: np.ndarray,
-    variances: np.ndarray,
-    opacity: float,
-    camera: np.ndarray,
-    axes: np.ndarray,
-    params: np.ndarray,
-    boxes: np.ndarray,
-    depths: np.ndarray,
-    skews: np.ndarray,
-) -> bool:
-    """Write columns 0-12 and 19-22, box, depth and skew of one Gaussian; return whether visible.
-
-    ``(x, y, z)`` is the mean in the camera frame, ``axes (3, 3)`` is scratch.
-    """
+@kernel(fast=False, fused=True)
+def _project_shapes(m: Any, camera: Any) -> None:
+    """Fill all of a block but its colours, and whether each is seen."""
+    c = load_camera_axes(camera)
+    t0, t1, t2 = camera[9], camera[10], camera[11]
     fx, fy, cx, cy = camera[15], camera[16], camera[17], camera[18]
     width, height, near_z = camera[19], camera[20], camera[21]
-    if not (z > near_z and z > 0.0 and opacity > _ALPHA_MIN):
-        return False
-    u, v = x / z, y / z
-    for k in range(3):
-        for row in range(3):
-            axes[row, k] = (
-                camera[3 * row] * rotation[0, k]
-                + camera[3 * row + 1] * rotation[1, k]
-                + camera[3 * row + 2] * rotation[2, k]
-            )
-    a0 = hx = hy = hz = bxx = bxy = byy = 0.0
-    qxx = qxy = qyy = 0.0
-    cov_xx = cov_xy = cov_yy = cov_xz = cov_yz = cov_zz = 0.0
-    for k in range(3):
-        r0, r1, r2 = axes[0, k], axes[1, k], axes[2, k]
-        variance = variances[k]
-        inverse = 1.0 / variance
-        inverse_others = 1.0 / (variances[(k + 1) % 3] * variances[(k + 2) % 3])
-        e = r0 * u + r1 * v + r2
-        f0, f1 = r0 - u * r2, r1 - v * r2
-        a0 += e * e * inverse
-        hx += r0 * e * inverse
-        hy += r1 * e * inverse
-        hz += r2 * e * inverse
-        bxx += r0 * r0 * inverse
-        bxy += r0 * r1 * inverse
-        byy += r1 * r1 * inverse
-        qxx += f1 * f1 * inverse_others
-        qxy -= f0 * f1 * inverse_others
-        qyy += f0 * f0 * inverse_others
-        cov_xx += f0 * f0 * variance
-        cov_xy += f0 * f1 * variance
-        cov_yy += f1 * f1 * variance
-        cov_xz += f0 * r2 * variance
-        cov_yz += f1 * r2 * variance
-        cov_zz += r2 * r2 * variance
-    inverse_a0 = 1.0 / a0
-    zz = z * z
-    params[i, 0] = fx * u + cx
-    params[i, 1] = fy * v + cy
-    params[i, 2] = zz * qxx * inverse_a0 / (fx * fx)
-    params[i, 3] = 2.0 * zz * qxy * inverse_a0 / (fx * fy)
-    params[i, 4] = zz * qyy * inverse_a0 / (fy * fy)
-    params[i, 5] = hx * inverse_a0 / fx
-    params[i, 6] = hy * inverse_a0 / fy
-    params[i, 7] = bxx * inverse_a0 / (fx * fx)
-    params[i, 8] = 2.0 * bxy * inverse_a0 / (fx * fy)
-    params[i, 9] = byy * inverse_a0 / (fy * fy)
-    params[i, 10] = z
-    params[i, 11] = opacity
-    params[i, 12] = a0
-    length = -1.0 / math.sqrt(hx * hx + hy * hy + hz * hz)
-    hx, hy, hz = hx * length, hy * length, hz * length
-    for column in range(3):
-        params[i, 19 + column] = (
-            camera[column] * hx + camera[3 + column] * hy + camera[6 + column] * hz
+    near_z = max(near_z, 0.0)
+    ifx, ify = 1.0 / fx, 1.0 / fy
+    ixx, ixy, iyy = ifx * ifx, 2.0 * ifx * ify, ify * ify
+    for lane in range(BLOCK):
+        x, y, z = in_camera(c, m[MEAN + lane], m[MEAN + BLOCK + lane], m[MEAN + 2 * BLOCK + lane])
+        x, y, z = x + t0, y + t1, z + t2
+        inverse_z = 1.0 / z
+        u, v = x * inverse_z, y * inverse_z
+        r00, r10, r20 = in_camera(
+            c, m[TURN + lane], m[TURN + 3 * BLOCK + lane], m[TURN + 6 * BLOCK + lane]
         )
-    params[i, 22] = math.sqrt(cov_zz)
-    params[i, 23] = 0.0
-    depths[i] = math.sqrt(x * x + y * y + zz)
+        r01, r11, r21 = in_camera(
+            c, m[TURN + BLOCK + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
+        )
+        r02, r12, r22 = in_camera(
+            c, m[TURN + 2 * BLOCK + lane], m[TURN + 5 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
+        )
+        var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
+        w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
+        others0, others1, others2 = w1 * w2, w2 * w0, w0 * w1
+        e0 = r00 * u + r10 * v + r20
+        e1 = r01 * u + r11 * v + r21
+        e2 = r02 * u + r12 * v + r22
+        ew0, ew1, ew2 = e0 * w0, e1 * w1, e2 * w2
+        a0 = e0 * ew0 + e1 * ew1 + e2 * ew2
+        hx = r00 * ew0 + r01 * ew1 + r02 * ew2
+        hy = r10 * ew0 + r11 * ew1 + r12 * ew2
+        hz = r20 * ew0 + r21 * ew1 + r22 * ew2
+        inverse_a0 = 1.0 / a0
+        k_xx, k_xy, k_yy = inverse_a0 * ixx, inverse_a0 * ixy, inverse_a0 * iyy
+        m[_PARAM + lane] = fx * u + cx
+        m[_PARAM + BLOCK + lane] = fy * v + cy
+        m[_PARAM + 5 * BLOCK + lane] = hx * inverse_a0 * ifx
+        m[_PARAM + 6 * BLOCK + lane] = hy * inverse_a0 * ify
+        p00, p01, p02 = r00 * w0, r01 * w1, r02 * w2
+        m[_PARAM + 7 * BLOCK + lane] = (r00 * p00 + r01 * p01 + r02 * p02) * k_xx
+        m[_PARAM + 8 * BLOCK + lane] = (r10 * p00 + r11 * p01 + r12 * p02) * k_xy
+        m[_PARAM + 9 * BLOCK + lane] = (r10 * r10 * w0 + r11 * r11 * w1 + r12 * r12 * w2) * k_yy
+        m[_PARAM + 10 * BLOCK + lane] = z
+        opacity = m[OPACITY + lane]
+        m[_PARAM + 11 * BLOCK + lane] = opacity
+        m[_PARAM + 12 * BLOCK + lane] = a0
+        flip = -1.0 / math.sqrt(hx * hx + hy * hy + hz * hz)
+        nx, ny, nz = hx * flip, hy * flip, hz * flip
+        m[_PARAM + 19 * BLOCK + lane] = c[0] * nx + c[3] * ny + c[6] * nz
+        m[_PARAM + 20 * BLOCK + lane] = c[1] * nx + c[4] * ny + c[7] * nz
+        m[_PARAM + 21 * BLOCK + lane] = c[2] * nx + c[5] * ny + c[8] * nz
 
-    threshold = 2.0 * math.log(opacity / _ALPHA_MIN)
-    scale = zz - threshold * cov_zz
-    if scale > _PLANE_MARGIN * zz:
+        f00, f01, f02 = r00 - u * r20, r01 - u * r21, r02 - u * r22
+        f10, f11, f12 = r10 - v * r20, r11 - v * r21, r12 - v * r22
+        zz = z * z
+        o0, o1, o2 = f00 * others0, f01 * others1, f02 * others2
+        m[_PARAM + 4 * BLOCK + lane] = zz * k_yy * (f00 * o0 + f01 * o1 + f02 * o2)
+        m[_PARAM + 3 * BLOCK + lane] = -zz * k_xy * (f10 * o0 + f11 * o1 + f12 * o2)
+        m[_PARAM + 2 * BLOCK + lane] = (
+            zz * k_xx * (f10 * f10 * others0 + f11 * f11 * others1 + f12 * f12 * others2)
+        )
+        s0, s1, s2 = f00 * var0, f01 * var1, f02 * var2
+        cov_xx = f00 * s0 + f01 * s1 + f02 * s2
+        cov_xy = f10 * s0 + f11 * s1 + f12 * s2
+        cov_xz = r20 * s0 + r21 * s1 + r22 * s2
+        s0, s1, s2 = f10 * var0, f11 * var1, f12 * var2
+        cov_yy = f10 * s0 + f11 * s1 + f12 * s2
+        cov_yz = r20 * s0 + r21 * s1 + r22 * s2
+        cov_zz = r20 * r20 * var0 + r21 * r21 * var1 + r22 * r22 * var2
+        m[_PARAM + 22 * BLOCK + lane] = math.sqrt(cov_zz)
+        m[_DEPTH + lane] = math.sqrt(x * x + y * y + zz)
+
+        threshold = 2.0 * log_wide(opacity * (1.0 / _ALPHA_MIN))
+        scale = zz - threshold * cov_zz
+        bounded = scale > _PLANE_MARGIN * zz
         # The silhouette's dual conic, seen from (u, v): centre and half axes of the ellipse.
         share = threshold / scale
-        center_x = fx * (u - share * cov_xz) + cx
-        center_y = fy * (v - share * cov_yz) + cy
+        middle_x = fx * (u - share * cov_xz) + cx
+        middle_y = fy * (v - share * cov_yz) + cy
         spread_xx = share * (cov_xx + share * cov_xz * cov_xz)
         spread_xy = share * (cov_xy + share * cov_xz * cov_yz)
-        spread_yy = share * (cov_yy + share * cov_yz * cov_yz)
-        half_x, half_y = fx * math.sqrt(spread_xx), fy * math.sqrt(spread_yy)
-        boxes[i, 0] = _outward(center_x - half_x, -1.0)
-        boxes[i, 1] = _outward(center_y - half_y, -1.0)
-        boxes[i, 2] = _outward(center_x + half_x, 1.0)
-        boxes[i, 3] = _outward(center_y + half_y, 1.0)
-        skews[i] = fx * spread_xy / math.sqrt(spread_yy)
-    else:
-        boxes[i, 0] = boxes[i, 1] = 0.0
-        boxes[i, 2] = width
-        boxes[i, 3] = height
-        skews[i] = np.inf
+        root_y = math.sqrt(share * (cov_yy + share * cov_yz * cov_yz))
+        half_x, half_y = fx * math.sqrt(spread_xx), fy * root_y
+        left, right = _outward(middle_x - half_x, -1.0), _outward(middle_x + half_x, 1.0)
+        top, bottom = _outward(middle_y - half_y, -1.0), _outward(middle_y + half_y, 1.0)
+        skew = fx * spread_xy / root_y
+        left = left if bounded else 0.0
+        top = top if bounded else 0.0
+        right = right if bounded else width
+        bottom = bottom if bounded else height
+        m[_BOX + lane] = left
+        m[_BOX + BLOCK + lane] = top
+        m[_BOX + 2 * BLOCK + lane] = right
+        m[_BOX + 3 * BLOCK + lane] = bottom
+        m[_SKEW + lane] = skew if bounded else math.inf
 
-    # Seen if the box holds the centre of a pixel of the image.
-    first_x = max(np.ceil(boxes[i, 0] - 0.5), 0.0)
-    last_x = min(np.floor(boxes[i, 2] - 0.5), width - 1.0)
-    first_y = max(np.ceil(boxes[i, 1] - 0.5), 0.0)
-    last_y = min(np.floor(boxes[i, 3] - 0.5), height - 1.0)
-    return first_x <= last_x and first_y <= last_y
+        # Seen if the box holds the centre of a pixel of the image.
+        first_x, last_x = np.ceil(left - 0.5), np.floor(right - 0.5)
+        first_y, last_y = np.ceil(top - 0.5), np.floor(bottom - 0.5)
+        first_x = 0.0 if first_x < 0.0 else first_x
+        first_y = 0.0 if first_y < 0.0 else first_y
+        last_x = width - 1.0 if last_x > width - 1.0 else last_x
+        last_y = height - 1.0 if last_y > height - 1.0 else last_y
+        seen = (first_x <= last_x) & (first_y <= last_y)
+        seen = seen & (z > near_z) & (opacity > _ALPHA_MIN)
+        m[_SEEN + lane] = 1.0 if seen else 0.0
+    for lane in range(BLOCK):
+        tanh = m[TANH + lane]
+        m[_PARAM + 16 * BLOCK + lane] = tanh * m[ORIENTATION + lane]
+        m[_PARAM + 17 * BLOCK + lane] = tanh * m[ORIENTATION + BLOCK + lane]
+        m[_PARAM + 18 * BLOCK + lane] = tanh * m[ORIENTATION + 2 * BLOCK + lane]
+        # Not seen where float32 cannot hold a value; NaN and infinity survive a sum of sizes.
+        total = abs(m[_PARAM + lane])
+        total += abs(m[_PARAM + 1 * BLOCK + lane])
+        total += abs(m[_PARAM + 2 * BLOCK + lane])
+        total += abs(m[_PARAM + 3 * BLOCK + lane])
+        total += abs(m[_PARAM + 4 * BLOCK + lane])
+        total += abs(m[_PARAM + 5 * BLOCK + lane])
+        total += abs(m[_PARAM + 6 * BLOCK + lane])
+        total += abs(m[_PARAM + 7 * BLOCK + lane])
+        total += abs(m[_PARAM + 8 * BLOCK + lane])
+        total += abs(m[_PARAM + 9 * BLOCK + lane])
+        total += abs(m[_PARAM + 10 * BLOCK + lane])
+        total += abs(m[_PARAM + 11 * BLOCK + lane])
+        total += abs(m[_PARAM + 12 * BLOCK + lane])
+        total += abs(m[_PARAM + 16 * BLOCK + lane])
+        total += abs(m[_PARAM + 17 * BLOCK + lane])
+        total += abs(m[_PARAM + 18 * BLOCK + lane])
+        total += abs(m[_PARAM + 19 * BLOCK + lane])
+        total += abs(m[_PARAM + 20 * BLOCK + lane])
+        total += abs(m[_PARAM + 21 * BLOCK + lane])
+        total += abs(m[_PARAM + 22 * BLOCK + lane])
+        total += abs(m[_BOX + lane])
+        total += abs(m[_BOX + 1 * BLOCK + lane])
+        total += abs(m[_BOX + 2 * BLOCK + lane])
+        total += abs(m[_BOX + 3 * BLOCK + lane])
+        seen = m[_SEEN + lane]
+        m[_SEEN + lane] = seen if total < _FLOAT32_MAX else 0.0
 
 
-@kernel(fast=False)
-def _row_is_finite(i: int, params: np.ndarray, boxes: np.ndarray) -> bool:
-    """Return whether every value of a row is a usable float32."""
-    for column in range(PARAM_COLUMNS):
-        if not abs(params[i, column]) < _FLOAT32_MAX:
-            return False
-    for column in range(4):  # noqa: SIM110 - numba compiles loops, not generators
-        if not abs(boxes[i, column]) < _FLOAT32_MAX:
-            return False
-    return True
+@inline
+def _write_row(
+    m: Any, lane: Any, i: Any, params: Any, boxes: Any, visible: Any, depths: Any, skews: Any
+) -> None:
+    """Copy one Gaussian of a block to the screen arrays."""
+    for column in range(PARAM_COLUMNS - 1):
+        params[i, column] = m[_PARAM + column * BLOCK + lane]
+    params[i, 23] = 0.0
+    for column in range(4):
+        boxes[i, column] = m[_BOX + column * BLOCK + lane]
+    depths[i] = m[_DEPTH + lane]
+    skews[i] = m[_SKEW + lane]
+    visible[i] = True
 
 
-@kernel(fast=False)
+@kernel(fast=False, fused=True)
 def project_raw_range(
     begin: int,
     end: int,
@@ -222,60 +268,74 @@ def project_raw_range(
     depths: np.ndarray,
     skews: np.ndarray,
 ) -> None:
-    """Project the raw Gaussians ``begin .. end``; every array is written in place."""
-    rotation = np.zeros((3, 3))
-    axes = np.zeros((3, 3))
-    variances = np.zeros(3)
-    harmonics = np.zeros(16)
-    for i in range(begin, end):
-        m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-        z = camera[6] * m0 + camera[7] * m1 + camera[8] * m2 + camera[11]
-        seen = z > camera[21]
-        if seen:
+    """Project the raw Gaussians ``begin .. end``; of those not seen only that is written."""
+    m = block_scratch(_PLANES)
+    queue = np.empty(QUEUE + BLOCK, np.int64)
+    coefficients = (degree + 1) * (degree + 1)
+    fx, fy, cx, cy = camera[15], camera[16], camera[17], camera[18]
+    width, height = camera[19], camera[20]
+    # Unit normals of the planes through the image's sides, pointing outwards.
+    left = 1.0 / math.sqrt(fx * fx + cx * cx)
+    right = 1.0 / math.sqrt(fx * fx + (width - cx) * (width - cx))
+    top = 1.0 / math.sqrt(fy * fy + cy * cy)
+    bottom = 1.0 / math.sqrt(fy * fy + (height - cy) * (height - cy))
+    at = begin
+    while at < end:
+        count = 0
+        while at < end and count < QUEUE:
+            i = at
+            at += 1
+            visible[i] = False
+            depths[i] = np.inf
+            m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+            z = camera[6] * m0 + camera[7] * m1 + camera[8] * m2 + camera[11]
+            if not z > camera[21] or opacity_logits[i] < _FAINT_LOGIT:
+                continue
             x = camera[0] * m0 + camera[1] * m1 + camera[2] * m2 + camera[9]
             y = camera[3] * m0 + camera[4] * m1 + camera[5] * m2 + camera[10]
-            rotation_from_quat(
-                np.float64(quats[i, 0]),
-                np.float64(quats[i, 1]),
-                np.float64(quats[i, 2]),
-                np.float64(quats[i, 3]),
-                rotation,
+            outside = max(
+                max((-fx * x - cx * z) * left, (fx * x - (width - cx) * z) * right),
+                max((-fy * y - cy * z) * top, (fy * y - (height - cy) * z) * bottom),
             )
-            filter_sq = np.float64(filter_3d[i]) * np.float64(filter_3d[i])
-            kept = 1.0
-            for k in range(3):
-                raw = math.exp(2.0 * np.float64(log_scales[i, k]))
-                variances[k] = raw + filter_sq
-                kept *= raw / variances[k]
-            opacity = math.sqrt(kept) / (1.0 + math.exp(-np.float64(opacity_logits[i])))
-            seen = _project_shape(
-                i, x, y, z, rotation, variances, opacity, camera, axes, params, boxes, depths, skews
-            )
-        if seen:
-            d0, d1, d2 = m0 - camera[12], m1 - camera[13], m2 - camera[14]
-            distance = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-            basis(degree, d0 / distance, d1 / distance, d2 / distance, harmonics)
-            for channel in range(3):
-                value = 0.5
-                for k in range((degree + 1) * (degree + 1)):
-                    value += harmonics[k] * np.float64(sh[i, k, channel])
-                # Written so that NaN stays NaN and hides the row below.
-                params[i, 13 + channel] = 0.0 if value <= 0.0 else value
-            n0, n1, n2 = (
-                np.float64(orientation[i, 0]),
-                np.float64(orientation[i, 1]),
-                np.float64(orientation[i, 2]),
-            )
-            length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-            gain = math.tanh(np.float64(orientation[i, 3])) / max(length, _DIRECTION_MIN_NORM)
-            params[i, 16], params[i, 17], params[i, 18] = gain * n0, gain * n1, gain * n2
-            seen = _row_is_finite(i, params, boxes)
-        visible[i] = seen
-        if not seen:
-            _hide(i, params, boxes, depths, skews)
+            if outside > 0.0:
+                # Far enough outside one plane, and wholly in front of the camera's.
+                largest = max(np.float64(log_scales[i, 0]), np.float64(log_scales[i, 1]))
+                largest = max(largest, np.float64(log_scales[i, 2]))
+                blur = np.float64(filter_3d[i])
+                radius = _REACH * math.sqrt(math.exp(2.0 * largest) + blur * blur)
+                if outside > radius and z > radius:
+                    continue
+            queue[count] = i
+            count += 1
+        for pad in range(count, (count + BLOCK - 1) // BLOCK * BLOCK):
+            queue[pad] = queue[count - 1]
+        for first in range(0, count, BLOCK):
+            for lane in range(BLOCK):
+                i = queue[first + lane]
+                load_raw(
+                    m, lane, i, means, log_scales, quats, opacity_logits, orientation, filter_3d
+                )
+            activate_block(m, camera)
+            _project_shapes(m, camera)
+            for lane in range(min(BLOCK, count - first)):
+                if m[_SEEN + lane] == 0.0:
+                    continue
+                i = queue[first + lane]
+                red = green = blue = 0.5
+                for k in range(coefficients):
+                    value = m[BASIS + k * BLOCK + lane]
+                    red += value * np.float64(sh[i, k, 0])
+                    green += value * np.float64(sh[i, k, 1])
+                    blue += value * np.float64(sh[i, k, 2])
+                if not abs(red) + abs(green) + abs(blue) < _FLOAT32_MAX:
+                    continue
+                m[_PARAM + 13 * BLOCK + lane] = max(red, 0.0)
+                m[_PARAM + 14 * BLOCK + lane] = max(green, 0.0)
+                m[_PARAM + 15 * BLOCK + lane] = max(blue, 0.0)
+                _write_row(m, lane, i, params, boxes, visible, depths, skews)
 
 
-@kernel(fast=False)
+@kernel(fast=False, fused=True)
 def project_activated_range(
     begin: int,
     end: int,
@@ -291,25 +351,27 @@ def project_activated_range(
     depths: np.ndarray,
     skews: np.ndarray,
 ) -> None:
-    """Project the activated Gaussians ``begin .. end``; the colour columns stay 0."""
-    axes = np.zeros((3, 3))
-    variances = np.zeros(3)
-    for i in range(begin, end):
-        m0, m1, m2 = means[i, 0], means[i, 1], means[i, 2]
-        x = camera[0] * m0 + camera[1] * m1 + camera[2] * m2 + camera[9]
-        y = camera[3] * m0 + camera[4] * m1 + camera[5] * m2 + camera[10]
-        z = camera[6] * m0 + camera[7] * m1 + camera[8] * m2 + camera[11]
-        for k in range(3):
-            variances[k] = scales[i, k] * scales[i, k]
-        opacity = math.exp(log_opacities[i])
-        seen = _project_shape(
-            i, x, y, z, rotations[i], variances, opacity, camera, axes, params, boxes, depths, skews
-        )
-        if seen:
-            for channel in range(3):
-                params[i, 13 + channel] = 0.0
-                params[i, 16 + channel] = normals[i, channel]
-            seen = _row_is_finite(i, params, boxes)
-        visible[i] = seen
-        if not seen:
-            _hide(i, params, boxes, depths, skews)
+    """Project the activated Gaussians ``begin .. end``; the colour columns are 0."""
+    m = block_scratch(_PLANES)
+    for lane in range(BLOCK):
+        m[_PARAM + 13 * BLOCK + lane] = 0.0
+        m[_PARAM + 14 * BLOCK + lane] = 0.0
+        m[_PARAM + 15 * BLOCK + lane] = 0.0
+    for first in range(begin, end, BLOCK):
+        for lane in range(BLOCK):
+            i = min(first + lane, end - 1)
+            for axis in range(3):
+                m[MEAN + axis * BLOCK + lane] = means[i, axis]
+                m[SCALE + axis * BLOCK + lane] = scales[i, axis] * scales[i, axis]
+                m[ORIENTATION + axis * BLOCK + lane] = normals[i, axis]
+                for column in range(3):
+                    m[TURN + (3 * axis + column) * BLOCK + lane] = rotations[i, axis, column]
+            m[TANH + lane] = 1.0
+            m[OPACITY + lane] = math.exp(log_opacities[i])
+        _project_shapes(m, camera)
+        for lane in range(min(BLOCK, end - first)):
+            i = first + lane
+            visible[i] = False
+            depths[i] = np.inf
+            if m[_SEEN + lane] != 0.0:
+                _write_row(m, lane, i, params, boxes, visible, depths, skews)

@@ -158,22 +158,65 @@ def test_activated_arrays_give_the_same_rows() -> None:
     np.testing.assert_allclose(other.boxes, screen.boxes, rtol=1e-6, atol=1e-5)
 
 
-def test_threads_and_reused_output_change_nothing() -> None:
-    gaussians = random_gaussians(500, 8)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_threads_and_reused_output_change_nothing(dtype: torch.dtype) -> None:
+    gaussians = random_gaussians(500, 8, spread=2.5, dtype=dtype)
     alone = project(gaussians)
-    reused = ScreenGaussians.allocate(500)
-    for field in dataclasses.fields(reused):
-        getattr(reused, field.name)[:] = 77
-    got = project_gaussians(
-        RawArrays.from_gaussians(gaussians), CAMERA, RenderOptions(threads=3), reused
-    )
-    assert got is reused
-    for field in dataclasses.fields(reused):
-        np.testing.assert_array_equal(getattr(got, field.name), getattr(alone, field.name))
+    seen = alone.visible
+    assert 0.2 < seen.mean() < 0.8
+    assert np.isinf(alone.depths[~seen]).all()
+    for threads in (1, 2, 4):
+        reused = ScreenGaussians.allocate(500)
+        for field in dataclasses.fields(reused):
+            getattr(reused, field.name)[:] = 77
+        got = project_gaussians(
+            RawArrays.from_gaussians(gaussians), CAMERA, RenderOptions(threads=threads), reused
+        )
+        assert got is reused
+        np.testing.assert_array_equal(got.visible, seen)
+        np.testing.assert_array_equal(got.depths, alone.depths)
+        # Other rows of what is not visible hold anything.
+        for name in ("params", "boxes", "skews"):
+            np.testing.assert_array_equal(getattr(got, name)[seen], getattr(alone, name)[seen])
     with pytest.raises(UsageError, match="rows"):
         project_gaussians(
             RawArrays.from_gaussians(gaussians), CAMERA, OPTIONS, ScreenGaussians.allocate(3)
         )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_no_value_depends_on_neighbours(dtype: torch.dtype) -> None:
+    """Any Gaussian alone, or with any others around it, has bitwise the same row and gradient."""
+    gaussians = random_gaussians(61, 9, spread=2.0, dtype=dtype)
+    # Values that are not finite, or overflow, must not leak into the rest of a block.
+    gaussians.means[7] = torch.nan
+    gaussians.log_scales[12] = torch.inf
+    gaussians.sh[20] = -torch.inf
+    gaussians.log_scales[21] = 300.0
+    gaussians.quats[33] = 0.0
+    whole = project(gaussians)
+    raw = RawArrays.from_gaussians(gaussians)
+    grad_params = np.random.default_rng(1).normal(size=(61, 24))
+    ids = np.arange(61, dtype=np.int32)
+    every = project_backward_visible(raw, CAMERA, OPTIONS, whole, grad_params, ids)
+    assert not whole.visible[[7, 12, 20, 21]].any()
+    assert 15 < whole.visible.sum() < 55
+    random = np.random.default_rng(2)
+    for size in (*range(1, 18), 40):
+        chosen = np.sort(random.choice(61, size, replace=False))
+        part = gaussians.select(torch.from_numpy(chosen))
+        screen = project(part)
+        np.testing.assert_array_equal(screen.visible, whole.visible[chosen])
+        seen = screen.visible
+        for field in dataclasses.fields(screen):
+            got, wanted = getattr(screen, field.name), getattr(whole, field.name)[chosen]
+            np.testing.assert_array_equal(got[seen], wanted[seen])
+        grads = project_backward_visible(
+            RawArrays.from_gaussians(part), CAMERA, OPTIONS, screen, grad_params[chosen], ids[:size]
+        )
+        for name in NAMES:
+            np.testing.assert_array_equal(getattr(grads, name), getattr(every, name)[chosen])
+            assert np.isfinite(getattr(grads, name)).all()
 
 
 # -- hard cases -----------------------------------------------------------------------------------
