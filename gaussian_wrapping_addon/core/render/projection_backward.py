@@ -312,35 +312,35 @@ def backward_range(
                     m[_GRAD + column * BLOCK + lane] = grad_params[i, column]
             activate_block(m, camera)
             _shape_gradients(m, camera)
-            for lane in range(BLOCK):
+            for lane in range(min(BLOCK, count - first)):
                 row = queue[first + lane]
                 i = np.int64(ids[row]) if compact else row
                 # A colour clamped at 0 does not move.
                 red = m[_GRAD + 13 * BLOCK + lane] if params[i, 13] > 0.0 else 0.0
                 green = m[_GRAD + 14 * BLOCK + lane] if params[i, 14] > 0.0 else 0.0
                 blue = m[_GRAD + 15 * BLOCK + lane] if params[i, 15] > 0.0 else 0.0
-                written = first + lane < count
                 for k in range(coefficients):
                     m[_WEIGHT + k * BLOCK + lane] = (
                         red * np.float64(sh[i, k, 0])
                         + green * np.float64(sh[i, k, 1])
                         + blue * np.float64(sh[i, k, 2])
                     )
-                    if written:
+                if compact:
+                    for k in range(coefficients):
                         value = m[BASIS + k * BLOCK + lane]
-                        if compact:
-                            grad_sh[row, k, 0] = red * value
-                            grad_sh[row, k, 1] = green * value
-                            grad_sh[row, k, 2] = blue * value
-                        else:
-                            grad_sh[row, k, 0] += red * value
-                            grad_sh[row, k, 1] += green * value
-                            grad_sh[row, k, 2] += blue * value
-                if compact and written:
+                        grad_sh[row, k, 0] = red * value
+                        grad_sh[row, k, 1] = green * value
+                        grad_sh[row, k, 2] = blue * value
                     for k in range(coefficients, sh.shape[1]):
                         grad_sh[row, k, 0] = 0.0
                         grad_sh[row, k, 1] = 0.0
                         grad_sh[row, k, 2] = 0.0
+                else:
+                    for k in range(coefficients):
+                        value = m[BASIS + k * BLOCK + lane]
+                        grad_sh[row, k, 0] += red * value
+                        grad_sh[row, k, 1] += green * value
+                        grad_sh[row, k, 2] += blue * value
             _raw_gradients(m)
             for lane in range(min(BLOCK, count - first)):
                 row = queue[first + lane]

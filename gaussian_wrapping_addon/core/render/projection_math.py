@@ -81,7 +81,7 @@ def exp_parts(x: Any) -> Any:
     p = (((_E11 * r + _E10) * r + _E9) * r + _E8) * r + _E7
     p = ((((p * r + _E6) * r + _E5) * r + _E4) * r + _E3) * r + _E2
     p = p * (r * r) + r
-    scale = _float_of((_bits_of(shifted) + _EXPONENT_OF_ONE) << 52)  # type: ignore[call-arg]
+    scale: Any = _float_of((_bits_of(shifted) + _EXPONENT_OF_ONE) << 52)  # type: ignore[call-arg]
     return scale, p
 
 
@@ -98,10 +98,10 @@ def exp_wide(x: Any) -> Any:
 def log_wide(x: Any) -> Any:
     """Return ln(x) for a positive normal x, to 4e-16 of the larger of 1 and the result."""
     # Mantissa in [sqrt(1/2), sqrt(2)); the exponent becomes a float as the lowest bits of one.
-    shifted = _bits_of(x) - _SQRT_HALF_BITS  # type: ignore[call-arg]
-    mantissa = _float_of((shifted & _MANTISSA) + _SQRT_HALF_BITS)  # type: ignore[call-arg]
+    shifted: Any = _bits_of(x) - _SQRT_HALF_BITS  # type: ignore[call-arg]
+    mantissa: Any = _float_of((shifted & _MANTISSA) + _SQRT_HALF_BITS)
     biased = (shifted + _ONE_BITS) >> 52
-    whole = _float_of(biased + _ROUNDER_BITS) - _ROUNDED_BIAS  # type: ignore[call-arg]
+    whole: Any = _float_of(biased + _ROUNDER_BITS) - _ROUNDED_BIAS
     s = (mantissa - 1.0) / (mantissa + 1.0)
     z = s * s
     g = (((((_L6 * z + _L5) * z + _L4) * z + _L3) * z + _L2) * z + _L1) * z + _L0

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
 import mpmath
 import numpy as np
@@ -102,9 +103,10 @@ def test_backward_adds_and_float32_is_close() -> None:
     screen = project(gaussians)
     grad_params = np.random.default_rng(0).normal(size=(100, 24)).astype(np.float32)
     once, twice = RawGradients.zeros(raw), RawGradients.zeros(raw)
-    project_backward(raw, CAMERA, OPTIONS, screen, grad_params, once)
+    wide = grad_params.astype(np.float64)
+    project_backward(raw, CAMERA, OPTIONS, screen, wide, once)
     for _ in range(2):
-        project_backward(raw, CAMERA, OPTIONS, screen, grad_params, twice)
+        project_backward(raw, CAMERA, OPTIONS, screen, wide, twice)
     narrow = RawArrays(
         **{f.name: getattr(raw, f.name).astype(np.float32) for f in dataclasses.fields(raw)}
     )
@@ -196,7 +198,7 @@ def test_no_value_depends_on_neighbours(dtype: torch.dtype) -> None:
     gaussians.quats[33] = 0.0
     whole = project(gaussians)
     raw = RawArrays.from_gaussians(gaussians)
-    grad_params = np.random.default_rng(1).normal(size=(61, 24))
+    grad_params = np.random.default_rng(1).normal(size=(61, 24)).astype(raw.means.dtype)
     ids = np.arange(61, dtype=np.int32)
     every = project_backward_visible(raw, CAMERA, OPTIONS, whole, grad_params, ids)
     assert not whole.visible[[7, 12, 20, 21]].any()
@@ -231,11 +233,19 @@ def single(**changes: object) -> OrientedGaussians:
     return gaussians.replaced(**values)
 
 
-def exact_columns(gaussians: OrientedGaussians, camera: Camera) -> list[float]:
+Exact = dict[str, list[mpmath.mpf]]
+
+
+def exact_values(gaussians: OrientedGaussians) -> Exact:
+    """Parameters of one Gaussian that its shape on the screen depends on."""
+    names = ("means", "log_scales", "quats")
+    return {name: [mpmath.mpf(v) for v in getattr(gaussians, name)[0].tolist()] for name in names}
+
+
+def exact_columns(raw: Exact, camera: Camera) -> list[mpmath.mpf]:
     """Columns 0-10, 12 and 19-22 of one unfiltered Gaussian with 60 digits."""
     with mpmath.workdps(60):
-        raw = {k: v[0].tolist() for k, v in gaussians.tensors() if k not in ("sh", "filter_3d")}
-        w, x, y, z = (mpmath.mpf(q) for q in raw["quats"])
+        w, x, y, z = raw["quats"]
         n = mpmath.sqrt(w * w + x * x + y * y + z * z)
         w, x, y, z = w / n, x / n, y / n, z / n
         turn = mpmath.matrix(
@@ -249,7 +259,7 @@ def exact_columns(gaussians: OrientedGaussians, camera: Camera) -> list[float]:
         view = pose[:, 0:3]
         mean = view * mpmath.matrix(raw["means"]) + pose[:, 3]
         axes = view * turn
-        variance = mpmath.diag([mpmath.exp(2 * mpmath.mpf(s)) for s in raw["log_scales"]])
+        variance = mpmath.diag([mpmath.exp(2 * s) for s in raw["log_scales"]])
         covariance = axes * variance * axes.T
         precision = axes * variance**-1 * axes.T
         ray = mean / mean[2]
@@ -260,42 +270,69 @@ def exact_columns(gaussians: OrientedGaussians, camera: Camera) -> list[float]:
         bxx, bxy, byy = precision[0, 0] / fx**2, precision[0, 1] / fx / fy, precision[1, 1] / fy**2
         zz = mean[2] ** 2
         normal = view.T * slant * (-1 / mpmath.norm(slant))
-        values = [
+        return [
             fx * ray[0] + camera.cx, fy * ray[1] + camera.cy,
             zz * (bxx - kx * kx / a0), 2 * zz * (bxy - kx * ky / a0), zz * (byy - ky * ky / a0),
             kx / a0, ky / a0, bxx / a0, 2 * bxy / a0, byy / a0, mean[2], a0,
             normal[0], normal[1], normal[2], mpmath.sqrt(covariance[2, 2]),
         ]  # fmt: skip
-        return [float(value) for value in values]
+
+
+EXACT_COLUMNS = [*range(11), 12, *range(19, 23)]
+
+
+def exact_gradient(raw: Exact, camera: Camera, weights: np.ndarray) -> dict[str, np.ndarray]:
+    """Gradient of the weighted sum of the exact columns, by central differences of 60 digits."""
+    with mpmath.workdps(60):
+        step = mpmath.mpf(10) ** -20
+
+        def total(name: str, k: int, change: mpmath.mpf) -> mpmath.mpf:
+            values = {**raw, name: [v + change * (j == k) for j, v in enumerate(raw[name])]}
+            columns = exact_columns(values, camera)
+            return mpmath.fsum(w * c for w, c in zip(weights.tolist(), columns, strict=True))
+
+        return {
+            name: np.array(
+                [
+                    float((total(name, k, step) - total(name, k, -step)) / (2 * step))
+                    for k in range(len(values))
+                ]
+            )
+            for name, values in raw.items()
+        }
 
 
 EDGE_ON = {"log_scales": [0.0, 0.0, np.log(1e-6)], "quats": [1.0, 1.0, 0.0, 0.0]}
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"log_scales": [0.0, -0.5, np.log(1e-6)], "quats": [0.9, 0.1, 0.3, -0.2]},
-        {"log_scales": [np.log(1e-6), np.log(2e-6), -1.0], "quats": [0.2, 0.5, 0.7, -0.6]},
-        {"log_scales": [np.log(1e-6), np.log(2e-6), -1.0], "quats": [1.0, 0.0, 0.0, 0.0]},
-        EDGE_ON,
-        EDGE_ON | {"means": [0.0, 0.0, 3.0]},
-        {"log_scales": [np.log(1e-4)] * 3, "means": [0.0, 0.0, 1e3]},
-        {"log_scales": [np.log(3e-4), np.log(1e-4), np.log(1e-4)], "means": [50.0, 9.0, 1e3]},
-        {"log_scales": [4.0, 3.0, 2.0], "means": [4.0, 3.0, 20.0], "quats": [0.9, 0.1, 0.3, 0.1]},
-    ],
-)
-def test_hard_shapes_against_sixty_digits(changes: dict[str, object]) -> None:
-    gaussians = single(**changes)
-    # A wide image, so that every case is seen; a pixel centre on the small ones.
+HARD_SHAPES: list[dict[str, object]] = [
+    {},
+    {"log_scales": [0.0, -0.5, np.log(1e-6)], "quats": [0.9, 0.1, 0.3, -0.2]},
+    {"log_scales": [np.log(1e-6), np.log(2e-6), -1.0], "quats": [0.2, 0.5, 0.7, -0.6]},
+    {"log_scales": [np.log(1e-6), np.log(2e-6), -1.0], "quats": [1.0, 0.0, 0.0, 0.0]},
+    EDGE_ON,
+    EDGE_ON | {"means": [0.0, 0.0, 3.0]},
+    {"log_scales": [np.log(1e-4)] * 3, "means": [0.0, 0.0, 1e3]},
+    {"log_scales": [np.log(3e-4), np.log(1e-4), np.log(1e-4)], "means": [50.0, 9.0, 1e3]},
+    {"log_scales": [4.0, 3.0, 2.0], "means": [4.0, 3.0, 20.0], "quats": [0.9, 0.1, 0.3, 0.1]},
+]
+
+
+def wide_camera(gaussians: OrientedGaussians) -> Camera:
+    """AXIS moved so that a pixel centre lies on the first mean."""
     u = AXIS.fx * float(gaussians.means[0, 0] / gaussians.means[0, 2])
     v = AXIS.fy * float(gaussians.means[0, 1] / gaussians.means[0, 2])
-    camera = dataclasses.replace(AXIS, cx=32.5 - u, cy=23.5 - v)
+    return dataclasses.replace(AXIS, cx=32.5 - u, cy=23.5 - v)
+
+
+@pytest.mark.parametrize("changes", HARD_SHAPES)
+def test_hard_shapes_against_sixty_digits(changes: dict[str, object]) -> None:
+    gaussians = single(**changes)
+    camera = wide_camera(gaussians)
     screen = project(gaussians, camera)
     assert screen.visible.all()
-    wanted = np.array(exact_columns(gaussians, camera))
-    got = screen.params[0, [*range(11), 12, *range(19, 23)]].astype(np.float64)
+    wanted = np.array([float(v) for v in exact_columns(exact_values(gaussians), camera)])
+    got = screen.params[0, EXACT_COLUMNS].astype(np.float64)
     size = np.abs(wanted)
     for block in ((2, 5), (5, 7), (7, 10), (12, 15)):
         size[slice(*block)] = size[slice(*block)].max()
@@ -309,6 +346,34 @@ def test_hard_shapes_against_sixty_digits(changes: dict[str, object]) -> None:
     grads = RawGradients.zeros(raw)
     project_backward(raw, camera, OPTIONS, screen, np.ones((1, 24)), grads)
     assert all(np.isfinite(getattr(grads, name)).all() for name in NAMES)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("changes", HARD_SHAPES)
+def test_gradients_of_hard_shapes_against_sixty_digits(
+    changes: dict[str, object], dtype: torch.dtype
+) -> None:
+    gaussians = single(**changes)
+    camera = wide_camera(gaussians)
+    gaussians = OrientedGaussians(**{name: t.to(dtype) for name, t in gaussians.tensors()})
+    exact = exact_values(gaussians)
+    # Every column counts: weights are those that make the columns' shares of the sum alike.
+    columns = np.abs(np.array([float(v) for v in exact_columns(exact, camera)]))
+    weights = np.random.default_rng(3).uniform(0.5, 1.5, len(columns)) / (columns + 1e-6)
+    weights = weights.astype(np.float32).astype(np.float64)
+    raw = RawArrays.from_gaussians(gaussians)
+    grad_params = np.zeros((1, 24), raw.means.dtype)
+    grad_params[0, EXACT_COLUMNS] = weights
+    screen = project(gaussians, camera)
+    assert screen.visible.all()
+    grads = RawGradients.zeros(raw)
+    project_backward(raw, camera, OPTIONS, screen, grad_params, grads)
+    wanted = exact_gradient(exact, camera, weights)
+    rounding = 2.0**-24 if dtype == torch.float32 else 0.0
+    whole = np.linalg.norm(np.concatenate(list(wanted.values())))
+    for name, value in wanted.items():
+        error = np.linalg.norm(getattr(grads, name)[0] - value)
+        assert error <= (1e-13 + rounding) * np.linalg.norm(value) + 1e-13 * whole, name
 
 
 def test_zero_quaternion_is_the_identity_and_gets_no_gradient() -> None:
@@ -370,6 +435,57 @@ def test_around_and_behind_the_camera() -> None:
     reach = np.sqrt(2.0 * np.log(255.0 * 0.8))
     assert np.isinf(project(single(means=[0.0, 0.0, 0.999 * reach], **near), AXIS).skews[0])
     assert np.isfinite(project(single(means=[0.0, 0.0, 1.001 * reach], **near), AXIS).skews[0])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_culling_leaves_out_only_what_is_not_seen(seed: int) -> None:
+    """Exactly those are visible whose box, by the reference's columns, holds a pixel centre."""
+    gaussians = random_gaussians(3000, seed, spread=4.0, scale=(0.003, 1.5), filter_size=0.05)
+    # Also around the limit of what is too faint.
+    gaussians.opacity_logits[::3] = torch.linspace(-6.0, -5.0, 1000, dtype=torch.float64)
+    camera = dataclasses.replace(CAMERA, cx=-7.0 if seed == 1 else CAMERA.cx)
+    screen = project(gaussians, camera)
+    reference = reference_projection(gaussians, camera, OPTIONS)
+    opacity = torch.exp(gaussians.log_opacities())
+    local = gaussians.means @ torch.from_numpy(camera.rotation).T
+    local += torch.from_numpy(camera.cam_from_world[:, 3])
+    axes = torch.from_numpy(camera.rotation) @ gaussians.rotations()
+    scaled = axes * gaussians.scales()[:, None]
+    covariance = scaled @ scaled.transpose(1, 2)
+    # Dual conic of the ellipsoid at 1/255 as a plane sees it: K (m m^T - threshold Sigma) K^T.
+    threshold = 2.0 * torch.log(opacity * 255.0)[:, None, None]
+    dual = local[:, :, None] * local[:, None] - threshold * covariance
+    lens = torch.tensor(
+        [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]],
+        dtype=torch.float64,
+    )
+    dual = (lens @ dual @ lens.T).numpy()
+    usable = reference.usable.numpy()
+    bounded = usable & (dual[:, 2, 2] > 0.0)
+    assert (usable & ~bounded).sum() > 10
+    with np.errstate(invalid="ignore", divide="ignore"):
+        middle = dual[:, [0, 1], 2] / dual[:, 2:, 2]
+        half = np.sqrt(middle**2 - dual[:, [0, 1], [0, 1]] / dual[:, 2:, 2])
+        first = np.maximum(np.ceil(middle - half - 0.5), 0.0)
+        last = np.minimum(np.floor(middle + half - 0.5), [camera.width - 1.0, camera.height - 1.0])
+        wanted = usable & (~bounded | (first <= last).all(1))
+    np.testing.assert_array_equal(screen.visible, wanted)
+    assert 100 < wanted.sum() < 2500
+
+
+def test_reused_output_allocates_no_arrays() -> None:
+    raw = RawArrays.from_gaussians(random_gaussians(20_000, 3, dtype=torch.float32))
+    screen = project_gaussians(raw, CAMERA, OPTIONS)
+    ids = np.flatnonzero(screen.visible).astype(np.int32)
+    grad_params = np.ones((20_000, 24), np.float32)
+    scratch = allocate_visible(raw, 20_000)
+    project_backward_visible(raw, CAMERA, OPTIONS, screen, grad_params, ids, scratch)
+    tracemalloc.start()
+    project_gaussians(raw, CAMERA, OPTIONS, screen)
+    project_backward_visible(raw, CAMERA, OPTIONS, screen, grad_params, ids, scratch)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20_000  # bytes: less than one for each Gaussian
 
 
 def test_off_the_image_or_between_pixel_centres_is_not_visible() -> None:
