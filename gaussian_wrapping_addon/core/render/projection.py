@@ -239,7 +239,8 @@ def project_backward(
     gaussians, camera, options
         What :func:`project_gaussians` was called with.
     screen : ScreenGaussians
-        What it returned; only the rows of visible Gaussians are touched.
+        What it returned, unchanged since; only the rows of visible Gaussians are read. A colour of
+        0 there was clamped and passes no gradient.
     grad_params : (n, 24) float32 or float64
         Gradient with respect to ``screen.params``. Column 23 is ignored.
     grads_out : RawGradients
@@ -278,7 +279,7 @@ def project_backward_visible(
     gaussians, camera, options
         What :func:`project_gaussians` was called with.
     screen : ScreenGaussians
-        What it returned.
+        What it returned, unchanged since.
     grad_params : (n, 24) float32 or float64
         Gradient with respect to ``screen.params``; only the rows ``ids`` are read.
     ids : (v,) int32
