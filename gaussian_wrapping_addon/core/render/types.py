@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from .. import tolerances
+from .. import limits, tolerances
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,26 @@ class RenderOptions:
     threads: int = 0
     """0 uses every core this process may use."""
     statistics: bool = False
-    """Gather :class:`RenderStatistics` (density control, wrapping, pruning)."""
+    """Gather all of :class:`RenderStatistics` (wrapping, pruning)."""
+    screen_gradients: bool = False
+    """Gather only ``visible``, ``radii_px``, ``grad_px`` and ``grad_abs_px`` (density control):
+    spares the sums of blending weights."""
+    budget_bytes: int = limits.RENDER_BUDGET_BYTES
+    """What everything that grows with the (tile, Gaussian) pairs may take. An image whose pairs do
+    not fit is rendered in bands of tiles; a band is never smaller than one tile."""
+
+    @property
+    def gathers_statistics(self) -> bool:
+        """Whether a rendering has statistics at all."""
+        return self.statistics or self.screen_gradients
 
 
 @dataclass
 class RenderStatistics:
     """Per-Gaussian figures of one view, all (n,) unless said otherwise.
 
-    Gradient figures are filled when ``backward`` runs through the render.
+    Gradient figures are filled when ``backward`` runs through the render. The weights are (0,)
+    where only the screen gradients were asked for.
     """
 
     visible: np.ndarray
@@ -61,6 +73,17 @@ class Render:
     alpha: Tensor  # (h, w) 1 - final transmittance
     depth: Tensor  # (h, w) z-depth of the 0.5-isosurface, scene units; 0 where there is none
     statistics: RenderStatistics | None = None
+
+
+@dataclass(frozen=True)
+class ImageGradients:
+    """Gradient of a scalar with respect to the images of a view; ``None`` stands for zeros."""
+
+    color: np.ndarray | None = None  # (h, w, 3)
+    normal: np.ndarray | None = None  # (h, w, 3)
+    geometric_normal: np.ndarray | None = None  # (h, w, 3)
+    alpha: np.ndarray | None = None  # (h, w)
+    depth: np.ndarray | None = None  # (h, w)
 
 
 @dataclass(frozen=True)
