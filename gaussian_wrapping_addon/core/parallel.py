@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import os
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -26,7 +27,7 @@ def default_threads() -> int:
 
 @functools.lru_cache(maxsize=4)
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="gwrap")
+    return ThreadPoolExecutor(threads - 1, thread_name_prefix="gwrap")
 
 
 def balanced_bounds(costs: np.ndarray, chunks: int) -> np.ndarray:
@@ -59,15 +60,35 @@ def even_bounds(count: int, threads: int, chunks_per_thread: int = 4) -> np.ndar
 def run_chunks(function: Callable[[int, int], object], bounds: np.ndarray, threads: int) -> None:
     """Call ``function(begin, end)`` for each run of ``bounds`` on ``threads`` threads.
 
-    An exception of any call is raised here, after the others have ended.
+    The calling thread is one of them; the others are asked once, not once a run. An exception is
+    raised here: on one thread at once, on several that of the first failing run, after all others.
     """
     begins, ends = bounds[:-1].tolist(), bounds[1:].tolist()
     if threads <= 1 or len(begins) <= 1:
         for begin, end in zip(begins, ends, strict=True):
             function(begin, end)
         return
-    futures = [_pool(threads).submit(function, b, e) for b, e in zip(begins, ends, strict=True)]
-    failures = [f.exception() for f in futures]
-    for failure in failures:
-        if failure is not None:
-            raise failure
+    waiting = deque(enumerate(zip(begins, ends, strict=True)))
+    failures: list[tuple[int, BaseException]] = []
+
+    def work() -> None:
+        while True:
+            try:
+                run, (begin, end) = waiting.popleft()
+            except IndexError:
+                return
+            try:
+                function(begin, end)
+            except BaseException as failure:
+                failures.append((run, failure))
+
+    pool, helpers = _pool(threads), min(threads, len(begins)) - 1
+    futures = [pool.submit(work) for _ in range(helpers)]
+    work()
+    for future in futures:
+        # One that has not started has nothing left to do; waiting for it could be for ever where
+        # all of the pool's threads are callers themselves.
+        if not future.cancel():
+            future.result()
+    if failures:
+        raise min(failures, key=lambda failed: failed[0])[1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled loops of the binning: pixel ranges, tiles an ellipse reaches, sorting, scattering."""
+"""Compiled loops of the binning: pixel ranges, tiles an ellipse reaches, slots, scattering."""
 
 from __future__ import annotations
 
@@ -14,168 +14,289 @@ _TILE = tolerances.TILE_PX
 # Rounding of the float32 box and skew, in shares of the half width and in pixels.
 _SHARE_MARGIN = 1e-6
 _PIXEL_MARGIN = 0.02
-_RADIX_BITS = 11
-_RADIX = 1 << _RADIX_BITS
+
+ID = 0
+"""Columns of a record: Gaussian, first and end row of tiles, its first span, its first slot."""
+RECORD_VALUES = 5
+# Pairs listed before they are scattered, and written for each span however short it is.
+_FLUSH_PAIRS = 1024
+_AHEAD = 4
 
 
 @kernel(fast=False)
-def _tile_columns(i: int, row: int, boxes: np.ndarray, skews: np.ndarray, ranges: np.ndarray):  # type: ignore[no-untyped-def]  # numba infers the pair of ints
-    """Return first and last tile column that Gaussian i reaches in a row of tiles.
-
-    The ellipse cut by the strip of pixel centres of the row is convex, so the columns are those
-    of its extent in x. That extent ends at the ellipse's own extreme point where the strip holds
-    it, else on the strip's edge nearer to it.
-    """
-    first, last = ranges[i, 2] // _TILE, ranges[i, 3] // _TILE
-    if last == first or ranges[i, 0] // _TILE == ranges[i, 1] // _TILE or math.isinf(skews[i]):
-        return first, last
-    half_x = 0.5 * (np.float64(boxes[i, 2]) - np.float64(boxes[i, 0]))
-    half_y = 0.5 * (np.float64(boxes[i, 3]) - np.float64(boxes[i, 1]))
-    if not (half_x > 0.0 and half_y > 0.0):
-        return first, last
-    center_x = 0.5 * (np.float64(boxes[i, 2]) + np.float64(boxes[i, 0]))
-    center_y = 0.5 * (np.float64(boxes[i, 3]) + np.float64(boxes[i, 1]))
-    skew = np.float64(skews[i])
-    top = (max(row * _TILE, ranges[i, 0]) + 0.5 - _PIXEL_MARGIN - center_y) / half_y
-    bottom = (min(row * _TILE + _TILE - 1, ranges[i, 1]) + 0.5 + _PIXEL_MARGIN - center_y) / half_y
-    top, bottom = max(top, -1.0), min(bottom, 1.0)
-    if top > bottom:
-        return first, last
-    # At height t (in half heights) the ellipse spans skew t +- across sqrt(1 - t^2).
-    across_sq = half_x * half_x * (1.0 + _SHARE_MARGIN) - skew * skew
-    across = math.sqrt(across_sq) if across_sq > 0.0 else 0.0
-    extreme = skew / half_x  # height of the rightmost point; the leftmost is opposite
-    t = min(max(extreme, top), bottom)
-    right = skew * t + across * math.sqrt(max(1.0 - t * t, 0.0))
-    t = min(max(-extreme, top), bottom)
-    left = skew * t - across * math.sqrt(max(1.0 - t * t, 0.0))
-    margin = _PIXEL_MARGIN + _SHARE_MARGIN * half_x
-    first_px = np.ceil(center_x + left - margin - 0.5)
-    last_px = np.floor(center_x + right + margin - 0.5)
-    # Both ends lie within the box up to the margin, so the conversion cannot overflow.
-    first_px = min(max(first_px, np.float64(ranges[i, 2])), np.float64(ranges[i, 3] + 1))
-    last_px = max(min(last_px, np.float64(ranges[i, 3])), np.float64(ranges[i, 2] - 1))
-    if first_px > last_px:
-        return first, first - 1
-    return int(first_px) // _TILE, int(last_px) // _TILE
-
-
-@kernel(fast=False)
-def span_range(
+def range_pixels(
     begin: int,
     end: int,
     boxes: np.ndarray,
-    skews: np.ndarray,
     visible: np.ndarray,
     width: int,
     height: int,
     ranges: np.ndarray,
-    pair_counts: np.ndarray,
-) -> None:
-    """Write pixel ranges and numbers of tiles of the Gaussians ``begin .. end``."""
+) -> tuple[int, int]:
+    """Write the pixel ranges of the Gaussians ``begin .. end``.
+
+    Returns
+    -------
+    visible, spans : int
+        How many are visible, and rows of tiles that they reach together.
+    """
+    count = 0
+    spans = 0
     for i in range(begin, end):
         if not visible[i]:
             ranges[i, 0] = ranges[i, 2] = 0
             ranges[i, 1] = ranges[i, 3] = -1
-            pair_counts[i] = 0
             continue
         ranges[i, 0] = int(max(np.ceil(boxes[i, 1] - 0.5), 0.0))
         ranges[i, 1] = int(min(np.floor(boxes[i, 3] - 0.5), height - 1.0))
         ranges[i, 2] = int(max(np.ceil(boxes[i, 0] - 0.5), 0.0))
         ranges[i, 3] = int(min(np.floor(boxes[i, 2] - 0.5), width - 1.0))
-        pairs = 0
-        for row in range(ranges[i, 0] // _TILE, ranges[i, 1] // _TILE + 1):
-            first, last = _tile_columns(i, row, boxes, skews, ranges)
-            pairs += last - first + 1
-        pair_counts[i] = pairs
+        count += 1
+        spans += ranges[i, 1] // _TILE - ranges[i, 0] // _TILE + 1
+    return count, spans
 
 
 @kernel(fast=False)
-def radix_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """Return the indices of the visible rows by increasing distance, ties by index (int32)."""
-    count = 0
-    for i in range(len(depths)):
-        count += visible[i]
-    order = np.zeros(count, np.int32)
-    keys = np.zeros(count, np.uint32)
-    # Positive floats are ordered like their bit patterns.
-    bits = depths.view(np.uint32)
-    position = 0
-    for i in range(len(depths)):
-        if visible[i]:
-            order[position] = i
-            keys[position] = bits[i]
-            position += 1
-    other_order = np.zeros(count, np.int32)
-    other_keys = np.zeros(count, np.uint32)
-    heads = np.zeros(_RADIX, np.int64)
-    for digit in range(3):
-        shift = np.uint32(digit * _RADIX_BITS)
-        heads[:] = 0
-        for k in range(count):
-            heads[(keys[k] >> shift) & np.uint32(_RADIX - 1)] += 1
-        total = 0
-        for value in range(_RADIX):
-            number = heads[value]
-            heads[value] = total
-            total += number
-        for k in range(count):
-            value = (keys[k] >> shift) & np.uint32(_RADIX - 1)
-            place = heads[value]
-            heads[value] = place + 1
-            other_order[place] = order[k]
-            other_keys[place] = keys[k]
-        order, other_order = other_order, order
-        keys, other_keys = other_keys, keys
-    return order
-
-
-@kernel(fast=False)
-def list_range(
+def span_tiles(
     begin: int,
     end: int,
-    order: np.ndarray,
-    rank_offsets: np.ndarray,
+    record: int,
+    span: int,
     boxes: np.ndarray,
     skews: np.ndarray,
+    visible: np.ndarray,
+    depths: np.ndarray,
     ranges: np.ndarray,
-    tiles_x: int,
-    tiles: np.ndarray,
-    counts: np.ndarray,
-) -> None:
-    """Write the tiles of the Gaussians ``order[begin .. end]`` and add them to ``counts``."""
-    for k in range(begin, end):
-        i = order[k]
-        place = rank_offsets[k]
-        for row in range(ranges[i, 0] // _TILE, ranges[i, 1] // _TILE + 1):
-            first, last = _tile_columns(i, row, boxes, skews, ranges)
-            for column in range(first, last + 1):
-                tile = row * tiles_x + column
-                tiles[place] = tile
-                counts[tile] += 1
-                place += 1
+    spans: np.ndarray,
+    records: np.ndarray,
+    keys: np.ndarray,
+    changes: np.ndarray,
+) -> tuple[int, int, int, int]:
+    """Find the tiles that the ellipses of the Gaussians ``begin .. end`` reach.
+
+    The ellipse cut by the strip of pixel centres of a row of tiles is convex, so the columns are
+    those of its extent in x. That extent ends at the ellipse's own extreme point where the strip
+    holds it, else on the strip's edge nearer to it.
+
+    Parameters
+    ----------
+    record, span : int
+        Where to write in ``records`` and ``spans``.
+    spans : (s, 2) uint16
+        Receives first and end column of tiles for each row of tiles.
+    records : (r, 5) int32
+        Receives one row for each Gaussian that reaches a tile; the number of its pairs in place of
+        the slot.
+    keys : (r,) uint32
+        Receives the bits of the distance: positive floats are ordered like them.
+    changes : (tiles_y, tiles_x + 1) int32
+        Receives the change of the number of pairs from each tile to the next in its row.
+
+    Returns
+    -------
+    end_record, pairs, lowest_key, highest_key : int
+    """
+    changes[:] = 0
+    all_pairs = 0
+    bits = depths.view(np.uint32)
+    lowest, highest = np.uint32(0xFFFFFFFF), np.uint32(0)
+    for i in range(begin, end):
+        if not visible[i]:
+            continue
+        first_row, last_row = ranges[i, 0] // _TILE, ranges[i, 1] // _TILE
+        first, last = ranges[i, 2] // _TILE, ranges[i, 3] // _TILE
+        pairs = 0
+        x0, x1 = np.float64(boxes[i, 0]), np.float64(boxes[i, 2])
+        y0, y1 = np.float64(boxes[i, 1]), np.float64(boxes[i, 3])
+        half_x, half_y = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
+        whole = last == first or first_row == last_row or math.isinf(skews[i])
+        if whole or not (half_x > 0.0 and half_y > 0.0):
+            for row in range(first_row, last_row + 1):
+                at = span + row - first_row
+                spans[at, 0], spans[at, 1] = first, last + 1
+                changes[row, first] += 1
+                changes[row, last + 1] -= 1
+            pairs = (last - first + 1) * (last_row - first_row + 1)
+        else:
+            center_x, center_y = 0.5 * (x1 + x0), 0.5 * (y1 + y0)
+            inverse = 1.0 / half_y
+            skew = np.float64(skews[i])
+            # At height t (in half heights) the ellipse spans skew t +- across sqrt(1 - t^2).
+            across_sq = half_x * half_x * (1.0 + _SHARE_MARGIN) - skew * skew
+            across = math.sqrt(across_sq) if across_sq > 0.0 else 0.0
+            extreme = skew / half_x  # height of the rightmost point; the leftmost is opposite
+            margin = _PIXEL_MARGIN + _SHARE_MARGIN * half_x + 0.5
+            low_px, high_px = np.float64(ranges[i, 2]), np.float64(ranges[i, 3])
+            for row in range(first_row, last_row + 1):
+                at = span + row - first_row
+                upper = max(row * _TILE, ranges[i, 0]) + 0.5 - _PIXEL_MARGIN
+                lower = min(row * _TILE + _TILE - 1, ranges[i, 1]) + 0.5 + _PIXEL_MARGIN
+                top = max((upper - center_y) * inverse, -1.0)
+                bottom = min((lower - center_y) * inverse, 1.0)
+                first_tile, end_tile = first, last + 1
+                if top <= bottom:
+                    t = min(max(extreme, top), bottom)
+                    right = skew * t + across * math.sqrt(max(1.0 - t * t, 0.0))
+                    t = min(max(-extreme, top), bottom)
+                    left = skew * t - across * math.sqrt(max(1.0 - t * t, 0.0))
+                    # Both ends lie within the box up to the margin: no conversion overflows.
+                    first_px = max(np.ceil(center_x + left - margin), low_px)
+                    last_px = min(np.floor(center_x + right + margin - 1.0), high_px)
+                    if first_px > last_px:
+                        first_tile = end_tile = 0
+                    else:
+                        first_tile = int(first_px) // _TILE
+                        end_tile = int(last_px) // _TILE + 1
+                spans[at, 0], spans[at, 1] = first_tile, end_tile
+                changes[row, first_tile] += 1
+                changes[row, end_tile] -= 1
+                pairs += end_tile - first_tile
+        if pairs == 0:
+            continue
+        key = bits[i]
+        lowest, highest = min(lowest, key), max(highest, key)
+        records[record, 0] = i
+        records[record, 1] = first_row
+        records[record, 2] = last_row + 1
+        records[record, 3] = span
+        records[record, 4] = pairs
+        keys[record] = key
+        record += 1
+        span += last_row - first_row + 1
+        all_pairs += pairs
+    return record, all_pairs, np.int64(lowest), np.int64(highest)
 
 
 @kernel(fast=False)
-def scatter_range(
+def count_band(
     begin: int,
     end: int,
-    order: np.ndarray,
-    rank_offsets: np.ndarray,
+    first_tile: int,
+    end_tile: int,
+    tiles_x: int,
+    spans: np.ndarray,
+    records: np.ndarray,
+) -> int:
+    """Write the numbers of pairs within a band of tiles in place of the slots; return their sum."""
+    all_pairs = 0
+    first_band_row, end_band_row = first_tile // tiles_x, (end_tile - 1) // tiles_x + 1
+    for k in range(begin, end):
+        pairs = 0
+        begin_row = records[k, 1]
+        offset = records[k, 3] - begin_row
+        for row in range(max(begin_row, first_band_row), min(records[k, 2], end_band_row)):
+            low = max(row * tiles_x + np.int64(spans[offset + row, 0]), first_tile)
+            high = min(row * tiles_x + np.int64(spans[offset + row, 1]), end_tile)
+            pairs += max(high - low, 0)
+        records[k, 4] = pairs
+        all_pairs += pairs
+    return all_pairs
+
+
+@kernel(fast=False)
+def place_slots(
+    begin: int,
+    end: int,
+    begin_gaussian: int,
+    end_gaussian: int,
+    slot: int,
+    records: np.ndarray,
     pair_offsets: np.ndarray,
-    tiles: np.ndarray,
+) -> None:
+    """Turn the numbers of pairs into first slots, counting on from ``slot``.
+
+    Writes ``pair_offsets`` of the Gaussians ``begin_gaussian .. end_gaussian``, whose records are
+    ``begin .. end``.
+    """
+    i = begin_gaussian
+    for k in range(begin, end):
+        while i <= records[k, 0]:
+            pair_offsets[i] = slot
+            i += 1
+        pairs = records[k, 4]
+        records[k, 4] = slot
+        slot += pairs
+    while i < end_gaussian:
+        pair_offsets[i] = slot
+        i += 1
+
+
+@kernel(fast=False)
+def rank_records(
+    begin: int, end: int, order: np.ndarray, records: np.ndarray, ranked: np.ndarray
+) -> None:
+    """Copy the records ``order[begin .. end]`` to the same places of ``ranked``."""
+    for k in range(begin, end):
+        record = np.uint64(order[k])
+        for column in range(RECORD_VALUES):
+            ranked[k, column] = records[record, column]
+
+
+@kernel(fast=False)
+def scatter_tiles(
+    first_tile: int,
+    end_tile: int,
+    first_band_tile: int,
+    end_band_tile: int,
+    tiles_x: int,
+    ranked: np.ndarray,
+    spans: np.ndarray,
     heads: np.ndarray,
     gaussian_ids: np.ndarray,
     pair_slots: np.ndarray,
 ) -> None:
-    """Write the pairs of the Gaussians ``order[begin .. end]`` at the tiles' ``heads``."""
-    for k in range(begin, end):
-        i = order[k]
-        slot = pair_offsets[i]
-        for listed in range(rank_offsets[k], rank_offsets[k + 1]):
-            tile = tiles[listed]
-            place = heads[tile]
-            heads[tile] = place + 1
-            gaussian_ids[place] = i
-            pair_slots[place] = slot
-            slot += 1
+    """Write the pairs of the tiles ``first_tile .. end_tile``, part of a band, at their ``heads``.
+
+    ``ranked`` holds the records by increasing distance. The pairs are first listed in a buffer that
+    stays in the cache, some of them beyond the end of their span and overwritten by the next: few
+    spans are longer than that, so the processor does not mispredict where they end.
+    """
+    room = _FLUSH_PAIRS + tiles_x + _AHEAD
+    tiles = np.empty(room, np.int32)
+    slots = np.empty(room, np.int32)
+    ids = np.empty(room, np.int32)
+    filled = np.uint64(0)
+    first_band_row = first_band_tile // tiles_x
+    first_row, end_row = first_tile // tiles_x, (end_tile - 1) // tiles_x + 1
+    for k in range(len(ranked)):
+        begin_row, stop_row = ranked[k, 1], min(ranked[k, 2], end_row)
+        if begin_row >= end_row or stop_row <= first_row:
+            continue
+        i = ranked[k, 0]
+        slot = ranked[k, 4]
+        offset = ranked[k, 3] - begin_row
+        for row in range(max(begin_row, first_band_row), stop_row):
+            span = np.uint64(offset + row)
+            # The part of the span within the band has slots; the part within the tiles is listed.
+            low = max(row * tiles_x + np.int64(spans[span, 0]), first_band_tile)
+            high = min(row * tiles_x + np.int64(spans[span, 1]), end_band_tile)
+            width = max(high - low, 0)
+            tile = max(low, first_tile)
+            listed = max(min(high, end_tile) - tile, 0)
+            at = slot + (tile - low)
+            for ahead in range(_AHEAD):
+                place = filled + np.uint64(ahead)
+                tiles[place] = tile + ahead
+                slots[place] = at + ahead
+                ids[place] = i
+            for ahead in range(_AHEAD, listed):
+                place = filled + np.uint64(ahead)
+                tiles[place] = tile + ahead
+                slots[place] = at + ahead
+                ids[place] = i
+            filled += np.uint64(listed)
+            slot += width
+            if filled >= np.uint64(_FLUSH_PAIRS):
+                for pair in range(filled):
+                    listed_tile = np.uint64(tiles[pair])
+                    place = np.uint64(heads[listed_tile])
+                    heads[listed_tile] = place + np.uint64(1)
+                    gaussian_ids[place] = ids[pair]
+                    pair_slots[place] = slots[pair]
+                filled = np.uint64(0)
+    for pair in range(filled):
+        listed_tile = np.uint64(tiles[pair])
+        place = np.uint64(heads[listed_tile])
+        heads[listed_tile] = place + np.uint64(1)
+        gaussian_ids[place] = ids[pair]
+        pair_slots[place] = slots[pair]

@@ -10,14 +10,15 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.render.array_store import ArrayStore
+from gaussian_wrapping_addon.core.render.depth_order import order_by_keys
 from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     ScreenGaussians,
     project_gaussians,
 )
 from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
-from gaussian_wrapping_addon.core.render.tile_kernels import radix_order
-from gaussian_wrapping_addon.core.render.tiles import TileLists, bin_gaussians
+from gaussian_wrapping_addon.core.render.tiles import TileBinning, TileLists, bin_gaussians
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.tolerances import ALPHA_MIN, TILE_PX
 from tests.core.render.scenes import look_at, random_gaussians
@@ -134,6 +135,41 @@ def test_any_number_of_threads_gives_the_same_lists() -> None:
             np.testing.assert_array_equal(getattr(many, field.name), getattr(one, field.name))
 
 
+@pytest.mark.parametrize("most_pairs", [1, 150, 600])
+def test_bands_hold_the_pairs_of_the_whole(most_pairs: int) -> None:
+    screen, _ = make(1, 300, scale=(0.003, 0.6), filter_size=0.0)
+    whole = bin_gaussians(screen, CAMERA.width, CAMERA.height, 1)
+    binning = TileBinning(screen, CAMERA.width, CAMERA.height, 2, ArrayStore())
+    bands = binning.bands(most_pairs)
+    assert [band[0] for band in bands] + [20] == [0] + [band[1] for band in bands]
+    np.testing.assert_array_equal(binning.ids, np.unique(whole.gaussian_ids))
+    for first, end in bands[::-1]:  # in any order
+        lists = binning.lists(first, end)
+        begin, stop = whole.start[first], whole.start[end]
+        pairs = stop - begin
+        assert pairs <= most_pairs or end == first + 1
+        np.testing.assert_array_equal(lists.gaussian_ids, whole.gaussian_ids[begin:stop])
+        np.testing.assert_array_equal(lists.start, whole.start.clip(begin, stop) - begin)
+        np.testing.assert_array_equal(
+            lists.pair_offsets,
+            np.concatenate(
+                [[0], np.cumsum(np.bincount(lists.gaussian_ids, minlength=len(screen)))]
+            ),
+        )
+        np.testing.assert_array_equal(np.sort(lists.pair_slots), np.arange(pairs))
+        np.testing.assert_array_equal(
+            np.searchsorted(lists.pair_offsets, lists.pair_slots, side="right") - 1,
+            lists.gaussian_ids,
+        )
+    if len(bands) > 1:
+        assert max(whole.start[end] - whole.start[first] for first, end in bands) < pairs_of(whole)
+
+
+def pairs_of(lists: TileLists) -> int:
+    """Return the number of pairs."""
+    return len(lists.gaussian_ids)
+
+
 def test_equal_distances_keep_the_order_of_storage() -> None:
     gaussians = random_gaussians(1, 3).select(torch.zeros(50, dtype=torch.long))
     screen = project_gaussians(RawArrays.from_gaussians(gaussians), CAMERA, OPTIONS)
@@ -143,16 +179,25 @@ def test_equal_distances_keep_the_order_of_storage() -> None:
             np.testing.assert_array_equal(lists.gaussian_ids[begin:end], np.arange(50))
 
 
-def test_radix_order_is_a_stable_argsort() -> None:
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("kind", ["wide", "narrow", "one", "few"])
+def test_order_by_keys_is_a_stable_argsort(kind: str, threads: int) -> None:
     random = np.random.default_rng(0)
-    depths = np.concatenate(
-        [random.uniform(0.2, 1e4, 3000), random.choice([0.5, 1.0, 2.0], 500), [1e-30, 3e38]]
-    ).astype(np.float32)
-    random.shuffle(depths)
-    visible = random.uniform(size=len(depths)) < 0.7
-    order = radix_order(depths, visible)
-    rows = np.nonzero(visible)[0]
-    np.testing.assert_array_equal(order, rows[np.argsort(depths[rows], kind="stable")])
+    count = 40_000
+    keys = {
+        "wide": random.integers(0, 2**31, count),
+        "narrow": 2**30 + random.integers(0, 5000, count),
+        "one": np.full(count, 123_456_789),
+        "few": random.choice([1, 2**31 - 1, 2**23], count),
+    }[kind].astype(np.uint32)
+    bounds = np.array([[0, 9000], [9000, 9000], [9100, 30_000], [31_000, count]])
+    counts = np.zeros(count, bool)
+    for begin, end in bounds:
+        counts[begin:end] = True
+    rows = np.nonzero(counts)[0]
+    extent = int(keys[rows].min()), int(keys[rows].max())
+    order = order_by_keys(keys, bounds, extent, threads, ArrayStore())
+    np.testing.assert_array_equal(order, rows[np.argsort(keys[rows], kind="stable")])
 
 
 @pytest.mark.parametrize("count", [0, 40])

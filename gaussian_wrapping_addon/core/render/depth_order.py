@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A stable order by distance: radix sorts of ranges of keys, one range a thread."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compiled import kernel
+from ..parallel import run_chunks
+from .array_store import ArrayStore
+
+_DIGIT_BITS = 10
+_BUCKETS = 1 << _DIGIT_BITS
+_MOST_DIGITS = 4
+# Below this a second thread costs more than it saves.
+_KEYS_PER_PART = 8192
+_COARSE_BITS = 12
+_INDEX_MASK = np.uint64(0xFFFFFFFF)
+
+
+@kernel(fast=False)
+def _coarse_histogram(
+    keys: np.ndarray, bounds: np.ndarray, lowest: int, shift: int, histogram: np.ndarray
+) -> None:
+    """Count the keys by their highest bits."""
+    histogram[:] = 0
+    for run in range(len(bounds)):
+        for k in range(bounds[run, 0], bounds[run, 1]):
+            histogram[(np.int64(keys[k]) - lowest) >> shift] += 1
+
+
+@kernel(fast=False)
+def _sort_part(
+    keys: np.ndarray,
+    bounds: np.ndarray,
+    low: int,
+    high: int,
+    begin: int,
+    packed: np.ndarray,
+    other: np.ndarray,
+    order: np.ndarray,
+) -> None:
+    """Sort the indices of the keys in ``low .. high``; write them from ``order[begin]`` on."""
+    end = begin
+    largest = np.int64(0)
+    for run in range(len(bounds)):
+        for k in range(bounds[run, 0], bounds[run, 1]):
+            key = np.int64(keys[k]) - low
+            if key >= 0 and key < high - low:
+                packed[end] = (np.uint64(key) << np.uint64(32)) | np.uint64(k)
+                largest = max(largest, key)
+                end += 1
+    bits = 0
+    while largest >> bits:
+        bits += 1
+    digits = (bits + _DIGIT_BITS - 1) // _DIGIT_BITS
+    width = np.uint64((bits + digits - 1) // digits) if digits else np.uint64(0)
+    mask = (np.uint64(1) << width) - np.uint64(1)
+    heads = np.zeros((_MOST_DIGITS, _BUCKETS), np.int64)
+    for k in range(begin, end):
+        key = packed[k] >> np.uint64(32)
+        for digit in range(digits):
+            heads[digit, np.int64((key >> (width * np.uint64(digit))) & mask)] += 1
+    for digit in range(digits):
+        total = begin
+        for value in range(np.int64(mask) + 1):
+            number = heads[digit, value]
+            heads[digit, value] = total
+            total += number
+        shift = np.uint64(32) + width * np.uint64(digit)
+        for k in range(begin, end):
+            value = np.int64((packed[k] >> shift) & mask)
+            place = heads[digit, value]
+            heads[digit, value] = place + 1
+            other[place] = packed[k]
+        packed, other = other, packed
+    for k in range(begin, end):
+        order[k] = np.int32(packed[k] & _INDEX_MASK)
+
+
+def order_by_keys(
+    keys: np.ndarray, bounds: np.ndarray, extent: tuple[int, int], threads: int, store: ArrayStore
+) -> np.ndarray:
+    """Return the indices of keys in increasing order of key, ties by index.
+
+    Parameters
+    ----------
+    keys : (r,) uint32
+    bounds : (m, 2) int64
+        The runs of ``keys`` that count, increasing.
+    extent : (int, int)
+        The smallest and the largest key that count.
+    threads : int
+    store : ArrayStore
+        Holds the result until its next use here.
+
+    Returns
+    -------
+    (v,) int32
+        Indices into ``keys``; the same for any number of threads.
+    """
+    count = int((bounds[:, 1] - bounds[:, 0]).sum())
+    order = store.take("order", count, np.int32)
+    packed = store.take("packed", count, np.uint64)
+    other = store.take("packed other", count, np.uint64)
+    lowest, highest = extent
+    parts = max(1, min(threads, count // _KEYS_PER_PART))
+    cuts, begins = np.array([lowest, highest + 1]), np.zeros(2, np.int64)
+    if parts > 1:
+        shift = max(0, (highest - lowest).bit_length() - _COARSE_BITS)
+        histogram = store.take("key histogram", 1 << _COARSE_BITS, np.int64)
+        _coarse_histogram(keys, bounds, lowest, shift, histogram)
+        below = np.concatenate([[0], np.cumsum(histogram)])
+        bins = np.unique(np.searchsorted(below, np.linspace(0, count, parts + 1)))
+        cuts, begins = lowest + (bins << shift), below[bins]
+
+    def sort(first: int, end: int) -> None:
+        for part in range(first, end):
+            low, high, begin = int(cuts[part]), int(cuts[part + 1]), int(begins[part])
+            _sort_part(keys, bounds, low, high, begin, packed, other, order)
+
+    run_chunks(sort, np.arange(len(cuts)), threads)
+    return order
