@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +31,8 @@ class RenderBuffers:
     scratch: list[np.ndarray] = field(default_factory=list)
     lists: list[np.ndarray] = field(default_factory=list)
     pairs: list[np.ndarray] = field(default_factory=list)
+    renderers: list[Any] = field(default_factory=list)
+    """Idle :class:`~.view_renderer.ViewRenderer` with their memory."""
 
     def take_scratch(self) -> np.ndarray:
         """Return the state of one thread's tile, with any content."""
@@ -83,23 +87,51 @@ class Images:
     strongest: np.ndarray  # (h, w) int32; (0, 0) without statistics
 
     @classmethod
-    def allocate(cls, camera: Camera, options: RenderOptions) -> Images:
-        """Return images of the camera's size, all 0."""
-        height, width = camera.height, camera.width
+    def allocate(
+        cls,
+        camera: Camera,
+        options: RenderOptions,
+        take: Callable[[str, tuple[int, ...], Any], np.ndarray] | None = None,
+    ) -> Images:
+        """Return images of the camera's size, all 0.
+
+        With ``take(name, shape, dtype)`` they lie in the memory it returns, with any content where
+        :func:`blend` writes every pixel.
+        """
+        if take is None:
+
+            def take(name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+                return np.zeros(shape, dtype)
+
+        one = (camera.height, camera.width)
+        three = (*one, 3)
         no_image = (0, 0)
-        return cls(
-            color=np.zeros((height, width, 3), np.float32),
-            normal=np.zeros((height, width, 3), np.float32),
-            geometric=np.zeros((height, width, 3), np.float32),
-            alpha=np.zeros((height, width), np.float32),
-            depth=np.zeros((height, width), np.float32),
-            slope=np.zeros((height, width) if options.depth else no_image, np.float32),
-            strongest=np.zeros((height, width) if options.statistics else no_image, np.int32),
+        images = cls(
+            color=take("color", three, np.float32),
+            normal=take("normal", three, np.float32),
+            geometric=take("geometric", three, np.float32),
+            alpha=take("alpha", one, np.float32),
+            depth=take("depth", one, np.float32),
+            slope=take("slope", one if options.depth else no_image, np.float32),
+            strongest=take("strongest", one if options.statistics else no_image, np.int32),
         )
+        if not options.depth:
+            images.depth.fill(0.0)
+        return images
 
 
-def blend(view: ScreenView, images: Images, buffers: RenderBuffers) -> np.ndarray:
+def blend(
+    view: ScreenView,
+    images: Images,
+    buffers: RenderBuffers,
+    pair_weights: np.ndarray | None = None,
+) -> np.ndarray:
     """Blend the tiles of a view into ``images`` and solve their isosurface depth.
+
+    Parameters
+    ----------
+    pair_weights : (pairs, 2) float32, optional
+        Where the weights are written; by default a new array.
 
     Returns
     -------
@@ -108,7 +140,8 @@ def blend(view: ScreenView, images: Images, buffers: RenderBuffers) -> np.ndarra
     """
     options, lists, camera = view.options, view.lists, view.camera
     depth, weights = options.depth, options.statistics
-    pair_weights = np.zeros((len(lists.gaussian_ids) if weights else 0, 2), np.float32)
+    if pair_weights is None:
+        pair_weights = np.zeros((len(lists.gaussian_ids) if weights else 0, 2), np.float32)
     forward = forward_kernel(view.lanes, depth, weights)
     background = np.asarray(options.background, np.float32)
     limit = np.float32(options.depth_valid_transmittance)
@@ -148,20 +181,24 @@ def blend(view: ScreenView, images: Images, buffers: RenderBuffers) -> np.ndarra
     return pair_weights
 
 
-def blend_backward(
+def pair_gradients(
     view: ScreenView,
     images: Images,
     grads: list[np.ndarray],
     buffers: RenderBuffers,
+    pairs: np.ndarray,
     *,
+    depth: bool,
     absolute: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the gradient on params (n, 24), and its length on (u, v) plain and absolute (n,)."""
+) -> None:
+    """Write the gradients of all pairs of a view's tiles at their slots of ``pairs (p, 24)``.
+
+    ``depth`` tells that the gradient of the depth is not all 0, ``absolute`` that the sums of
+    absolute values are wanted.
+    """
     lists, camera = view.lists, view.camera
-    count = len(view.screen)
     g_color, g_normal, g_geometric, g_alpha, g_depth = grads
-    backward = backward_kernel(view.lanes, view.options.depth and bool(g_depth.any()), absolute)
-    pairs = buffers.take_pairs(len(lists.gaussian_ids))
+    backward = backward_kernel(view.lanes, view.options.depth and depth, absolute)
 
     def run(first: int, end: int) -> None:
         scratch = buffers.take_scratch()
@@ -193,6 +230,21 @@ def blend_backward(
         buffers.scratch.append(scratch)
 
     run_chunks(run, view.bounds, view.threads)
+
+
+def blend_backward(
+    view: ScreenView,
+    images: Images,
+    grads: list[np.ndarray],
+    buffers: RenderBuffers,
+    *,
+    absolute: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the gradient on params (n, 24), and its length on (u, v) plain and absolute (n,)."""
+    lists, count = view.lists, len(view.screen)
+    pairs = buffers.take_pairs(len(lists.gaussian_ids))
+    depth = bool(grads[4].any())
+    pair_gradients(view, images, grads, buffers, pairs, depth=depth, absolute=absolute)
     grad_params = np.zeros((count, ROW_VALUES), np.float32)
     grad_px = np.zeros(count, np.float32)
     grad_abs_px = np.zeros(count, np.float32)

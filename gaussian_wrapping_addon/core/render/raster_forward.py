@@ -112,6 +112,9 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                 counts[block] = 0
             for k in range(begin, begin + count):
                 prefetch_row(params, np.int64(gaussian_ids[k]))
+                if weights:
+                    pair_weights[pair_slots[k], 0] = ZERO
+                    pair_weights[pair_slots[k], 1] = ZERO
                 bits = np.uint64(masks[k])
                 while bits != np.uint64(0):
                     named = np.int64(lowest_bit(bits)) & (blocks - 1)

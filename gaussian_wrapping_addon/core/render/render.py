@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import weakref
 from typing import Any
 
 import numpy as np
@@ -12,23 +14,15 @@ from torch import Tensor
 
 from ..dataset.camera import Camera
 from ..gaussians.model import OrientedGaussians
-from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
-from .blend import Images, RenderBuffers, ScreenView, blend, blend_backward
-from .block_masks import mask_kernel
-from .projection import (
-    RawArrays,
-    RawGradients,
-    project_backward,
-    project_gaussians,
-)
-from .raster_backward import sum_weights
-from .raster_math import vector_lanes
-from .tiles import bin_gaussians
-from .types import Render, RenderOptions, RenderStatistics
+from ..parallel import default_threads
+from .array_store import ArrayStore
+from .blend import Images, RenderBuffers, ScreenView
+from .projection import RawArrays, RawGradients, project_backward, project_gaussians
+from .tiles import TileBinning
+from .types import ImageGradients, Render, RenderOptions, RenderStatistics
+from .view_renderer import ViewPass, ViewRenderer, band_view
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
-# What a tile costs besides its pairs, in pairs: clearing and writing its pixels.
-_TILE_COST = 16
 
 
 @functools.cache
@@ -69,13 +63,13 @@ def render(
         If the tile lists or the contributor lists grow beyond what can be addressed.
     """
     options = options or RenderOptions()
-    collected = _empty_statistics(len(gaussians)) if options.statistics else None
+    collected: list[RenderStatistics] = []
     tensors = [getattr(gaussians, name) for name in _TRAINED]
     images = _Rasterize.apply(
         *tensors, gaussians, camera, options, collected, buffers or _shared_buffers()
     )
     color, normal, geometric, alpha, depth = images
-    return Render(color, normal, geometric, alpha, depth, collected)
+    return Render(color, normal, geometric, alpha, depth, collected[0] if collected else None)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -93,15 +87,16 @@ class _Rasterize(torch.autograd.Function):
         gaussians: OrientedGaussians,
         camera: Camera,
         options: RenderOptions,
-        statistics: RenderStatistics | None,
+        collected: list[RenderStatistics],
         buffers: RenderBuffers,
     ) -> tuple[Tensor, ...]:
-        view = project_view(RawArrays.from_gaussians(gaussians), camera, options)
         images = Images.allocate(camera, options)
-        pair_weights = blend(view, images, buffers)
-        if statistics is not None:
-            _fill_statistics(statistics, view, images, pair_weights)
-        ctx.view, ctx.images, ctx.statistics, ctx.buffers = view, images, statistics, buffers
+        view = _render_view(RawArrays.from_gaussians(gaussians), camera, options, images, buffers)
+        if view.statistics is not None:
+            collected.append(_own(view.statistics))
+        ctx.view, ctx.collected = view, collected
+        ctx.camera, ctx.options = camera, options
+        ctx.set_materialize_grads(False)
         outputs = tuple(
             torch.from_numpy(image)
             for image in (
@@ -118,76 +113,54 @@ class _Rasterize(torch.autograd.Function):
         return outputs
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         _ = ctx.saved_tensors
-        view, statistics = ctx.view, ctx.statistics
-        incoming = [np.ascontiguousarray(grad.detach().numpy(), np.float32) for grad in grads]
-        grad_params, grad_px, grad_abs_px = blend_backward(
-            view, ctx.images, incoming, ctx.buffers, absolute=statistics is not None
-        )
-        if statistics is not None:
-            statistics.grad_px[:] = grad_px
-            statistics.grad_abs_px[:] = grad_abs_px
-        raw = RawGradients.zeros(view.gaussians)
-        project_backward(view.gaussians, view.camera, view.options, view.screen, grad_params, raw)
+        view: ViewPass = ctx.view
+        incoming = [None if grad is None else grad.detach().numpy() for grad in grads]
+        grad_params = view.params_gradient(ImageGradients(*incoming))
+        if view.statistics is not None:
+            ctx.collected[0].grad_px[:] = view.statistics.grad_px
+            ctx.collected[0].grad_abs_px[:] = view.statistics.grad_abs_px
+        gaussians = view.gaussians
+        seen = np.zeros(len(gaussians), np.bool_)
+        seen[view.ids] = True
+        screen = dataclasses.replace(view.screen, visible=seen)
+        raw = RawGradients.zeros(gaussians)
+        project_backward(gaussians, ctx.camera, ctx.options, screen, grad_params, raw)
         return (*(torch.from_numpy(getattr(raw, name)) for name in _TRAINED), *[None] * 5)
+
+
+def _render_view(
+    gaussians: RawArrays,
+    camera: Camera,
+    options: RenderOptions,
+    images: Images,
+    buffers: RenderBuffers,
+) -> ViewPass:
+    """Render with an idle renderer, which is idle again when the view is gone."""
+    try:
+        renderer = buffers.renderers.pop()
+    except IndexError:
+        renderer = ViewRenderer(RenderBuffers(buffers.scratch, buffers.lists))
+    view = renderer.render(gaussians, camera, options, images)
+    weakref.finalize(view, buffers.renderers.append, renderer).atexit = False
+    return view
+
+
+def _own(statistics: RenderStatistics) -> RenderStatistics:
+    """Return statistics that stay when the renderer's memory is used again."""
+    copies = {
+        item.name: getattr(statistics, item.name).copy()
+        for item in dataclasses.fields(statistics)
+        if item.name != "strongest"
+    }
+    return dataclasses.replace(statistics, **copies)
 
 
 def project_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> ScreenView:
     """Project and bin: everything of a view that comes before the pixels."""
-    threads = options.threads or default_threads()
+    threads, store = options.threads or default_threads(), ArrayStore()
     screen = project_gaussians(gaussians, camera, options)
-    lists = bin_gaussians(screen, camera.width, camera.height, threads)
-    masks = np.zeros(len(lists.gaussian_ids), np.uint32)
-    bounds = balanced_bounds(np.diff(lists.start) + _TILE_COST, threads * CHUNKS_PER_THREAD)
-    lanes = vector_lanes()
-    mask_range = mask_kernel(lanes)
-
-    def mark(first: int, end: int) -> None:
-        mask_range(
-            first,
-            end,
-            lists.start,
-            lists.gaussian_ids,
-            screen.boxes,
-            screen.skews,
-            lists.tiles_x,
-            masks,
-        )
-
-    run_chunks(mark, bounds, threads)
-    return ScreenView(gaussians, camera, options, screen, lists, lanes, masks, bounds, threads)
-
-
-def _empty_statistics(count: int) -> RenderStatistics:
-    return RenderStatistics(
-        visible=np.zeros(count, np.bool_),
-        radii_px=np.zeros(count, np.float32),
-        weight_sum=np.zeros(count, np.float32),
-        weight_max=np.zeros(count, np.float32),
-        grad_px=np.zeros(count, np.float32),
-        grad_abs_px=np.zeros(count, np.float32),
-    )
-
-
-def _fill_statistics(
-    statistics: RenderStatistics, view: ScreenView, images: Images, pair_weights: np.ndarray
-) -> None:
-    boxes = view.screen.boxes
-    offsets = view.lists.pair_offsets
-    statistics.visible = np.diff(offsets) > 0
-    sides = np.maximum(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])  # (n,)
-    statistics.radii_px = np.where(statistics.visible, 0.5 * sides, 0.0).astype(np.float32)
-    statistics.strongest = images.strongest
-
-    def combine(first: int, end: int) -> None:
-        sum_weights(
-            first,
-            end,
-            pair_weights,
-            offsets,
-            statistics.weight_sum,
-            statistics.weight_max,
-        )
-
-    run_chunks(combine, even_bounds(len(view.screen), view.threads), view.threads)
+    binning = TileBinning(screen, camera.width, camera.height, threads, store)
+    band = (0, binning.tiles_x * binning.tiles_y)
+    return band_view(gaussians, camera, options, screen, binning.lists(*band), band, store)

@@ -165,8 +165,15 @@ class TileBinning:
             first = end
         return bands
 
-    def lists(self, first: int, end: int) -> TileLists:
+    def lists(self, first: int, end: int, most_pairs: int | None = None) -> TileLists:
         """Return the lists of the tiles ``first .. end``; those made before are overwritten.
+
+        Parameters
+        ----------
+        first, end : int
+            Any run of tiles.
+        most_pairs : int, optional
+            No memory is reserved for more pairs than these, beyond what the band needs.
 
         Raises
         ------
@@ -187,8 +194,8 @@ class TileBinning:
         pair_offsets = self._offsets(first, end)
         heads = store.take("heads", tiles, np.int64)
         heads[:] = start[:-1]
-        gaussian_ids = store.take("gaussian ids", pairs, np.int32)
-        pair_slots = store.take("pair slots", pairs, np.int32)
+        gaussian_ids = store.take("gaussian ids", pairs, np.int32, most_pairs)
+        pair_slots = store.take("pair slots", pairs, np.int32, most_pairs)
         ranked = store.take("ranked", (len(self._order), RECORD_VALUES), np.int32)
 
         def rank(begin: int, stop: int) -> None:

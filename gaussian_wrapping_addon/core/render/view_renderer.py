@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rendering without autograd: images in reused memory, gradients of the seen Gaussians only."""
+"""Rendering without autograd: images in reused memory, gradients of the seen Gaussians only.
+
+What grows with the (tile, Gaussian) pairs exists for one band of tiles at a time (kernels.md 4.10):
+its lists, and on the way back the gradients of its pairs, which are added to the Gaussians' rows
+before the next band. The bands follow from the scene and the budget alone, so gradients do not
+depend on the number of threads.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +13,74 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import UsageError
+from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
 from .array_store import ArrayStore
-from .blend import Images, RenderBuffers, ScreenView, blend, blend_backward
-from .projection import RawArrays, RawGradients, project_backward
+from .block_masks import mask_kernel
+from .blend import Images, RenderBuffers, ScreenView, blend, pair_gradients
+from .pair_sums import add_pair_gradients, add_pair_weights, mark_seen, take_screen_gradients
+from .projection import (
+    RawArrays,
+    ScreenGaussians,
+    project_backward_visible,
+    project_gaussians,
+)
+from .raster_math import ROW_VALUES, vector_lanes
+from .tiles import TileBinning, TileLists
 from .types import ImageGradients, RenderOptions, RenderStatistics, VisibleGradients
+
+PAIR_BYTES = 4 * ROW_VALUES + 32
+"""Of one pair: its gradient, its place in the lists, which pixels it reaches, blending weights."""
+
+# What a tile costs besides its pairs, in pairs: clearing and writing its pixels.
+_TILE_COST = 16
+_MAX_ZERO_IMAGES = 4
+
+
+def band_view(
+    gaussians: RawArrays,
+    camera: Camera,
+    options: RenderOptions,
+    screen: ScreenGaussians,
+    lists: TileLists,
+    band: tuple[int, int],
+    store: ArrayStore,
+) -> ScreenView:
+    """Return the view of a band of tiles, all tiles of other bands left out."""
+    threads = options.threads or default_threads()
+    first, end = band
+    costs = np.diff(lists.start[first : end + 1]) + _TILE_COST
+    bounds = first + balanced_bounds(costs, threads * CHUNKS_PER_THREAD if threads > 1 else 1)
+    lanes = vector_lanes()
+    masks = _block_masks(screen, lists, lanes, bounds, threads, store)
+    return ScreenView(gaussians, camera, options, screen, lists, lanes, masks, bounds, threads)
+
+
+def _block_masks(
+    screen: ScreenGaussians,
+    lists: TileLists,
+    lanes: int,
+    bounds: np.ndarray,
+    threads: int,
+    store: ArrayStore,
+) -> np.ndarray:
+    """Return the blocks of its tile that each pair reaches (:class:`ScreenView`)."""
+    masks = store.take("masks", len(lists.gaussian_ids), np.uint32)
+    mask_range = mask_kernel(lanes)
+
+    def mark(first: int, end: int) -> None:
+        mask_range(
+            first,
+            end,
+            lists.start,
+            lists.gaussian_ids,
+            screen.boxes,
+            screen.skews,
+            lists.tiles_x,
+            masks,
+        )
+
+    run_chunks(mark, bounds, threads)
+    return masks
 
 
 class ViewPass:
@@ -21,6 +91,12 @@ class ViewPass:
     color, normal, geometric_normal : (h, w, 3) float32
     alpha, depth : (h, w) float32
         The images of :class:`Render`. They must not be written to before :meth:`backward`.
+    gaussians, screen : RawArrays, ScreenGaussians
+        What was rendered, and its projection.
+    ids : (v,) int32
+        The Gaussians that reach a tile of the image, increasing.
+    bands : int
+        Parts in which the image was rendered.
     statistics : RenderStatistics or None
         With ``options.statistics`` or ``options.screen_gradients``; ``grad_px`` and
         ``grad_abs_px`` are filled by :meth:`backward`.
@@ -28,20 +104,96 @@ class ViewPass:
 
     def __init__(
         self,
-        store: ArrayStore,
-        buffers: RenderBuffers,
-        view: ScreenView,
+        renderer: ViewRenderer,
+        gaussians: RawArrays,
+        camera: Camera,
+        options: RenderOptions,
+        screen: ScreenGaussians,
+        binning: TileBinning,
         images: Images,
-        statistics: RenderStatistics | None,
     ) -> None:
-        self._store, self._buffers, self._view, self._images = store, buffers, view, images
-        self.color, self.normal, self.geometric_normal = (
-            images.color,
-            images.normal,
-            images.geometric,
-        )
+        self._renderer, self._store = renderer, renderer.store
+        self._number = renderer.rendered
+        self.gaussians, self.screen = gaussians, screen
+        self._camera, self._options = camera, options
+        self._binning, self._images = binning, images
+        self.color, self.normal = images.color, images.normal
+        self.geometric_normal = images.geometric
         self.alpha, self.depth = images.alpha, images.depth
-        self.statistics = statistics
+        self.ids = binning.ids
+        self.statistics: RenderStatistics | None = None
+        self._threads = options.threads or default_threads()
+        self._most_pairs = max(1, options.budget_bytes // PAIR_BYTES)
+        self._bands = binning.bands(self._most_pairs)
+        self._listed: tuple[tuple[int, int], ScreenView] | None = None
+
+    @property
+    def bands(self) -> int:
+        """Parts in which the image is rendered."""
+        return len(self._bands)
+
+    def _view(self, band: tuple[int, int]) -> ScreenView:
+        """Return the view of a band; the lists of one band exist at a time."""
+        if self._listed is None or self._listed[0] != band:
+            lists = self._binning.lists(*band, most_pairs=self._most_pairs)
+            gaussians, camera, options = self.gaussians, self._camera, self._options
+            view = band_view(gaussians, camera, options, self.screen, lists, band, self._store)
+            self._listed = band, view
+        return self._listed[1]
+
+    def _over_seen(self) -> np.ndarray:
+        return even_bounds(len(self.ids), self._threads, 4 if self._threads > 1 else 1)
+
+    def forward(self) -> None:
+        """Blend all bands; called once, by the renderer."""
+        if self._options.gathers_statistics:
+            self.statistics = self._first_statistics()
+        for band in self._bands:
+            view = self._view(band)
+            pairs = len(view.lists.gaussian_ids) if self._options.statistics else 0
+            weights = self._store.take("pair weights", (pairs, 2), np.float32, self._most_pairs)
+            blend(view, self._images, self._renderer.buffers, weights)
+            if self._options.statistics:
+                self._add_weights(view.lists, weights)
+
+    def _first_statistics(self) -> RenderStatistics:
+        """Return statistics of what binning knows, all else 0."""
+        count, weighed = len(self.gaussians), self._options.statistics
+        zeros = self._store.zeros
+        statistics = RenderStatistics(
+            visible=zeros("visible", count, np.bool_),
+            radii_px=zeros("radii", count, np.float32),
+            weight_sum=zeros("weight sum", count if weighed else 0, np.float32),
+            weight_max=zeros("weight max", count if weighed else 0, np.float32),
+            grad_px=zeros("grad px", count, np.float32),
+            grad_abs_px=zeros("grad abs px", count, np.float32),
+            strongest=self._images.strongest if weighed else None,
+        )
+
+        def mark(begin: int, end: int) -> None:
+            mark_seen(
+                begin, end, self.ids, self.screen.boxes, statistics.visible, statistics.radii_px
+            )
+
+        run_chunks(mark, self._over_seen(), self._threads)
+        return statistics
+
+    def _add_weights(self, lists: TileLists, weights: np.ndarray) -> None:
+        statistics = self.statistics
+        assert statistics is not None
+
+        def add(begin: int, end: int) -> None:
+            add_pair_weights(
+                begin,
+                end,
+                self.ids,
+                weights,
+                lists.pair_offsets,
+                statistics.weight_sum,
+                statistics.weight_max,
+            )
+
+        run_chunks(add, self._over_seen(), self._threads)
 
     def backward(self, grads: ImageGradients) -> VisibleGradients:
         """Return the gradient with respect to the raw parameters of the seen Gaussians.
@@ -60,28 +212,77 @@ class ViewPass:
         Raises
         ------
         UsageError
-            If the shape of a gradient is not that of its image.
+            If the shape of a gradient is not that of its image, or if the renderer has rendered
+            another view since.
         """
-        view = self._view
+        grad_params = self.params_gradient(grads)
+        gaussians, count = self.gaussians, len(self.ids)
+
+        def take(name: str) -> np.ndarray:
+            shape = (count, *getattr(gaussians, name).shape[1:])
+            return self._store.take(f"grad {name}", shape, np.float32)
+
+        out = VisibleGradients(
+            self.ids,
+            take("means"),
+            take("log_scales"),
+            take("quats"),
+            take("opacity_logits"),
+            take("sh"),
+            take("orientation"),
+        )
+        return project_backward_visible(
+            gaussians, self._camera, self._options, self.screen, grad_params, self.ids, out
+        )
+
+    def params_gradient(self, grads: ImageGradients) -> np.ndarray:
+        """Return the gradient on the screen's params, (n, 24) float32; only rows ``ids`` count."""
+        if self._renderer.rendered != self._number:
+            raise UsageError(
+                "The memory of this view holds another one by now.",
+                "Run backward before the next rendering, or use another renderer.",
+            )
         incoming = self._incoming(grads)
-        grad_params, grad_px, grad_abs_px = blend_backward(
-            view, self._images, incoming, self._buffers, absolute=self.statistics is not None
-        )
+        depth = grads.depth is not None and bool(incoming[4].any())
+        absolute = self.statistics is not None
+        store = self._store
+        grad_params = store.take("grad params", (len(self.gaussians), ROW_VALUES), np.float32)
+        # The lists of the last band are still there.
+        for band in reversed(self._bands):
+            view = self._view(band)
+            lists = view.lists
+            pairs = store.take(
+                "pairs", (len(lists.gaussian_ids), ROW_VALUES), np.float32, self._most_pairs
+            )
+            pair_gradients(
+                view,
+                self._images,
+                incoming,
+                self._renderer.buffers,
+                pairs,
+                depth=depth,
+                absolute=absolute,
+            )
+            self._add_pairs(lists, pairs, grad_params, band == self._bands[-1])
         if self.statistics is not None:
-            self.statistics.grad_px[:] = grad_px
-            self.statistics.grad_abs_px[:] = grad_abs_px
-        raw = RawGradients.zeros(view.gaussians)
-        project_backward(view.gaussians, view.camera, view.options, view.screen, grad_params, raw)
-        ids = np.nonzero(np.diff(view.lists.pair_offsets) > 0)[0].astype(np.int32)
-        return VisibleGradients(
-            ids,
-            raw.means[ids],
-            raw.log_scales[ids],
-            raw.quats[ids],
-            raw.opacity_logits[ids],
-            raw.sh[ids],
-            raw.orientation[ids],
-        )
+            self._take_screen_gradients(self.statistics, grad_params)
+        return grad_params
+
+    def _add_pairs(
+        self, lists: TileLists, pairs: np.ndarray, grad_params: np.ndarray, fresh: bool
+    ) -> None:
+        def add(begin: int, end: int) -> None:
+            add_pair_gradients(begin, end, self.ids, pairs, lists.pair_offsets, fresh, grad_params)
+
+        run_chunks(add, self._over_seen(), self._threads)
+
+    def _take_screen_gradients(self, statistics: RenderStatistics, grad_params: np.ndarray) -> None:
+        def take(begin: int, end: int) -> None:
+            take_screen_gradients(
+                begin, end, self.ids, grad_params, statistics.grad_px, statistics.grad_abs_px
+            )
+
+        run_chunks(take, self._over_seen(), self._threads)
 
     def _incoming(self, grads: ImageGradients) -> list[np.ndarray]:
         """Return the five gradients, zeros where there is none."""
@@ -89,7 +290,7 @@ class ViewPass:
         for name in ("color", "normal", "geometric_normal", "alpha", "depth"):
             image, grad = getattr(self, name), getattr(grads, name)
             if grad is None:
-                grad = self._store.zeros(f"zero {image.ndim}", image.shape, np.float32)
+                grad = self._renderer.zero_image(image.shape)
             elif grad.shape != image.shape:
                 raise UsageError(
                     f"The gradient of {name} is {grad.shape}, the image {image.shape}.",
@@ -100,32 +301,77 @@ class ViewPass:
 
 
 class ViewRenderer:
-    """Renders one view after the other in the same memory; for one thread at a time."""
+    """Renders one view after the other in the same memory; for one thread at a time.
 
-    def __init__(self) -> None:
-        self._store = ArrayStore()
-        self._buffers = RenderBuffers()
+    Once it has rendered a view of the largest size and number of Gaussians, nothing that grows
+    with Gaussians, pixels or pairs is allocated any more.
+
+    Parameters
+    ----------
+    buffers : RenderBuffers, optional
+        Scratch of the threads; by default its own.
+    """
+
+    def __init__(self, buffers: RenderBuffers | None = None) -> None:
+        self.store = ArrayStore()
+        self.buffers = RenderBuffers() if buffers is None else buffers
+        self.rendered = 0
+        """Views so far; the memory is that of the last."""
+        self._zero_images: dict[tuple[int, ...], np.ndarray] = {}
 
     def render(
-        self, gaussians: RawArrays, camera: Camera, options: RenderOptions | None = None
+        self,
+        gaussians: RawArrays,
+        camera: Camera,
+        options: RenderOptions | None = None,
+        images: Images | None = None,
     ) -> ViewPass:
         """Render like :func:`~.render.render`, without autograd.
 
         The parameters must stay as they are until :meth:`ViewPass.backward` has run. What the
         previous call returned is overwritten.
 
+        Parameters
+        ----------
+        gaussians : RawArrays
+            Scene frame.
+        camera : Camera
+            In the scene frame; any image size.
+        options : RenderOptions, optional
+        images : Images, optional
+            Where the images are written; by default memory of the renderer.
+
         Raises
         ------
         ResourceError
             If the tile lists or the contributor lists grow beyond what can be addressed.
         """
-        from .render import _empty_statistics, _fill_statistics, project_view
-
         options = options or RenderOptions()
-        view = project_view(gaussians, camera, options)
-        images = Images.allocate(camera, options)
-        pair_weights = blend(view, images, self._buffers)
-        statistics = _empty_statistics(len(gaussians)) if options.gathers_statistics else None
-        if statistics is not None:
-            _fill_statistics(statistics, view, images, pair_weights)
-        return ViewPass(self._store, self._buffers, view, images, statistics)
+        threads = options.threads or default_threads()
+        store = self.store
+        self.rendered += 1
+        screen = project_gaussians(gaussians, camera, options, self._screen(len(gaussians)))
+        binning = TileBinning(screen, camera.width, camera.height, threads, store)
+        if images is None:
+            images = Images.allocate(camera, options, store.take)
+        view = ViewPass(self, gaussians, camera, options, screen, binning, images)
+        view.forward()
+        return view
+
+    def _screen(self, count: int) -> ScreenGaussians:
+        take = self.store.take
+        return ScreenGaussians(
+            take("params", (count, ROW_VALUES), np.float32),
+            take("boxes", (count, 4), np.float32),
+            take("in image", count, np.bool_),
+            take("depths", count, np.float32),
+            take("skews", count, np.float32),
+        )
+
+    def zero_image(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Return an image that stays 0."""
+        if shape not in self._zero_images:
+            if len(self._zero_images) >= _MAX_ZERO_IMAGES:
+                self._zero_images.clear()
+            self._zero_images[shape] = np.zeros(shape, np.float32)
+        return self._zero_images[shape]
