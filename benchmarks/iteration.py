@@ -45,7 +45,8 @@ from gaussian_wrapping_addon.core.render.projection import (
 from gaussian_wrapping_addon.core.render.raster_math import vector_lanes
 from gaussian_wrapping_addon.core.render.render import project_view, render
 from gaussian_wrapping_addon.core.render.tiles import bin_gaussians
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types import ImageGradients, RenderOptions
+from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 
 Part = tuple[str, Callable[[], object]]
 
@@ -94,6 +95,8 @@ def render_parts(
     leaves = gaussians.replaced(
         **{name: t.clone().requires_grad_(name != "filter_3d") for name, t in gaussians.tensors()}
     )
+    renderer, grads = ViewRenderer(), ImageGradients(*incoming)
+    counted = dataclasses.replace(options, screen_gradients=True)
     weights = [torch.from_numpy(grad) for grad in incoming]
 
     def iteration(chosen: RenderOptions) -> None:
@@ -126,6 +129,14 @@ def render_parts(
             lambda: project_backward(raw, camera, options, screen, grad_params, gradients),
         ),
         ("render forward + backward", lambda: iteration(options)),
+        (
+            "  the same without autograd",
+            lambda: renderer.render(raw, camera, options).backward(grads),
+        ),
+        (
+            "  and with screen gradients",
+            lambda: renderer.render(raw, camera, counted).backward(grads),
+        ),
     ]
 
 

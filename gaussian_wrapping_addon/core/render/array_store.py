@@ -58,6 +58,10 @@ class ArrayStore:
         array.fill(0)
         return array
 
-    def nbytes(self) -> int:
-        """Return the bytes of all arrays kept."""
-        return sum(array.nbytes for array in self._kept.values())
+    def names(self) -> list[str]:
+        """Return the names of the arrays kept."""
+        return list(self._kept)
+
+    def nbytes(self, *names: str) -> int:
+        """Return the bytes of the arrays of these names; 0 for one that was never taken."""
+        return sum(self._kept[name].nbytes for name in names if name in self._kept)

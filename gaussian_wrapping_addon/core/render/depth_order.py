@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ..compiled import kernel
@@ -14,7 +16,7 @@ _BUCKETS = 1 << _DIGIT_BITS
 _MOST_DIGITS = 4
 # Below this a second thread costs more than it saves.
 _KEYS_PER_PART = 8192
-_COARSE_BITS = 12
+_COARSE_BITS = 10
 _INDEX_MASK = np.uint64(0xFFFFFFFF)
 
 
@@ -62,16 +64,16 @@ def _sort_part(
         for digit in range(digits):
             heads[digit, np.int64((key >> (width * np.uint64(digit))) & mask)] += 1
     for digit in range(digits):
-        total = begin
+        total: Any = begin
         for value in range(np.int64(mask) + 1):
             number = heads[digit, value]
             heads[digit, value] = total
             total += number
         shift = np.uint64(32) + width * np.uint64(digit)
         for k in range(begin, end):
-            value = np.int64((packed[k] >> shift) & mask)
-            place = heads[digit, value]
-            heads[digit, value] = place + 1
+            bucket = np.int64((packed[k] >> shift) & mask)
+            place = heads[digit, bucket]
+            heads[digit, bucket] = place + 1
             other[place] = packed[k]
         packed, other = other, packed
     for k in range(begin, end):

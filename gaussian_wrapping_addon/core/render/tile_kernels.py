@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,7 @@ def span_tiles(
     records: np.ndarray,
     keys: np.ndarray,
     changes: np.ndarray,
-) -> tuple[int, int, int, int]:
+) -> tuple[int, int, np.int64, np.int64]:
     """Find the tiles that the ellipses of the Gaussians ``begin .. end`` reach.
 
     The ellipse cut by the strip of pixel centres of a row of tiles is convex, so the columns are
@@ -99,7 +100,7 @@ def span_tiles(
     changes[:] = 0
     all_pairs = 0
     bits = depths.view(np.uint32)
-    lowest, highest = np.uint32(0xFFFFFFFF), np.uint32(0)
+    lowest, highest = np.int64(0xFFFFFFFF), np.int64(0)
     for i in range(begin, end):
         if not visible[i]:
             continue
@@ -154,7 +155,7 @@ def span_tiles(
         if pairs == 0:
             continue
         key = bits[i]
-        lowest, highest = min(lowest, key), max(highest, key)
+        lowest, highest = min(lowest, np.int64(key)), max(highest, np.int64(key))
         records[record, 0] = i
         records[record, 1] = first_row
         records[record, 2] = last_row + 1
@@ -164,7 +165,7 @@ def span_tiles(
         record += 1
         span += last_row - first_row + 1
         all_pairs += pairs
-    return record, all_pairs, np.int64(lowest), np.int64(highest)
+    return record, all_pairs, lowest, highest
 
 
 @kernel(fast=False)
@@ -185,8 +186,8 @@ def count_band(
         begin_row = records[k, 1]
         offset = records[k, 3] - begin_row
         for row in range(max(begin_row, first_band_row), min(records[k, 2], end_band_row)):
-            low = max(row * tiles_x + np.int64(spans[offset + row, 0]), first_tile)
-            high = min(row * tiles_x + np.int64(spans[offset + row, 1]), end_tile)
+            low: Any = max(row * tiles_x + np.int64(spans[offset + row, 0]), first_tile)
+            high: Any = min(row * tiles_x + np.int64(spans[offset + row, 1]), end_tile)
             pairs += max(high - low, 0)
         records[k, 4] = pairs
         all_pairs += pairs
@@ -268,10 +269,10 @@ def scatter_tiles(
         for row in range(max(begin_row, first_band_row), stop_row):
             span = np.uint64(offset + row)
             # The part of the span within the band has slots; the part within the tiles is listed.
-            low = max(row * tiles_x + np.int64(spans[span, 0]), first_band_tile)
-            high = min(row * tiles_x + np.int64(spans[span, 1]), end_band_tile)
+            low: Any = max(row * tiles_x + np.int64(spans[span, 0]), first_band_tile)
+            high: Any = min(row * tiles_x + np.int64(spans[span, 1]), end_band_tile)
             width = max(high - low, 0)
-            tile = max(low, first_tile)
+            tile: Any = max(low, first_tile)
             listed = max(min(high, end_tile) - tile, 0)
             at = slot + (tile - low)
             for ahead in range(_AHEAD):

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bands of tiles keep to the budget and change nothing; warm renderings allocate nothing large."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.render.array_store import ArrayStore
+from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.render import project_view, render
+from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.view_renderer import PAIR_BYTES, ViewPass, ViewRenderer
+
+from .scenes import look_at, random_gaussians
+from .test_views import assert_equal, image_gradients, run
+
+CAMERA = look_at((2.2, 1.0, 0.8), width=85, height=70, focal=80.0)
+PAIR_ARRAYS = ("gaussian ids", "pair slots", "rows", "pairs", "pair weights")
+ROUNDED = 2e-6
+"""Relative L2 difference that another order of float32 sums of tens of pairs makes."""
+
+WARM_BYTES = 128 * 1024
+"""More than the tables of constant size that sorting and threads allocate."""
+
+
+def scene(count: int = 250) -> OrientedGaussians:
+    """Return Gaussians of very different sizes."""
+    return random_gaussians(count, 2, dtype=torch.float32, scale=(0.01, 0.4))
+
+
+def most_pairs_of_a_tile() -> int:
+    """Return the pairs of the fullest tile of the scene."""
+    view = project_view(RawArrays.from_gaussians(scene()), CAMERA, RenderOptions(threads=1))
+    return int(np.diff(view.lists.start).max())
+
+
+@pytest.mark.parametrize("budget_pairs", [1, 150, 400])
+def test_budgets_change_gradients_by_rounding_only(budget_pairs: int) -> None:
+    whole = run(ViewRenderer(), scene(), CAMERA, statistics=True)
+    renderer = ViewRenderer()
+    budget = budget_pairs * PAIR_BYTES
+    parts = run(renderer, scene(), CAMERA, statistics=True, budget_bytes=budget)
+    raw = RawArrays.from_gaussians(scene())
+    view = renderer.render(raw, CAMERA, RenderOptions(statistics=True, budget_bytes=budget))
+    assert view.bands > 2
+    assert parts.keys() == whole.keys()
+    for name, exact in whole.items():
+        if exact.dtype != np.float32 or name in ("color", "alpha", "depth", "weight_max"):
+            np.testing.assert_array_equal(parts[name], exact, err_msg=name)
+        else:
+            difference = np.linalg.norm(parts[name].astype(np.float64) - exact)
+            assert difference <= ROUNDED * np.linalg.norm(exact), name
+
+
+def test_bands_are_bitwise_the_same_for_any_number_of_threads() -> None:
+    options = {"statistics": True, "budget_bytes": 150 * PAIR_BYTES}
+    one = run(ViewRenderer(), scene(), CAMERA, threads=1, **options)
+    for threads in (2, 4):
+        assert_equal(run(ViewRenderer(), scene(), CAMERA, threads=threads, **options), one)
+
+
+def test_autograd_renders_in_bands_too() -> None:
+    results = []
+    for budget in (2**30, 150 * PAIR_BYTES):
+        means = scene().means.clone().requires_grad_()
+        out = render(
+            scene().replaced(means=means), CAMERA, RenderOptions(budget_bytes=budget, threads=2)
+        )
+        (out.color.square().sum() + out.normal.sum()).backward()
+        assert means.grad is not None
+        results.append((out.color.detach(), means.grad))
+    assert torch.equal(results[0][0], results[1][0])
+    assert not torch.equal(results[0][1], results[1][1])  # another order of sums
+    difference = (results[0][1] - results[1][1]).norm()
+    assert difference <= ROUNDED * results[0][1].norm()
+
+
+@pytest.mark.parametrize("budget_pairs", [150, 400])
+def test_what_grows_with_pairs_stays_within_the_budget(budget_pairs: int) -> None:
+    assert most_pairs_of_a_tile() < 150
+    budget = budget_pairs * PAIR_BYTES
+    renderer = ViewRenderer()
+    run(renderer, scene(), CAMERA, statistics=True, budget_bytes=budget)
+    used = renderer.store.nbytes(*PAIR_ARRAYS)
+    assert 0.5 * budget < used <= budget
+    # The names are all there are: a rendering without bands takes more under the same names only.
+    whole = ViewRenderer()
+    run(whole, scene(), CAMERA, statistics=True)
+    grown = {
+        name
+        for name in whole.store.names()
+        if whole.store.nbytes(name) > 1.5 * renderer.store.nbytes(name)
+    }
+    assert grown == set(PAIR_ARRAYS)
+
+
+def test_a_warm_renderer_allocates_nothing_that_grows() -> None:
+    count = 150_000
+    gaussians = random_gaussians(count, 4, dtype=torch.float32, scale=(0.004, 0.02), sh_degree=1)
+    raw = RawArrays.from_gaussians(gaussians)
+    camera = look_at((2.2, 1.0, 0.8), width=220, height=190, focal=200.0)
+    grads = image_gradients(camera)
+    renderer = ViewRenderer()
+    for options in (RenderOptions(threads=2, statistics=True), RenderOptions(threads=2)):
+
+        def iteration(options: RenderOptions = options) -> ViewPass:
+            view = renderer.render(raw, camera, options)
+            view.backward(grads)
+            return view
+
+        iteration()
+        iteration()
+        tracemalloc.start()
+        try:
+            view = iteration()
+            _, peak_bytes = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        # Less than one byte a Gaussian or a seen one, four a pixel, or one a pair.
+        assert peak_bytes < WARM_BYTES
+    assert min(count, len(view.ids), 4 * view.alpha.size) > WARM_BYTES
+    assert renderer.store.nbytes("pairs") // PAIR_BYTES > WARM_BYTES
+
+
+def test_stored_arrays_keep_their_memory_while_it_is_enough() -> None:
+    store = ArrayStore()
+    first = store.take("a", (10, 3), np.float32)
+    first[:] = 1.0
+    assert store.take("a", (4, 6), np.float32).base is first.base
+    assert store.take("b", (10, 3), np.float32).base is not first.base
+    assert not store.zeros("a", (10, 3), np.float32).any()
+    grown = store.take("a", (100, 3), np.float32)
+    assert grown.base is not first.base
+    assert grown.flags.c_contiguous
+    assert store.nbytes("a") >= grown.nbytes
+    assert store.take("c", 100, np.int32, 110).base.nbytes == 440
+    assert store.take("c", 120, np.int32, 110).base.nbytes == 480
