@@ -123,3 +123,21 @@ def order_by_keys(
 
     run_chunks(sort, np.arange(len(cuts)), threads)
     return order
+
+
+def radix_order(depths: np.ndarray, visible: np.ndarray, threads: int = 1) -> np.ndarray:
+    """Return the indices of the visible rows by increasing distance, ties by index (int32).
+
+    Parameters
+    ----------
+    depths : (n,) float32
+        Distances, >= 0 where visible.
+    visible : (n,) bool
+    threads : int
+    """
+    ids = np.nonzero(visible)[0].astype(np.int32)
+    # Positive floats are ordered like their bit patterns.
+    keys = depths[ids].view(np.uint32)
+    extent = (int(keys.min()), int(keys.max())) if len(keys) else (0, 0)
+    bounds = np.array([[0, len(keys)]], np.int64)
+    return ids[order_by_keys(keys, bounds, extent, threads, ArrayStore())]

@@ -16,7 +16,7 @@ from gaussian_wrapping_addon.core.render.render import project_view, render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import PAIR_BYTES, ViewPass, ViewRenderer
 
-from .scenes import look_at, random_gaussians
+from .scenes import isotropic, look_at, random_gaussians
 from .test_views import assert_equal, image_gradients, run
 
 CAMERA = look_at((2.2, 1.0, 0.8), width=85, height=70, focal=80.0)
@@ -125,6 +125,21 @@ def test_a_warm_renderer_allocates_nothing_that_grows() -> None:
         assert peak_bytes < WARM_BYTES
     assert min(count, len(view.ids), 4 * view.alpha.size) > WARM_BYTES
     assert renderer.store.nbytes("pairs") // PAIR_BYTES > WARM_BYTES
+
+
+def test_lists_of_contributors_end_where_the_light_does() -> None:
+    # More layers than contribute: each takes just over 1/255, so 1e-4 is left after about 2300.
+    count = 5000
+    means = [(0.0, 0.001 * layer, 0.0) for layer in range(count)]
+    gaussians = isotropic(means, [3.0] * count, [1.05 / 255.0] * count, torch.float32)
+    camera = look_at((0.0, -8.0, 0.0), width=4, height=4, focal=400.0)
+    renderer = ViewRenderer()
+    view = renderer.render(RawArrays.from_gaussians(gaussians), camera, RenderOptions(threads=1))
+    assert len(view.ids) == count
+    assert (view.alpha > 1.0 - 1.05e-4).all()
+    assert (view.depth > 0.0).all()
+    (lists,) = renderer.buffers.lists
+    assert 2**20 < lists.nbytes < 13 * 2**20
 
 
 def test_stored_arrays_keep_their_memory_while_it_is_enough() -> None:

@@ -11,7 +11,7 @@ import torch
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.array_store import ArrayStore
-from gaussian_wrapping_addon.core.render.depth_order import order_by_keys
+from gaussian_wrapping_addon.core.render.depth_order import order_by_keys, radix_order
 from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     ScreenGaussians,
@@ -198,6 +198,20 @@ def test_order_by_keys_is_a_stable_argsort(kind: str, threads: int) -> None:
     extent = int(keys[rows].min()), int(keys[rows].max())
     order = order_by_keys(keys, bounds, extent, threads, ArrayStore())
     np.testing.assert_array_equal(order, rows[np.argsort(keys[rows], kind="stable")])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7])
+def test_radix_order_is_a_stable_argsort(share: float) -> None:
+    random = np.random.default_rng(0)
+    depths = np.concatenate(
+        [random.uniform(0.2, 1e4, 3000), random.choice([0.5, 1.0, 2.0], 500), [0.0, 1e-30, 3e38]]
+    ).astype(np.float32)
+    random.shuffle(depths)
+    visible = random.uniform(size=len(depths)) < share
+    order = radix_order(depths, visible)
+    rows = np.nonzero(visible)[0]
+    assert order.dtype == np.int32
+    np.testing.assert_array_equal(order, rows[np.argsort(depths[rows], kind="stable")])
 
 
 @pytest.mark.parametrize("count", [0, 40])
