@@ -37,21 +37,24 @@ def _sort_part(
     bounds: np.ndarray,
     low: int,
     high: int,
-    begin: int,
     packed: np.ndarray,
     other: np.ndarray,
     order: np.ndarray,
 ) -> None:
-    """Sort the indices of the keys in ``low .. high``; write them from ``order[begin]`` on."""
-    end = begin
+    """Write the indices of the keys in ``low .. high`` to ``order``, which has their number.
+
+    ``packed`` and ``other`` have room for one more.
+    """
+    begin, end = 0, np.uint64(0)
     largest = np.int64(0)
     for run in range(len(bounds)):
         for k in range(bounds[run, 0], bounds[run, 1]):
+            # Every key is written; those of other parts are overwritten by the next.
             key = np.int64(keys[k]) - low
-            if key >= 0 and key < high - low:
-                packed[end] = (np.uint64(key) << np.uint64(32)) | np.uint64(k)
-                largest = max(largest, key)
-                end += 1
+            belongs = (key >= 0) & (key < high - low)
+            packed[end] = (np.uint64(key) << np.uint64(32)) | np.uint64(k)
+            largest = max(largest, key if belongs else np.int64(0))
+            end += np.uint64(belongs)
     bits = 0
     while largest >> bits:
         bits += 1
@@ -103,11 +106,11 @@ def order_by_keys(
     """
     count = int((bounds[:, 1] - bounds[:, 0]).sum())
     order = store.take("order", count, np.int32)
-    packed = store.take("packed", count, np.uint64)
-    other = store.take("packed other", count, np.uint64)
     lowest, highest = extent
     parts = max(1, min(threads, count // _KEYS_PER_PART))
-    cuts, begins = np.array([lowest, highest + 1]), np.zeros(2, np.int64)
+    packed = store.take("packed", count + parts, np.uint64)
+    other = store.take("packed other", count + parts, np.uint64)
+    cuts, begins = np.array([lowest, highest + 1]), np.array([0, count])
     if parts > 1:
         shift = max(0, (highest - lowest).bit_length() - _COARSE_BITS)
         histogram = store.take("key histogram", 1 << _COARSE_BITS, np.int64)
@@ -118,8 +121,17 @@ def order_by_keys(
 
     def sort(first: int, end: int) -> None:
         for part in range(first, end):
-            low, high, begin = int(cuts[part]), int(cuts[part + 1]), int(begins[part])
-            _sort_part(keys, bounds, low, high, begin, packed, other, order)
+            begin, stop = int(begins[part]), int(begins[part + 1])
+            room = slice(begin + part, stop + part + 1)
+            _sort_part(
+                keys,
+                bounds,
+                int(cuts[part]),
+                int(cuts[part + 1]),
+                packed[room],
+                other[room],
+                order[begin:stop],
+            )
 
     run_chunks(sort, np.arange(len(cuts)), threads)
     return order
