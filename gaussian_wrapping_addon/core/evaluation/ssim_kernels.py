@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled rows of the structural similarity (SSIM) of two images, and its gradient."""
+"""Compiled comparison of two images: errors, structural similarity (SSIM), and the gradient."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ..compiled import kernel
+from .window_runs import LANES, RING, TAPS, filter_run, filter_two_runs
 
-WINDOW = 11
+WINDOW = TAPS
 """Side of the Gaussian window, pixels; sigma is 1.5 (method.md 3.1)."""
 RADIUS = WINDOW // 2
 SIGMA_PX = 1.5
+REACH = WINDOW - 1
+"""Rows or columns that a window reaches beyond its first."""
 
 _taps = [np.exp(-0.5 * ((i - RADIUS) / SIGMA_PX) ** 2) for i in range(WINDOW)]
 WEIGHTS = tuple(float(tap / sum(_taps)) for tap in _taps)
@@ -18,171 +21,226 @@ WEIGHTS = tuple(float(tap / sum(_taps)) for tap in _taps)
 C1 = 0.01**2
 C2 = 0.03**2
 
-_W0, _W1, _W2, _W3, _W4, _W5 = WEIGHTS[: RADIUS + 1]
+BLOCK_PX = 512
+"""Columns that are walked down at once: what is kept of their last rows fits a cache of 1 MB."""
+
+_AVERAGED = 4  # x, y, x^2 + y^2, x y: SSIM needs no more of the two variances than their sum
+_MAPS = 3  # derivatives of SSIM with respect to E[x], E[x^2] and E[x y] of its window
+_MARGIN = 3 * REACH
+STRIDE = (3 * (BLOCK_PX + 2 * REACH) + 2 * _MARGIN + 2 * LANES) // LANES * LANES
+"""Values between two rows of scratch; constant, so that LLVM sees that they do not overlap."""
+
+
+@kernel(fast=False)
+def _turned(weights, first):  # type: ignore[no-untyped-def]
+    """Weights of a ring's slots, for a window whose first row lies in slot ``first``."""
+    w, k = weights, RING - first
+    return (
+        w[k % RING], w[(k + 1) % RING], w[(k + 2) % RING], w[(k + 3) % RING],
+        w[(k + 4) % RING], w[(k + 5) % RING], w[(k + 6) % RING], w[(k + 7) % RING],
+        w[(k + 8) % RING], w[(k + 9) % RING], w[(k + 10) % RING], w[(k + 11) % RING],
+    )  # fmt: skip
 
 
 @kernel(fast=True)
-def _filter_row(source, count, out):  # type: ignore[no-untyped-def]
-    """out[j] = sum_k weight[k] source[j + 3 k]: along a row of interleaved colours."""
-    kind = out.dtype.type
-    w0, w1, w2, w3, w4, w5 = kind(_W0), kind(_W1), kind(_W2), kind(_W3), kind(_W4), kind(_W5)
-    a, b = source[0:count], source[30 : 30 + count]
-    c, d = source[3 : 3 + count], source[27 : 27 + count]
-    e, f = source[6 : 6 + count], source[24 : 24 + count]
-    g, h = source[9 : 9 + count], source[21 : 21 + count]
-    i, k = source[12 : 12 + count], source[18 : 18 + count]
-    m = source[15 : 15 + count]
+def _filter_along(count, target, target_at, source, source_at, weights):  # type: ignore[no-untyped-def]
+    """Filter one row of interleaved colours; writes ``count`` values, rounded up to whole runs."""
+    for j in range(0, count, LANES):
+        filter_run(target, target_at + j, source, source_at + j, 3, weights)  # type: ignore[call-arg]
+
+
+@kernel(fast=True)
+def _filter_across(count, kinds, target, ring, turned):  # type: ignore[no-untyped-def]
+    """Filter a ring of ``kinds`` rows a slot into two times ``kinds`` rows."""
+    for q in range(kinds):
+        at = q * STRIDE
+        for j in range(at, at + count, LANES):
+            filter_two_runs(target, j, kinds * STRIDE, ring, j, kinds * STRIDE, turned)  # type: ignore[call-arg]
+
+
+@kernel(fast=True)
+def _keep_row(mask, row, first, last, keep):  # type: ignore[no-untyped-def]
+    """Write 1 or 0 for each value of the pixels [first, last) of a row of the mask."""
+    for p in range(last - first):
+        value = keep.dtype.type(1.0 if mask[row, first + p] else 0.0)
+        keep[3 * p] = value
+        keep[3 * p + 1] = value
+        keep[3 * p + 2] = value
+
+
+@kernel(fast=True)
+def _load_row(row, first, count, image, photo, scale, keep, rows):  # type: ignore[no-untyped-def]
+    """Write x, y, x^2 + y^2 and x y of ``count`` values of a row, 0 outside the mask."""
+    kind = rows.dtype.type
+    x_row, y_row = image[row, first : first + count], photo[row, first : first + count]
     for j in range(count):
-        out[j] = (
-            w0 * (a[j] + b[j])
-            + w1 * (c[j] + d[j])
-            + w2 * (e[j] + f[j])
-            + w3 * (g[j] + h[j])
-            + w4 * (i[j] + k[j])
-            + w5 * m[j]
-        )
-
-
-@kernel(fast=True)
-def _filter_column(rows, first, count, out):  # type: ignore[no-untyped-def]
-    """out[j] = sum_k weight[k] rows[first + k, j]."""
-    kind = out.dtype.type
-    w0, w1, w2, w3, w4, w5 = kind(_W0), kind(_W1), kind(_W2), kind(_W3), kind(_W4), kind(_W5)
-    a, b = rows[first], rows[first + 10]
-    c, d = rows[first + 1], rows[first + 9]
-    e, f = rows[first + 2], rows[first + 8]
-    g, h = rows[first + 3], rows[first + 7]
-    i, k = rows[first + 4], rows[first + 6]
-    m = rows[first + 5]
+        rows[j] = x_row[j]
     for j in range(count):
-        out[j] = (
-            w0 * (a[j] + b[j])
-            + w1 * (c[j] + d[j])
-            + w2 * (e[j] + f[j])
-            + w3 * (g[j] + h[j])
-            + w4 * (i[j] + k[j])
-            + w5 * m[j]
-        )
-
-
-@kernel(fast=True)
-def _products(x, y, count, xx, yy, xy):  # type: ignore[no-untyped-def]
+        rows[STRIDE + j] = kind(y_row[j]) * scale
     for j in range(count):
-        xx[j] = x[j] * x[j]
-        yy[j] = y[j] * y[j]
-        xy[j] = x[j] * y[j]
+        x, y = rows[j] * keep[j], rows[STRIDE + j] * keep[j]
+        rows[j] = x
+        rows[STRIDE + j] = y
+        rows[2 * STRIDE + j] = x * x + y * y
+        rows[3 * STRIDE + j] = x * y
 
 
 @kernel(fast=True)
-def _similarity_row(mu_x, mu_y, xx, yy, xy, count, value, by_mean, by_square, by_product):  # type: ignore[no-untyped-def]
-    """SSIM of one row of windows, and its derivatives with respect to E[x], E[x^2], E[x y]."""
-    kind = value.dtype.type
-    c1, c2, two = kind(C1), kind(C2), kind(2.0)
+def _similarity_row(count, means, keep, partial):  # type: ignore[no-untyped-def]
+    """Write SSIM of one row of windows, and its derivatives by E[x], E[x^2] and E[x y]."""
+    kind = means.dtype.type
+    c1, c2, one, two = kind(C1), kind(C2), kind(1.0), kind(2.0)
     for j in range(count):
-        mx, my = mu_x[j], mu_y[j]
-        a1 = two * mx * my + c1
-        a2 = two * (xy[j] - mx * my) + c2
-        b1 = mx * mx + my * my + c1
-        b2 = (xx[j] - mx * mx) + (yy[j] - my * my) + c2
-        scale = kind(1.0) / (b1 * b2)
-        s = a1 * a2 * scale
-        value[j] = s
-        by_mean[j] = two * (my * (a2 - a1) * scale - s * mx * (b2 - b1) * scale)
-        by_square[j] = -s * b1 * scale
-        by_product[j] = two * a1 * scale
+        mx, my = means[j], means[STRIDE + j]
+        square, product = mx * mx + my * my, mx * my
+        a1 = two * product + c1
+        a2 = two * (means[3 * STRIDE + j] - product) + c2
+        b1 = square + c1
+        b2 = (means[2 * STRIDE + j] - square) + c2
+        inverse = one / (b1 * b2)
+        s = a1 * a2 * inverse
+        weight = two * keep[j] * inverse
+        partial[_MARGIN + j] = weight * (my * (a2 - a1) - s * mx * (b2 - b1))
+        partial[STRIDE + _MARGIN + j] = kind(-0.5) * weight * s * b1
+        partial[2 * STRIDE + _MARGIN + j] = weight * a1
+        partial[3 * STRIDE + _MARGIN + j] = keep[j] * s
 
 
 @kernel(fast=True)
-def similarity_rows(begin, end, image, photo, mask, sums, counts, maps):  # type: ignore[no-untyped-def]
-    """SSIM of the rows of windows [begin, end).
+def _sum(values):  # type: ignore[no-untyped-def]
+    total = values.dtype.type(0.0)
+    for value in values:
+        total += value
+    return total
+
+
+@kernel(fast=True)
+def _errors_row(count, x_row, y_row, scale_y, keep):  # type: ignore[no-untyped-def]
+    """Return the sums of absolute and squared errors of a row."""
+    kind = x_row.dtype.type
+    total, total_sq = kind(0.0), kind(0.0)
+    for j in range(count):
+        difference = (x_row[j] - kind(y_row[j]) * scale_y) * keep[j]
+        total += abs(difference)
+        total_sq += difference * difference
+    return total, total_sq
+
+
+@kernel(fast=True)
+def _gradient_row(count, x_row, y_row, scale_y, keep, maps, step, scale, out):  # type: ignore[no-untyped-def]
+    """Write a row of the gradient from the derivatives' maps, filtered both ways."""
+    kind = x_row.dtype.type
+    zero, two = kind(0.0), kind(2.0)
+    for j in range(count):
+        x, y = x_row[j], kind(y_row[j]) * scale_y
+        similar = maps[j] + two * x * maps[STRIDE + j] + y * maps[2 * STRIDE + j]
+        sign = step if x > y else (-step if x < y else zero)
+        out[j] = keep[j] * (sign + scale * similar)
+
+
+@kernel(fast=True)
+def compare_rows(  # type: ignore[no-untyped-def]
+    begin, end, image, photo, scale_photo, mask, weight_absolute, weight_similar, sums, gradient
+):
+    """Compare the rows [begin, end) of two images, in one walk from top to bottom.
+
+    The window is separable: each row is filtered along itself as it comes, and the last 11 are
+    kept in a ring to be filtered across. SSIM's derivatives go the same way: along their row, into
+    a ring, across. A strip computes the 10 rows above it anew, so that nothing depends on where
+    strips begin. Two windows are filtered across at once, which halves the loads from the ring.
 
     Parameters
     ----------
-    image, photo : (h, 3 w) float
+    image : (h, 3 w) float
         Interleaved colours in [0, 1].
+    photo : (h, 3 w) float or uint8
+    scale_photo : float
+        What the photo's values are multiplied by.
     mask : (h, w) bool, or (0, 0) for none
-        Windows whose centre is false are left out.
-    sums : (h - 10,) float64, counts : (h - 10,) int64
-        Sum of SSIM over the values of each row of windows, and how many.
-    maps : (3, h - 10, 3 w - 30) float, or (3, 0, 0) to skip them
-        Derivatives of the sum with respect to E[x], E[x^2] and E[x y] of each window.
+        Both images count as black where it is false, and windows centred there not at all.
+    weight_absolute, weight_similar : float
+        ``gradient`` is that of ``weight_absolute`` x the sum of absolute errors +
+        ``weight_similar`` x the sum of SSIM over all windows and colours.
+    sums : (b, h, 3) float64
+        Written: sums over a row of one of the b column blocks of absolute errors, squared errors,
+        and SSIM of the row of windows that begins in this row.
+    gradient : (h, 3 w) float, or (0, 0) for none
+        Written.
     """
-    width = image.shape[1]
-    count = width - 30
-    rows = end - begin + 10
-    filtered = np.empty((5, rows, count), image.dtype)
-    xx = np.empty(width, image.dtype)
-    yy = np.empty(width, image.dtype)
-    xy = np.empty(width, image.dtype)
-    for r in range(rows):
-        x, y = image[begin + r], photo[begin + r]
-        _products(x, y, width, xx, yy, xy)
-        _filter_row(x, count, filtered[0, r])
-        _filter_row(y, count, filtered[1, r])
-        _filter_row(xx, count, filtered[2, r])
-        _filter_row(yy, count, filtered[3, r])
-        _filter_row(xy, count, filtered[4, r])
-    means = np.empty((5, count), image.dtype)
-    value = np.empty(count, image.dtype)
-    partial = np.empty((3, count), image.dtype)
-    for r in range(end - begin):
-        for q in range(5):
-            _filter_column(filtered[q], r, count, means[q])
-        _similarity_row(
-            means[0], means[1], means[2], means[3], means[4], count, value,
-            partial[0], partial[1], partial[2],
-        )  # fmt: skip
-        row = begin + r
-        used = 0
-        total = 0.0
-        if mask.shape[0] > 0:
-            for p in range(count // 3):
-                keep = mask[row + 5, p + 5]
-                used += 3 if keep else 0
-                for channel in range(3):
-                    if keep:
-                        total += value[3 * p + channel]
-                    else:
-                        partial[0, 3 * p + channel] = 0.0
-                        partial[1, 3 * p + channel] = 0.0
-                        partial[2, 3 * p + channel] = 0.0
-        else:
-            used = count
-            for j in range(count):
-                total += value[j]
-        sums[row] = total
-        counts[row] = used
-        if maps.shape[1] > 0:
-            for q in range(3):
-                for j in range(count):
-                    maps[q, row, j] = partial[q, j]
-
-
-@kernel(fast=True)
-def similarity_gradient_rows(begin, end, image, photo, maps, factor, gradient):  # type: ignore[no-untyped-def]
-    """Add ``factor`` x the gradient of the summed SSIM to rows [begin, end) of ``gradient``."""
-    height, width = image.shape
-    count = width - 30
-    out_rows = height - 10
-    rows = end - begin
-    columns = np.zeros((3, rows, width + 30), image.dtype)
+    height, width = image.shape[0], image.shape[1] // 3
     kind = image.dtype.type
-    for r in range(rows):
-        row = begin + r
-        low, high = max(0, row - 10), min(out_rows, row + 1)
-        for q in range(3):
-            target = columns[q, r, 30 : 30 + count]
-            for source in range(low, high):
-                weight = kind(WEIGHTS[row - source])
-                line = maps[q, source]
-                for j in range(count):
-                    target[j] += weight * line[j]
-    spread = np.empty((3, width), image.dtype)
-    scale, two = kind(factor), kind(2.0)
-    for r in range(rows):
-        for q in range(3):
-            _filter_row(columns[q, r], width, spread[q])
-        x, y, out = image[begin + r], photo[begin + r], gradient[begin + r]
-        by_mean, by_square, by_product = spread[0], spread[1], spread[2]
-        for j in range(width):
-            out[j] += scale * (by_mean[j] + two * x[j] * by_square[j] + y[j] * by_product[j])
+    scale_y, step, scale = kind(scale_photo), kind(weight_absolute), kind(weight_similar)
+    masked, differentiated = mask.shape[0] > 0, gradient.shape[0] > 0
+    has_windows = height >= WINDOW and width >= WINDOW
+    reach = REACH if has_windows else 0
+    above = reach if differentiated else 0
+    w0, w1, w2, w3 = kind(WEIGHTS[0]), kind(WEIGHTS[1]), kind(WEIGHTS[2]), kind(WEIGHTS[3])
+    w4, w5 = kind(WEIGHTS[4]), kind(WEIGHTS[5])
+    weights = (w0, w1, w2, w3, w4, w5, w4, w3, w2, w1, w0)
+    ring_weights = (w0, w1, w2, w3, w4, w5, w4, w3, w2, w1, w0, kind(0.0))
+    rows = np.empty(_AVERAGED * STRIDE, kind)
+    ring = np.zeros(RING * _AVERAGED * STRIDE, kind)
+    means = np.empty(2 * _AVERAGED * STRIDE, kind)
+    partial = np.empty((_MAPS + 1) * STRIDE, kind)
+    maps_ring = np.empty(RING * _MAPS * STRIDE, kind)
+    maps = np.zeros(2 * _MAPS * STRIDE, kind)
+    keep = np.ones(STRIDE, kind)
+    # Rows come in pairs of an even and an odd one, for any strip.
+    top = max(0, begin - above) // 2 * 2
+    for block in range(sums.shape[0]):
+        left = block * BLOCK_PX
+        right = min(width, left + BLOCK_PX)
+        first = max(0, left - above)
+        last = min(width, right + reach)
+        inner = 3 * (right - left)
+        count = 3 * (last - first - REACH)  # values of a row of windows
+        counted = 3 * (min(right, width - REACH) - left)  # of them, those of no other block
+        partial[:] = kind(0.0)  # there are no windows beyond the left and right borders,
+        maps_ring[:] = kind(0.0)  # nor above the first row
+        for pair in range(top // 2, (end + reach + 1) // 2):
+            for i in range(2 * pair, 2 * pair + 2):
+                if has_windows and i < height:
+                    if masked:
+                        _keep_row(mask, i, first, last, keep)
+                    span = 3 * (last - first)
+                    _load_row(i, 3 * first, span, image, photo, scale_y, keep, rows)
+                    for q in range(_AVERAGED):
+                        at = ((i % RING) * _AVERAGED + q) * STRIDE
+                        _filter_along(count, ring, at, rows, q * STRIDE, weights)
+            row = 2 * pair - reach  # the windows and the gradient of two rows are due now
+            if row < top:
+                continue
+            if has_windows:
+                turned = _turned(ring_weights, row % RING)
+                _filter_across(count, _AVERAGED, means, ring, turned)
+                for r in range(row, row + 2):
+                    if r + REACH < height:
+                        if masked:
+                            _keep_row(mask, r + RADIUS, first + RADIUS, last - RADIUS, keep)
+                        own = means[(r - row) * _AVERAGED * STRIDE :]
+                        _similarity_row(count, own, keep, partial)
+                    else:
+                        partial[:] = kind(0.0)
+                    if begin <= r < end:
+                        at = _MAPS * STRIDE + _MARGIN + 3 * (left - first)
+                        sums[block, r, 2] = _sum(partial[at : at + max(0, counted)])
+                    if differentiated:
+                        for q in range(_MAPS):
+                            at = ((r % RING) * _MAPS + q) * STRIDE
+                            source = q * STRIDE + 3 * (left - first)
+                            _filter_along(inner, maps_ring, at, partial, source, weights)
+                if differentiated:
+                    turned = _turned(ring_weights, (row + 2) % RING)  # from 10 rows above on
+                    _filter_across(inner, _MAPS, maps, maps_ring, turned)
+            for r in range(max(row, begin), min(row + 2, end)):
+                if masked:
+                    _keep_row(mask, r, left, right, keep)
+                x_row = image[r, 3 * left : 3 * right]
+                y_row = photo[r, 3 * left : 3 * right]
+                total, total_sq = _errors_row(inner, x_row, y_row, scale_y, keep)
+                sums[block, r, 0] = total
+                sums[block, r, 1] = total_sq
+                if differentiated:
+                    out = gradient[r, 3 * left : 3 * right]
+                    own = maps[(r - row) * _MAPS * STRIDE :]
+                    _gradient_row(inner, x_row, y_row, scale_y, keep, own, step, scale, out)

@@ -10,19 +10,25 @@ import numpy as np
 
 from ..errors import UsageError
 from ..parallel import even_bounds, run_chunks
-from .ssim_kernels import RADIUS, WINDOW, similarity_gradient_rows, similarity_rows
+from .ssim_kernels import BLOCK_PX, RADIUS, WINDOW, compare_rows
 
 _NO_MASK = np.zeros((0, 0), np.bool_)
 
 
 @dataclass(frozen=True)
-class Similarity:
-    """Mean SSIM, the number of values it is a mean of, and its gradient where asked for."""
+class Comparison:
+    """How an image differs from a photo, over the pixels of a mask, and what would change that."""
 
-    mean: float
-    values: int
+    absolute: float
+    """Mean absolute error over pixels and colours; 0 where the mask leaves none."""
+    squared: float
+    """Mean squared error."""
+    similarity: float
+    """Mean SSIM over windows and colours; 1 where there are none."""
+    windows: int
     gradient: np.ndarray | None
-    """(h, w, 3): derivative of the mean with respect to the image."""
+    """(h, w, 3), of the image's type: derivative of ``weights[0] absolute + weights[1] similarity``
+    with respect to the image; ``None`` without weights."""
 
 
 def as_unit_floats(image: np.ndarray, dtype: type = np.float32) -> np.ndarray:
@@ -61,80 +67,91 @@ def psnr(image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -
 def ssim(
     image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None, *, threads: int = 1
 ) -> float:
-    """Return the mean structural similarity (method.md 3.1); see :func:`similarity`.
+    """Return the mean structural similarity (method.md 3.1); see :func:`compare`.
 
     The image is clamped to [0, 1] as a display would.
     """
     a = np.clip(as_unit_floats(image, np.float64), 0.0, 1.0)
-    return similarity(a, as_unit_floats(photo, np.float64), mask, threads=threads).mean
+    return compare(a, photo, mask, threads=threads).similarity
 
 
-def similarity(
+def has_windows(shape: tuple[int, ...], mask: np.ndarray | None = None) -> bool:
+    """Tell whether SSIM has any window in an image of a shape, centred in the mask."""
+    if min(shape[:2]) < WINDOW:
+        return False
+    return mask is None or bool(mask[RADIUS : shape[0] - RADIUS, RADIUS : shape[1] - RADIUS].any())
+
+
+def compare(
     image: np.ndarray,
     photo: np.ndarray,
     mask: np.ndarray | None = None,
     *,
-    gradient: bool = False,
+    weights: tuple[float, float] | None = None,
     threads: int = 1,
-) -> Similarity:
-    """Return the mean SSIM over windows and colours, with its gradient where asked for.
+) -> Comparison:
+    """Return the mean errors and the mean SSIM, with their gradient where weights are given.
 
-    The window is 11 x 11, Gaussian with sigma 1.5, "valid" padding. With a mask, both images
-    are black outside of it, and only windows centred inside it are counted.
+    The window of SSIM is 11 x 11, Gaussian with sigma 1.5, "valid" padding. With a mask, both
+    images are black outside of it, and only windows centred inside it are counted.
 
     Parameters
     ----------
-    image, photo : (h, w, 3) float32 or float64, contiguous, the same type
-        Colours in [0, 1].
+    image : (h, w, 3) float32 or float64
+        Colours in [0, 1]. All is computed in its type.
+    photo : (h, w, 3) uint8, or floats whose white is 1
     mask : (h, w) bool, optional
         Pixels to compare.
-    gradient : bool
-        Also return the derivative with respect to ``image``.
+    weights : (float, float), optional
+        Of the mean absolute error and of the mean SSIM in the scalar to differentiate.
 
     Returns
     -------
-    Similarity
-        ``mean`` is 1 and ``values`` is 0 where no window fits or none is left.
+    Comparison
+        Bitwise the same for any number of threads.
 
     Raises
     ------
     UsageError
         If the shapes differ.
     """
-    if mask is not None:
-        mask = np.ascontiguousarray(mask, np.bool_)
+    image, photo = np.ascontiguousarray(image), np.ascontiguousarray(photo)
     _check(image, photo, mask, may_be_empty=True)
+    if photo.dtype != np.uint8:
+        photo = photo.astype(image.dtype, copy=False)
     height, width = image.shape[:2]
-    if min(height, width) < WINDOW:
-        return Similarity(1.0, 0, np.zeros_like(image) if gradient else None)
-    if mask is not None:
-        image, photo = (x * mask[..., None].astype(x.dtype) for x in (image, photo))
-    flat_image = np.ascontiguousarray(image).reshape(height, 3 * width)
-    flat_photo = np.ascontiguousarray(photo).reshape(height, 3 * width)
-    out_rows, out_values = height - 2 * RADIUS, 3 * (width - 2 * RADIUS)
-    sums, counts = np.zeros(out_rows), np.zeros(out_rows, np.int64)
-    maps = np.empty((3, out_rows, out_values) if gradient else (3, 0, 0), image.dtype)
-    flat_mask = _NO_MASK if mask is None else mask
+    inside = (slice(RADIUS, height - RADIUS), slice(RADIUS, width - RADIUS))
+    if mask is None:
+        mask = _NO_MASK
+        pixels = height * width
+        windows = max(0, height - 2 * RADIUS) * max(0, width - 2 * RADIUS)
+    else:
+        mask = np.ascontiguousarray(mask, np.bool_)
+        pixels = int(np.count_nonzero(mask))
+        fits = min(height, width) >= WINDOW
+        windows = int(np.count_nonzero(mask[inside])) if fits else 0
+    values, windows = 3 * pixels, 3 * windows
+    flat_image, flat_photo = image.reshape(height, -1), photo.reshape(height, -1)  # (h, 3 w)
+    sums = np.zeros((-(-width // BLOCK_PX), height, 3))
+    gradient = np.empty(flat_image.shape if weights else (0, 0), image.dtype)
+    absolute, similar = weights or (0.0, 0.0)
+    white = 1.0 / 255.0 if photo.dtype == np.uint8 else 1.0
 
-    def forward(begin: int, end: int) -> None:
-        similarity_rows(begin, end, flat_image, flat_photo, flat_mask, sums, counts, maps)
+    def run(begin: int, end: int) -> None:
+        compare_rows(
+            begin, end, flat_image, flat_photo, white, mask, absolute / max(1, values),
+            similar / max(1, windows), sums, gradient,
+        )  # fmt: skip
 
-    run_chunks(forward, even_bounds(out_rows, threads, 2), threads)
-    values = int(counts.sum())
-    mean = float(sums.sum()) / values if values else 1.0
-    if not gradient:
-        return Similarity(mean, values, None)
-    result = np.zeros_like(flat_image)
-    factor = 1.0 / max(1, values)
-
-    def backward(begin: int, end: int) -> None:
-        similarity_gradient_rows(begin, end, flat_image, flat_photo, maps, factor, result)
-
-    run_chunks(backward, even_bounds(height, threads, 2), threads)
-    shaped = result.reshape(height, width, 3)
-    if mask is not None:
-        shaped *= mask[..., None]
-    return Similarity(mean, values, shaped)
+    run_chunks(run, even_bounds(height, threads, 1), threads)
+    total, total_sq, total_similar = sums.sum((0, 1)).tolist()
+    return Comparison(
+        total / max(1, values),
+        total_sq / max(1, values),
+        total_similar / windows if windows else 1.0,
+        windows,
+        gradient.reshape(image.shape) if weights else None,
+    )
 
 
 def _check(

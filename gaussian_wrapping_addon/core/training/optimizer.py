@@ -10,51 +10,18 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from ..compiled import kernel
 from ..gaussians.model import OrientedGaussians
 from ..parallel import default_threads, even_bounds, run_chunks
+from ..render.types import VisibleGradients
+from .adam_kernels import BETA1, BETA2, COLUMNS, LANES, SH_COLUMN, adam_rows
 
 TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 """Tensors that receive gradients; ``filter_3d`` is recomputed instead (method.md 1.5)."""
 
-BETA1, BETA2 = 0.9, 0.999
-EPSILON = 1e-15
 _TABLE_STEPS = 20_000
 """Both bias corrections are 1 within float32 from here on."""
 
-
-@kernel(fast=True)
-def _adam_rows(  # type: ignore[no-untyped-def]
-    begin, end, value, gradient, first, second, active, steps, corrections, rates
-):
-    """One step of rows [begin, end).
-
-    Parameters
-    ----------
-    value, gradient, first, second : (n, c) float32
-    active : (n,) bool
-        Rows that are stepped; the moments of the others stay.
-    steps : (n,) int32
-        Steps of each row so far, this one included.
-    corrections : (s, 2) float32
-        ``1 / (1 - beta1^t)`` and ``1 / sqrt(1 - beta2^t)``.
-    rates : (c,) float32
-        Learning rate of each column.
-    """
-    columns = value.shape[1]
-    last = corrections.shape[0] - 1
-    one = np.float32(1.0)
-    b1, b2, epsilon = np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON)
-    for i in range(begin, end):
-        if not active[i]:
-            continue
-        step = min(steps[i], last)
-        up, down = corrections[step, 0], corrections[step, 1]
-        x, g, m, v = value[i], gradient[i], first[i], second[i]
-        for j in range(columns):
-            m[j] = b1 * m[j] + (one - b1) * g[j]
-            v[j] = b2 * v[j] + (one - b2) * g[j] * g[j]
-            x[j] -= rates[j] * up * m[j] / (np.sqrt(v[j]) * down + epsilon)
+_STAYS = np.float32(-1.0)
 
 
 @functools.lru_cache(maxsize=1)
@@ -82,66 +49,73 @@ class Adam:
         self.values: dict[str, torch.Tensor] = {
             name: tensor.detach().clone().contiguous() for name, tensor in gaussians.tensors()
         }
-        self.first = {n: np.zeros(tuple(self.values[n].shape), np.float32) for n in TRAINED}
-        self.second = {n: np.zeros(tuple(self.values[n].shape), np.float32) for n in TRAINED}
+        harmonics = -(-3 * self.values["sh"].shape[1] // LANES) * LANES
+        self._moments = np.zeros((len(gaussians), 2, SH_COLUMN + harmonics), np.float32)
         self.steps = np.zeros(len(gaussians), np.int32)
-        self._require_gradients()
 
     def __len__(self) -> int:
         return len(self.steps)
 
-    def _require_gradients(self) -> None:
-        for name in TRAINED:
-            self.values[name].requires_grad_(True)
-
     def gaussians(self) -> OrientedGaussians:
-        """Return the current Gaussians; the tensors are the trained leaves themselves."""
+        """Return the current Gaussians; the tensors are the trained ones themselves."""
         return OrientedGaussians(**self.values)
 
     def array(self, name: str) -> np.ndarray:
         """Return the memory of one tensor; writing changes the Gaussians."""
-        return self.values[name].detach().numpy()
+        return self.values[name].numpy()
 
-    def step(
-        self, rates: Mapping[str, np.ndarray], active: np.ndarray, *, threads: int = 0
+    def moments(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the memory of the first and second moment of one tensor, of its shape."""
+        shape = tuple(self.values[name].shape)
+        begin = COLUMNS.get(name, SH_COLUMN)
+        both = self._moments[:, :, begin : begin + math.prod(shape[1:])]
+        return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
+
+    def step_rows(
+        self,
+        gradients: VisibleGradients,
+        rates: Mapping[str, np.ndarray],
+        *,
+        sh_degree: int | None = None,
+        threads: int = 0,
     ) -> None:
-        """Update the active Gaussians from the tensors' gradients, then drop the gradients.
+        """Update the Gaussians that a view has seen, in place.
+
+        A Gaussian counts as seen when any of its gradients is not 0. Those that are listed but
+        hidden behind others keep their values, moments and steps, like those that are not listed.
 
         Parameters
         ----------
+        gradients : VisibleGradients
+            No Gaussian is listed twice.
         rates : mapping of name to (c,) float32
-            Learning rate of each column of the flattened tensor; a name that is absent stays.
-        active : (n,) bool
-            Gaussians to step.
+            Learning rate of each column of the flattened tensor, >= 0; a tensor that is absent
+            stays.
+        sh_degree : int, optional
+            Highest degree of the harmonics that has ever had a gradient: spares the columns
+            beyond, whose moments are 0, the step of 0.
         """
         threads = threads or default_threads()
-        self.steps[active] += 1
+        coefficients = self.values["sh"].shape[1]
+        used = coefficients if sh_degree is None else min(coefficients, (sh_degree + 1) ** 2)
+        packed = np.full(self._moments.shape[2], _STAYS)
+        for name, begin in (*COLUMNS.items(), ("sh", SH_COLUMN)):
+            if name in rates:
+                packed[begin : begin + len(rates[name])] = rates[name]
+        rows, listed = len(self), len(gradients.ids)
+        flat = [getattr(gradients, name).reshape(-1) for name in COLUMNS]
+        flat += [gradients.sh.reshape(listed, 3 * coefficients)]
+        flat += [self.array(name).reshape(-1) for name in COLUMNS]
+        flat += [self.array("sh").reshape(rows, 3 * coefficients)]
         table = _corrections()
-        bounds = even_bounds(len(self), threads, 2)
-        for name in TRAINED:
-            gradient = self.values[name].grad
-            if gradient is None or name not in rates:
-                continue
-            rows = (len(self), -1)
-            arrays = (
-                self.array(name).reshape(rows),
-                gradient.contiguous().numpy().reshape(rows),
-                self.first[name].reshape(rows),
-                self.second[name].reshape(rows),
-            )
-            column_rates = rates[name]
 
-            def run(
-                begin: int,
-                end: int,
-                arrays: tuple[np.ndarray, ...] = arrays,
-                column_rates: np.ndarray = column_rates,
-            ) -> None:
-                _adam_rows(begin, end, *arrays, active, self.steps, table, column_rates)
+        def run(begin: int, end: int) -> None:
+            adam_rows(
+                begin, end, gradients.ids, *flat, self._moments, self.steps, table, packed,
+                3 * used,
+            )  # fmt: skip
 
-            run_chunks(run, bounds, threads)
-        for name in TRAINED:
-            self.values[name].grad = None
+        run_chunks(run, even_bounds(listed, threads, 2), threads)
 
     def rebuild(
         self, parents: np.ndarray, fresh: np.ndarray, changes: Mapping[str, np.ndarray]
@@ -163,21 +137,17 @@ class Adam:
                 array = np.ascontiguousarray(changes[name], np.float32)
                 self.values[name] = torch.from_numpy(array.copy())
             else:
-                self.values[name] = self.values[name].detach()[rows].contiguous()
-        for moments in (self.first, self.second):
-            for name in TRAINED:
-                picked = moments[name][parents]
-                picked[fresh] = 0.0
-                moments[name] = picked
+                self.values[name] = self.values[name][rows].contiguous()
+        self._moments = self._moments[parents]
+        self._moments[fresh] = 0.0
         self.steps = self.steps[parents]
         self.steps[fresh] = 0
-        self._require_gradients()
 
     def reset_moments(self, name: str) -> None:
         """Forget the moments of one tensor (after its values were set by hand)."""
-        self.first[name][...] = 0.0
-        self.second[name][...] = 0.0
+        for moment in self.moments(name):
+            moment[...] = 0.0
 
     def is_finite(self) -> bool:
         """Tell whether every parameter is a finite number."""
-        return all(math.isfinite(float(tensor.detach().sum())) for tensor in self.values.values())
+        return all(math.isfinite(float(tensor.sum())) for tensor in self.values.values())

@@ -13,6 +13,7 @@ from ..gaussians.model import OrientedGaussians
 from .density_control import DensityStatistics
 from .optimizer import TRAINED, Adam
 
+_MOMENTS = ("first", "second")
 _STATISTICS = ("gradient", "gradient_abs", "views")
 
 
@@ -59,8 +60,8 @@ class TrainingState:
         for name in adam.values:
             arrays[f"value.{name}"] = adam.array(name).copy()
         for name in TRAINED:
-            arrays[f"first.{name}"] = adam.first[name].copy()
-            arrays[f"second.{name}"] = adam.second[name].copy()
+            for kind, moment in zip(_MOMENTS, adam.moments(name), strict=True):
+                arrays[f"{kind}.{name}"] = moment.copy()
         arrays["steps"] = adam.steps.copy()
         for name in _STATISTICS:
             arrays[f"statistics.{name}"] = getattr(self.statistics, name).copy()
@@ -100,8 +101,8 @@ class TrainingState:
         for name in adam.values:
             _require(adam.array(name), arrays[f"value.{name}"], count)
         for name in TRAINED:
-            for kind, moments in (("first", adam.first), ("second", adam.second)):
-                moments[name] = _require(moments[name], arrays[f"{kind}.{name}"], count).copy()
+            for kind, moment in zip(_MOMENTS, adam.moments(name), strict=True):
+                moment[...] = _require(moment, arrays[f"{kind}.{name}"], count)
         adam.steps = _require(adam.steps, arrays["steps"], count).copy()
         for name in _STATISTICS:
             old = getattr(state.statistics, name)

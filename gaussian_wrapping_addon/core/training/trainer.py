@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import time
@@ -23,8 +24,9 @@ from ..gaussians.mip_filter import mip_filter
 from ..gaussians.model import OrientedGaussians
 from ..parallel import default_threads
 from ..progress import Progress
-from ..render.render import render
-from ..render.types import RenderOptions
+from ..render.projection import RawArrays
+from ..render.types import ImageGradients, RenderOptions
+from ..render.view_renderer import ViewRenderer
 from ..settings import TrainingSettings
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from .density_control import densify_and_prune, reset_opacity
@@ -151,6 +153,7 @@ class _Trainer:
     ) -> None:
         self.scene, self.photos, self.settings = scene, photos, settings
         self.folder, self.seed, self.threads = folder, seed, threads
+        self.renderer = ViewRenderer()
         self.held_out = held_out_views(scene, settings.holdout_every)
         kept = set(self.held_out)
         self.views = [i for i in range(len(scene.views)) if i not in kept and self._shows(i)]
@@ -269,23 +272,22 @@ class _Trainer:
         camera, mask = self.photos.camera(view, divisor), self.photos.mask(view, divisor)
         gathers = schedule.gathers_statistics(iteration)
         uses_depth = schedule.uses_depth(iteration)
+        degree = schedule.sh_degree(iteration)
         options = RenderOptions(
-            depth=uses_depth,
-            sh_degree=schedule.sh_degree(iteration),
-            threads=self.threads,
-            statistics=gathers,
+            depth=uses_depth, sh_degree=degree, threads=self.threads, screen_gradients=gathers
         )
-        image = render(adam.gaussians(), camera, options)
-        loss, figures = color_loss(
+        image = self.renderer.render(RawArrays.from_gaussians(adam.gaussians()), camera, options)
+        value, by_color, figures = color_loss(
             image.color,
             self.photos.photo(view, divisor),
             mask,
             lambda_dssim=settings.lambda_dssim,
             threads=self.threads,
         )
+        gradients = ImageGradients(color=by_color)
         if uses_depth:
             oriented = schedule.is_oriented(iteration)
-            normal_loss, _ = normal_losses(
+            normal_value, by_normals, _ = normal_losses(
                 image.depth,
                 image.geometric_normal,
                 image.normal,
@@ -296,17 +298,16 @@ class _Trainer:
                 lambda_normal=settings.lambda_normal if oriented else 0.0,
                 threads=self.threads,
             )
-            loss = loss + normal_loss
-        value = float(loss.detach())
+            value += normal_value
+            gradients = dataclasses.replace(by_normals, color=by_color)
         if not math.isfinite(value):
             raise _NotFinite()
-        loss.backward()
+        seen = image.backward(gradients)
         if gathers:
             assert image.statistics is not None
             state.statistics.add(image.statistics, camera.width, camera.height)
-        moved = adam.values["opacity_logits"].grad
-        active = np.zeros(len(adam), bool) if moved is None else (moved != 0).numpy()
-        adam.step(schedule.rates(iteration, state.rate_factor), active, threads=self.threads)
+        rates = schedule.rates(iteration, state.rate_factor)
+        adam.step_rows(seen, rates, sh_degree=degree, threads=self.threads)
         state.iteration = iteration + 1
         share = AVERAGE_SHARE if iteration > 0 else 1.0
         state.error_average += share * (figures.mean_squared - state.error_average)
@@ -376,13 +377,13 @@ class _Trainer:
     def _measure(self, gaussians: OrientedGaussians, progress: Progress) -> list[HeldOutFigure]:
         figures = []
         options = RenderOptions(depth=False, threads=self.threads)
+        raw = RawArrays.from_gaussians(gaussians)
         for view in self.held_out:
             progress.update(1.0, f"measuring {self.scene.views[view].camera.name}")
             mask = self.photos.mask(view, 1)
             if mask is not None and not mask.any():
                 continue
-            with torch.no_grad():
-                image = render(gaussians, self.photos.camera(view, 1), options).color.numpy()
+            image = self.renderer.render(raw, self.photos.camera(view, 1), options).color
             photo = self.photos.photo(view, 1)
             figures.append(
                 HeldOutFigure(

@@ -134,8 +134,8 @@ def test_numbers_that_break_down_are_recovered_once(
 
     def sometimes_nan(*arguments, **named):  # type: ignore[no-untyped-def]
         calls[0] += 1
-        loss, figures = honest(*arguments, **named)
-        return (loss * float("nan") if calls[0] in bad else loss), figures
+        loss, gradient, figures = honest(*arguments, **named)
+        return (loss * float("nan") if calls[0] in bad else loss), gradient, figures
 
     monkeypatch.setattr(trainer, "color_loss", sometimes_nan)
     result = train(scene, photos, settings, tmp_path, Progress(), threads=1)

@@ -24,7 +24,7 @@ def test_clones_are_halved_shifted_and_flipped() -> None:
     gaussians.orientation[:, 3] += 0.3 * torch.sign(gaussians.orientation[:, 3])
     adam = Adam(gaussians)
     for name in TRAINED:
-        adam.first[name][...] = 1.0
+        adam.moments(name)[0][...] = 1.0
     errors = np.random.default_rng(0).uniform(0.1, 2.0, 60)
     assert wrap(adam, errors, 0.1, 1000) == 6
     chosen = np.sort(np.argsort(-errors)[:6])
@@ -57,8 +57,8 @@ def test_clones_are_halved_shifted_and_flipped() -> None:
     others = torch.from_numpy(np.setdiff1d(np.arange(60), chosen))
     for name, tensor in gaussians.tensors():
         assert torch.equal(getattr(after, name)[others], tensor[others]), name
-    assert (adam.first["means"][:60] == 1).all()
-    assert not adam.first["means"][60:].any()
+    assert (adam.moments("means")[0][:60] == 1).all()
+    assert not adam.moments("means")[0][60:].any()
 
 
 def test_shrinking_along_an_axis_changes_this_axis_alone() -> None:
