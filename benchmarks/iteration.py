@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Time the parts of one training iteration: ``python -m benchmarks.iteration --help``.
 
-Each part is a named callable; more parts are added to the list that :func:`render_parts` returns.
+Each part is a named callable. The last rows are whole iterations as the trainer runs them, each
+followed by its raster kernels alone (forward and backward) and the ratio of both.
 CPU time sums over threads and repeats within a few percent even on a busy machine, so it is what
 to compare; wall time depends on who else is running. Both columns are the minimum of the repeats.
 """
@@ -25,7 +26,7 @@ import torch
 if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.training_parts import training_parts
+from benchmarks.training_parts import RASTER, WHOLE, iteration_parts, training_parts
 from benchmarks.workload import surface_gaussians, view
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
@@ -155,13 +156,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     camera = view(width, height)
     parts = render_parts(gaussians, camera, RenderOptions(threads=threads))
     parts += training_parts(gaussians, camera, threads)
+    parts += iteration_parts(gaussians, camera, threads)
     print(
         f"{chosen.gaussians} Gaussians, {width} x {height} pixels, {threads} threads, "
         f"runs of {vector_lanes()} pixels, minimum of {chosen.repeats}"
     )
-    print(f"{'part':<30}{'CPU ms':>10}{'wall ms':>10}")
+    print(f"{'part':<34}{'CPU ms':>10}{'wall ms':>10}")
+    whole = None
     for timing in measure(parts, chosen.repeats):
-        print(f"{timing.name:<30}{timing.cpu_ms:>10.1f}{timing.wall_ms:>10.1f}")
+        line = f"{timing.name:<34}{timing.cpu_ms:>10.1f}{timing.wall_ms:>10.1f}"
+        if timing.name.startswith(WHOLE):
+            whole = timing
+        elif whole is not None and timing.name.startswith(f"  {RASTER}"):
+            cpu, wall = whole.cpu_ms / timing.cpu_ms, whole.wall_ms / timing.wall_ms
+            line += f"   whole / alone: CPU {cpu:.2f}, wall {wall:.2f}"
+        print(line)
 
 
 if __name__ == "__main__":
