@@ -11,6 +11,7 @@ import numpy as np
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.mip_filter import mip_filter
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.render.array_store import ArrayStore
 from gaussian_wrapping_addon.core.render.blend import (
     Images,
     RenderBuffers,
@@ -57,7 +58,7 @@ class Iteration:
     ) -> None:
         self.camera, self.threads, self.depth = camera, threads, depth
         self.options = RenderOptions(depth=depth, threads=threads, screen_gradients=statistics)
-        self.adam, self.renderer = Adam(gaussians), ViewRenderer()
+        self.adam, self.renderer, self.store = Adam(gaussians), ViewRenderer(), ArrayStore()
         self.statistics = DensityStatistics.zeros(len(gaussians))
         columns = {name: self.adam.array(name)[:1].size for name in TRAINED}
         self.rates = {name: np.full(count, 1e-12, np.float32) for name, count in columns.items()}
@@ -70,7 +71,7 @@ class Iteration:
 
     def losses(self, image: ViewPass) -> ImageGradients:
         """Return what the losses say about the images."""
-        _, by_color, _ = color_loss(image.color, self.photo, threads=self.threads)
+        _, by_color, _ = color_loss(image.color, self.photo, threads=self.threads, store=self.store)
         if not self.depth:
             return ImageGradients(color=by_color)
         _, gradients, _ = normal_losses(
@@ -80,6 +81,7 @@ class Iteration:
             image.alpha,
             self.camera,
             threads=self.threads,
+            store=self.store,
         )
         return dataclasses.replace(gradients, color=by_color)
 
@@ -125,12 +127,16 @@ def training_parts(gaussians: OrientedGaussians, camera: Camera, threads: int) -
     image, photo = whole.forward(), whole.photo
     seen = image.backward(whole.losses(image))
     normals = (image.depth, image.geometric_normal, image.normal, image.alpha)
+    store = ArrayStore()
     adam, rates, means = whole.adam, whole.rates, gaussians.means.numpy()
     return [
-        ("L1 + SSIM and gradient", lambda: color_loss(image.color, photo, threads=threads)),
+        (
+            "L1 + SSIM and gradient",
+            lambda: color_loss(image.color, photo, threads=threads, store=store),
+        ),
         (
             "both normal losses, gradient",
-            lambda: normal_losses(*normals, camera, threads=threads),
+            lambda: normal_losses(*normals, camera, threads=threads, store=store),
         ),
         ("Adam, seen Gaussians", lambda: adam.step_rows(seen, rates, threads=threads)),
         ("3D filter, 50 cameras", lambda: mip_filter(means, [camera] * 50, threads=threads)),

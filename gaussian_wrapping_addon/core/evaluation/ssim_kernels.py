@@ -31,17 +31,6 @@ STRIDE = (3 * (BLOCK_PX + 2 * REACH) + 2 * _MARGIN + 2 * LANES) // LANES * LANES
 """Values between two rows of scratch; constant, so that LLVM sees that they do not overlap."""
 
 
-@kernel(fast=False)
-def _turned(weights, first):  # type: ignore[no-untyped-def]
-    """Weights of a ring's slots, for a window whose first row lies in slot ``first``."""
-    w, k = weights, RING - first
-    return (
-        w[k % RING], w[(k + 1) % RING], w[(k + 2) % RING], w[(k + 3) % RING],
-        w[(k + 4) % RING], w[(k + 5) % RING], w[(k + 6) % RING], w[(k + 7) % RING],
-        w[(k + 8) % RING], w[(k + 9) % RING], w[(k + 10) % RING], w[(k + 11) % RING],
-    )  # fmt: skip
-
-
 @kernel(fast=True)
 def _filter_along(count, target, target_at, source, source_at, weights):  # type: ignore[no-untyped-def]
     """Filter one row of interleaved colours; writes ``count`` values, rounded up to whole runs."""
@@ -50,12 +39,32 @@ def _filter_along(count, target, target_at, source, source_at, weights):  # type
 
 
 @kernel(fast=True)
-def _filter_across(count, kinds, target, ring, turned):  # type: ignore[no-untyped-def]
-    """Filter a ring of ``kinds`` rows a slot into two times ``kinds`` rows."""
+def _filter_across(count, kinds, target, ring, first, weights):  # type: ignore[no-untyped-def]
+    """Filter a ring of ``kinds`` rows a slot into two times ``kinds`` rows.
+
+    ``first``: slot of the first row of the first window, even.
+    """
+    apart = kinds * STRIDE
     for q in range(kinds):
         at = q * STRIDE
-        for j in range(at, at + count, LANES):
-            filter_two_runs(target, j, kinds * STRIDE, ring, j, kinds * STRIDE, turned)  # type: ignore[call-arg]
+        if first == 0:
+            for j in range(at, at + count, LANES):
+                filter_two_runs(target, j, apart, ring, j, apart, weights, 0)  # type: ignore[call-arg]
+        elif first == 2:
+            for j in range(at, at + count, LANES):
+                filter_two_runs(target, j, apart, ring, j, apart, weights, 2)  # type: ignore[call-arg]
+        elif first == 4:
+            for j in range(at, at + count, LANES):
+                filter_two_runs(target, j, apart, ring, j, apart, weights, 4)  # type: ignore[call-arg]
+        elif first == 6:
+            for j in range(at, at + count, LANES):
+                filter_two_runs(target, j, apart, ring, j, apart, weights, 6)  # type: ignore[call-arg]
+        elif first == 8:
+            for j in range(at, at + count, LANES):
+                filter_two_runs(target, j, apart, ring, j, apart, weights, 8)  # type: ignore[call-arg]
+        elif first == 10:
+            for j in range(at, at + count, LANES):
+                filter_two_runs(target, j, apart, ring, j, apart, weights, 10)  # type: ignore[call-arg]
 
 
 @kernel(fast=True)
@@ -109,8 +118,8 @@ def _similarity_row(count, means, keep, partial):  # type: ignore[no-untyped-def
 @kernel(fast=True)
 def _sum(values):  # type: ignore[no-untyped-def]
     total = values.dtype.type(0.0)
-    for value in values:
-        total += value
+    for j in range(len(values)):
+        total += values[j]
     return total
 
 
@@ -174,10 +183,10 @@ def compare_rows(  # type: ignore[no-untyped-def]
     has_windows = height >= WINDOW and width >= WINDOW
     reach = REACH if has_windows else 0
     above = reach if differentiated else 0
-    w0, w1, w2, w3 = kind(WEIGHTS[0]), kind(WEIGHTS[1]), kind(WEIGHTS[2]), kind(WEIGHTS[3])
-    w4, w5 = kind(WEIGHTS[4]), kind(WEIGHTS[5])
-    weights = (w0, w1, w2, w3, w4, w5, w4, w3, w2, w1, w0)
-    ring_weights = (w0, w1, w2, w3, w4, w5, w4, w3, w2, w1, w0, kind(0.0))
+    weights = (
+        kind(WEIGHTS[0]), kind(WEIGHTS[1]), kind(WEIGHTS[2]),
+        kind(WEIGHTS[3]), kind(WEIGHTS[4]), kind(WEIGHTS[5]),
+    )  # fmt: skip
     rows = np.empty(_AVERAGED * STRIDE, kind)
     ring = np.zeros(RING * _AVERAGED * STRIDE, kind)
     means = np.empty(2 * _AVERAGED * STRIDE, kind)
@@ -211,8 +220,7 @@ def compare_rows(  # type: ignore[no-untyped-def]
             if row < top:
                 continue
             if has_windows:
-                turned = _turned(ring_weights, row % RING)
-                _filter_across(count, _AVERAGED, means, ring, turned)
+                _filter_across(count, _AVERAGED, means, ring, row % RING, weights)
                 for r in range(row, row + 2):
                     if r + REACH < height:
                         if masked:
@@ -230,8 +238,8 @@ def compare_rows(  # type: ignore[no-untyped-def]
                             source = q * STRIDE + 3 * (left - first)
                             _filter_along(inner, maps_ring, at, partial, source, weights)
                 if differentiated:
-                    turned = _turned(ring_weights, (row + 2) % RING)  # from 10 rows above on
-                    _filter_across(inner, _MAPS, maps, maps_ring, turned)
+                    above_row = (row + 2) % RING  # that of 10 rows above
+                    _filter_across(inner, _MAPS, maps, maps_ring, above_row, weights)
             for r in range(max(row, begin), min(row + 2, end)):
                 if masked:
                     _keep_row(mask, r, left, right, keep)

@@ -89,6 +89,7 @@ def compare(
     *,
     weights: tuple[float, float] | None = None,
     threads: int = 1,
+    out: np.ndarray | None = None,
 ) -> Comparison:
     """Return the mean errors and the mean SSIM, with their gradient where weights are given.
 
@@ -104,6 +105,8 @@ def compare(
         Pixels to compare.
     weights : (float, float), optional
         Of the mean absolute error and of the mean SSIM in the scalar to differentiate.
+    out : (h, w, 3), C-contiguous, of the image's type, optional
+        Where the gradient is written; by default a new array.
 
     Returns
     -------
@@ -133,7 +136,9 @@ def compare(
     values, windows = 3 * pixels, 3 * windows
     flat_image, flat_photo = image.reshape(height, -1), photo.reshape(height, -1)  # (h, 3 w)
     sums = np.zeros((-(-width // BLOCK_PX), height, 3))
-    gradient = np.empty(flat_image.shape if weights else (0, 0), image.dtype)
+    gradient = np.empty((0, 0), image.dtype)
+    if weights:
+        gradient = (np.empty_like(image) if out is None else out).reshape(height, -1)
     absolute, similar = weights or (0.0, 0.0)
     white = 1.0 / 255.0 if photo.dtype == np.uint8 else 1.0
 

@@ -12,12 +12,14 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import types
+from numba.core.errors import RequireLiteralValue
 from numba.extending import intrinsic
 
 LANES = 16
 """Values of a run. LLVM splits it into as many registers as the processor needs."""
 
 TAPS = 11
+HALF = TAPS // 2 + 1
 RING = TAPS + 1
 """Rows that two neighbouring windows reach."""
 
@@ -43,20 +45,22 @@ class _Runs:
         lanes = ir.Constant(ir.VectorType(_WORD, LANES), [0] * LANES)
         return self.builder.shuffle_vector(first, nothing, lanes)
 
-    def load_taps(self, count: int, array_type: Any, array: Any, at: Any, step: Any) -> list[Any]:
-        """Return the runs at ``at``, ``at + step`` and so on."""
-        runs = []
-        for tap in range(count):
-            place = self.builder.add(at, self.builder.mul(step, ir.Constant(step.type, tap)))
-            pointer = self.pointer(array_type, array, place)
-            runs.append(self.builder.load(pointer, align=self.align))
-        return runs
+    def place(self, at: Any, step: Any, count: int) -> Any:
+        return self.builder.add(at, self.builder.mul(step, ir.Constant(step.type, count)))
+
+    def load(self, array_type: Any, array: Any, at: Any) -> Any:
+        return self.builder.load(self.pointer(array_type, array, at), align=self.align)
 
     def weighted(self, weights: list[Any], runs: list[Any]) -> Any:
-        total = self.builder.fmul(weights[0], runs[0], flags=("contract",))
-        for weight, run in zip(weights[1:], runs[1:], strict=True):
-            part = self.builder.fmul(weight, run, flags=("contract",))
-            total = self.builder.fadd(total, part, flags=("contract",))
+        """Return the sum of 11 runs by the symmetric weights whose first six are given."""
+        b, total = self.builder, None
+        for tap, weight in enumerate(weights):
+            mirrored = len(runs) - 1 - tap
+            run = runs[tap]
+            if mirrored > tap:
+                run = b.fadd(run, runs[mirrored])
+            part = b.fmul(weight, run, flags=("contract",))
+            total = part if total is None else b.fadd(total, part, flags=("contract",))
         return total
 
     def store(self, run: Any, array_type: Any, array: Any, at: Any) -> None:
@@ -65,37 +69,46 @@ class _Runs:
 
 @intrinsic
 def filter_run(typingctx, target, target_at, source, source_at, step, weights):  # type: ignore[no-untyped-def]
-    """``target[target_at + j] = sum_k weights[k] source[source_at + k step + j]``, 11 weights."""
+    """``target[target_at + j] = sum_k weights[k] source[source_at + k step + j]``, 0 <= k < 11.
 
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        runs = _Runs(context, builder, sig.args[0].dtype)
-        taps = [runs.splat(builder.extract_value(args[5], tap)) for tap in range(TAPS)]
-        loaded = runs.load_taps(TAPS, sig.args[2], args[2], args[3], args[4])
-        runs.store(runs.weighted(taps, loaded), sig.args[0], args[0], args[1])
-        return context.get_dummy_value()
-
-    tuples = types.UniTuple(source.dtype, TAPS)
-    return types.void(target, types.intp, source, types.intp, types.intp, tuples), generate
-
-
-@intrinsic
-def filter_two_runs(typingctx, target, target_at, apart, source, source_at, step, weights):  # type: ignore[no-untyped-def]
-    """Filter a ring of 12 rows for two windows that begin in neighbouring rows, loading it once.
-
-    ``target[target_at + j]`` takes row k with ``weights[k]``, and ``target[target_at + apart + j]``
-    with ``weights[k - 1]``, in the ring.
+    ``weights``: the first six; the others mirror them.
     """
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         runs = _Runs(context, builder, sig.args[0].dtype)
-        taps = [runs.splat(builder.extract_value(args[6], tap)) for tap in range(RING)]
-        loaded = runs.load_taps(RING, sig.args[3], args[3], args[4], args[5])
-        first = runs.weighted(taps, loaded)
-        second = runs.weighted(taps[-1:] + taps[:-1], loaded)
-        runs.store(first, sig.args[0], args[0], args[1])
-        runs.store(second, sig.args[0], args[0], builder.add(args[1], args[2]))
+        taps = [runs.splat(builder.extract_value(args[5], tap)) for tap in range(HALF)]
+        places = [runs.place(args[3], args[4], tap) for tap in range(TAPS)]
+        loaded = [runs.load(sig.args[2], args[2], place) for place in places]
+        runs.store(runs.weighted(taps, loaded), sig.args[0], args[0], args[1])
         return context.get_dummy_value()
 
-    tuples = types.UniTuple(source.dtype, RING)
+    tuples = types.UniTuple(source.dtype, HALF)
+    return types.void(target, types.intp, source, types.intp, types.intp, tuples), generate
+
+
+@intrinsic
+def filter_two_runs(  # type: ignore[no-untyped-def]
+    typingctx, target, target_at, apart, source, source_at, step, weights, first
+):
+    """Filter a ring of 12 rows for two windows that begin in neighbouring rows, loading it once.
+
+    ``first``: the slot of the first window's first row, a constant, so that all 12 addresses are
+    one register and constants. The second window's result goes to ``target_at + apart``.
+    """
+    if not isinstance(first, types.IntegerLiteral):
+        raise RequireLiteralValue("the first slot is no constant")
+    slots = [(first.literal_value + k) % RING for k in range(RING)]
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        runs = _Runs(context, builder, sig.args[0].dtype)
+        taps = [runs.splat(builder.extract_value(args[6], tap)) for tap in range(HALF)]
+        places = [runs.place(args[4], args[5], slot) for slot in slots]
+        loaded = [runs.load(sig.args[3], args[3], place) for place in places]
+        upper, lower = runs.weighted(taps, loaded[:TAPS]), runs.weighted(taps, loaded[1:])
+        runs.store(upper, sig.args[0], args[0], args[1])
+        runs.store(lower, sig.args[0], args[0], builder.add(args[1], args[2]))
+        return context.get_dummy_value()
+
+    tuples = types.UniTuple(source.dtype, HALF)
     index = types.intp
-    return types.void(target, index, index, source, index, index, tuples), generate
+    return types.void(target, index, index, source, index, index, tuples, first), generate

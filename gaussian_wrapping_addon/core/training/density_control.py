@@ -45,11 +45,12 @@ class DensityStatistics:
 
     def add(self, statistics: RenderStatistics, width: int, height: int) -> None:
         """Add one view after its backward pass; ``width`` and ``height`` of its image."""
-        seen = statistics.visible
-        half_image = np.float32(0.5 * max(width, height))
-        self.gradient[seen] += half_image * statistics.grad_px[seen]
-        self.gradient_abs[seen] += half_image * statistics.grad_abs_px[seen]
-        self.views[seen] += 1
+        half_image = 0.5 * max(width, height)
+        # 0 for the unseen: all are added, which is faster than picking the seen.
+        weight = np.multiply(statistics.visible, half_image, dtype=np.float32)
+        self.gradient += weight * statistics.grad_px
+        self.gradient_abs += weight * statistics.grad_abs_px
+        self.views += statistics.visible
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from ..dataset.camera import Camera
 from ..errors import UsageError
 from ..evaluation.view_metrics import compare, has_windows
 from ..parallel import default_threads, even_bounds, run_chunks
+from ..render.array_store import ArrayStore
 from ..render.types import ImageGradients
 from .loss_kernels import agreement_rows, normal_rows
 
@@ -43,6 +44,7 @@ def color_loss(
     *,
     lambda_dssim: float = 0.2,
     threads: int = 0,
+    store: ArrayStore | None = None,
 ) -> tuple[float, np.ndarray, ColorFigures]:
     """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and figures (method.md 3.1).
 
@@ -55,6 +57,8 @@ def color_loss(
         False pixels count in no term.
     lambda_dssim : float
         Share of the SSIM term. It is 0 where no window of SSIM fits or is left.
+    store : ArrayStore, optional
+        Memory for the gradient, which is then valid until the next call with it.
 
     Returns
     -------
@@ -72,7 +76,8 @@ def color_loss(
     if not has_windows(image.shape, mask):
         lambda_dssim = 0.0
     weights = (1.0 - lambda_dssim, -lambda_dssim)
-    found = compare(image, photo, mask, weights=weights, threads=threads)
+    out = _take(store, "by color", image)
+    found = compare(image, photo, mask, weights=weights, threads=threads, out=out)
     assert found.gradient is not None
     value = (1.0 - lambda_dssim) * found.absolute + lambda_dssim * (1.0 - found.similarity)
     return value, found.gradient, ColorFigures(found.absolute, found.squared, found.similarity)
@@ -127,6 +132,7 @@ def normal_losses(
     lambda_normal: float = 0.03,
     max_jump: float = 0.0,
     threads: int = 0,
+    store: ArrayStore | None = None,
 ) -> tuple[float, ImageGradients, NormalFigures]:
     """Return ``lambda_DN L_DN + lambda_N L_N``, gradients and both means (method.md 3.2 and 3.3).
 
@@ -144,6 +150,8 @@ def normal_losses(
         Of the same size, scene frame.
     mask : (h, w) bool, optional
         False pixels count in no term.
+    store : ArrayStore, optional
+        Memory for the gradients, which are then valid until the next call with it.
 
     Returns
     -------
@@ -166,8 +174,10 @@ def normal_losses(
     flat_mask = _NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_)
     pixels = max(1, height * width if mask is None else int(np.count_nonzero(flat_mask)))
     sums = np.empty((height, 3))
-    by_geometric, by_learned = np.empty_like(geometric), np.empty_like(learned)
-    by_depth, by_alpha = np.empty_like(z), np.empty_like(cover)
+    by_geometric, by_learned = (
+        _take(store, name, geometric) for name in ("by geometric normal", "by normal")
+    )
+    by_depth, by_alpha = (_take(store, name, z) for name in ("by depth", "by alpha"))
     packed, rotation = _pack(camera), np.ascontiguousarray(camera.rotation)
 
     def run(begin: int, end: int) -> None:
@@ -187,6 +197,12 @@ def normal_losses(
         depth=by_depth,
     )
     return value, gradients, NormalFigures(depth_normal, oriented, share)
+
+
+def _take(store: ArrayStore | None, name: str, like: np.ndarray) -> np.ndarray:
+    if store is None:
+        return np.empty(like.shape, like.dtype)
+    return store.take(name, like.shape, like.dtype)
 
 
 def _check_size(depth: np.ndarray, camera: Camera) -> None:

@@ -24,6 +24,7 @@ from ..gaussians.mip_filter import mip_filter
 from ..gaussians.model import OrientedGaussians
 from ..parallel import default_threads
 from ..progress import Progress
+from ..render.array_store import ArrayStore
 from ..render.projection import RawArrays
 from ..render.types import ImageGradients, RenderOptions
 from ..render.view_renderer import ViewRenderer
@@ -153,7 +154,7 @@ class _Trainer:
     ) -> None:
         self.scene, self.photos, self.settings = scene, photos, settings
         self.folder, self.seed, self.threads = folder, seed, threads
-        self.renderer = ViewRenderer()
+        self.renderer, self.store = ViewRenderer(), ArrayStore()
         self.held_out = held_out_views(scene, settings.holdout_every)
         kept = set(self.held_out)
         self.views = [i for i in range(len(scene.views)) if i not in kept and self._shows(i)]
@@ -283,6 +284,7 @@ class _Trainer:
             mask,
             lambda_dssim=settings.lambda_dssim,
             threads=self.threads,
+            store=self.store,
         )
         gradients = ImageGradients(color=by_color)
         if uses_depth:
@@ -297,6 +299,7 @@ class _Trainer:
                 lambda_depth_normal=settings.lambda_depth_normal,
                 lambda_normal=settings.lambda_normal if oriented else 0.0,
                 threads=self.threads,
+                store=self.store,
             )
             value += normal_value
             gradients = dataclasses.replace(by_normals, color=by_color)

@@ -11,6 +11,7 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.render.array_store import ArrayStore
 from gaussian_wrapping_addon.core.render.types import ImageGradients
 from gaussian_wrapping_addon.core.training.losses import (
     color_loss,
@@ -227,6 +228,9 @@ def test_single_precision_is_close_and_threads_agree() -> None:
     mask = random.uniform(size=depth.shape) < 0.9
     exact = in_order(normal_losses(*[x.astype(float) for x in narrow], view, mask)[1])
     one, *others = (normal_losses(*narrow, view, mask, threads=t) for t in (1, 2, 5))
+    store = ArrayStore()
+    normal_losses(*narrow, view, store=store)  # its memory is written anew
+    others.append(normal_losses(*narrow, view, mask, store=store))
     for other in others:
         assert one[0] == other[0]
         assert all(map(np.array_equal, in_order(one[1]), in_order(other[1])))
