@@ -25,7 +25,7 @@ from tests.core.training.test_optimizer import all_rates, random_gradients
 
 @functools.cache
 def single_precision_listing(kernel: Any) -> str:
-    """Compile a kernel anew for float32, since cached code keeps no listing; return its assembly."""
+    """Compile a kernel anew for float32, as cached code keeps no listing; return its assembly."""
     options = {k: v for k, v in kernel.targetoptions.items() if k != "nopython"}
     fresh = numba.njit(**options)(kernel.py_func)
     double = numba.float64[:, ::1]
