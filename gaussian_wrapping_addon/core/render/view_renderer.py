@@ -15,8 +15,8 @@ from ..dataset.camera import Camera
 from ..errors import UsageError
 from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
 from .array_store import ArrayStore
-from .block_masks import mask_kernel
 from .blend import Images, RenderBuffers, ScreenView, blend, pair_gradients
+from .block_masks import mask_kernel
 from .pair_sums import add_pair_gradients, add_pair_weights, mark_seen, take_screen_gradients
 from .projection import (
     RawArrays,

@@ -10,7 +10,7 @@ import torch
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render import raster_math, reference
-from gaussian_wrapping_addon.core.render import render as render_module
+from gaussian_wrapping_addon.core.render import view_renderer
 from gaussian_wrapping_addon.core.render.blend import (
     Images,
     RenderBuffers,
@@ -89,7 +89,7 @@ def relative_l2(a: torch.Tensor, b: torch.Tensor) -> float:
 def test_images_equal_the_definition(
     count: int, width: int, height: int, lanes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(render_module, "vector_lanes", lambda: lanes)
+    monkeypatch.setattr(view_renderer, "vector_lanes", lambda: lanes)
     gaussians = random_gaussians(count, seed=count, dtype=torch.float32)
     camera = look_at((2.2, 1.0, 0.8), width=width, height=height, focal=1.1 * width)
     options = RenderOptions(background=BACKGROUND, threads=1)
@@ -113,7 +113,7 @@ def test_images_equal_the_definition(
 def test_gradients_equal_the_definition(
     depth: bool, lanes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(render_module, "vector_lanes", lambda: lanes)
+    monkeypatch.setattr(view_renderer, "vector_lanes", lambda: lanes)
     gaussians = random_gaussians(70, seed=3, dtype=torch.float32)
     camera = look_at((2.2, 1.0, 0.8), width=41, height=27)
     options = RenderOptions(depth=depth, background=BACKGROUND, threads=2)

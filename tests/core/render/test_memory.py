@@ -20,7 +20,7 @@ from .scenes import isotropic, look_at, random_gaussians
 from .test_views import assert_equal, image_gradients, run
 
 CAMERA = look_at((2.2, 1.0, 0.8), width=85, height=70, focal=80.0)
-PAIR_ARRAYS = ("gaussian ids", "pair slots", "rows", "pairs", "pair weights")
+PAIR_ARRAYS = ("gaussian ids", "pair slots", "masks", "pairs", "pair weights")
 ROUNDED = 2e-6
 """Relative L2 difference that another order of float32 sums of tens of pairs makes."""
 
