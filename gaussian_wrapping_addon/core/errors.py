@@ -87,3 +87,9 @@ class MeshingError(WrapError):
     """The field holds no surface in the region, or a mesh cannot be made of it."""
 
     exit_code = EXIT_BAD_DATA
+
+
+class DeviceError(WrapError):
+    """The GPU, its driver or the compiler for it cannot do what was asked."""
+
+    exit_code = EXIT_RESOURCES

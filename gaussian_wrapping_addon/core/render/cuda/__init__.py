@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The renderer on NVIDIA GPUs: CUDA C compiled at run time, driven through the driver's C API."""

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""NVRTC, the CUDA C compiler that comes with a CUDA torch, through ctypes."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib.util
+import os
+import re
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...errors import DeviceError
+
+_FILE_NAME = re.compile(r"libnvrtc\.so\.(\d+)(?:\.\d+)*|nvrtc64_(\d+)\d_\d\.dll")
+_HINT = "Install a PyTorch with CUDA, or the package nvidia-cuda-nvrtc."
+_MAX_FOLDER_DEPTH = 4
+
+
+@dataclass(frozen=True)
+class CompiledText:
+    """What the driver loads, and what the compiler said."""
+
+    image: bytes
+    """Machine code of one architecture, or PTX ending in a zero byte."""
+    log: str
+
+
+@functools.cache
+def find_nvrtc(cuda_major: int | None = None) -> Path | None:
+    """Return the NVRTC library to use, or ``None`` where there is none.
+
+    Looked for in the ``nvidia`` wheels that torch depends on, in torch's own folder (Windows),
+    and in the CUDA toolkit that ``CUDA_PATH`` or ``CUDA_HOME`` names.
+
+    Parameters
+    ----------
+    cuda_major : int, optional
+        Major version of torch's CUDA, which the driver surely supports: preferred. Otherwise the
+        newest.
+    """
+    found = []
+    for path in _library_files():
+        match = _FILE_NAME.fullmatch(path.name)
+        if match:
+            found.append((int(match[1] or match[2]), path))
+    if not found:
+        return None
+    return max(found, key=lambda item: (item[0] == cuda_major, item[0], str(item[1])))[1]
+
+
+def compile_text(
+    text: str, capability: tuple[int, int], library: Path, *, verbose: bool = False
+) -> CompiledText:
+    """Compile CUDA C for one compute capability.
+
+    An architecture newer than the compiler gets PTX for the newest one it knows, which the driver
+    translates.
+
+    Parameters
+    ----------
+    text : str
+    capability : (int, int)
+        Such as (8, 9).
+    library : Path
+        From :func:`find_nvrtc`.
+    verbose : bool
+        Have registers, shared memory and spills of every kernel in the log.
+
+    Raises
+    ------
+    DeviceError
+        If the compiler cannot be loaded, knows no architecture this old, or refuses the text;
+        the message holds its log.
+    """
+    nvrtc = _load(library)
+    wanted = capability[0] * 10 + capability[1]
+    known = _architectures(nvrtc)
+    usable = [number for number in known if number <= wanted]
+    if not usable:
+        raise DeviceError(
+            f"{library.name} compiles for no GPU as old as compute capability "
+            f"{capability[0]}.{capability[1]}.",
+            "Render on the CPU.",
+        )
+    exact = wanted in known
+    options = ["--std=c++17", "--restrict"]
+    options.append(f"--gpu-architecture={'sm' if exact else 'compute'}_{max(usable)}")
+    if verbose:
+        options.append("--ptxas-options=-v")
+    program = ctypes.c_void_p()
+    _check(
+        nvrtc,
+        nvrtc.nvrtcCreateProgram(
+            ctypes.byref(program), text.encode(), b"gaussian_wrapping.cu", 0, None, None
+        ),
+    )
+    try:
+        encoded = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
+        result = nvrtc.nvrtcCompileProgram(program, len(options), encoded)
+        log = _read(nvrtc, program, "ProgramLog").rstrip(b"\0").decode(errors="replace").strip()
+        if result != 0:
+            raise DeviceError(
+                f"NVRTC {library.name} refused the kernels for compute capability "
+                f"{capability[0]}.{capability[1]}: {log or _words(nvrtc, result)}",
+                "Report this message; rendering on the CPU works meanwhile.",
+            )
+        return CompiledText(_read(nvrtc, program, "CUBIN" if exact else "PTX"), log)
+    finally:
+        nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
+
+
+def _library_files() -> Iterable[Path]:
+    folders: list[Path] = []
+    for package in ("nvidia", "torch"):
+        spec = importlib.util.find_spec(package)
+        for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
+            folders.append(Path(folder) / "lib" if package == "torch" else Path(folder))
+    for variable in ("CUDA_PATH", "CUDA_HOME"):
+        if os.environ.get(variable):
+            folders += [Path(os.environ[variable]) / name for name in ("bin", "lib64", "lib")]
+    for folder in folders:
+        for place, inside, names in os.walk(folder):
+            if len(Path(place).relative_to(folder).parts) >= _MAX_FOLDER_DEPTH:
+                inside.clear()
+            yield from (Path(place) / name for name in names if "nvrtc" in name)
+
+
+@functools.cache
+def _load(library: Path) -> ctypes.CDLL:
+    try:
+        if sys.platform == "win32":
+            # Where its own parts are found.
+            with os.add_dll_directory(str(library.parent)):
+                nvrtc = ctypes.CDLL(str(library))
+        else:
+            nvrtc = ctypes.CDLL(str(library))
+    except OSError as error:
+        raise DeviceError(f"{library.name} cannot be loaded: {error}.", _HINT) from None
+    nvrtc.nvrtcGetErrorString.restype = ctypes.c_char_p
+    return nvrtc
+
+
+def _architectures(nvrtc: ctypes.CDLL) -> list[int]:
+    count = ctypes.c_int()
+    _check(nvrtc, nvrtc.nvrtcGetNumSupportedArchs(ctypes.byref(count)))
+    numbers = (ctypes.c_int * count.value)()
+    _check(nvrtc, nvrtc.nvrtcGetSupportedArchs(numbers))
+    return list(numbers)
+
+
+def _read(nvrtc: ctypes.CDLL, program: ctypes.c_void_p, what: str) -> bytes:
+    size = ctypes.c_size_t()
+    _check(nvrtc, getattr(nvrtc, f"nvrtcGet{what}Size")(program, ctypes.byref(size)))
+    buffer = ctypes.create_string_buffer(size.value)
+    _check(nvrtc, getattr(nvrtc, f"nvrtcGet{what}")(program, buffer))
+    return buffer.raw
+
+
+def _words(nvrtc: ctypes.CDLL, result: int) -> str:
+    return str((nvrtc.nvrtcGetErrorString(result) or b"unknown error").decode())
+
+
+def _check(nvrtc: ctypes.CDLL, result: int) -> None:
+    if result != 0:
+        raise DeviceError(f"NVRTC failed: {_words(nvrtc, result)}.", _HINT)

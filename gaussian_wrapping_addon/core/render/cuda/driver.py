@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The few functions of the CUDA driver API that load and launch kernels, through ctypes.
+
+Kernels run in the device's primary context, which torch uses as well, so they read and write
+torch's memory and queue on its streams.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import sys
+from collections.abc import Sequence
+
+from ...errors import DeviceError
+
+_HINT = "Update NVIDIA's driver, or render on the CPU."
+
+
+class DriverModule:
+    """Compiled kernels loaded into the primary context of one GPU.
+
+    Parameters
+    ----------
+    device_index : int
+        As torch counts.
+    image : bytes
+        From the compiler.
+    names : sequence of str
+        Kernels to look up.
+
+    Raises
+    ------
+    DeviceError
+        If the driver is missing or refuses.
+    """
+
+    def __init__(self, device_index: int, image: bytes, names: Sequence[str]) -> None:
+        self._cuda = load_driver()
+        device = ctypes.c_int()
+        _check(self._cuda, "cuDeviceGet", ctypes.byref(device), device_index)
+        # Never released: torch keeps the context for the life of the process.
+        self._context = ctypes.c_void_p()
+        _check(self._cuda, "cuDevicePrimaryCtxRetain", ctypes.byref(self._context), device)
+        self._functions: dict[str, ctypes.c_void_p] = {}
+        self._enter()
+        try:
+            module = ctypes.c_void_p()
+            _check(self._cuda, "cuModuleLoadDataEx", ctypes.byref(module), image, 0, None, None)
+            for name in names:
+                function = ctypes.c_void_p()
+                _check(
+                    self._cuda,
+                    "cuModuleGetFunction",
+                    ctypes.byref(function),
+                    module,
+                    name.encode(),
+                )
+                self._functions[name] = function
+        finally:
+            self._leave()
+
+    def launch(
+        self, name: str, blocks: int, threads: int, parameters: ctypes.Array, stream: int
+    ) -> None:
+        """Queue a kernel; ``parameters`` points at the values of its arguments, in order.
+
+        Raises
+        ------
+        DeviceError
+            If it cannot be queued. What goes wrong while it runs, torch reports later.
+        """
+        self._enter()
+        try:
+            _check(
+                self._cuda,
+                "cuLaunchKernel",
+                self._functions[name],
+                *(ctypes.c_uint(value) for value in (blocks, 1, 1, threads, 1, 1, 0)),
+                ctypes.c_void_p(stream),
+                parameters,
+                None,
+            )
+        finally:
+            self._leave()
+
+    def _enter(self) -> None:
+        # The calling thread (autograd has its own) may have another context, or none.
+        _check(self._cuda, "cuCtxPushCurrent_v2", self._context)
+
+    def _leave(self) -> None:
+        _check(self._cuda, "cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
+
+
+@functools.cache
+def load_driver() -> ctypes.CDLL:
+    """Return NVIDIA's driver library, initialised.
+
+    Raises
+    ------
+    DeviceError
+        If this machine has none.
+    """
+    name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+    try:
+        cuda = ctypes.CDLL(name)
+    except OSError:
+        raise DeviceError(f"NVIDIA's driver library {name} is not here.", _HINT) from None
+    _check(cuda, "cuInit", 0)
+    return cuda
+
+
+def _check(cuda: ctypes.CDLL, function: str, *arguments: object) -> None:
+    result = getattr(cuda, function)(*arguments)
+    if result != 0:
+        words = ctypes.c_char_p()
+        cuda.cuGetErrorString(result, ctypes.byref(words))
+        text = (words.value or b"unknown error").decode(errors="replace")
+        raise DeviceError(f"{function} of NVIDIA's driver failed: {text} ({result}).", _HINT)

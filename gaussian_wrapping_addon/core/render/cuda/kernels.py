@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Launching the kernels by name with torch tensors as arguments, and whether that can work here."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from abc import ABC, abstractmethod
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...errors import DeviceError
+from ..projection_kernels import CAMERA_VALUES
+from .compiler import compile_text, find_nvrtc
+from .driver import DriverModule, load_driver
+from .source import KERNELS, THREADS_PER_BLOCK, cuda_source
+
+
+class CameraValues(ctypes.Structure):
+    """A packed camera, passed to kernels by value."""
+
+    _fields_ = [("v", ctypes.c_double * CAMERA_VALUES)]  # noqa: RUF012 - ctypes wants a list
+
+    @classmethod
+    def of(cls, packed: np.ndarray) -> CameraValues:
+        """Copy what ``pack_camera`` returned."""
+        return cls.from_buffer_copy(np.ascontiguousarray(packed, np.float64))
+
+
+Argument = Tensor | int | float | CameraValues
+
+
+class Kernels(ABC):
+    """Something that runs the kernels of the CUDA text on tensors of one device."""
+
+    def launch(self, name: str, blocks: int, *arguments: Argument) -> None:
+        """Run a kernel with :data:`THREADS_PER_BLOCK` threads a block; 0 blocks do nothing.
+
+        Tensors are passed as the addresses of their memory, which must be contiguous; whole
+        numbers as ``int``, others as ``float``.
+        """
+        if blocks == 0:
+            return
+        values = [_value(argument) for argument in arguments]
+        pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
+        self._run(name, blocks, pointers)
+
+    def launch_each(self, name: str, count: int, *arguments: Argument) -> None:
+        """Run a kernel with one thread for each of ``count`` items, the first argument."""
+        self.launch(name, -(-count // THREADS_PER_BLOCK), count, *arguments)
+
+    @abstractmethod
+    def _run(self, name: str, blocks: int, parameters: ctypes.Array) -> None: ...
+
+
+class DeviceKernels(Kernels):
+    """The kernels compiled for, and run on, one GPU."""
+
+    def __init__(self, device_index: int) -> None:
+        library = find_nvrtc(_torch_cuda_major())
+        if library is None:
+            raise DeviceError("No NVRTC library was found.", _NO_NVRTC_HINT)
+        capability = torch.cuda.get_device_capability(device_index)
+        compiled = compile_text(cuda_source(), capability, library)
+        self._device_index = device_index
+        self._module = DriverModule(device_index, compiled.image, KERNELS)
+
+    def _run(self, name: str, blocks: int, parameters: ctypes.Array) -> None:
+        stream = torch.cuda.current_stream(self._device_index).cuda_stream
+        self._module.launch(name, blocks, THREADS_PER_BLOCK, parameters, stream)
+
+
+_NO_NVRTC_HINT = "Install the package nvidia-cuda-nvrtc of torch's CUDA version."
+
+
+@functools.cache
+def device_kernels(device_index: int) -> DeviceKernels:
+    """Return the kernels of a GPU, compiled on the first call of the process.
+
+    Raises
+    ------
+    DeviceError
+        If compiler or driver are missing or fail.
+    """
+    return DeviceKernels(device_index)
+
+
+def cuda_available() -> tuple[bool, str]:
+    """Return whether the renderer can run on a GPU here, and in one sentence why or why not."""
+    if torch.version.cuda is None:
+        return False, "This PyTorch was built without CUDA."
+    if not torch.cuda.is_available():
+        return False, "PyTorch finds no CUDA device, or the driver is too old for it."
+    library = find_nvrtc(_torch_cuda_major())
+    if library is None:
+        return False, f"No NVRTC library was found. {_NO_NVRTC_HINT}"
+    try:
+        load_driver()
+    except DeviceError as error:
+        return False, str(error)
+    return True, f"{torch.cuda.get_device_name()}, kernels compiled by {library.name}."
+
+
+def _torch_cuda_major() -> int | None:
+    return int(torch.version.cuda.split(".")[0]) if torch.version.cuda else None
+
+
+def _value(argument: Argument) -> ctypes._SimpleCData | ctypes.Structure:
+    if isinstance(argument, Tensor):
+        assert argument.is_contiguous()
+        return ctypes.c_void_p(argument.data_ptr())
+    if isinstance(argument, CameraValues):
+        return argument
+    if isinstance(argument, int):
+        return ctypes.c_int(argument)
+    return ctypes.c_float(argument)

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The one CUDA C text: constants of the method in front, then the parts in their order."""
+
+from __future__ import annotations
+
+import functools
+import math
+from pathlib import Path
+
+from ... import tolerances
+from ..isosurface import SLOPE_FLOOR
+from ..raster_math import DENOMINATOR_MIN, FRONT_SIGMAS
+
+PARTS = (
+    "common.cu",
+    "projection.cu",
+    "projection_backward.cu",
+    "binning.cu",
+    "raster.cu",
+    "isosurface.cu",
+    "raster_backward.cu",
+)
+
+KERNELS = (
+    "project_gaussians",
+    "project_backward",
+    "count_pairs",
+    "list_pairs",
+    "forward_tiles",
+    "forward_tiles_weights",
+    "sum_weights",
+    "isosurface_tiles",
+    "backward_tiles",
+    "backward_tiles_depth",
+    "backward_tiles_absolute",
+    "backward_tiles_depth_absolute",
+    "sum_pairs",
+)
+"""Names of the text's entry points."""
+
+THREADS_PER_BLOCK = 256
+
+_SINGLE = {
+    "ALPHA_MIN": tolerances.ALPHA_MIN,
+    "ALPHA_MAX": tolerances.ALPHA_MAX,
+    "TRANSMITTANCE_MIN": tolerances.TRANSMITTANCE_MIN,
+    "ISO_LEVEL": tolerances.ISO_LEVEL,
+    "DENOMINATOR_MIN": float(DENOMINATOR_MIN),
+    "FRONT_SIGMAS": float(FRONT_SIGMAS),
+    "SLOPE_FLOOR": float(SLOPE_FLOOR),
+    "TINY": 1e-30,
+    "FARTHEST": 3e38,
+    "FLOAT32_LARGE": 3.0e38,  # every smaller magnitude is a usable float32
+    # Ellipses above this half width take every row of their box: rows are narrowed in float32,
+    # whose rounding at this size stays a tenth of the margin.
+    "NARROW_PX": 2048.0,
+    "NARROW_MARGIN": 0.05,
+    # Newton's method has converged below this share of the thinnest Gaussian's sigma, or below
+    # the rounding of the depth, or where the transmittance is 0.5 within its own rounding.
+    "SOLVER_STEP_SIGMAS": 1e-5,
+    "SOLVER_STEP_SHARE": 2.5e-7,
+    "SOLVER_LEVEL_MARGIN": 3e-7,
+    "SOLVER_SLOPE_FLOOR": 1e-6,
+}
+_DOUBLE = {
+    "ALPHA_MIN_WIDE": tolerances.ALPHA_MIN,
+    "QUATERNION_MIN_NORM": tolerances.QUATERNION_MIN_NORM,
+    "DIRECTION_MIN_NORM": tolerances.DIRECTION_MIN_NORM,
+    # As in projection_kernels.py and tile_kernels.py.
+    "PLANE_MARGIN": 1e-12,
+    "FLOAT32_STEP": 2.0**-23,
+    "FARTHEST_PX": 1.0e9,
+    "SHARE_MARGIN": 1e-6,
+    "STRIP_MARGIN": 0.02,
+    "SH_C0": 0.5 / math.sqrt(math.pi),
+    "SH_C1": math.sqrt(3.0 / (4.0 * math.pi)),
+    "SH_C2A": math.sqrt(15.0 / (4.0 * math.pi)),
+    "SH_C2B": math.sqrt(5.0 / (16.0 * math.pi)),
+    "SH_C2C": math.sqrt(15.0 / (16.0 * math.pi)),
+    "SH_C3A": math.sqrt(35.0 / (32.0 * math.pi)),
+    "SH_C3B": math.sqrt(105.0 / (4.0 * math.pi)),
+    "SH_C3C": math.sqrt(21.0 / (32.0 * math.pi)),
+    "SH_C3D": math.sqrt(7.0 / (16.0 * math.pi)),
+    "SH_C3E": math.sqrt(105.0 / (16.0 * math.pi)),
+}
+_INTEGER = {"TILE": tolerances.TILE_PX, "SOLVER_NEWTON_STEPS": 8, "SOLVER_MAX_STEPS": 80}
+
+
+@functools.cache
+def cuda_source() -> str:
+    """Return the whole text; compilers report errors by the parts' names and lines."""
+    folder = Path(__file__).resolve().parent
+    lines = [f"#define {name} {value}" for name, value in _INTEGER.items()]
+    lines += [f"#define {name} {value!r}" for name, value in _DOUBLE.items()]
+    lines += [f"#define {name} {value!r}f" for name, value in _SINGLE.items()]
+    lines.append("#define INFINITE __int_as_float(0x7f800000)")
+    for part in PARTS:
+        lines += [f'#line 1 "{part}"', (folder / part).read_text(encoding="utf-8")]
+    return "\n".join(lines)
