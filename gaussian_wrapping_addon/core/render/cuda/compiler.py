@@ -117,8 +117,8 @@ def _library_files() -> Iterable[Path]:
     folders: list[Path] = []
     for package in ("nvidia", "torch"):
         spec = importlib.util.find_spec(package)
-        for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
-            folders.append(Path(folder) / "lib" if package == "torch" else Path(folder))
+        for place in (spec.submodule_search_locations or ()) if spec is not None else ():
+            folders.append(Path(place) / "lib" if package == "torch" else Path(place))
     for variable in ("CUDA_PATH", "CUDA_HOME"):
         if os.environ.get(variable):
             folders += [Path(os.environ[variable]) / name for name in ("bin", "lib64", "lib")]

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ... import tolerances
 from ...dataset.camera import Camera
 from ...errors import ResourceError, UsageError
 from ...gaussians.model import OrientedGaussians
-from ... import tolerances
 from ..types import Render, RenderOptions, RenderStatistics
 from .kernels import Kernels, device_kernels
 from .tile_lists import (

@@ -21,12 +21,12 @@ from .source import KERNELS, THREADS_PER_BLOCK, cuda_source
 class CameraValues(ctypes.Structure):
     """A packed camera, passed to kernels by value."""
 
-    _fields_ = [("v", ctypes.c_double * CAMERA_VALUES)]  # noqa: RUF012 - ctypes wants a list
+    _fields_ = [("v", ctypes.c_double * CAMERA_VALUES)]
 
     @classmethod
     def of(cls, packed: np.ndarray) -> CameraValues:
         """Copy what ``pack_camera`` returned."""
-        return cls.from_buffer_copy(np.ascontiguousarray(packed, np.float64))
+        return cls.from_buffer_copy(np.ascontiguousarray(packed, np.float64).tobytes())
 
 
 Argument = Tensor | int | float | CameraValues
