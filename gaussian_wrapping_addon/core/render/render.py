@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The fast renderer: Gaussians and a camera in, images and their gradients out, on the CPU."""
+"""The fast renderer: Gaussians and a camera in, images and their gradients out."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from ..gaussians.model import OrientedGaussians
 from ..parallel import default_threads
 from .array_store import ArrayStore
 from .blend import Images, RenderBuffers, ScreenView
+from .cuda.cuda_render import render_cuda
 from .projection import RawArrays, RawGradients, project_backward, project_gaussians
 from .tiles import TileBinning
 from .types import ImageGradients, Render, RenderOptions, RenderStatistics
@@ -44,7 +45,7 @@ def render(
     Parameters
     ----------
     gaussians : OrientedGaussians
-        CPU tensors, scene frame.
+        Scene frame. CPU tensors, or float32 CUDA tensors: then all of it runs on the GPU.
     camera : Camera
         In the scene frame; any image size.
     options : RenderOptions, optional
@@ -61,7 +62,11 @@ def render(
     ------
     ResourceError
         If the tile lists or the contributor lists grow beyond what can be addressed.
+    DeviceError
+        If the Gaussians are on a GPU that compiler or driver cannot serve.
     """
+    if gaussians.means.is_cuda:
+        return render_cuda(gaussians, camera, options)
     options = options or RenderOptions()
     collected: list[RenderStatistics] = []
     tensors = [getattr(gaussians, name) for name in _TRAINED]

@@ -40,13 +40,13 @@ class EmulatedKernels(Kernels):
         assert result == 0, f"{name}: {('', 'no such kernel', 'the threads wait for ever')[result]}"
 
 
-def build_emulator(folder: Path, text: str | None = None) -> Path:
+def build_emulator(folder: Path, text: str | None = None, names: tuple[str, ...] = KERNELS) -> Path:
     """Compile the emulator into a folder; skip the test where there is no g++."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("g++ is not installed; it compiles the CUDA text for the host")
     (folder / "text.cu").write_text(text or cuda_source(), encoding="utf-8")
-    (folder / "table.inc").write_text("".join(f"KERNEL({name})\n" for name in KERNELS))
+    (folder / "table.inc").write_text("".join(f"KERNEL({name})\n" for name in names))
     library = folder / "emulator.so"
     source = Path(__file__).with_name("emulator.cpp")
     done = subprocess.run(

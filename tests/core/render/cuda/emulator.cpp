@@ -36,6 +36,9 @@ static inline float4 make_float4(float x, float y, float z, float w) { return {x
 #define __launch_bounds__(threads)
 #define __shared__ static __attribute__((section("emulated_shared")))
 
+// The section exists even where a text has no shared memory.
+__attribute__((used)) __shared__ char first_of_section;
+
 static const int THREADS = 256;
 static const size_t STACK_BYTES = 1 << 16;
 

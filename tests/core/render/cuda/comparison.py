@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Comparing a rendering on the (emulated) GPU with the CPU kernels or the float64 definition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.render.cuda.cuda_render import render_with
+from gaussian_wrapping_addon.core.render.cuda.kernels import Argument, Kernels
+from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
+
+from .emulation import EmulatedKernels
+
+TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
+IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
+STATISTICS = ("visible", "radii_px", "weight_sum", "weight_max", "grad_px", "grad_abs_px")
+BUDGET_BYTES = 1 << 30
+
+Renderer = Callable[[OrientedGaussians, Camera, RenderOptions], Render]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Images and gradients of one rendering; tensors on the CPU."""
+
+    images: dict[str, Tensor]
+    gradients: dict[str, Tensor]
+    render: Render
+
+    def values(self) -> list[Tensor]:
+        """Return everything that must be reproduced."""
+        found = [*self.images.values(), *self.gradients.values()]
+        statistics = self.render.statistics
+        if statistics is not None:
+            found += [torch.as_tensor(getattr(statistics, name)) for name in STATISTICS]
+            found.append(torch.as_tensor(statistics.strongest))
+        return found
+
+
+class WatchedKernels(EmulatedKernels):
+    """Emulated kernels that remember the slopes of log T at the depths, (h, w)."""
+
+    slope: Tensor
+
+    def launch(self, name: str, blocks: int, *arguments: Argument) -> None:
+        """Launch and look."""
+        super().launch(name, blocks, *arguments)
+        if name == "isosurface_tiles":
+            assert isinstance(arguments[-1], Tensor)
+            self.slope = arguments[-1]
+
+
+def emulated(kernels: Kernels, budget_bytes: int = BUDGET_BYTES) -> Renderer:
+    """Return the renderer of the CUDA path with the given kernels."""
+    return lambda gaussians, camera, options: render_with(
+        kernels, gaussians, camera, options, budget_bytes
+    )
+
+
+def leaves(
+    gaussians: OrientedGaussians, dtype: torch.dtype, device: str = "cpu"
+) -> OrientedGaussians:
+    """Return copies that collect gradients."""
+    return gaussians.replaced(
+        **{
+            name: tensor.detach().to(device, dtype, copy=True).requires_grad_(name != "filter_3d")
+            for name, tensor in gaussians.tensors()
+        }
+    )
+
+
+def outcome(
+    renderer: Renderer,
+    gaussians: OrientedGaussians,
+    camera: Camera,
+    options: RenderOptions,
+    *,
+    weights: dict[str, Tensor],
+    dtype: torch.dtype = torch.float32,
+    device: str = "cpu",
+) -> Outcome:
+    """Render, and differentiate the images' sum weighed by ``weights``."""
+    leaf = leaves(gaussians, dtype, device)
+    out = renderer(leaf, camera, options)
+    total = sum((getattr(out, n) * w.to(device, dtype)).sum() for n, w in weights.items())
+    assert isinstance(total, Tensor)
+    total.backward()
+    return Outcome(
+        {name: getattr(out, name).detach().cpu() for name in IMAGES},
+        {name: getattr(leaf, name).grad.cpu() for name in TRAINED},
+        out,
+    )
+
+
+def random_weights(
+    camera: Camera, options: RenderOptions, depth_weight: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Return a random linear functional of the images; ``depth_weight`` scales the depth's."""
+    generator = torch.Generator().manual_seed(5)
+    shape = (camera.height, camera.width)
+    weights = {
+        name: torch.randn((*shape, 3) if i < 3 else shape, generator=generator)
+        for i, name in enumerate(IMAGES)
+    }
+    if not options.depth:
+        del weights["depth"]
+    elif depth_weight is not None:
+        weights["depth"] = weights["depth"] * depth_weight
+    return weights
+
+
+def depth_weights(
+    library: Path, gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
+) -> Tensor:
+    """Return weights that make the depths' gradients comparable.
+
+    A depth's gradient is something well conditioned over the slope of log T: each pixel is weighed
+    by its slope, and pixels where T is all but flat at the crossing are left out.
+    """
+    kernels = WatchedKernels(library)
+    with torch.no_grad():
+        depth = emulated(kernels)(gaussians, camera, options).depth
+    slope = torch.where(depth > 0, kernels.slope, 0.0)
+    if not (slope > 0).any():
+        return slope
+    typical = slope[slope > 0].median()
+    return torch.where(slope > 0.05 * typical, slope / typical, 0.0)
+
+
+def relative_l2(a: Tensor, b: Tensor) -> float:
+    """Return |a - b| / |b|, or |a| where b is 0."""
+    scale = float(b.double().norm())
+    return float((a.double() - b.double()).norm()) / (scale or 1.0)
+
+
+def assert_same_images(found: Outcome, wanted: Outcome, tolerance: float = 2e-6) -> None:
+    """Compare all images; depths where they exist to 1e-5, few of them to 5e-5."""
+    for name in IMAGES[:4]:
+        error = (found.images[name].double() - wanted.images[name].double()).abs().max()
+        assert float(error) < tolerance, name
+    a, b = found.images["depth"].double(), wanted.images["depth"].double()
+    assert torch.equal(a > 0, b > 0)
+    error = ((a - b).abs() / b)[b > 0]
+    if len(error):
+        # Where T is nearly flat at the crossing, its rounding is magnified in the depth.
+        assert float((error > 1e-5).double().mean()) < 0.01
+        assert float(error.max()) < 5e-5
+
+
+def assert_same_gradients(found: Outcome, wanted: Outcome, tolerance: float = 1e-4) -> None:
+    """Compare the gradients of every parameter group in the L2 norm."""
+    for name in TRAINED:
+        error = relative_l2(found.gradients[name], wanted.gradients[name])
+        assert error < tolerance, f"{name}: {error}"
+
+
+def assert_bitwise_equal(found: Outcome, wanted: Outcome) -> None:
+    """Compare images, gradients and statistics bit by bit."""
+    for a, b in zip(found.values(), wanted.values(), strict=True):
+        assert torch.equal(a, b)
