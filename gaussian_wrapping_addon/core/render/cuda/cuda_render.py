@@ -6,6 +6,8 @@ Nothing that is per Gaussian or per pixel crosses the bus, except the statistics
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,14 +71,8 @@ def render_cuda(
     if device.type != "cuda":
         raise UsageError("The Gaussians are not on a GPU.", "Use render() for CPU tensors.")
     index = device.index if device.index is not None else torch.cuda.current_device()
-    try:
-        budget = budget_bytes or _free_bytes(device)
-        return render_with(device_kernels(index), gaussians, camera, options, budget)
-    except torch.OutOfMemoryError as error:
-        raise ResourceError(
-            f"The GPU's memory does not suffice for view {camera.name!r}: {error}.",
-            "Use smaller images or fewer Gaussians, or render on the CPU.",
-        ) from None
+    budget = budget_bytes or _free_bytes(device)
+    return render_with(device_kernels(index), gaussians, camera, options, budget)
 
 
 def render_with(
@@ -98,11 +94,24 @@ def render_with(
     count = len(gaussians)
     statistics = _empty_statistics(count) if options.statistics else None
     tensors = [getattr(gaussians, name) for name in _TRAINED]
-    images = _Rasterize.apply(
-        *tensors, kernels, gaussians, camera, options, statistics, budget_bytes
-    )
+    with _enough_memory(camera):
+        images = _Rasterize.apply(
+            *tensors, kernels, gaussians, camera, options, statistics, budget_bytes
+        )
     color, normal, geometric, alpha, depth = images
     return Render(color, normal, geometric, alpha, depth, statistics)
+
+
+@contextlib.contextmanager
+def _enough_memory(camera: Camera) -> Iterator[None]:
+    """Turn torch's error of the GPU's memory into ours."""
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise ResourceError(
+            f"The GPU's memory does not suffice for view {camera.name!r}: {error}.",
+            "Use smaller images or fewer Gaussians, or render on the CPU.",
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -158,49 +167,55 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        kernels, statistics = ctx.kernels, ctx.statistics
-        outputs = ctx.saved_tensors[len(_TRAINED) :]
-        incoming = [
-            torch.zeros_like(output) if grad is None else grad.detach().contiguous()
-            for output, grad in zip(outputs, grads, strict=True)
-        ]
-        with_depth = ctx.options.depth and grads[4] is not None
-        name = "backward_tiles" + ("_depth" if with_depth else "")
-        name += "_absolute" if statistics is not None else ""
-        params = ctx.screen.params
-        grad_params = torch.zeros_like(params)  # (n, 24)
-        for band in ctx.bands:
-            pairs = params.new_empty((len(band.gaussian_ids), ROW_VALUES))
-            kernels.launch(
-                name,
-                band.tiles,
-                params,
-                band.start,
-                band.gaussian_ids,
-                band.pair_slots,
-                band.masks,
-                *_place(ctx.camera, band),
-                *outputs,
-                ctx.slope,
-                *incoming,
-                pairs,
-            )
-            blocks = -(-len(params) // WARPS)
-            kernels.launch("sum_pairs", blocks, len(params), pairs, band.pair_offsets, grad_params)
-        if statistics is not None:
-            statistics.grad_px[:] = grad_params[:, 0:2].norm(dim=1).cpu().numpy()
-            statistics.grad_abs_px[:] = grad_params[:, 22:24].norm(dim=1).cpu().numpy()
-        raw = ctx.raw
-        found = [torch.zeros_like(getattr(raw.gaussians, trained)) for trained in _TRAINED]
-        kernels.launch_each(
-            "project_backward",
-            len(params),
-            *raw.arguments(),
-            ctx.screen.visible,
-            grad_params,
-            *found,
+        with _enough_memory(ctx.camera):
+            return (*_backward(ctx, grads), *[None] * 6)
+
+
+def _backward(ctx: Any, grads: tuple[Tensor | None, ...]) -> list[Tensor]:
+    """Return the gradients of the trained tensors."""
+    kernels, statistics = ctx.kernels, ctx.statistics
+    outputs = ctx.saved_tensors[len(_TRAINED) :]
+    incoming = [
+        torch.zeros_like(output) if grad is None else grad.detach().contiguous()
+        for output, grad in zip(outputs, grads, strict=True)
+    ]
+    with_depth = ctx.options.depth and grads[4] is not None
+    name = "backward_tiles" + ("_depth" if with_depth else "")
+    name += "_absolute" if statistics is not None else ""
+    params = ctx.screen.params
+    grad_params = torch.zeros_like(params)  # (n, 24)
+    for band in ctx.bands:
+        pairs = params.new_empty((len(band.gaussian_ids), ROW_VALUES))
+        kernels.launch(
+            name,
+            band.tiles,
+            params,
+            band.start,
+            band.gaussian_ids,
+            band.pair_slots,
+            band.masks,
+            *_place(ctx.camera, band),
+            *outputs,
+            ctx.slope,
+            *incoming,
+            pairs,
         )
-        return (*found, *[None] * 6)
+        blocks = -(-len(params) // WARPS)
+        kernels.launch("sum_pairs", blocks, len(params), pairs, band.pair_offsets, grad_params)
+    if statistics is not None:
+        statistics.grad_px[:] = grad_params[:, 0:2].norm(dim=1).cpu().numpy()
+        statistics.grad_abs_px[:] = grad_params[:, 22:24].norm(dim=1).cpu().numpy()
+    raw = ctx.raw
+    found = [torch.zeros_like(getattr(raw.gaussians, trained)) for trained in _TRAINED]
+    kernels.launch_each(
+        "project_backward",
+        len(params),
+        *raw.arguments(),
+        ctx.screen.visible,
+        grad_params,
+        *found,
+    )
+    return found
 
 
 def _blend(

@@ -113,6 +113,6 @@ def _value(argument: Argument) -> ctypes._SimpleCData | ctypes.Structure:
         return ctypes.c_void_p(argument.data_ptr())
     if isinstance(argument, CameraValues):
         return argument
-    if isinstance(argument, int):
-        return ctypes.c_int(argument)
+    if isinstance(argument, (int, np.integer)):
+        return ctypes.c_int(int(argument))
     return ctypes.c_float(argument)

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -15,8 +15,6 @@ from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.cuda.cuda_render import render_with
 from gaussian_wrapping_addon.core.render.cuda.kernels import Argument, Kernels
 from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
-
-from .emulation import EmulatedKernels
 
 TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
@@ -44,17 +42,23 @@ class Outcome:
         return found
 
 
-class WatchedKernels(EmulatedKernels):
-    """Emulated kernels that remember the slopes of log T at the depths, (h, w)."""
+class WatchedKernels(Kernels):
+    """Other kernels, watched: remembers the slopes of log T at the depths, (h, w)."""
 
     slope: Tensor
 
+    def __init__(self, inner: Kernels) -> None:
+        self._inner = inner
+
     def launch(self, name: str, blocks: int, *arguments: Argument) -> None:
         """Launch and look."""
-        super().launch(name, blocks, *arguments)
+        self._inner.launch(name, blocks, *arguments)
         if name == "isosurface_tiles":
             assert isinstance(arguments[-1], Tensor)
             self.slope = arguments[-1]
+
+    def _run(self, name: str, blocks: int, parameters: ctypes.Array) -> None:
+        raise AssertionError("launch() hands everything on")
 
 
 def emulated(kernels: Kernels, budget_bytes: int = BUDGET_BYTES) -> Renderer:
@@ -117,17 +121,17 @@ def random_weights(
 
 
 def depth_weights(
-    library: Path, gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
+    kernels: Kernels, gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
 ) -> Tensor:
     """Return weights that make the depths' gradients comparable.
 
     A depth's gradient is something well conditioned over the slope of log T: each pixel is weighed
     by its slope, and pixels where T is all but flat at the crossing are left out.
     """
-    kernels = WatchedKernels(library)
+    watched = WatchedKernels(kernels)
     with torch.no_grad():
-        depth = emulated(kernels)(gaussians, camera, options).depth
-    slope = torch.where(depth > 0, kernels.slope, 0.0)
+        depth = emulated(watched)(gaussians, camera, options).depth.cpu()
+    slope = torch.where(depth > 0, watched.slope.cpu(), 0.0)
     if not (slope > 0).any():
         return slope
     typical = slope[slope > 0].median()

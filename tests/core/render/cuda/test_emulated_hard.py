@@ -53,7 +53,7 @@ def compared(
 ) -> Outcome:
     """Compare with the CPU kernels, and return what was rendered; all of it is finite."""
     options = options or RenderOptions(background=BACKGROUND)
-    well = depth_weights(library, gaussians, camera, options)
+    well = depth_weights(EmulatedKernels(library), gaussians, camera, options)
     weights = random_weights(camera, options, well)
     found = outcome(emulated(EmulatedKernels(library)), gaussians, camera, options, weights=weights)
     cpu = outcome(render, gaussians, camera, options, weights=weights)

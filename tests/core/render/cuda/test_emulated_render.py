@@ -46,7 +46,11 @@ def test_images_and_gradients_equal_the_definition(
 ) -> None:
     gaussians, camera = scene(*size)
     options = RenderOptions(background=BACKGROUND, depth=depth)
-    well = depth_weights(emulator_library, gaussians, camera, options) if depth else None
+    well = (
+        depth_weights(EmulatedKernels(emulator_library), gaussians, camera, options)
+        if depth
+        else None
+    )
     weights = random_weights(camera, options, well)
     found = outcome(
         emulated(EmulatedKernels(emulator_library)), gaussians, camera, options, weights=weights
@@ -65,7 +69,7 @@ def test_everything_equals_the_cpu_kernels(
 ) -> None:
     gaussians, camera = scene(*size)
     options = RenderOptions(background=BACKGROUND, statistics=True, threads=1)
-    well = depth_weights(emulator_library, gaussians, camera, options)
+    well = depth_weights(EmulatedKernels(emulator_library), gaussians, camera, options)
     weights = random_weights(camera, options, well)
     found = outcome(
         emulated(EmulatedKernels(emulator_library)), gaussians, camera, options, weights=weights
@@ -128,7 +132,7 @@ def test_the_hardwares_approximations_stay_within_tolerance(emulator_library: Pa
     # exp and quotients disturbed by their documented bounds, signs mixed.
     gaussians, camera = scene(150, 33, 17)
     options = RenderOptions(background=BACKGROUND)
-    well = depth_weights(emulator_library, gaussians, camera, options)
+    well = depth_weights(EmulatedKernels(emulator_library), gaussians, camera, options)
     weights = random_weights(camera, options, well)
     rough = outcome(
         emulated(EmulatedKernels(emulator_library, ulp=1.0)), gaussians, camera, options,
