@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Raw Gaussians onto the screen, one thread each, in float64: the formulas of
-// projection_kernels.py, where they are derived. About 1500 operations a Gaussian, which even at
-// a consumer GPU's float64 rate is little beside the raster loops.
+// projection_kernels.py, where they are derived. By a rough count 1500 operations, which even at
+// a consumer GPU's float64 rate should be little beside the raster loops (not measured).
 
 // Rotation of a quaternion, row by row; returns its norm, or 0 where it is degenerate.
 __device__ __forceinline__ double rotation_from_quat(const float* quat, double* r) {
