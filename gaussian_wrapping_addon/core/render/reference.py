@@ -86,6 +86,69 @@ def render_reference(
     )
 
 
+def reference_depth_at(
+    gaussians: OrientedGaussians, camera: Camera, positions: Tensor, options: RenderOptions
+) -> Tensor:
+    """Return the depth of :func:`render_reference` at any positions of the image.
+
+    Parameters
+    ----------
+    gaussians, camera, options
+        As for :func:`render_reference`.
+    positions : (m, 2) tensor
+        Pixels, the Gaussians' float type; differentiable.
+
+    Returns
+    -------
+    (m,) tensor
+        z-depth in scene units; 0 where there is none and off ``[0, width] x [0, height]``.
+    """
+    hits, seen = _cast_at(gaussians, camera, positions, options)
+    return positions.new_zeros(len(positions)).index_put((seen,), _depth(hits, options))
+
+
+def reference_transmittance_at(
+    gaussians: OrientedGaussians,
+    camera: Camera,
+    positions: Tensor,
+    depths: Tensor,
+    options: RenderOptions,
+) -> Tensor:
+    """Return what the contributors of :func:`render_reference` let through up to z-depths.
+
+    Parameters
+    ----------
+    gaussians, camera, positions, options
+        As for :func:`reference_depth_at`.
+    depths : (m,) tensor
+        Scene units, >= 0; differentiable.
+
+    Returns
+    -------
+    (m,) tensor
+        In [0, 1]; 0 off the image.
+    """
+    hits, seen = _cast_at(gaussians, camera, positions, options)
+    before = (hits.peak - depths[seen][:, None]).clamp_min(0.0)  # (k, n)
+    density = torch.exp(hits.log_alpha - 0.5 * hits.sharpness * before * before)
+    density = torch.where(hits.contributes, density.clamp_max(tolerances.ALPHA_MAX), 0.0)
+    through = torch.prod(1.0 - density, dim=1)
+    return positions.new_zeros(len(positions)).index_put((seen,), through)
+
+
+def _cast_at(
+    gaussians: OrientedGaussians, camera: Camera, positions: Tensor, options: RenderOptions
+) -> tuple[_Hits, Tensor]:
+    """Return the hits of the positions on the image, and the indices of these positions."""
+    screen = reference_projection(gaussians, camera, options)
+    chosen = torch.nonzero(screen.usable)[:, 0]
+    order = chosen[torch.argsort(screen.depths[chosen].float(), stable=True)]
+    size = positions.new_tensor([camera.width, camera.height])
+    seen = torch.nonzero(((positions >= 0.0) & (positions <= size)).all(1))[:, 0]
+    x, y = positions[seen].unbind(1)
+    return _cast(screen.params[order], x, y), seen
+
+
 def _render_rows(
     params: Tensor,
     background: Tensor,

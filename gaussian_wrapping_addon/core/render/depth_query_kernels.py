@@ -1,0 +1,529 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compiled isosurface depth and transmittance at positions of a view, and their gradient.
+
+Vectors run over the Gaussians of a cell, not over positions, so that one position costs no more
+than one of many. The Gaussians that reach a cell are laid out in *spans* of 32: 32 values of one
+column after those of another, all of a span inside one array at constant offsets, which is what
+lets LLVM vectorise (kernels.md 4.4). The contributors of a position are moved together and solved
+by Newton steps on ``log T`` inside a bracket (method.md 2.4).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any
+
+import numpy as np
+
+from ..compiled import inline, kernel
+from .area_lists import TILE, strip_span
+from .raster_math import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    DENOMINATOR_MIN,
+    FAR,
+    FRONT_SIGMAS,
+    HALF,
+    ISO_LEVEL,
+    ONE,
+    TRANSMITTANCE_MIN,
+    TWO,
+    ZERO,
+    exp_short,
+    exp_wide,
+)
+
+GEOMETRY = 13
+"""Leading columns of params that a ray's transmittance depends on."""
+
+_SPAN = 32
+_INDEX = np.arange(_SPAN, dtype=np.float32)
+# Columns of a span: the Gaussians, ...
+_U, _V, _QA, _QB, _QC = 0, _SPAN, 2 * _SPAN, 3 * _SPAN, 4 * _SPAN
+_PX, _PY, _R, _S, _T = 5 * _SPAN, 6 * _SPAN, 7 * _SPAN, 8 * _SPAN, 9 * _SPAN
+_Z, _OPACITY, _A0 = 10 * _SPAN, 11 * _SPAN, 12 * _SPAN
+# ... what they are on the ray of the position at hand, ...
+_RAW, _PEAK, _SHARPNESS = 13 * _SPAN, 14 * _SPAN, 15 * _SPAN
+_FORWARD_COLUMNS = 16
+# ... and the gradients on them.
+_G = 13 * _SPAN
+_GRADIENT_COLUMNS = 2 * GEOMETRY
+
+# Converged: a Newton step below this share of the thinnest Gaussian's sigma along the ray, where
+# the slope can be extrapolated from the last step or need not be ...
+_STEP_SIGMAS, _STEP_SIGMAS_ALONE = np.float32(2e-4), np.float32(1e-5)
+_NEAR_SIGMAS = np.float32(0.1)
+# ... or below the rounding of the depth itself ...
+_STEP_SHARE = np.float32(1.2e-7)
+# ... or a transmittance equal to 0.5 within its own rounding.
+_LEVEL_MARGIN = np.float32(1.2e-7)
+_DENOMINATORS = np.float32(16.0)
+"""Larger than the squared inverse sigma along any ray that meets a Gaussian, in shares of a0."""
+_NEWTON_STEPS = 8
+"""From here on every second step is a bisection, which bounds the number of steps."""
+_MAX_STEPS = 80
+_NEWTON_FLOOR = np.float32(1e-6)
+SLOPE_FLOOR = np.float32(1e-3)
+"""Floor of -d(log T)/dt in shares of the position's largest 1/sigma along the ray (method.md
+2.5)."""
+# exp(-x) is below 3e-7 beyond this x = s d^2.
+_NEGLIGIBLE = np.float32(30.0)
+_THIRD, _FIFTH = np.float32(1.0 / 3.0), np.float32(0.2)
+_TINY = np.float32(1e-30)
+
+
+@kernel(fast=False)
+def fill_spans(
+    columns: int,
+    cell: int,
+    shift: int,
+    tiles_x: int,
+    params: np.ndarray,
+    boxes: np.ndarray,
+    skews: np.ndarray,
+    start: np.ndarray,
+    gaussian_ids: np.ndarray,
+    spans: np.ndarray,
+    fronts: np.ndarray,
+    sharpest: np.ndarray,
+    pairs: np.ndarray,
+) -> int:
+    """Lay out the Gaussians that reach a cell, in the order of its tile; return their number.
+
+    Parameters
+    ----------
+    columns : int
+        Columns per span.
+    spans : (s, columns * 32) float32
+        The last span is filled up with Gaussians of no opacity.
+    fronts : (s + 1,) float32
+        Receives the z-depth before which no Gaussian of this span or a later one has a density
+        worth counting.
+    sharpest : (s + 1,) float32
+        Receives the largest a0 of this span and the later ones.
+    pairs : (g,) int64
+        Receives the pair of each Gaussian.
+    """
+    tile = cell >> (2 * shift)
+    part = cell & ((1 << (2 * shift)) - 1)
+    cell_px = TILE >> shift
+    x0 = tile % tiles_x * TILE + (part & ((1 << shift) - 1)) * cell_px
+    y0 = tile // tiles_x * TILE + (part >> shift) * cell_px
+    x1, y1 = x0 + cell_px, y0 + cell_px
+    count = 0
+    for k in range(start[tile], start[tile + 1]):
+        i = gaussian_ids[k]
+        if shift > 0:
+            if boxes[i, 0] > x1 or boxes[i, 2] < x0 or boxes[i, 1] > y1 or boxes[i, 3] < y0:
+                continue
+            left, right = strip_span(
+                float(boxes[i, 0]), float(boxes[i, 1]), float(boxes[i, 2]), float(boxes[i, 3]),
+                float(skews[i]), float(y0), float(y1),
+            )  # fmt: skip
+            if left > x1 or right < x0:
+                continue
+        span = spans[count // _SPAN]
+        lane = count % _SPAN
+        for column in range(GEOMETRY):
+            span[column * _SPAN + lane] = params[i, column]
+        front = params[i, 10] - FRONT_SIGMAS * params[i, 22]
+        at = count // _SPAN
+        fronts[at] = front if lane == 0 else min(fronts[at], front)
+        sharpest[at] = params[i, 12] if lane == 0 else max(sharpest[at], params[i, 12])
+        pairs[count] = k
+        count += 1
+    last = (count + _SPAN - 1) // _SPAN
+    for lane in range(count, last * _SPAN):
+        span = spans[last - 1]
+        for column in range(GEOMETRY):
+            span[column * _SPAN + lane % _SPAN] = ZERO
+    fronts[last] = FAR
+    sharpest[last] = ZERO
+    for at in range(last - 1, -1, -1):
+        fronts[at] = min(fronts[at], fronts[at + 1])
+        sharpest[at] = max(sharpest[at], sharpest[at + 1])
+    return count
+
+
+@inline
+def _cast(span: Any, x: Any, y: Any) -> None:
+    """Evaluate a span on the ray of a position; opacity 0 where it is below 1/255."""
+    for j in range(_SPAN):
+        dx = x - span[_U + j]
+        dy = y - span[_V + j]
+        shift = dx * span[_PX + j] + dy * span[_PY + j]
+        num = max((dx * span[_QA + j] + dy * span[_QB + j]) * dx + dy * dy * span[_QC + j], ZERO)
+        den = dx * dx * span[_R + j] + dx * dy * span[_S + j] + dy * dy * span[_T + j]
+        den = max(den + TWO * shift + ONE, DENOMINATOR_MIN)
+        inverse = ONE / den
+        raw = exp_short(HALF * num * inverse) * span[_OPACITY + j]
+        span[_RAW + j] = raw if raw >= ALPHA_MIN else ZERO
+        span[_PEAK + j] = (shift + ONE) * inverse * span[_Z + j]
+        span[_SHARPNESS + j] = span[_A0 + j] * den
+
+
+@inline
+def _evaluate(capped: Any, count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
+    """Return T and -d(log T)/dt at depth t; ``capped``: what is capped at 0.99 has no slope."""
+    product, slope = ONE, ZERO
+    for c in range(count):
+        ahead = max(peaks[c] - t, ZERO)
+        pull = sharpnesses[c] * ahead
+        raw = alphas[c] * exp_wide(HALF * pull * ahead)
+        density = min(raw, ALPHA_MAX)
+        keep = ONE - density
+        product *= keep
+        steep = density * pull / keep
+        if capped:
+            steep = steep if raw < ALPHA_MAX else ZERO
+        slope += steep
+    return product, slope
+
+
+@inline
+def _log_twice(value: Any) -> Any:
+    """Return log(2 value), exactly near 0.5 and with the right sign and order elsewhere."""
+    y = (TWO * value - ONE) / (TWO * value + ONE)
+    square = y * y
+    return TWO * y * (ONE + square * (_THIRD + square * _FIFTH))
+
+
+@inline
+def _solve(
+    count: Any, alphas: Any, peaks: Any, sharpnesses: Any, low: Any, high: Any, guess: Any,
+    sharpest: Any,
+) -> Any:  # fmt: skip
+    """Return where T crosses 0.5 between ``low`` and ``high``, and -d(log T)/dt there."""
+    t = guess
+    last_t, last_slope, found_slope = ZERO, -ONE, ZERO
+    for number in range(_MAX_STEPS):
+        product, slope = _evaluate(False, count, t, alphas, peaks, sharpnesses)
+        excess = _log_twice(max(product, _TINY))
+        if excess > ZERO:
+            low = t
+        else:
+            high = t
+        step = excess / max(slope, _NEWTON_FLOOR * sharpest)
+        apart = abs(t - last_t) * sharpest
+        smooth = last_slope >= ZERO and apart < _NEAR_SIGMAS and apart > _STEP_SIGMAS_ALONE
+        bend = ZERO
+        if smooth:
+            bend = (slope - last_slope) / (t - last_t)
+        share = _STEP_SIGMAS if smooth else _STEP_SIGMAS_ALONE
+        moved = t + step
+        # Rounding may put a step this small on the bracket's end, hence no test for inside.
+        done = abs(step) <= max(share / sharpest, _STEP_SHARE * t)
+        done = done or abs(excess) <= _LEVEL_MARGIN or high - low <= _STEP_SHARE * high
+        found_slope = slope
+        if done:
+            moved = min(max(moved, low), high)
+            found_slope = slope + bend * (moved - t)
+            t = moved
+            break
+        last_t, last_slope = t, slope
+        newton = moved > low and moved < high and (number < _NEWTON_STEPS or number % 2 == 0)
+        t = moved if newton else HALF * (low + high)
+    return t, found_slope
+
+
+@inline
+def _sharpest_behind(first: Any, total: Any, spans: Any, x: Any, y: Any, through: Any) -> Any:
+    """Return the largest sharpness of the contributors from span ``first`` on."""
+    largest = ZERO
+    for at in range(first, (total + _SPAN - 1) // _SPAN):
+        span = spans[at]
+        _cast(span, x, y)
+        for j in range(_SPAN):
+            raw = span[_RAW + j]
+            if raw > ZERO and through >= TRANSMITTANCE_MIN:
+                largest = max(largest, span[_SHARPNESS + j])
+                through -= min(raw, ALPHA_MAX) * through
+    return largest
+
+
+@functools.cache
+def query_kernel(solve: bool) -> Any:
+    """Return the kernel that answers positions, compiled on first call.
+
+    Parameters
+    ----------
+    solve : bool
+        Find the depth of the isosurface; otherwise evaluate the transmittance at given depths.
+    """
+
+    @kernel(fast=True)
+    def query_range(
+        first_cell: int,
+        end_cell: int,
+        params: np.ndarray,
+        boxes: np.ndarray,
+        skews: np.ndarray,
+        start: np.ndarray,
+        gaussian_ids: np.ndarray,
+        tiles_x: int,
+        shift: int,
+        cell_start: np.ndarray,
+        places: np.ndarray,
+        limit: float,
+        depths: np.ndarray,
+        values: np.ndarray,
+        slopes: np.ndarray,
+        stops: np.ndarray,
+    ) -> None:
+        """Answer the positions of cells: write ``values`` and ``slopes``, read ``depths``.
+
+        ``depths (k,)`` is what is written where the depth is solved. ``stops (k,) int32`` receives
+        the number of Gaussians of the cell's list that come before the light is used up.
+        """
+        longest = 0
+        for cell in range(first_cell, end_cell):
+            if cell_start[cell] < cell_start[cell + 1]:
+                tile = cell >> (2 * shift)
+                longest = max(longest, start[tile + 1] - start[tile])
+        room = (longest + _SPAN - 1) // _SPAN
+        spans = np.empty((room, _FORWARD_COLUMNS * _SPAN), np.float32)
+        fronts = np.empty(room + 1, np.float32)
+        sharpest_a0 = np.empty(room + 1, np.float32)
+        pairs = np.empty(longest, np.int64)
+        alphas = np.empty((room + 1) * _SPAN, np.float32)
+        peaks = np.empty((room + 1) * _SPAN, np.float32)
+        sharpnesses = np.empty((room + 1) * _SPAN, np.float32)
+        indices = np.empty((room + 1) * _SPAN, np.int32)
+        for cell in range(first_cell, end_cell):
+            if cell_start[cell] == cell_start[cell + 1]:
+                continue
+            total = fill_spans(
+                _FORWARD_COLUMNS, cell, shift, tiles_x, params, boxes, skews, start,
+                gaussian_ids, spans, fronts, sharpest_a0, pairs,
+            )  # fmt: skip
+            for p in range(cell_start[cell], cell_start[cell + 1]):
+                x, y = places[p, 0], places[p, 1]
+                through, high = ONE, ZERO
+                before_crossing, crossing = ZERO, 0
+                count: Any = 0
+                stop: Any = total
+                end = depths[p]
+                behind: Any = (total + _SPAN - 1) // _SPAN
+                for at in range((total + _SPAN - 1) // _SPAN):
+                    if solve:
+                        if through <= limit and through < ISO_LEVEL and fronts[at] >= high:
+                            behind = at
+                            break
+                    elif fronts[at] >= end:
+                        break
+                    span = spans[at]
+                    _cast(span, x, y)
+                    first = count
+                    for j in range(_SPAN):
+                        raw = span[_RAW + j]
+                        alphas[count] = raw
+                        peaks[count] = span[_PEAK + j]
+                        sharpnesses[count] = span[_SHARPNESS + j]
+                        indices[count] = at * _SPAN + j
+                        count += 1 if raw > ZERO else 0
+                    for c in range(first, count):
+                        before = through
+                        through -= min(alphas[c], ALPHA_MAX) * through
+                        if solve and before > ISO_LEVEL:
+                            high = max(high, peaks[c])
+                            if through <= ISO_LEVEL:
+                                before_crossing, crossing = before, c
+                        if through < TRANSMITTANCE_MIN:
+                            count = c + 1
+                            stop = indices[c] + 1
+                            break
+                    if through < TRANSMITTANCE_MIN:
+                        break
+                stops[p] = stop
+                if not solve:
+                    values[p], slopes[p] = _evaluate(
+                        True, count, end, alphas, peaks, sharpnesses
+                    )
+                    continue
+                values[p], slopes[p] = ZERO, ONE
+                if not (before_crossing > ZERO and through <= limit and through < ISO_LEVEL):
+                    continue
+                sharpest = ZERO
+                kept = 0
+                for c in range(count):
+                    sharpness, peak = sharpnesses[c], peaks[c]
+                    sharpest = max(sharpest, sharpness)
+                    beyond = max(peak - high, ZERO)
+                    if c == crossing:
+                        crossing = kept
+                    alphas[kept] = alphas[c]
+                    peaks[kept] = peak
+                    sharpnesses[kept] = sharpness
+                    kept += 1 if sharpness * beyond * beyond < _NEGLIGIBLE else 0
+                product, _ = _evaluate(False, kept, ZERO, alphas, peaks, sharpnesses)
+                if product <= ISO_LEVEL:
+                    continue
+                # Alone, the Gaussian at the crossing lets 0.5 through where exp(-s d^2 / 2) = ratio.
+                light = min(alphas[crossing], ALPHA_MAX) * before_crossing
+                ratio = min(max((before_crossing - ISO_LEVEL) / max(light, _TINY), ZERO), ONE)
+                log_ratio = math.log(max(ratio, _TINY))
+                ahead = math.sqrt(max(-TWO * log_ratio / max(sharpnesses[crossing], _TINY), ZERO))
+                guess = peaks[crossing] - ahead
+                if not (guess > ZERO and guess < high):
+                    guess = HALF * high
+                t, slope = _solve(
+                    kept, alphas, peaks, sharpnesses, ZERO, high, guess,
+                    math.sqrt(max(sharpest, _TINY)),
+                )  # fmt: skip
+                # What lies behind only counts where it may be thin enough to raise the floor.
+                if slope < SLOPE_FLOOR * math.sqrt(sharpest_a0[behind] * _DENOMINATORS):
+                    sharpest = max(
+                        sharpest, _sharpest_behind(behind, total, spans, x, y, through)
+                    )
+                values[p] = t
+                slopes[p] = max(slope, SLOPE_FLOOR * math.sqrt(max(sharpest, _TINY)))
+
+    return query_range
+
+
+@inline
+def _pull_span(span: Any, x: Any, y: Any, t: Any, weight: Any, stop: Any) -> Any:
+    """Add the gradient of ``weight log T(t)`` on a span; return that on the position."""
+    sum_x, sum_y = ZERO, ZERO
+    for j in range(_SPAN):
+        qa, qb, qc = span[_QA + j], span[_QB + j], span[_QC + j]
+        px, py = span[_PX + j], span[_PY + j]
+        r, s, v = span[_R + j], span[_S + j], span[_T + j]
+        dx = x - span[_U + j]
+        dy = y - span[_V + j]
+        shift = dx * px + dy * py
+        num = max((dx * qa + dy * qb) * dx + dy * dy * qc, ZERO)
+        den = dx * dx * r + dx * dy * s + dy * dy * v
+        den = max(den + TWO * shift + ONE, DENOMINATOR_MIN)
+        inverse = ONE / den
+        distance = num * inverse
+        raw = exp_short(HALF * distance) * span[_OPACITY + j]
+        contributes = (raw >= ALPHA_MIN) & (_INDEX[j] < stop)
+        peak = (shift + ONE) * inverse * span[_Z + j]
+        ahead = max(peak - t, ZERO)
+        sharpness = span[_A0 + j] * den
+        density = raw * exp_wide(HALF * sharpness * ahead * ahead)
+        free = contributes & (density < ALPHA_MAX)
+        density = density if free else ZERO
+        g_log = -weight * density / (ONE - density)
+        g_distance = -HALF * g_log
+        g_peak = -g_log * sharpness * ahead
+        g_sharpness = g_distance * ahead * ahead
+        g_num = g_distance * inverse
+        g_den = span[_A0 + j] * g_sharpness - (g_num * distance + g_peak * peak * inverse)
+        g_shift = g_peak * inverse * span[_Z + j] + TWO * g_den
+        g_x = g_num * (TWO * qa * dx + qb * dy) + g_den * (TWO * r * dx + s * dy) + g_shift * px
+        g_y = g_num * (TWO * qc * dy + qb * dx) + g_den * (TWO * v * dy + s * dx) + g_shift * py
+        sum_x += g_x
+        sum_y += g_y
+        span[_G + _U + j] -= g_x
+        span[_G + _V + j] -= g_y
+        span[_G + _QA + j] += g_num * dx * dx
+        span[_G + _QB + j] += g_num * dx * dy
+        span[_G + _QC + j] += g_num * dy * dy
+        span[_G + _PX + j] += g_shift * dx
+        span[_G + _PY + j] += g_shift * dy
+        span[_G + _R + j] += g_den * dx * dx
+        span[_G + _S + j] += g_den * dx * dy
+        span[_G + _T + j] += g_den * dy * dy
+        span[_G + _Z + j] += g_peak * peak
+        span[_G + _OPACITY + j] += g_log
+        span[_G + _A0 + j] += g_sharpness * den
+    return sum_x, sum_y
+
+
+@kernel(fast=True)
+def pull_range(
+    first_tile: int,
+    end_tile: int,
+    params: np.ndarray,
+    boxes: np.ndarray,
+    skews: np.ndarray,
+    start: np.ndarray,
+    gaussian_ids: np.ndarray,
+    pair_slots: np.ndarray,
+    tiles_x: int,
+    shift: int,
+    cell_start: np.ndarray,
+    places: np.ndarray,
+    depths: np.ndarray,
+    weights: np.ndarray,
+    stops: np.ndarray,
+    pair_grads: np.ndarray,
+    grad_places: np.ndarray,
+) -> None:
+    """Write the gradient of ``sum weights * log T(depths)`` for the positions of tiles.
+
+    Parameters
+    ----------
+    depths, weights : (k,) float32
+    stops : (k,) int32
+        As :func:`query_kernel` wrote them.
+    pair_grads : (pairs, 13) float32
+        Zero; each pair adds up at its slot, cell after cell.
+    grad_places : (k, 2) float32
+    """
+    longest = 0
+    for tile in range(first_tile, end_tile):
+        if cell_start[tile << (2 * shift)] < cell_start[(tile + 1) << (2 * shift)]:
+            longest = max(longest, start[tile + 1] - start[tile])
+    room = (longest + _SPAN - 1) // _SPAN
+    spans = np.empty((room, _GRADIENT_COLUMNS * _SPAN), np.float32)
+    fronts = np.empty(room + 1, np.float32)
+    sharpest_a0 = np.empty(room + 1, np.float32)
+    pairs = np.empty(longest, np.int64)
+    for cell in range(first_tile << (2 * shift), end_tile << (2 * shift)):
+        idle = True
+        for p in range(cell_start[cell], cell_start[cell + 1]):
+            grad_places[p, 0] = ZERO
+            grad_places[p, 1] = ZERO
+            idle &= weights[p] == ZERO
+        if idle:
+            continue
+        total = fill_spans(
+            _GRADIENT_COLUMNS, cell, shift, tiles_x, params, boxes, skews, start, gaussian_ids,
+            spans, fronts, sharpest_a0, pairs,
+        )  # fmt: skip
+        for at in range((total + _SPAN - 1) // _SPAN):
+            spans[at, _G:] = ZERO
+        for p in range(cell_start[cell], cell_start[cell + 1]):
+            if weights[p] == ZERO:
+                continue
+            x, y, t = places[p, 0], places[p, 1], depths[p]
+            sum_x, sum_y = ZERO, ZERO
+            for at in range((total + _SPAN - 1) // _SPAN):
+                if fronts[at] >= t or at * _SPAN >= stops[p]:
+                    break
+                stop = np.float32(stops[p] - at * _SPAN)
+                g_x, g_y = _pull_span(spans[at], x, y, t, weights[p], stop)
+                sum_x += g_x
+                sum_y += g_y
+            grad_places[p, 0] = sum_x
+            grad_places[p, 1] = sum_y
+        for g in range(total):
+            out = pair_grads[pair_slots[pairs[g]]]
+            span = spans[g // _SPAN]
+            lane = g % _SPAN
+            for column in range(10):
+                out[column] += span[_G + column * _SPAN + lane]
+            out[10] += span[_G + _Z + lane] / span[_Z + lane]
+            out[11] += span[_G + _OPACITY + lane] / span[_OPACITY + lane]
+            out[12] += span[_G + _A0 + lane]
+
+
+@kernel(fast=False)
+def add_pair_gradients(
+    first: int, end: int, pair_grads: np.ndarray, pair_offsets: np.ndarray, grad_params: np.ndarray
+) -> None:
+    """Add the pairs of the Gaussians ``first .. end``, in the order of their slots."""
+    total = np.zeros(GEOMETRY, np.float32)
+    for i in range(first, end):
+        if pair_offsets[i] == pair_offsets[i + 1]:
+            continue
+        total[:] = ZERO
+        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
+            for column in range(GEOMETRY):
+                total[column] += pair_grads[slot, column]
+        for column in range(GEOMETRY):
+            grad_params[i, column] += total[column]
