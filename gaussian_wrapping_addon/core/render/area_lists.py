@@ -17,6 +17,7 @@ from ..compiled import kernel
 from ..errors import ResourceError
 from ..parallel import even_bounds, run_chunks
 from .projection import ScreenGaussians
+from .tile_kernels import radix_order
 
 TILE = tolerances.TILE_PX
 _MAX_PAIRS = 2**31 - 1
@@ -24,7 +25,7 @@ _MAX_PAIRS = 2**31 - 1
 PIXEL_MARGIN = 0.02
 SHARE_MARGIN = 1e-6
 _MAX_SHIFT = 2
-_POSITIONS_PER_CELL = 6
+_POSITIONS_PER_CELL = 14
 """Cells shrink while they still hold this many positions: each costs one walk of its tile's list,
 and shortens the list that its positions walk."""
 
@@ -74,8 +75,7 @@ def list_areas(screen: ScreenGaussians, width: int, height: int, threads: int) -
     """
     count = len(screen)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    visible = np.flatnonzero(screen.visible)
-    order = visible[np.argsort(screen.depths[visible], kind="stable")].astype(np.int32)
+    order = radix_order(screen.depths, screen.visible)
     pair_offsets = np.zeros(count + 1, np.int64)
     # Runs of the order are counted apart, so that each knows where it writes in every tile.
     bounds = even_bounds(len(order), threads, 1)

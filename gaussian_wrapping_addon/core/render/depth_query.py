@@ -23,7 +23,13 @@ from ..gaussians.model import OrientedGaussians
 from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
 from .area_lists import AreaLists, SortedPositions, list_areas, sort_positions
 from .blend import ScreenView
-from .depth_query_kernels import GEOMETRY, add_pair_gradients, pull_range, query_kernel
+from .depth_query_kernels import (
+    GEOMETRY,
+    add_pair_gradients,
+    pull_range,
+    query_kernel,
+    shrink_range,
+)
 from .projection import (
     RawArrays,
     RawGradients,
@@ -36,11 +42,10 @@ from .types import RenderOptions
 _FINE_SIDE_PX = 65536
 """Longer side of the screen that Gaussians are projected onto for queries. Projection drops those
 that lie between pixel centres; at this size that loses none that matters."""
-_LARGEST = float(np.finfo(np.float32).max)
 _DEEPEST = 1e18
 """Depths beyond this count as this; squares of it still fit a float32."""
-_CELL_COST = 256
-"""What a cell with positions costs besides its positions, in Gaussians walked."""
+_POSITION_COST = 256
+"""What a position costs besides the Gaussians that it walks, in Gaussians."""
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits")
 
 
@@ -208,8 +213,7 @@ def add_query_gradients(
             positions.places, result.at, weights, result.stops, pair_grads, grad_places,
         )  # fmt: skip
 
-    tile_costs = _cell_costs(view, positions).reshape(-1, 1 << (2 * positions.shift)).sum(1)
-    bounds = balanced_bounds(tile_costs, view.threads * CHUNKS_PER_THREAD)
+    bounds = balanced_bounds(_tile_costs(view, positions), view.threads * CHUNKS_PER_THREAD)
     run_chunks(run, bounds, view.threads)
 
     def combine(first: int, end: int) -> None:
@@ -344,22 +348,20 @@ def _project_finely(
     gaussians: RawArrays, camera: Camera, options: RenderOptions
 ) -> ScreenGaussians:
     """Project onto a finer screen, by a power of two, and bring the rows back to pixels."""
+    threads = options.threads or default_threads()
     scale = 1
     while scale * max(camera.width, camera.height) < _FINE_SIDE_PX:
         scale *= 2
     fine = camera.resized(camera.width * scale, camera.height * scale)
     screen = project_gaussians(gaussians, fine, options)
-    params, boxes = screen.params, screen.boxes
-    with np.errstate(over="ignore"):
-        params[:, 0:2] /= scale
-        params[:, 2:5] *= scale * scale
-        params[:, 5:7] *= scale
-        params[:, 7:10] *= scale * scale
-    boxes /= scale
-    screen.skews[:] /= scale
-    # What overflows in pixels would not have been visible on the screen itself.
-    sound = (np.abs(params[:, 2:10]) < _LARGEST).all(1)
-    return dataclasses.replace(screen, visible=screen.visible & sound)
+
+    def shrink(begin: int, end: int) -> None:
+        shrink_range(
+            begin, end, float(scale), screen.params, screen.boxes, screen.skews, screen.visible
+        )
+
+    run_chunks(shrink, even_bounds(len(screen), threads), threads)
+    return screen
 
 
 def _sorted(view: QueryView, positions: np.ndarray) -> SortedPositions:
@@ -371,17 +373,15 @@ def _sorted(view: QueryView, positions: np.ndarray) -> SortedPositions:
     return sort_positions(places, view.camera.width, view.camera.height)
 
 
-def _cell_costs(view: QueryView, positions: SortedPositions) -> np.ndarray:
-    """(cells,) about what each cell costs."""
-    lengths = np.repeat(np.diff(view.lists.start), 1 << (2 * positions.shift))
-    counts = np.diff(positions.start)
+def _tile_costs(view: QueryView, positions: SortedPositions) -> np.ndarray:
+    """(tiles,) about what the positions of each tile cost."""
+    lengths = np.diff(view.lists.start)
+    counts = np.diff(positions.start[:: 1 << (2 * positions.shift)])
     walked = lengths >> (2 * positions.shift)
-    return counts * (walked + _CELL_COST) + (counts > 0) * lengths
+    return counts * (walked + _POSITION_COST) + (counts > 0) * (lengths << positions.shift)
 
 
-def _query(
-    view: QueryView, positions: SortedPositions, at: np.ndarray, solve: bool
-) -> QueryResult:
+def _query(view: QueryView, positions: SortedPositions, at: np.ndarray, solve: bool) -> QueryResult:
     count = len(positions.order)
     found, slopes = np.zeros(count, np.float32), np.ones(count, np.float32)
     stops = np.zeros(count, np.int32)
@@ -395,7 +395,7 @@ def _query(
             positions.places, limit, at, found, slopes, stops,
         )  # fmt: skip
 
-    bounds = balanced_bounds(_cell_costs(view, positions), view.threads * CHUNKS_PER_THREAD)
+    bounds = balanced_bounds(_tile_costs(view, positions), view.threads * CHUNKS_PER_THREAD)
     run_chunks(run, bounds, view.threads)
     values = np.zeros(positions.given, np.float32)
     values[positions.order] = found

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..compiled import inline, kernel
-from .area_lists import TILE, strip_span
+from .area_lists import PIXEL_MARGIN, SHARE_MARGIN, TILE
 from .raster_math import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -27,17 +27,23 @@ from .raster_math import (
     HALF,
     ISO_LEVEL,
     ONE,
+    PREFETCH_AHEAD,
     TRANSMITTANCE_MIN,
     TWO,
     ZERO,
     exp_short,
     exp_wide,
 )
+from .vector_runs import lowest_bit, positive_run, prefetch_row
 
 GEOMETRY = 13
 """Leading columns of params that a ray's transmittance depends on."""
 
+_FIRST_QUADRATIC = 2
+"""Columns before this one are pixels; those up to 9 are per pixel, 5 and 6, or per its square."""
+
 _SPAN = 32
+_RUN = 16
 _INDEX = np.arange(_SPAN, dtype=np.float32)
 # Columns of a span: the Gaussians, ...
 _U, _V, _QA, _QB, _QC = 0, _SPAN, 2 * _SPAN, 3 * _SPAN, 4 * _SPAN
@@ -49,6 +55,13 @@ _FORWARD_COLUMNS = 16
 # ... and the gradients on them.
 _G = 13 * _SPAN
 _GRADIENT_COLUMNS = 2 * GEOMETRY
+# Columns of a span of a tile: the Gaussians, where they begin in depth, and their ellipses.
+_FRONT, _CENTER_X, _CENTER_Y, _SKEW = 13 * _SPAN, 14 * _SPAN, 15 * _SPAN, 16 * _SPAN
+_EXTREME, _INVERSE, _ACROSS, _MARGIN = 17 * _SPAN, 18 * _SPAN, 19 * _SPAN, 20 * _SPAN
+_TOUCHED = 21 * _SPAN
+_TILE_COLUMNS = 22
+_FLOAT_MARGIN = np.float32(4e-6)
+"""Several roundings of a float32, in shares of what is rounded."""
 
 # Converged: a Newton step below this share of the thinnest Gaussian's sigma along the ray, where
 # the slope can be extrapolated from the last step or need not be ...
@@ -74,10 +87,37 @@ _TINY = np.float32(1e-30)
 
 
 @kernel(fast=False)
-def fill_spans(
-    columns: int,
-    cell: int,
-    shift: int,
+def shrink_range(
+    begin: int,
+    end: int,
+    scale: float,
+    params: np.ndarray,
+    boxes: np.ndarray,
+    skews: np.ndarray,
+    visible: np.ndarray,
+) -> None:
+    """Turn the rows ``begin .. end`` of a screen ``scale`` times as fine into pixels.
+
+    Rows that overflow are hidden: they would not have been visible on the coarser screen.
+    """
+    shrink, square = np.float32(1.0 / scale), np.float32(scale * scale)
+    grow = np.float32(scale)
+    for i in range(begin, end):
+        if not visible[i]:
+            continue
+        for column in range(_FIRST_QUADRATIC):
+            params[i, column] *= shrink
+        for column in range(_FIRST_QUADRATIC, 10):
+            params[i, column] *= grow if 5 <= column <= 6 else square
+            visible[i] &= abs(params[i, column]) < FAR
+        for column in range(4):
+            boxes[i, column] *= shrink
+        skews[i] *= shrink
+
+
+@kernel(fast=False)
+def fill_tile(
+    tile: int,
     tiles_x: int,
     params: np.ndarray,
     boxes: np.ndarray,
@@ -85,16 +125,88 @@ def fill_spans(
     start: np.ndarray,
     gaussian_ids: np.ndarray,
     spans: np.ndarray,
+) -> None:
+    """Lay out the Gaussians of a tile and their ellipses in ``spans (s, 22 * 32) float32``."""
+    left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
+    count = start[tile + 1] - start[tile]
+    for k in range(count):
+        ahead = start[tile] + min(k + PREFETCH_AHEAD, count - 1)
+        prefetch_row(params, np.int64(gaussian_ids[ahead]))
+        i = gaussian_ids[start[tile] + k]
+        span = spans[k // _SPAN]
+        lane = k % _SPAN
+        for column in range(GEOMETRY):
+            span[column * _SPAN + lane] = params[i, column]
+        span[_FRONT + lane] = params[i, 10] - FRONT_SIGMAS * params[i, 22]
+        half_x = 0.5 * (np.float64(boxes[i, 2]) - np.float64(boxes[i, 0]))
+        half_y = 0.5 * (np.float64(boxes[i, 3]) - np.float64(boxes[i, 1]))
+        skew = np.float64(skews[i])
+        if math.isinf(skew) or not (half_x > 0.0 and half_y > 0.0):
+            # No ellipse that could rule a cell out.
+            span[_CENTER_X + lane] = span[_CENTER_Y + lane] = span[_SKEW + lane] = ZERO
+            span[_EXTREME + lane] = span[_INVERSE + lane] = ZERO
+            span[_ACROSS + lane] = FAR
+            continue
+        center_x = 0.5 * (np.float64(boxes[i, 2]) + np.float64(boxes[i, 0])) - left
+        across = math.sqrt(max(half_x * half_x * (1.0 + SHARE_MARGIN) - skew * skew, 0.0))
+        span[_CENTER_X + lane] = center_x
+        span[_CENTER_Y + lane] = 0.5 * (np.float64(boxes[i, 3]) + np.float64(boxes[i, 1])) - top
+        span[_SKEW + lane] = skew
+        span[_EXTREME + lane] = skew / half_x
+        span[_INVERSE + lane] = 1.0 / half_y
+        # The reach of an ellipse counts its margins, so that rounding rules nothing out.
+        span[_ACROSS + lane] = across
+        span[_MARGIN + lane] = PIXEL_MARGIN + _FLOAT_MARGIN * (half_x + abs(center_x))
+    for k in range(count, (count + _SPAN - 1) // _SPAN * _SPAN):
+        span = spans[k // _SPAN]
+        for column in range(_TILE_COLUMNS):
+            span[column * _SPAN + k % _SPAN] = ZERO
+        span[_FRONT + k % _SPAN] = FAR
+        span[_CENTER_X + k % _SPAN] = -FAR
+
+
+@inline
+def _touch(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
+    """Mark by 1 the ellipses of a span that reach a rectangle, see ``area_lists.strip_span``."""
+    for j in range(_SPAN):
+        inverse, center_y = span[_INVERSE + j], span[_CENTER_Y + j]
+        first = max((y0 - center_y) * inverse - _FLOAT_MARGIN, -ONE)
+        last = min((y1 - center_y) * inverse + _FLOAT_MARGIN, ONE)
+        extreme, skew, across = span[_EXTREME + j], span[_SKEW + j], span[_ACROSS + j]
+        t = min(max(extreme, first), last)
+        right = skew * t + across * math.sqrt(max(ONE - t * t, ZERO))
+        t = min(max(-extreme, first), last)
+        left = skew * t - across * math.sqrt(max(ONE - t * t, ZERO))
+        center_x, margin = span[_CENTER_X + j], span[_MARGIN + j]
+        touched = (first <= last) & (center_x + right + margin >= x0)
+        touched = touched & (center_x + left - margin <= x1)
+        span[_TOUCHED + j] = ONE if touched else ZERO
+
+
+@kernel(fast=True)
+def fill_cell(
+    columns: int,
+    part: int,
+    shift: int,
+    count: int,
+    tile_spans: np.ndarray,
+    spans: np.ndarray,
     fronts: np.ndarray,
     sharpest: np.ndarray,
-    pairs: np.ndarray,
+    members: np.ndarray,
 ) -> int:
-    """Lay out the Gaussians that reach a cell, in the order of its tile; return their number.
+    """Lay out those Gaussians of a tile that reach one of its cells; return their number.
 
     Parameters
     ----------
     columns : int
-        Columns per span.
+        Columns of ``spans``.
+    part : int
+        Number of the cell within its tile.
+    count : int
+        Gaussians of the tile.
+    tile_spans : (t, 22 * 32) float32
+        From :func:`fill_tile`.
     spans : (s, columns * 32) float32
         The last span is filled up with Gaussians of no opacity.
     fronts : (s + 1,) float32
@@ -102,48 +214,59 @@ def fill_spans(
         worth counting.
     sharpest : (s + 1,) float32
         Receives the largest a0 of this span and the later ones.
-    pairs : (g,) int64
-        Receives the pair of each Gaussian.
+    members : (g,) int64
+        Receives the place of each Gaussian in the tile's list.
     """
-    tile = cell >> (2 * shift)
-    part = cell & ((1 << (2 * shift)) - 1)
     cell_px = TILE >> shift
-    x0 = tile % tiles_x * TILE + (part & ((1 << shift) - 1)) * cell_px
-    y0 = tile // tiles_x * TILE + (part >> shift) * cell_px
-    x1, y1 = x0 + cell_px, y0 + cell_px
-    count = 0
-    for k in range(start[tile], start[tile + 1]):
-        i = gaussian_ids[k]
+    margin = np.float32(PIXEL_MARGIN)
+    x0 = np.float32((part & ((1 << shift) - 1)) * cell_px)
+    y0 = np.float32((part >> shift) * cell_px)
+    x1, y1 = x0 + np.float32(cell_px), y0 + np.float32(cell_px)
+    total: Any = 0
+    for at in range((count + _SPAN - 1) // _SPAN):
+        source = tile_spans[at]
         if shift > 0:
-            if boxes[i, 0] > x1 or boxes[i, 2] < x0 or boxes[i, 1] > y1 or boxes[i, 3] < y0:
-                continue
-            left, right = strip_span(
-                float(boxes[i, 0]), float(boxes[i, 1]), float(boxes[i, 2]), float(boxes[i, 3]),
-                float(skews[i]), float(y0), float(y1),
-            )  # fmt: skip
-            if left > x1 or right < x0:
-                continue
-        span = spans[count // _SPAN]
-        lane = count % _SPAN
-        for column in range(GEOMETRY):
-            span[column * _SPAN + lane] = params[i, column]
-        front = params[i, 10] - FRONT_SIGMAS * params[i, 22]
-        at = count // _SPAN
-        fronts[at] = front if lane == 0 else min(fronts[at], front)
-        sharpest[at] = params[i, 12] if lane == 0 else max(sharpest[at], params[i, 12])
-        pairs[count] = k
-        count += 1
-    last = (count + _SPAN - 1) // _SPAN
-    for lane in range(count, last * _SPAN):
-        span = spans[last - 1]
-        for column in range(GEOMETRY):
-            span[column * _SPAN + lane % _SPAN] = ZERO
+            _touch(source, x0, y0 - margin, x1, y1 + margin)
+        else:
+            for j in range(_SPAN):
+                source[_TOUCHED + j] = ONE if at * _SPAN + j < count else ZERO
+        for run in range(0, _SPAN, _RUN):
+            hits = positive_run(_RUN, source, _TOUCHED + run)
+            while hits != np.uint64(0):
+                j = run + np.int64(lowest_bit(hits))
+                hits &= hits - np.uint64(1)
+                target = spans[total // _SPAN]
+                lane = total % _SPAN
+                for column in range(GEOMETRY):
+                    target[column * _SPAN + lane] = source[column * _SPAN + j]
+                front, a0 = source[_FRONT + j], source[_A0 + j]
+                to = total // _SPAN
+                fronts[to] = front if lane == 0 else min(fronts[to], front)
+                sharpest[to] = a0 if lane == 0 else max(sharpest[to], a0)
+                members[total] = at * _SPAN + j
+                total += 1
+    last = (total + _SPAN - 1) // _SPAN
+    for k in range(total, last * _SPAN):
+        for column in range(columns):
+            spans[last - 1, column * _SPAN + k % _SPAN] = ZERO
     fronts[last] = FAR
     sharpest[last] = ZERO
     for at in range(last - 1, -1, -1):
         fronts[at] = min(fronts[at], fronts[at + 1])
         sharpest[at] = max(sharpest[at], sharpest[at + 1])
-    return count
+    return total
+
+
+@kernel(fast=False)
+def longest_list(
+    first_tile: int, end_tile: int, start: np.ndarray, shift: int, cell_start: np.ndarray
+) -> int:
+    """Return the length of the longest list of those tiles that hold positions."""
+    longest = 0
+    for tile in range(first_tile, end_tile):
+        if cell_start[tile << (2 * shift)] < cell_start[(tile + 1) << (2 * shift)]:
+            longest = max(longest, start[tile + 1] - start[tile])
+    return longest
 
 
 @inline
@@ -254,8 +377,8 @@ def query_kernel(solve: bool) -> Any:
 
     @kernel(fast=True)
     def query_range(
-        first_cell: int,
-        end_cell: int,
+        first_tile: int,
+        end_tile: int,
         params: np.ndarray,
         boxes: np.ndarray,
         skews: np.ndarray,
@@ -271,31 +394,34 @@ def query_kernel(solve: bool) -> Any:
         slopes: np.ndarray,
         stops: np.ndarray,
     ) -> None:
-        """Answer the positions of cells: write ``values`` and ``slopes``, read ``depths``.
+        """Answer the positions of tiles: write ``values`` and ``slopes``, read ``depths``.
 
         ``depths (k,)`` is what is written where the depth is solved. ``stops (k,) int32`` receives
         the number of Gaussians of the cell's list that come before the light is used up.
         """
-        longest = 0
-        for cell in range(first_cell, end_cell):
-            if cell_start[cell] < cell_start[cell + 1]:
-                tile = cell >> (2 * shift)
-                longest = max(longest, start[tile + 1] - start[tile])
+        longest = longest_list(first_tile, end_tile, start, shift, cell_start)
         room = (longest + _SPAN - 1) // _SPAN
+        tile_spans = np.empty((room, _TILE_COLUMNS * _SPAN), np.float32)
         spans = np.empty((room, _FORWARD_COLUMNS * _SPAN), np.float32)
         fronts = np.empty(room + 1, np.float32)
         sharpest_a0 = np.empty(room + 1, np.float32)
-        pairs = np.empty(longest, np.int64)
-        alphas = np.empty((room + 1) * _SPAN, np.float32)
-        peaks = np.empty((room + 1) * _SPAN, np.float32)
-        sharpnesses = np.empty((room + 1) * _SPAN, np.float32)
-        indices = np.empty((room + 1) * _SPAN, np.int32)
-        for cell in range(first_cell, end_cell):
+        members = np.empty(longest, np.int64)
+        alphas = np.empty(room * _SPAN, np.float32)
+        peaks = np.empty(room * _SPAN, np.float32)
+        sharpnesses = np.empty(room * _SPAN, np.float32)
+        filled = -1
+        for cell in range(first_tile << (2 * shift), end_tile << (2 * shift)):
             if cell_start[cell] == cell_start[cell + 1]:
                 continue
-            total = fill_spans(
-                _FORWARD_COLUMNS, cell, shift, tiles_x, params, boxes, skews, start,
-                gaussian_ids, spans, fronts, sharpest_a0, pairs,
+            tile = cell >> (2 * shift)
+            if tile != filled:
+                fill_tile(
+                    tile, tiles_x, params, boxes, skews, start, gaussian_ids, tile_spans
+                )  # fmt: skip
+                filled = tile
+            total = fill_cell(
+                _FORWARD_COLUMNS, cell & ((1 << (2 * shift)) - 1), shift,
+                start[tile + 1] - start[tile], tile_spans, spans, fronts, sharpest_a0, members,
             )  # fmt: skip
             for p in range(cell_start[cell], cell_start[cell + 1]):
                 x, y = places[p, 0], places[p, 1]
@@ -314,32 +440,34 @@ def query_kernel(solve: bool) -> Any:
                         break
                     span = spans[at]
                     _cast(span, x, y)
-                    first = count
-                    for j in range(_SPAN):
-                        raw = span[_RAW + j]
-                        alphas[count] = raw
-                        peaks[count] = span[_PEAK + j]
-                        sharpnesses[count] = span[_SHARPNESS + j]
-                        indices[count] = at * _SPAN + j
-                        count += 1 if raw > ZERO else 0
-                    for c in range(first, count):
-                        before = through
-                        through -= min(alphas[c], ALPHA_MAX) * through
-                        if solve and before > ISO_LEVEL:
-                            high = max(high, peaks[c])
-                            if through <= ISO_LEVEL:
-                                before_crossing, crossing = before, c
-                        if through < TRANSMITTANCE_MIN:
-                            count = c + 1
-                            stop = indices[c] + 1
+                    spent = False
+                    for run in range(0, _SPAN, _RUN):
+                        hits = positive_run(_RUN, span, _RAW + run)
+                        while hits != np.uint64(0):
+                            j = run + np.int64(lowest_bit(hits))
+                            hits &= hits - np.uint64(1)
+                            raw, peak = span[_RAW + j], span[_PEAK + j]
+                            alphas[count] = raw
+                            peaks[count] = peak
+                            sharpnesses[count] = span[_SHARPNESS + j]
+                            before = through
+                            through -= min(raw, ALPHA_MAX) * through
+                            if solve and before > ISO_LEVEL:
+                                high = max(high, peak)
+                                if through <= ISO_LEVEL:
+                                    before_crossing, crossing = before, count
+                            count += 1
+                            if through < TRANSMITTANCE_MIN:
+                                stop = at * _SPAN + j + 1
+                                spent = True
+                                break
+                        if spent:
                             break
-                    if through < TRANSMITTANCE_MIN:
+                    if spent:
                         break
                 stops[p] = stop
                 if not solve:
-                    values[p], slopes[p] = _evaluate(
-                        True, count, end, alphas, peaks, sharpnesses
-                    )
+                    values[p], slopes[p] = _evaluate(True, count, end, alphas, peaks, sharpnesses)
                     continue
                 values[p], slopes[p] = ZERO, ONE
                 if not (before_crossing > ZERO and through <= limit and through < ISO_LEVEL):
@@ -356,9 +484,11 @@ def query_kernel(solve: bool) -> Any:
                     peaks[kept] = peak
                     sharpnesses[kept] = sharpness
                     kept += 1 if sharpness * beyond * beyond < _NEGLIGIBLE else 0
-                product, _ = _evaluate(False, kept, ZERO, alphas, peaks, sharpnesses)
-                if product <= ISO_LEVEL:
-                    continue
+                if fronts[0] <= ZERO:
+                    # Some Gaussian may reach the camera: light must pass at depth 0.
+                    product, _ = _evaluate(False, kept, ZERO, alphas, peaks, sharpnesses)
+                    if product <= ISO_LEVEL:
+                        continue
                 # Alone, the Gaussian at the crossing lets 0.5 through where exp(-s d^2 / 2) = ratio.
                 light = min(alphas[crossing], ALPHA_MAX) * before_crossing
                 ratio = min(max((before_crossing - ISO_LEVEL) / max(light, _TINY), ZERO), ONE)
@@ -373,9 +503,7 @@ def query_kernel(solve: bool) -> Any:
                 )  # fmt: skip
                 # What lies behind only counts where it may be thin enough to raise the floor.
                 if slope < SLOPE_FLOOR * math.sqrt(sharpest_a0[behind] * _DENOMINATORS):
-                    sharpest = max(
-                        sharpest, _sharpest_behind(behind, total, spans, x, y, through)
-                    )
+                    sharpest = max(sharpest, _sharpest_behind(behind, total, spans, x, y, through))
                 values[p] = t
                 slopes[p] = max(slope, SLOPE_FLOOR * math.sqrt(max(sharpest, _TINY)))
 
@@ -464,15 +592,14 @@ def pull_range(
         Zero; each pair adds up at its slot, cell after cell.
     grad_places : (k, 2) float32
     """
-    longest = 0
-    for tile in range(first_tile, end_tile):
-        if cell_start[tile << (2 * shift)] < cell_start[(tile + 1) << (2 * shift)]:
-            longest = max(longest, start[tile + 1] - start[tile])
+    longest = longest_list(first_tile, end_tile, start, shift, cell_start)
     room = (longest + _SPAN - 1) // _SPAN
+    tile_spans = np.empty((room, _TILE_COLUMNS * _SPAN), np.float32)
     spans = np.empty((room, _GRADIENT_COLUMNS * _SPAN), np.float32)
     fronts = np.empty(room + 1, np.float32)
     sharpest_a0 = np.empty(room + 1, np.float32)
-    pairs = np.empty(longest, np.int64)
+    members = np.empty(longest, np.int64)
+    filled = -1
     for cell in range(first_tile << (2 * shift), end_tile << (2 * shift)):
         idle = True
         for p in range(cell_start[cell], cell_start[cell + 1]):
@@ -481,12 +608,17 @@ def pull_range(
             idle &= weights[p] == ZERO
         if idle:
             continue
-        total = fill_spans(
-            _GRADIENT_COLUMNS, cell, shift, tiles_x, params, boxes, skews, start, gaussian_ids,
-            spans, fronts, sharpest_a0, pairs,
+        tile = cell >> (2 * shift)
+        if tile != filled:
+            fill_tile(tile, tiles_x, params, boxes, skews, start, gaussian_ids, tile_spans)
+            filled = tile
+        total = fill_cell(
+            _GRADIENT_COLUMNS, cell & ((1 << (2 * shift)) - 1), shift,
+            start[tile + 1] - start[tile], tile_spans, spans, fronts, sharpest_a0, members,
         )  # fmt: skip
         for at in range((total + _SPAN - 1) // _SPAN):
             spans[at, _G:] = ZERO
+        reached = 0
         for p in range(cell_start[cell], cell_start[cell + 1]):
             if weights[p] == ZERO:
                 continue
@@ -496,13 +628,14 @@ def pull_range(
                 if fronts[at] >= t or at * _SPAN >= stops[p]:
                     break
                 stop = np.float32(stops[p] - at * _SPAN)
+                reached = max(reached, at + 1)
                 g_x, g_y = _pull_span(spans[at], x, y, t, weights[p], stop)
                 sum_x += g_x
                 sum_y += g_y
             grad_places[p, 0] = sum_x
             grad_places[p, 1] = sum_y
-        for g in range(total):
-            out = pair_grads[pair_slots[pairs[g]]]
+        for g in range(min(total, reached * _SPAN)):
+            out = pair_grads[pair_slots[start[tile] + members[g]]]
             span = spans[g // _SPAN]
             lane = g % _SPAN
             for column in range(10):
