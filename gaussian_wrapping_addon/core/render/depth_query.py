@@ -331,11 +331,16 @@ class _Query(torch.autograd.Function):
         on_positions, on_depths = add_query_gradients(
             view, ctx.result, grad.detach().numpy(), grad_params
         )
-        raw = RawGradients.zeros(view.gaussians)
-        project_backward(view.gaussians, view.camera, view.options, view.screen, grad_params, raw)
+        on_gaussians: list[Tensor | None] = [None] * len(_TRAINED)
+        if any(ctx.needs_input_grad[: len(_TRAINED)]):
+            raw = RawGradients.zeros(view.gaussians)
+            project_backward(
+                view.gaussians, view.camera, view.options, view.screen, grad_params, raw
+            )
+            on_gaussians = [torch.from_numpy(getattr(raw, name)) for name in _TRAINED]
         of_positions, of_depths = ctx.types
         return (
-            *(torch.from_numpy(getattr(raw, name)) for name in _TRAINED),
+            *on_gaussians,
             torch.from_numpy(on_positions).to(of_positions),
             None if of_depths is None else torch.from_numpy(on_depths).to(of_depths),
             None,

@@ -144,18 +144,17 @@ def fill_tile(
         if math.isinf(skew) or not (half_x > 0.0 and half_y > 0.0):
             # No ellipse that could rule a cell out.
             span[_CENTER_X + lane] = span[_CENTER_Y + lane] = span[_SKEW + lane] = ZERO
-            span[_EXTREME + lane] = span[_INVERSE + lane] = ZERO
+            span[_EXTREME + lane] = span[_INVERSE + lane] = span[_MARGIN + lane] = ZERO
             span[_ACROSS + lane] = FAR
             continue
-        center_x = 0.5 * (np.float64(boxes[i, 2]) + np.float64(boxes[i, 0])) - left
-        across = math.sqrt(max(half_x * half_x * (1.0 + SHARE_MARGIN) - skew * skew, 0.0))
+        center_x: Any = 0.5 * (np.float64(boxes[i, 2]) + np.float64(boxes[i, 0])) - left
+        across: Any = max(half_x * half_x * (1.0 + SHARE_MARGIN) - skew * skew, 0.0)
         span[_CENTER_X + lane] = center_x
         span[_CENTER_Y + lane] = 0.5 * (np.float64(boxes[i, 3]) + np.float64(boxes[i, 1])) - top
         span[_SKEW + lane] = skew
         span[_EXTREME + lane] = skew / half_x
         span[_INVERSE + lane] = 1.0 / half_y
-        # The reach of an ellipse counts its margins, so that rounding rules nothing out.
-        span[_ACROSS + lane] = across
+        span[_ACROSS + lane] = math.sqrt(across)
         span[_MARGIN + lane] = PIXEL_MARGIN + _FLOAT_MARGIN * (half_x + abs(center_x))
     for k in range(count, (count + _SPAN - 1) // _SPAN * _SPAN):
         span = spans[k // _SPAN]
@@ -228,8 +227,8 @@ def fill_cell(
         if shift > 0:
             _touch(source, x0, y0 - margin, x1, y1 + margin)
         else:
-            for j in range(_SPAN):
-                source[_TOUCHED + j] = ONE if at * _SPAN + j < count else ZERO
+            for lane in range(_SPAN):
+                source[_TOUCHED + lane] = ONE if at * _SPAN + lane < count else ZERO
         for run in range(0, _SPAN, _RUN):
             hits = positive_run(_RUN, source, _TOUCHED + run)
             while hits != np.uint64(0):
@@ -489,7 +488,7 @@ def query_kernel(solve: bool) -> Any:
                     product, _ = _evaluate(False, kept, ZERO, alphas, peaks, sharpnesses)
                     if product <= ISO_LEVEL:
                         continue
-                # Alone, the Gaussian at the crossing lets 0.5 through where exp(-s d^2 / 2) = ratio.
+                # Alone, the Gaussian at the crossing lets 0.5 through where its fall-off is ratio.
                 light = min(alphas[crossing], ALPHA_MAX) * before_crossing
                 ratio = min(max((before_crossing - ISO_LEVEL) / max(light, _TINY), ZERO), ONE)
                 log_ratio = math.log(max(ratio, _TINY))
