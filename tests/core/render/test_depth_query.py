@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import platform
 
+import llvmlite.binding
 import numpy as np
 import pytest
 import torch
@@ -33,6 +35,7 @@ from gaussian_wrapping_addon.core.render.depth_query import (
     query_view_of,
     solve_depths,
 )
+from gaussian_wrapping_addon.core.render.depth_query_kernels import pull_range, query_kernel
 from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     RawGradients,
@@ -46,6 +49,7 @@ from gaussian_wrapping_addon.core.render.render import project_view, render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 
 from .scenes import isotropic, look_at, random_gaussians
+from .test_vectorised import fused_instructions
 
 SHAPES = ("means", "log_scales", "quats", "opacity_logits")
 EYE = (2.2, 1.0, 0.8)
@@ -530,6 +534,20 @@ def test_area_lists_hold_every_gaussian_that_reaches_a_tile() -> None:
     other = list_areas(view.screen, camera.width, camera.height, 3)
     for field in dataclasses.fields(lists):
         assert np.array_equal(getattr(lists, field.name), getattr(other, field.name)), field.name
+
+
+def test_queries_use_packed_arithmetic() -> None:
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        pytest.skip("packed FMA is looked for in x86 code")
+    if not llvmlite.binding.get_host_cpu_features().get("fma"):
+        pytest.skip("this processor has no FMA instructions")
+    gaussians, camera = scene("generic")
+    leaf = leaves(gaussians, torch.float32)
+    query_depth(leaf, camera, torch.full((1, 2), 20.0)).sum().backward()
+    for kernel, least in ((query_kernel(True), 30), (pull_range, 40)):
+        packed, single = fused_instructions(kernel)
+        assert packed >= least
+        assert single < packed
 
 
 def floats(low: float, high: float, shape: tuple[int, ...]) -> st.SearchStrategy[np.ndarray]:
