@@ -64,12 +64,12 @@ class Evaluations:
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
-def _span(q: Any, x0: float, y: float, columns: int) -> Any:
+def _span(q: Any, limit: float, x0: float, y: float, columns: int) -> Any:
     """Return first and last of the ``columns`` pixels from ``x0`` on whose alpha is 1/255 or more.
 
-    ``alpha >= 1/255`` is ``num <= limit den``, a quadratic in the pixel's x.
+    ``alpha >= 1/255`` is ``num <= limit den``, a quadratic in the pixel's x, with the ``limit``
+    2 ln(255 opacity).
     """
-    limit = 2.0 * math.log(q[11] * 255.0)
     dy = y - q[1]
     a = q[2] - limit * q[7]
     b = (q[3] - limit * q[8]) * dy - 2.0 * limit * q[5]
@@ -108,10 +108,11 @@ def _reached_rows(
         for k in range(start[tile], start[tile + 1]):
             for column in range(13):
                 q[column] = params[ids[k], column]
+            limit = 2.0 * math.log(q[11] * 255.0)
             rows[k, 0], rows[k, 1] = 1, 0
             found = False
             for row in range(min(height - top, _TILE)):
-                first, last = _span(q, float(left), top + row + 0.5, columns)
+                first, last = _span(q, limit, float(left), top + row + 0.5, columns)
                 if first <= last:
                     if not found:
                         rows[k, 0] = row
@@ -183,6 +184,7 @@ def _count(
             i = ids[k]
             for column in range(13):
                 q[column] = params[i, column]
+            limit = 2.0 * math.log(q[11] * 255.0)
             first_half = max(ranges[i, 2] - left, 0) // 8
             last_half = min(ranges[i, 3] - left, _TILE - 1) // 8
             blocks, flat_blocks = 0, 0
@@ -192,7 +194,7 @@ def _count(
                 totals[_ROWS_16] += 16
                 totals[_HALVES_8] += 8 * (last_half - first_half + 1)
                 y = top + row + 0.5
-                first, last = _span(q, float(left), y, columns)
+                first, last = _span(q, limit, float(left), y, columns)
                 if first > last:
                     continue
                 totals[_RUNS_8] += 8 * (last // 8 - first // 8 + 1)
