@@ -22,7 +22,6 @@ from gaussian_wrapping_addon.core.render.projection import (
 from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
 from gaussian_wrapping_addon.core.render.render import project_view, render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
-from gaussian_wrapping_addon.core.training.losses import color_loss, normal_losses
 
 from .exact import as_float64, exact_images
 from .exact_gradients import TRAINED
@@ -36,6 +35,7 @@ from .scene_errors import (
     scene_errors,
 )
 from .tables import Cell, Table
+from .training_step import loss_gradients, noisy_photo
 from .workload import surface_gaussians, view
 
 _GROUPS = {
@@ -49,12 +49,32 @@ _GROUPS = {
     "features": slice(13, 22),
 }
 _TARGET = 1e-4
+_IMAGE_NOTE = (
+    "Largest absolute error of colour, normals and alpha; *off*: pixels where it exceeds 1e-5, "
+    "because rounding decided a threshold (alpha >= 1/255, T >= 1e-4) the other way. Depth: pixels "
+    "that have one in float64, pixels where only one of the two has, share of the others whose "
+    "relative error against the bisection is below 1e-5, and the largest. *Step x slope*: the last "
+    "bit of a float32 depth times -d(log T)/dt at the crossing, in the median; where it nears 1, "
+    "float32 cannot hold the depth to within the thickness of the Gaussians, and the depth's "
+    "gradient, which is taken at the rounded depth, is lost."
+)
+_BACKWARD_NOTE = (
+    "Blending and depth: autograd of the torch reference on the same float32 rows of params. "
+    "Projection (with harmonics and mip filter): autograd of the reference projection. Losses: the "
+    "same formula in float64."
+)
 
 
 def generic(count: int, seed: int) -> OrientedGaussians:
     """Return the workload's Gaussians with a mip filter of about their thickness."""
     gaussians = surface_gaussians(count, seed)
     return gaussians.replaced(filter_3d=torch.full((count,), 0.003))
+
+
+def covering(count: int, seed: int) -> OrientedGaussians:
+    """Return the same, but large enough for about 1500 to cover the image."""
+    gaussians = generic(count, seed)
+    return gaussians.replaced(log_scales=gaussians.log_scales + 1.3)
 
 
 def generic_errors(sizes: list[tuple[int, int, int]], seed: int) -> list[SceneErrors]:
@@ -119,16 +139,7 @@ def image_table(errors: list[SceneErrors]) -> Table:
             "step x slope",
         ),
         rows,
-        (
-            "Largest absolute error of colour, normals and alpha; *off*: pixels where it exceeds "
-            "1e-5, because rounding decided a threshold (alpha >= 1/255, T >= 1e-4) the other "
-            "way. Depth: pixels that have one in float64, pixels where only one of the two has, "
-            "share of the others whose relative error against the bisection is below 1e-5, and "
-            "the largest. *Step x slope*: the last bit of a float32 depth times -d(log T)/dt at "
-            "the crossing, in the median; where it nears 1, float32 cannot hold the depth to "
-            "within the thickness of the Gaussians, and the depth's gradient, which is taken at "
-            "the rounded depth, is lost.",
-        ),
+        (_IMAGE_NOTE,),
     )
 
 
@@ -173,9 +184,7 @@ def gradient_tables(generic: list[SceneErrors], hard: list[SceneErrors]) -> list
 def backward_table(seed: int) -> Table:
     """Return the error of every hand-written backward alone, fed with the same float32 values."""
     rows: list[tuple[Cell, ...]] = []
-    # Large enough to cover the image, so that the depth has normals.
-    gaussians = generic(1500, seed)
-    gaussians = gaussians.replaced(log_scales=gaussians.log_scales + 1.3)
+    gaussians = covering(1500, seed)
     # No 8-bit value: a pixel that equals the photo has no L1 gradient.
     camera, options = view(60, 44), RenderOptions(background=(0.201, 0.502, 0.103))
     rows += _blending_rows(gaussians, camera, options, seed)
@@ -185,12 +194,7 @@ def backward_table(seed: int) -> Table:
         "Each hand-written backward alone, float32 against float64",
         ("backward", "gradient on", "L2-relative", "largest"),
         rows,
-        (
-            f"1500 Gaussians, {camera.width} x {camera.height}. Blending and depth: autograd of "
-            "the torch reference on the same float32 rows of params. Projection (with harmonics "
-            "and mip filter): autograd of the reference projection. Losses: the same formula in "
-            "float64.",
-        ),
+        (f"{len(gaussians)} Gaussians, {camera.width} x {camera.height}. {_BACKWARD_NOTE}",),
     )
 
 
@@ -263,25 +267,10 @@ def _loss_rows(
 ) -> list[tuple[Cell, ...]]:
     with torch.no_grad():
         out = render(gaussians, camera, options)
-    random = np.random.default_rng(seed)
-    photo = (out.color.numpy() + random.normal(scale=0.1, size=out.color.shape)).clip(0.0, 1.0)
-    photo = (255.0 * photo).astype(np.uint8)
-    names = ("depth", "geometric_normal", "normal", "alpha")
-
-    def gradients(dtype: torch.dtype) -> list[torch.Tensor]:
-        image = out.color.to(dtype).requires_grad_()
-        parts = [getattr(out, name).to(dtype).requires_grad_() for name in names]
-        color = color_loss(image, photo)[0]
-        normals = normal_losses(*parts, camera)[0]
-        return [
-            *torch.autograd.grad(color, [image]),
-            *torch.autograd.grad(normals, parts),
-        ]
-
-    labels = [("L1 + SSIM", "colour"), *(("normal losses", name) for name in names)]
+    photo = noisy_photo(out.color.numpy(), seed)
+    found = loss_gradients(out, camera, photo, torch.float32)
     rows: list[tuple[Cell, ...]] = []
-    pairs = zip(gradients(torch.float32), gradients(torch.float64), strict=True)
-    for (name, group), (found, wanted) in zip(labels, pairs, strict=True):
-        error = gradient_error(found, wanted)
+    for (name, group), wanted in loss_gradients(out, camera, photo, torch.float64).items():
+        error = gradient_error(found[name, group], wanted)
         rows.append((name, group, error.l2, error.largest))
     return rows

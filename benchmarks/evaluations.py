@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.parallel import run_chunks
+from gaussian_wrapping_addon.core.parallel import default_threads, even_bounds, run_chunks
 from gaussian_wrapping_addon.core.render.blend import ScreenView
 
 _TILE = tolerances.TILE_PX
@@ -25,7 +25,7 @@ _LIVENESS_EVERY = 16
 _ALPHA_MIN, _ALPHA_MAX = tolerances.ALPHA_MIN, tolerances.ALPHA_MAX
 _T_MIN = tolerances.TRANSMITTANCE_MIN
 # Columns of the counts.
-_ROWS_16, _HALVES_8, _RUNS_8, _BLOCKS_4X4, _BLOCKS_8X2, _INSIDE, _USEFUL, _OWN = range(8)
+_ROWS_16, _HALVES_8, _RUNS_8, _BLOCKS_4X4, _BLOCKS_4X2, _INSIDE, _USEFUL, _OWN = range(8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,24 +43,14 @@ class Evaluations:
     """In each row, the halves that hold a pixel inside the ellipse."""
     blocks_4x4: int
     """Blocks of 4 x 4 pixels that hold a pixel inside."""
-    blocks_8x2: int
-    """Blocks of 8 x 2 pixels that hold a pixel inside."""
+    blocks_4x2: int
+    """Blocks 4 pixels wide and 2 high that hold a pixel inside."""
     inside: int
     """Pixels inside the ellipse: no culling can do with less."""
     useful: int
     """Pixels with ``alpha >= 1/255`` and ``T >= 1e-4``."""
-    own_16: int
-    """What the kernels evaluate with runs of 16 pixels, from the view's own masks."""
-    own_8: int
-    """What the kernels evaluate with runs of 8 pixels, from the view's own masks."""
-
-    def own(self, lanes: int) -> int:
-        """Return what the kernels evaluate with runs of 8 or 16 pixels."""
-        return self.own_16 if lanes == 16 else self.own_8
-
-    def yardstick(self, lanes: int) -> int:
-        """Return what the C++ yardstick evaluates."""
-        return self.rows_16 if lanes == 16 else self.halves_8
+    own: int
+    """What the kernels evaluate, from the view's own masks."""
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
@@ -86,7 +76,7 @@ def _span(q: Any, limit: float, x0: float, y: float, columns: int) -> Any:
     right = q[0] + middle + half + _MARGIN_PX - x0 - 0.5
     if right < 0.0 or left > columns - 1.0:
         return 1, 0
-    return int(math.ceil(max(left, 0.0))), int(math.floor(min(right, columns - 1.0)))
+    return math.ceil(max(left, 0.0)), math.floor(min(right, columns - 1.0))
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
@@ -144,7 +134,7 @@ def reached_rows(view: ScreenView) -> np.ndarray:
             rows,
         )
 
-    run_chunks(run, view.bounds, view.threads)
+    run_chunks(run, *_chunks(view))
     return rows
 
 
@@ -158,6 +148,20 @@ def _bits(value: int) -> int:
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
+def _live_blocks(
+    through: np.ndarray, rows: int, columns: int, block_width: int, block_height: int
+) -> int:
+    """Return as bits which blocks, numbered row by row, hold a pixel that is not opaque."""
+    live = 0
+    for row in range(rows):
+        for column in range(columns):
+            if through[row, column] >= _T_MIN:
+                block = row // block_height * (_TILE // block_width) + column // block_width
+                live |= 1 << block
+    return live
+
+
+@numba.njit(nogil=True, error_model="numpy", cache=True)
 def _count(
     first_tile: int,
     end_tile: int,
@@ -166,6 +170,9 @@ def _count(
     ids: np.ndarray,
     ranges: np.ndarray,
     rows: np.ndarray,
+    masks: np.ndarray,
+    block_width: int,
+    block_height: int,
     tiles_x: int,
     width: int,
     height: int,
@@ -178,10 +185,12 @@ def _count(
         columns, live_rows = min(width - left, _TILE), min(height - top, _TILE)
         through[:] = 1.0
         live = (1 << live_rows) - 1
+        live_blocks = _live_blocks(through, live_rows, columns, block_width, block_height)
         for k in range(start[tile], start[tile + 1]):
             if live == 0:
                 break
             i = ids[k]
+            totals[_OWN] += block_width * block_height * _bits(np.int64(masks[k]) & live_blocks)
             for column in range(13):
                 q[column] = params[i, column]
             limit = 2.0 * math.log(q[11] * 255.0)
@@ -200,8 +209,7 @@ def _count(
                 totals[_RUNS_8] += 8 * (last // 8 - first // 8 + 1)
                 for block in range(first // 4, last // 4 + 1):
                     blocks |= 1 << (row // 4 * 4 + block)
-                for block in range(first // 8, last // 8 + 1):
-                    flat_blocks |= 1 << (row // 2 * 2 + block)
+                    flat_blocks |= 1 << (row // 2 * 4 + block)
                 totals[_INSIDE] += last - first + 1
                 dy = y - q[1]
                 for column in range(first, last + 1):
@@ -217,47 +225,54 @@ def _count(
                         through[row, column] = before - alpha * before
                         totals[_USEFUL] += 1
             totals[_BLOCKS_4X4] += 16 * _bits(blocks)
-            totals[_BLOCKS_8X2] += 16 * _bits(flat_blocks)
+            totals[_BLOCKS_4X2] += 8 * _bits(flat_blocks)
             if (k - start[tile]) % _LIVENESS_EVERY == _LIVENESS_EVERY - 1:
                 for row in range(live_rows):
                     if through[row, :columns].max() < _T_MIN:
                         live &= ~(1 << row)
+                live_blocks = _live_blocks(through, live_rows, columns, block_width, block_height)
 
 
-def count_evaluations(view: ScreenView, rows: np.ndarray | None = None) -> Evaluations:
+def own_masks(view: ScreenView, lanes: int) -> tuple[np.ndarray, int]:
+    """Return which blocks of its tile the kernels visit for each pair, and the blocks' width.
+
+    Returns
+    -------
+    masks : (pairs,) uint32
+        One bit per block of ``lanes`` pixels, numbered row by row.
+    block_width : int
+    """
+    if hasattr(view, "masks"):
+        return view.masks, 4
+    first, last = view.rows.astype(np.int64).T  # (pairs,)
+    ranges = view.lists.pixel_ranges[view.lists.gaussian_ids]
+    tile = np.repeat(np.arange(len(view.lists.start) - 1), np.diff(view.lists.start))
+    left = tile % view.lists.tiles_x * _TILE
+    halves = _TILE // lanes
+    masks = np.zeros(len(first), np.uint32)
+    for row in range(_TILE):
+        for half in range(halves):
+            begin = left + half * lanes
+            reached = (ranges[:, 2] < begin + lanes) & (ranges[:, 3] >= begin)
+            reached &= (first <= row) & (row <= last)
+            masks |= reached.astype(np.uint32) << np.uint32(row * halves + half)
+    return masks, lanes
+
+
+def count_evaluations(view: ScreenView, lanes: int, rows: np.ndarray | None = None) -> Evaluations:
     """Count what one forward pass of a view evaluates.
 
     Parameters
     ----------
     view : ScreenView
+        Prepared for runs of ``lanes`` pixels.
+    lanes : int
+        8 or 16.
     rows : (pairs, 2) uint8, optional
         From :func:`reached_rows`, if it was called already.
     """
     rows = reached_rows(view) if rows is None else rows
-    totals = _totals(view, rows)
-    own = _totals(view, own_rows(view, rows))
-    pairs = len(view.lists.gaussian_ids)
-    return Evaluations(
-        pairs,
-        pairs * _TILE * _TILE,
-        int(totals[_ROWS_16]),
-        int(totals[_HALVES_8]),
-        int(totals[_RUNS_8]),
-        int(totals[_BLOCKS_4X4]),
-        int(totals[_BLOCKS_8X2]),
-        int(totals[_INSIDE]),
-        int(totals[_USEFUL]),
-        int(own[_ROWS_16]),
-        int(own[_HALVES_8]),
-    )
-
-
-def own_rows(view: ScreenView, otherwise: np.ndarray) -> np.ndarray:
-    """Return the rows that the view itself narrowed its pairs to."""
-    return getattr(view, "rows", otherwise)
-
-
-def _totals(view: ScreenView, rows: np.ndarray) -> np.ndarray:
+    masks, block_width = own_masks(view, lanes)
     lists, camera = view.lists, view.camera
     results: list[np.ndarray] = []
 
@@ -271,6 +286,9 @@ def _totals(view: ScreenView, rows: np.ndarray) -> np.ndarray:
             lists.gaussian_ids,
             lists.pixel_ranges,
             rows,
+            masks,
+            block_width,
+            lanes // block_width,
             lists.tiles_x,
             camera.width,
             camera.height,
@@ -278,5 +296,13 @@ def _totals(view: ScreenView, rows: np.ndarray) -> np.ndarray:
         )
         results.append(totals)
 
-    run_chunks(run, view.bounds, view.threads)
-    return np.sum(results, axis=0)
+    run_chunks(run, *_chunks(view))
+    pairs = len(lists.gaussian_ids)
+    totals = [int(value) for value in np.sum(results, axis=0)]
+    return Evaluations(pairs, pairs * _TILE * _TILE, *totals)
+
+
+def _chunks(view: ScreenView) -> tuple[np.ndarray, int]:
+    """Return runs of tiles for all cores: counting is not timed."""
+    threads = default_threads()
+    return even_bounds(len(view.lists.start) - 1, threads, 16), threads

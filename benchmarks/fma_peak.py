@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The largest rate of fused multiply-adds of one core, measured with the compiler of the kernels."""
+"""The largest rate of fused multiply-adds of one core, by the compiler of the kernels."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ import llvmlite.binding
 import numpy as np
 
 from gaussian_wrapping_addon.core.parallel import even_bounds, run_chunks
-from gaussian_wrapping_addon.core.render.blend import Images, ScreenView
+from gaussian_wrapping_addon.core.render.blend import Images, RenderBuffers, ScreenView
 
 SOURCE = Path(__file__).with_name("raster.cpp")
 _CACHE = Path(__file__).resolve().parents[2] / ".cache" / "yardstick"
@@ -130,7 +130,6 @@ class Yardstick:
         self.name = f"C++ {compiler.name} {instructions.name}"
         self.compiler, self.instructions = compiler, instructions
         self._library = ctypes.CDLL(str(build(compiler, instructions)))
-        self._pairs = np.zeros((0, _VALUES), np.float32)
 
     def blend(self, view: ScreenView, rows: np.ndarray, images: Images) -> None:
         """Fill colour, normals and alpha of ``images``; ``rows (pairs, 2) uint8`` are what each
@@ -150,27 +149,32 @@ class Yardstick:
         run_chunks(run, view.bounds, view.threads)
 
     def blend_backward(
-        self, view: ScreenView, rows: np.ndarray, images: Images, grads: list[np.ndarray]
+        self,
+        view: ScreenView,
+        rows: np.ndarray,
+        images: Images,
+        grads: list[np.ndarray],
+        buffers: RenderBuffers,
     ) -> np.ndarray:
         """Return the gradient on params (n, 24); ``grads`` as the kernels take them."""
         lists = view.lists
-        if len(self._pairs) < len(lists.gaussian_ids):
-            self._pairs = np.zeros((len(lists.gaussian_ids), _VALUES), np.float32)
+        pairs = buffers.take_pairs(len(lists.gaussian_ids))
         shared = self._shared(view, rows, with_slots=True)
-        arrays = [images.color, images.normal, images.geometric, images.alpha, *grads[:4]]
-        arguments = [_address(array) for array in (*arrays, self._pairs)]
+        arrays = [images.color, images.normal, images.geometric, images.alpha, *grads[:4], pairs]
+        arguments = [_address(array) for array in arrays]
 
         def run(first: int, end: int) -> None:
             self._library.backward(*map(ctypes.c_int64, (first, end)), *shared, *arguments)
 
         run_chunks(run, view.bounds, view.threads)
         gradients = np.zeros((len(view.screen), _VALUES), np.float32)
-        sums = [_address(a) for a in (self._pairs, lists.pair_offsets, gradients)]
+        sums = [_address(a) for a in (pairs, lists.pair_offsets, gradients)]
 
         def combine(first: int, end: int) -> None:
             self._library.sum_pairs(*map(ctypes.c_int64, (first, end)), *sums)
 
         run_chunks(combine, even_bounds(len(view.screen), view.threads), view.threads)
+        buffers.pairs.append(pairs)
         return gradients
 
     @staticmethod
