@@ -98,7 +98,7 @@ def random_gradients(images: Images, seed: int) -> list[np.ndarray]:
     ]
 
 
-class _Variant:
+class KernelVariant:
     """The kernels with runs of one length on one view."""
 
     def __init__(
@@ -140,7 +140,17 @@ class _Variant:
         ]
 
 
-def _projection_parts(raw: RawArrays, variant: _Variant) -> list[tuple[str, Callable[[], object]]]:
+def kernel_variant(
+    gaussians: OrientedGaussians, width: int, height: int, lanes: int
+) -> KernelVariant:
+    """Return the kernels on one view of any Gaussians, one thread."""
+    workload = Workload(len(gaussians), width, height)
+    return KernelVariant(RawArrays.from_gaussians(gaussians), workload, lanes, 1, RenderBuffers())
+
+
+def _projection_parts(
+    raw: RawArrays, variant: KernelVariant
+) -> list[tuple[str, Callable[[], object]]]:
     camera, options = variant.view.camera, variant.options
     gradients = RawGradients.zeros(raw)
     grad_params = variant.run(lambda: variant.backward(variant.view))()
@@ -157,7 +167,7 @@ def _projection_parts(raw: RawArrays, variant: _Variant) -> list[tuple[str, Call
 
 
 def agreement(
-    yardstick: Yardstick, variant: _Variant, rows: np.ndarray, images: Images
+    yardstick: Yardstick, variant: KernelVariant, rows: np.ndarray, images: Images
 ) -> tuple[float, float]:
     """Compare a yardstick with the kernels; it is not timed unless they agree.
 
@@ -228,7 +238,7 @@ def measure_workload(
     best = vector_lanes()
     lanes = [best] if large or best == 8 else [16, 8]
     buffers = RenderBuffers()
-    variants = [_Variant(raw, workload, n, 1, buffers) for n in lanes]
+    variants = [KernelVariant(raw, workload, n, 1, buffers) for n in lanes]
     first = variants[0]
     rows = reached_rows(first.view)
     counts = dataclasses.asdict(count_evaluations(first.view, best, rows))
@@ -250,7 +260,7 @@ def measure_workload(
     one = _measured(parts, repeats, budget_s)
     several: dict[str, dict[str, Timing]] = {}
     if threads > 1:
-        shared = _Variant(raw, workload, best, threads, buffers)
+        shared = KernelVariant(raw, workload, best, threads, buffers)
         parts = [((kernel_name(best), name), run) for name, run in shared.parts()]
         parts += [((kernel_name(best), name), run) for name, run in _projection_parts(raw, shared)]
         for ruler in rulers[:1]:
@@ -268,7 +278,7 @@ def own_instructions() -> InstructionSet:
 
 
 def _yardstick_parts(
-    ruler: Yardstick, variant: _Variant, rows: np.ndarray, images: Images
+    ruler: Yardstick, variant: KernelVariant, rows: np.ndarray, images: Images
 ) -> list[tuple[str, Callable[[], object]]]:
     return [
         (FORWARD, lambda: ruler.blend(variant.flat, rows, images)),

@@ -151,7 +151,7 @@ def panels(results: dict[str, list[Result]], methods: list[Method]) -> list[Pane
     if methods:
         series = [Series(m.name, [(m.timing.cpu_ms, m.worst("images"))], False) for m in methods]
         title = "Gradient error against time, small scene"
-        found.append(Panel(title, "CPU ms, one thread", "L2-relative, worst group", series))
+        found.append(Panel(title, "CPU ms, one thread", "L2-relative, worst group", series, True))
     return found
 
 

@@ -8,7 +8,7 @@ import html
 import math
 from pathlib import Path
 
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#8b4513")
 """Told apart by colour-blind people (Okabe and Ito)."""
 _WIDTH, _HEIGHT = 460, 360
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 34, 46
@@ -31,6 +31,8 @@ class Panel:
     x_label: str
     y_label: str
     series: list[Series]
+    legend_low: bool = False
+    """Legend at the lower left instead of the upper left."""
 
 
 def _decades(values: list[float]) -> tuple[int, int]:
@@ -95,6 +97,8 @@ def _panel(panel: Panel, left: int) -> list[str]:
             )
         parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{color}"/>' for x, y in places]
         y = _TOP + 14 + 15 * number
+        if panel.legend_low:
+            y += inner_h - 15 * len(panel.series) - 8
         parts.append(f'<circle cx="{left + _LEFT + 10}" cy="{y - 4}" r="3.2" fill="{color}"/>')
         parts.append(text(left + _LEFT + 18, y, series.name, "start"))
     return parts
