@@ -255,7 +255,7 @@ def measure_workload(
         agreed[ruler.name] = agreement(ruler, first, rows, images)
         parts += [((ruler.name, n), r) for n, r in _yardstick_parts(ruler, first, rows, images)]
     parts += [((kernel_name(best), name), run) for name, run in _projection_parts(raw, first)]
-    step = whole_iteration(gaussians, view(workload.width, workload.height), 1, workload.seed)
+    step = whole_iteration(gaussians, view(workload.width, workload.height), 1)
     parts.append(((kernel_name(best), ITERATION), step))
     one = _measured(parts, repeats, budget_s)
     several: dict[str, dict[str, Timing]] = {}

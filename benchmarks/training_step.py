@@ -27,13 +27,13 @@ def noisy_photo(color: np.ndarray, seed: int) -> np.ndarray:
 
 
 def whole_iteration(
-    gaussians: OrientedGaussians, camera: Camera, threads: int, seed: int
+    gaussians: OrientedGaussians, camera: Camera, threads: int
 ) -> Callable[[], object]:
     """Return one training iteration without depth: render, L1 + SSIM, backward, Adam."""
     options = RenderOptions(depth=False, threads=threads)
     buffers, adam = RenderBuffers(), Adam(gaussians)
     with torch.no_grad():
-        photo = noisy_photo(render(gaussians, camera, options, buffers).color.numpy(), seed)
+        photo = noisy_photo(render(gaussians, camera, options, buffers).color.numpy(), 0)
     rates = {
         name: np.full(int(np.prod(adam.array(name).shape[1:])), _RATE, np.float32)
         for name in TRAINED
