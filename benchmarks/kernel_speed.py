@@ -65,7 +65,7 @@ AVX2_CPU = "haswell"
 _LARGE = 500_000
 """From this many Gaussians on, only the variant that the renderer would choose is timed."""
 _IMAGE_TOLERANCE, _GRADIENT_TOLERANCE = 1e-6, 1e-5
-_FLIPPED_SHARE, _FLIPPED_GRADIENT = 1e-4, 1e-2
+_FLIPPED_SHARE, _FLIPPED_GRADIENT = 1e-4, 1e-3
 
 
 @contextlib.contextmanager
@@ -179,8 +179,9 @@ def agreement(
     Raises
     ------
     RuntimeError
-        If images differ by more than 1e-6 or gradients by more than 1e-5. Where rounding decides
-        a threshold the other way, one value of 10 000 may be off, and the gradients by 1e-2.
+        If images differ by more than 1e-6 or gradients by more than 1e-5. Rounding decides some
+        thresholds the other way, as between the kernels' own variants: one value of 10 000 and one
+        Gaussian of 10 000 may be off, and where a value is, the other gradients by 1e-3.
     """
     variant.run(lambda: blend(variant.flat, variant.images, variant.buffers))()
     yardstick.blend(variant.flat, rows, images)
@@ -195,14 +196,24 @@ def agreement(
     lengths = np.linalg.norm(wanted.astype(np.float64), axis=0)
     differences = np.linalg.norm((found - wanted).astype(np.float64), axis=0)
     gradients = float((differences[lengths > 0] / lengths[lengths > 0]).max(initial=0.0))
+    kept = _without_flipped(found, wanted, lengths)
     tolerance = _FLIPPED_GRADIENT if off else _GRADIENT_TOLERANCE
-    good = off <= _FLIPPED_SHARE * values and gradients <= tolerance
+    good = off <= _FLIPPED_SHARE * values and kept <= tolerance
     if not good or differences[lengths == 0].any():
         raise RuntimeError(
             f"{yardstick.name} differs from the kernels by {largest:.1e} in the images ({off} of "
-            f"{values} values) and by {gradients:.1e} in the gradients: it measures nothing."
+            f"{values} values) and by {kept:.1e} in the gradients: it measures nothing."
         )
     return largest, gradients
+
+
+def _without_flipped(found: np.ndarray, wanted: np.ndarray, lengths: np.ndarray) -> float:
+    """Return the L2-relative difference without the one Gaussian of 10 000 that differs most."""
+    used = lengths > 0
+    relative = np.abs(found - wanted)[:, used] / lengths[used]  # (n, columns)
+    flipped = int(_FLIPPED_SHARE * len(relative))
+    order = np.argsort(relative.max(1, initial=0.0))[: len(relative) - flipped]
+    return float(np.linalg.norm(relative[order], axis=0).max(initial=0.0))
 
 
 def measure_workload(
