@@ -22,6 +22,7 @@ _TILE = tolerances.TILE_PX
 _MARGIN_PX = 0.02
 """Rounding of the float32 rows of params, as where an ellipse ends."""
 _LIVENESS_EVERY = 16
+_BLOCK_WIDTH = 4
 _ALPHA_MIN, _ALPHA_MAX = tolerances.ALPHA_MIN, tolerances.ALPHA_MAX
 _T_MIN = tolerances.TRANSMITTANCE_MIN
 # Columns of the counts.
@@ -233,30 +234,16 @@ def _count(
                 live_blocks = _live_blocks(through, live_rows, columns, block_width, block_height)
 
 
-def own_masks(view: ScreenView, lanes: int) -> tuple[np.ndarray, int]:
+def own_masks(view: ScreenView) -> tuple[np.ndarray, int]:
     """Return which blocks of its tile the kernels visit for each pair, and the blocks' width.
 
     Returns
     -------
     masks : (pairs,) uint32
-        One bit per block of ``lanes`` pixels, numbered row by row.
+        One bit per block of the lanes' number of pixels, numbered row by row.
     block_width : int
     """
-    if hasattr(view, "masks"):
-        return view.masks, 4
-    first, last = view.rows.astype(np.int64).T  # (pairs,)
-    ranges = view.lists.pixel_ranges[view.lists.gaussian_ids]
-    tile = np.repeat(np.arange(len(view.lists.start) - 1), np.diff(view.lists.start))
-    left = tile % view.lists.tiles_x * _TILE
-    halves = _TILE // lanes
-    masks = np.zeros(len(first), np.uint32)
-    for row in range(_TILE):
-        for half in range(halves):
-            begin = left + half * lanes
-            reached = (ranges[:, 2] < begin + lanes) & (ranges[:, 3] >= begin)
-            reached &= (first <= row) & (row <= last)
-            masks |= reached.astype(np.uint32) << np.uint32(row * halves + half)
-    return masks, lanes
+    return view.masks, _BLOCK_WIDTH
 
 
 def count_evaluations(view: ScreenView, lanes: int, rows: np.ndarray | None = None) -> Evaluations:
@@ -272,7 +259,7 @@ def count_evaluations(view: ScreenView, lanes: int, rows: np.ndarray | None = No
         From :func:`reached_rows`, if it was called already.
     """
     rows = reached_rows(view) if rows is None else rows
-    masks, block_width = own_masks(view, lanes)
+    masks, block_width = own_masks(view)
     lists, camera = view.lists, view.camera
     results: list[np.ndarray] = []
 

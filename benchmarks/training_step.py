@@ -10,14 +10,10 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.blend import RenderBuffers
-from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
+from gaussian_wrapping_addon.core.render.types import Render
 from gaussian_wrapping_addon.core.training.losses import color_loss, normal_losses
-from gaussian_wrapping_addon.core.training.optimizer import TRAINED, Adam
 
-_RATE = 1e-12
-"""So small that the scene stays what it is, however often an iteration is repeated."""
+from .training_parts import Iteration
 
 
 def noisy_photo(color: np.ndarray, seed: int) -> np.ndarray:
@@ -30,37 +26,20 @@ def whole_iteration(
     gaussians: OrientedGaussians, camera: Camera, threads: int
 ) -> Callable[[], object]:
     """Return one training iteration without depth: render, L1 + SSIM, backward, Adam."""
-    options = RenderOptions(depth=False, threads=threads)
-    buffers, adam = RenderBuffers(), Adam(gaussians)
-    with torch.no_grad():
-        photo = noisy_photo(render(gaussians, camera, options, buffers).color.numpy(), 0)
-    rates = {
-        name: np.full(int(np.prod(adam.array(name).shape[1:])), _RATE, np.float32)
-        for name in TRAINED
-    }
-
-    def iteration() -> None:
-        out = render(adam.gaussians(), camera, options, buffers)
-        loss, _ = color_loss(out.color, photo, threads=threads)
-        loss.backward()
-        moved = adam.values["opacity_logits"].grad
-        assert moved is not None
-        adam.step(rates, (moved != 0).numpy(), threads=threads)
-
-    return iteration
+    return Iteration(gaussians, camera, threads).run
 
 
 def loss_gradients(
     out: Render, camera: Camera, photo: np.ndarray, dtype: torch.dtype
 ) -> dict[tuple[str, str], torch.Tensor]:
     """Return the hand-written gradients of the losses on the images, computed in ``dtype``."""
-    image = out.color.detach().to(dtype).requires_grad_()
+    image = out.color.detach().to(dtype).numpy()
     names = ("depth", "geometric_normal", "normal", "alpha")
-    parts = [getattr(out, name).detach().to(dtype).requires_grad_() for name in names]
-    found = {
-        ("L1 + SSIM", "colour"): torch.autograd.grad(color_loss(image, photo)[0], [image])[0],
-    }
-    by_normals = torch.autograd.grad(normal_losses(*parts, camera)[0], parts)
-    for name, gradient in zip(names, by_normals, strict=True):
-        found["normal losses", name] = gradient
+    parts = [getattr(out, name).detach().to(dtype).numpy() for name in names]
+    found = {("L1 + SSIM", "colour"): torch.from_numpy(color_loss(image, photo)[1])}
+    by_normals = normal_losses(*parts, camera)[1]
+    for name in names:
+        gradient = getattr(by_normals, name)
+        assert gradient is not None
+        found["normal losses", name] = torch.from_numpy(gradient)
     return found
