@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
+from tests.poses import look_at_pose
 
 BALL_RADIUS = 1.0
 FLOOR_Z = -1.0
@@ -40,11 +41,7 @@ def look_at(
     center: np.ndarray, target: np.ndarray, name: str, width: int, height: int, focal_px: float
 ) -> Camera:
     """Return a camera at ``center`` that looks at ``target`` with world Z up."""
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
+    pose = look_at_pose(center, target)
     return Camera(name, width, height, focal_px, focal_px, width / 2, height / 2, pose)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.source_model import LENS_NAMES, quaternion_from_rotation
+from tests.poses import look_at_pose
 
 WIDTH, HEIGHT = 64, 48
 
@@ -34,15 +35,6 @@ class Model:
     cameras: list[tuple[int, str | int, int, int, list[float]]]
     images: list[ImageRecord]
     points: list[tuple[list[float], list[int], float, list[tuple[int, int]]]]
-
-
-def look_at_pose(center: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return (3, 4) cam_from_world of an upright camera (world Z up) at ``center``."""
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
 
 
 def ring_poses(count: int, radius: float = 3.0, height: float = 1.0) -> list[np.ndarray]:

@@ -27,13 +27,13 @@ from tests.core.dataset.model_writers import (
     HEIGHT,
     WIDTH,
     Model,
-    look_at_pose,
     ring_model,
     ring_poses,
     write_binary,
     write_photos,
     write_project,
 )
+from tests.poses import look_at_pose
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 

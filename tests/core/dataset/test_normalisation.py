@@ -10,7 +10,8 @@ from gaussian_wrapping_addon.core.dataset.normalisation import SceneFrame, find_
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
-from tests.core.dataset.model_writers import look_at_pose, ring_poses
+from tests.core.dataset.model_writers import ring_poses
+from tests.poses import look_at_pose
 
 
 def frame_of(poses: list[np.ndarray]) -> tuple[SceneFrame, np.ndarray]:

@@ -8,16 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
+from tests.poses import look_at_pose
 
 
 def camera_at(eye: np.ndarray, *, focal: float = 300.0) -> Camera:
     """Return a 400 x 300 camera at ``eye`` that looks at the origin, principal point off centre."""
-    eye = np.asarray(eye, np.float64)
-    forward = -eye / np.linalg.norm(eye)
-    right = np.cross(forward, [0.1, 0.2, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.concatenate([rotation, -(rotation @ eye)[:, None]], 1)
+    pose = look_at_pose(eye)
     return Camera("view", 400, 300, focal, 1.02 * focal, 203.0, 148.0, pose)
 
 

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Small random scenes and cameras that the tests of the renderer share."""
+"""Small scenes and cameras that the tests of the renderer share."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from tests.poses import look_at_pose
 
 
 def look_at(
@@ -20,13 +23,6 @@ def look_at(
     name: str = "camera",
 ) -> Camera:
     """Return a camera at ``eye`` looking at ``target``, Z up, off-centre principal point."""
-    forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
-    forward /= np.linalg.norm(forward)
-    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.concatenate([rotation, -(rotation @ np.asarray(eye, np.float64))[:, None]], 1)
     return Camera(
         name,
         width,
@@ -35,8 +31,16 @@ def look_at(
         1.03 * focal,
         0.5 * width + 0.7,
         0.5 * height - 0.4,
-        np.ascontiguousarray(pose),
+        look_at_pose(eye, target),
     )
+
+
+def front_camera(
+    width: int = 6, height: int = 5, *, focal: float = 9.0, distance: float = 4.0
+) -> Camera:
+    """Return a camera on the -y axis that looks along y at the origin, in the image's centre."""
+    pose = look_at_pose((0.0, -distance, 0.0))
+    return Camera("front", width, height, focal, focal, width / 2, height / 2, pose)
 
 
 def random_gaussians(
@@ -84,4 +88,30 @@ def isotropic(
         torch.zeros((count, 1, 3), dtype=dtype),
         torch.tensor([[0.0, 0.0, 1.0, 0.5]], dtype=dtype).repeat(count, 1),
         torch.zeros(count, dtype=dtype),
+    )
+
+
+def coloured(gaussians: OrientedGaussians, seed: int = 0) -> OrientedGaussians:
+    """Return the Gaussians with random constant colours and learned normals."""
+    random = np.random.default_rng(seed)
+    count = len(gaussians)
+    return gaussians.replaced(
+        sh=torch.from_numpy(random.normal(size=(count, 1, 3)) * 0.5).to(gaussians.sh),
+        orientation=torch.from_numpy(random.normal(size=(count, 4))).to(gaussians.orientation),
+    )
+
+
+def one_gaussian(
+    scales: tuple[float, float, float],
+    opacity: float,
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    turn: float = 0.0,
+    axis: int = 2,
+) -> OrientedGaussians:
+    """Return a coloured float64 Gaussian turned about a world axis, its quaternion not of unit
+    length."""
+    quat = torch.zeros((1, 4), dtype=torch.float64)
+    quat[0, 0], quat[0, 1 + axis] = 1.3 * math.cos(turn / 2), 1.3 * math.sin(turn / 2)
+    return coloured(isotropic([mean], [1.0], [opacity])).replaced(
+        log_scales=torch.tensor([scales], dtype=torch.float64).log(), quats=quat
     )

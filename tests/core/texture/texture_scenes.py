@@ -14,6 +14,7 @@ from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from tests.poses import look_at_pose
 
 Pattern = Callable[[np.ndarray], np.ndarray]
 SUPERSAMPLING = 2
@@ -31,14 +32,7 @@ def plain(color: tuple[float, float, float]) -> Pattern:
 
 
 def look_at(eye, target=(0.0, 0.0, 0.0), width=200, height=150, focal=170.0) -> Camera:
-    eye = np.asarray(eye, float)
-    forward = np.asarray(target, float) - eye
-    forward /= np.linalg.norm(forward)
-    helper = [0.0, 0.0, 1.0] if abs(forward[2]) < 0.95 else [0.0, 1.0, 0.0]
-    right = np.cross(forward, helper)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.concatenate([rotation, -(rotation @ eye)[:, None]], 1)
+    pose = look_at_pose(eye, target)
     return Camera("c", width, height, focal, focal, width / 2, height / 2, pose)
 
 
