@@ -154,6 +154,7 @@ def judge(
     camera: Camera,
     *,
     digits: int = 0,
+    gradient_digits: int | None = None,
     gradients: bool = True,
     margin: float = 1e-4,
     limit: float = 0.45,
@@ -162,9 +163,9 @@ def judge(
 ) -> Verdict:
     """Render with the kernels and from first principles and compare.
 
-    Gradients are compared with differences in ``digits``-digit arithmetic where ``digits`` is
-    given, else with autograd of the definition in float64, which ``test_first_principles.py``
-    proves.
+    Gradients are compared with differences in arithmetic of ``gradient_digits`` digits (by default
+    ``digits``); where that is 0, with autograd of the definition in float64, which
+    ``test_first_principles.py`` proves.
     """
     options = RenderOptions(
         background=background, near_z=near_z, depth_valid_transmittance=limit, threads=1
@@ -193,7 +194,7 @@ def judge(
         weights = random_weights(truth, margin=margin)
         losses = [{name: weights[name] for name in BLENDED}, {"depth": weights["depth"]}]
         fast = [gradients_of(render, exact, camera, options, w, torch.float32) for w in losses]
-        if digits:
+        if digits if gradient_digits is None else gradient_digits:
             wanted = oracle.gradients(losses)
         else:
             wanted = [
