@@ -160,12 +160,14 @@ def judge(
     limit: float = 0.45,
     near_z: float = 0.2,
     background: tuple[float, float, float] = (0.2, 0.5, 0.1),
+    nearer_than: float = np.inf,
 ) -> Verdict:
     """Render with the kernels and from first principles and compare.
 
     Gradients are compared with differences in arithmetic of ``gradient_digits`` digits (by default
     ``digits``); where that is 0, with autograd of the definition in float64, which
-    ``test_first_principles.py`` proves.
+    ``test_first_principles.py`` proves. With ``nearer_than`` the loss over the depth weighs
+    all depths below it alike, flat or not.
     """
     options = RenderOptions(
         background=background, near_z=near_z, depth_valid_transmittance=limit, threads=1
@@ -192,6 +194,9 @@ def judge(
     sizes: dict[str, float] = {}
     if gradients:
         weights = random_weights(truth, margin=margin)
+        if nearer_than < np.inf:
+            near = has & (depth < nearer_than)
+            weights["depth"] = np.where(near, np.random.default_rng(7).normal(size=near.shape), 0.0)
         losses = [{name: weights[name] for name in BLENDED}, {"depth": weights["depth"]}]
         fast = [gradients_of(render, exact, camera, options, w, torch.float32) for w in losses]
         if digits if gradient_digits is None else gradient_digits:
