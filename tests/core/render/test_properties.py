@@ -82,7 +82,7 @@ def cameras(draw: st.DrawFn) -> Camera:
     width, height = draw(st.integers(1, 36)), draw(st.integers(1, 33))
     focal = draw(st.sampled_from([20.0, 45.0, 300.0, 1e-6, 1e9]))
     center = st.sampled_from([0.5, 0.3, -2.0, 1e4, -1e9])
-    eye = np.random.default_rng(draw(seeds)).normal(size=3) + [0.0, 0.0, 0.01]
+    eye = np.random.default_rng(draw(seeds)).normal(size=3)
     eye *= draw(st.sampled_from([1.0, 3.0, 1e-6, 1e4, 1e12]))
     return Camera(
         "any",
@@ -355,7 +355,7 @@ def test_any_sane_view_is_the_definition(
         scale=(smallest, 0.6),
         opacity=(0.01, 0.2) if faint else (0.2, 0.999),
     )
-    eye = np.random.default_rng(seed).normal(size=3) * 1.5 + [0.0, 0.0, 0.1]
+    eye = np.random.default_rng(seed).normal(size=3) * 1.5
     camera = look_at(tuple(eye), width=width, height=height, focal=focal)
     verdict = judge(gaussians, camera)
     verdict.assert_within(blended=2e-5, depth=1e-4, gradient=1e-3, depth_gradient=1e-2, clear=0.9)

@@ -21,7 +21,7 @@ from .scenes import coloured, front_camera, isotropic, look_at, random_gaussians
 DIGITS = 60
 
 
-# -- item 5: layers ---------------------------------------------------------------------------------
+# -- item 5: layers -------------------------------------------------------------------------------
 
 
 def ten_thousand_layers(opacity: float) -> OrientedGaussians:

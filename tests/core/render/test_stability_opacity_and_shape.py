@@ -179,8 +179,8 @@ def fat_before_thin(thickness: float) -> OrientedGaussians:
 
 FALLOFF = pytest.mark.xfail(
     strict=True,
-    reason="the solver's exponential ends at 2e-10, not 0, which 1 / sigma^2 of a thin Gaussian far "
-    "behind magnifies; and a small Newton step counts as converged where the slope is steep",
+    reason="the solver's exponential ends at 2e-10, not 0, which 1 / sigma^2 of a thin Gaussian "
+    "far behind magnifies; and a small Newton step counts as converged where the slope is steep",
 )
 
 
