@@ -37,6 +37,8 @@ COUNT = 5
 BACKGROUND = (0.25, 0.5, 0.75)
 COLUMNS = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1, "sh": 12, "orientation": 4}
 LIMIT = float(np.float32(1e30))
+SH_LIMIT = 1e9
+"""Harmonics beyond this times squared pixel offsets overflow float32, see ``ABSURD``."""
 seeds = st.integers(0, 2**31)
 
 
@@ -66,6 +68,7 @@ def wild_gaussians(draw: st.DrawFn) -> OrientedGaussians:
     for name, row, column, value in draw(st.lists(change, max_size=8)):
         places = slice(None) if column < 0 else column % COLUMNS[name]
         values[name][row, places] = value
+    values["sh"].clamp_(-SH_LIMIT, SH_LIMIT)
     size = draw(st.sampled_from([0.01, 0.0, 1e-20, 1e10]))
     values["filter_3d"][:] = size
     if size == 0.0:
