@@ -22,6 +22,10 @@ ISO_LEVEL = 0.5
 DEPTH_VALID_TRANSMITTANCE = 0.45
 """A pixel has an isosurface depth only where the final transmittance is at most this."""
 
+SLOPE_FLOOR = 1e-3
+"""Floor of -d(log T)/dt in the depth's gradient, in shares of 1/sigma along the ray
+(method.md 2.5)."""
+
 TILE_PX = 16
 
 QUATERNION_MIN_NORM = 1e-12

@@ -16,8 +16,8 @@ from .. import tolerances
 from ..compiled import kernel
 from ..errors import ResourceError
 from ..parallel import even_bounds, run_chunks
+from .depth_order import radix_order
 from .projection import ScreenGaussians
-from .tile_kernels import radix_order
 
 TILE = tolerances.TILE_PX
 _MAX_PAIRS = 2**31 - 1

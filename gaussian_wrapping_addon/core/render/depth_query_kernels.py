@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import tolerances
 from ..compiled import inline, kernel
 from .area_lists import PIXEL_MARGIN, SHARE_MARGIN, TILE
 from .raster_math import (
@@ -77,7 +78,7 @@ _NEWTON_STEPS = 8
 """From here on every second step is a bisection, which bounds the number of steps."""
 _MAX_STEPS = 80
 _NEWTON_FLOOR = np.float32(1e-6)
-SLOPE_FLOOR = np.float32(1e-3)
+SLOPE_FLOOR = np.float32(tolerances.SLOPE_FLOOR)
 """Floor of -d(log T)/dt in shares of the position's largest 1/sigma along the ray (method.md
 2.5)."""
 # exp(-x) is below 3e-7 beyond this x = s d^2.

@@ -9,6 +9,7 @@ from typing import Any
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+from .. import tolerances
 from . import raster_math as constants
 from .raster_math import FORWARD_PLANES, STRIDE, TILE
 from .simd import Block, Mask, State, Vector
@@ -27,8 +28,6 @@ _PREFIX = AT_DEPTH + 10 * TILE
 """Product of the Gaussians that lie wholly before the brackets."""
 SOLVER_VALUES = 11 * TILE
 
-SLOPE_FLOOR = 1e-3
-"""Floor of -d(log T)/dt in shares of the pixel's largest 1/sigma along the ray (method.md 2.5)."""
 _NEWTON_FLOOR = 1e-6
 _ROUGH_STEPS = 2
 """Newton steps on a cheap likeness of T first: half the cost of a true one each."""
@@ -310,7 +309,7 @@ def _step_intrinsic(lanes: int) -> Any:
             # Rounding may put a last step on the bracket's end, hence no test for inside.
             settled = moved.max(low).min(high)
             moved = done.choose(settled, inside.choose(moved, (low + high) * 0.5))
-            final = (slope + growth * (settled - t)).max(sharpest * SLOPE_FLOOR)
+            final = (slope + growth * (settled - t)).max(sharpest * tolerances.SLOPE_FLOOR)
             solver.write(low, _LOW)
             solver.write(high, _HIGH)
             solver.write(is_open.choose(moved, t), AT_DEPTH)

@@ -20,9 +20,6 @@ from .reference_projection import reference_projection
 from .types import Render, RenderOptions
 
 _ELEMENTS_PER_CHUNK = 1_000_000
-_SLOPE_FLOOR = 1e-3
-"""Floor of -d(log T)/dt in the depth's gradient, in shares of the pixel's largest 1/sigma along
-the ray (method.md 2.5)."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +236,7 @@ def _depth(hits: _Hits, options: RenderOptions) -> Tensor:
         before = (peak - start[:, None]).clamp_min(0.0)
         slope = (g / (1.0 - g) * sharpness * before).sum(1)
         largest = torch.where(part, sharpness, 0.0).amax(1).sqrt()
-        slope = torch.maximum(slope, _SLOPE_FLOOR * largest)
+        slope = torch.maximum(slope, tolerances.SLOPE_FLOOR * largest)
     # One Newton step whose value is polish and whose gradient is the implicit one.
     crossing = start + (log_transmittance(start) - level) / slope
     return depth.index_put((deep[valid],), crossing[valid])

@@ -9,8 +9,7 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render import raster_math, reference
-from gaussian_wrapping_addon.core.render import view_renderer
+from gaussian_wrapping_addon.core.render import raster_math, reference, view_renderer
 from gaussian_wrapping_addon.core.render.blend import (
     Images,
     RenderBuffers,

@@ -8,7 +8,6 @@ import math
 from pathlib import Path
 
 from ... import tolerances
-from ..isosurface import SLOPE_FLOOR
 from ..raster_math import DENOMINATOR_MIN, FRONT_SIGMAS
 
 PARTS = (
@@ -47,7 +46,7 @@ _SINGLE = {
     "ISO_LEVEL": tolerances.ISO_LEVEL,
     "DENOMINATOR_MIN": float(DENOMINATOR_MIN),
     "FRONT_SIGMAS": float(FRONT_SIGMAS),
-    "SLOPE_FLOOR": float(SLOPE_FLOOR),
+    "SLOPE_FLOOR": tolerances.SLOPE_FLOOR,
     "TINY": 1e-30,
     "FARTHEST": 3e38,
     "FLOAT32_LARGE": 3.0e38,  # every smaller magnitude is a usable float32
