@@ -24,7 +24,7 @@ DEPTH_VALID_TRANSMITTANCE = 0.45
 
 SLOPE_FLOOR = 1e-3
 """Floor of -d(log T)/dt in the depth's gradient, in shares of 1/sigma along the ray
-(method.md 2.5)."""
+of the Gaussian at which the blending crosses 0.5 (method.md 2.5)."""
 
 TILE_PX = 16
 

@@ -185,9 +185,7 @@ def _blend_intrinsic(lanes: int, depth: bool, weights: bool) -> Any:
                 block.walk(place, count_, trail, reaches_back)
 
             def finish(n: Any) -> Any:
-                sight, contributes, _, after = visit(n)
-                if record is not None:
-                    record.sharpen(sight, contributes)
+                _, _, _, after = visit(n)
                 return (after >= float(TRANSMITTANCE_MIN)).any()
 
             block.walk(place, count_, finish, lambda n: always)

@@ -26,7 +26,9 @@ _PRODUCT, _FIRST, _SECOND = AT_DEPTH + 5 * TILE, AT_DEPTH + 6 * TILE, AT_DEPTH +
 _SHARPEST, NEAREST = AT_DEPTH + 8 * TILE, AT_DEPTH + 9 * TILE
 _PREFIX = AT_DEPTH + 10 * TILE
 """Product of the Gaussians that lie wholly before the brackets."""
-SOLVER_VALUES = 11 * TILE
+_AT_CROSSING = AT_DEPTH + 11 * TILE
+"""1/sigma of the Gaussian at which the blending crosses 0.5."""
+SOLVER_VALUES = 12 * TILE
 
 _NEWTON_FLOOR = 1e-6
 _ROUGH_STEPS = 2
@@ -37,8 +39,9 @@ _LEAST_BEND, _MOST_BEND = 0.5, 2.0
 # this share of the depth, and the step itself small enough to extrapolate the slope ...
 _CUBE_SHARE, _STEP_SIGMAS = 2e-7, 0.01
 _STEP_SIGMAS_ALONE = 1e-5
-# ... or the step is below the rounding of the depth ...
-_STEP_SHARE = 2.5e-7
+# ... or the step is below the rounding of the depth, and not because a layer is steep that may
+# end before the level is reached ...
+_STEP_SHARE, _LEVEL_NEAR = 2.5e-7, 1e-3
 # ... or the transmittance equal to 0.5 within its own rounding.
 _LEVEL_MARGIN = 3e-7
 # exp(-x / 2) is below 3e-7 beyond this x = sharpness d^2.
@@ -88,6 +91,7 @@ def start_solver(
         (sharpest.max(_TINY).sqrt(), _SHARPEST),
         (low, NEAREST),
         (1.0, _PREFIX),
+        (crossing.sharpness.max(0.0).sqrt(), _AT_CROSSING),
         (crossed.choose(1.0, 0.0), _OPEN),
     ):
         block.store(value, state, block.index(plane))
@@ -304,12 +308,16 @@ def _step_intrinsic(lanes: int) -> Any:
             inside = (moved > low) & (moved < high) & (block.splat(args[1]) <= 0.0)
             sigmas = size * sharpest
             done = (sigmas < _STEP_SIGMAS) & (sigmas * sigmas * size <= t * _CUBE_SHARE)
-            done = done | (sigmas < _STEP_SIGMAS_ALONE) | (size <= t * _STEP_SHARE)
-            done = done | (excess.abs() <= _LEVEL_MARGIN) | (high - low <= high * _STEP_SHARE)
+            level = excess.abs()
+            done = done | (sigmas < _STEP_SIGMAS_ALONE)
+            done = done | ((size <= t * _STEP_SHARE) & (level < _LEVEL_NEAR))
+            done = done | (level <= _LEVEL_MARGIN) | (high - low <= high * _STEP_SHARE)
             # Rounding may put a last step on the bracket's end, hence no test for inside.
             settled = moved.max(low).min(high)
             moved = done.choose(settled, inside.choose(moved, (low + high) * 0.5))
-            final = (slope + growth * (settled - t)).max(sharpest * tolerances.SLOPE_FLOOR)
+            final = (slope + growth * (settled - t)).max(
+                solver.read(_AT_CROSSING) * tolerances.SLOPE_FLOOR
+            )
             solver.write(low, _LOW)
             solver.write(high, _HIGH)
             solver.write(is_open.choose(moved, t), AT_DEPTH)

@@ -224,6 +224,12 @@ def _depth(hits: _Hits, options: RenderOptions) -> Tensor:
 
     level = math.log(tolerances.ISO_LEVEL)
     with torch.no_grad():
+        # The Gaussian at which the blending, in its order, crosses the level.
+        alpha = torch.where(part, torch.exp(log_alpha).clamp_max(tolerances.ALPHA_MAX), 0.0)
+        behind = torch.cumprod(1.0 - alpha, dim=1)  # (q, c)
+        first = (behind <= tolerances.ISO_LEVEL).to(torch.uint8).argmax(1, keepdim=True)
+        at_crossing = sharpness.gather(1, first)[:, 0]  # (q,)
+
         low = torch.zeros_like(peak[:, 0])
         high = torch.where(part, peak, 0.0).amax(1)
         valid = log_transmittance(low) > level
@@ -235,8 +241,7 @@ def _depth(hits: _Hits, options: RenderOptions) -> Tensor:
         g = torch.exp(log_g(start))
         before = (peak - start[:, None]).clamp_min(0.0)
         slope = (g / (1.0 - g) * sharpness * before).sum(1)
-        largest = torch.where(part, sharpness, 0.0).amax(1).sqrt()
-        slope = torch.maximum(slope, tolerances.SLOPE_FLOOR * largest)
+        slope = torch.maximum(slope, tolerances.SLOPE_FLOOR * at_crossing.sqrt())
     # One Newton step whose value is polish and whose gradient is the implicit one.
     crossing = start + (log_transmittance(start) - level) / slope
     return depth.index_put((deep[valid],), crossing[valid])

@@ -16,8 +16,12 @@ def exp_short(x: Vector, scale: float = 1.0) -> Vector:
 
 
 def exp_wide(x: Vector, scale: float = 1.0) -> Vector:
-    """Return exp(-scale x) for 0 <= scale x <= 22.4, and 2e-10 above (relative error 7e-6)."""
-    return _power(_fit(x * (scale / 32.0)), 5)
+    """Return exp(-scale x) for 0 <= scale x <= 22.4, and 0 above (relative error 7e-6).
+
+    A small value in place of 0 would be magnified by the 1 / sigma^2 of thin Gaussians far behind.
+    """
+    value = _power(_fit(x * (scale / 32.0)), 5)
+    return (x < 32.0 * float(constants.FIT_END) / scale).choose(value, 0.0)
 
 
 def _fit(y: Vector) -> Vector:
