@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,19 +32,24 @@ _AT_CROSSING = AT_DEPTH + 11 * TILE
 SOLVER_VALUES = 12 * TILE
 
 _NEWTON_FLOOR = 1e-6
+_LOG_2 = math.log(2.0)
+_LEAST_DEPTH = 1e-3
+"""Of -log T, where its logarithm is taken: far from 0.5 no slope is extrapolated."""
 _ROUGH_STEPS = 2
 """Newton steps on a cheap likeness of T first: half the cost of a true one each."""
 # Halley's correction of a Newton step stays within these factors.
 _LEAST_BEND, _MOST_BEND = 0.5, 2.0
 # Converged: the cube of the step, in units of the thinnest Gaussian's sigma along the ray, is below
 # this share of the depth, and the step itself small enough to extrapolate the slope ...
-_CUBE_SHARE, _STEP_SIGMAS = 2e-7, 0.01
+_CUBE_SHARE, _STEP_SIGMAS = 2e-7, 0.003
 _STEP_SIGMAS_ALONE = 1e-5
 # ... or the step is below the rounding of the depth, and not because a layer is steep that may
 # end before the level is reached ...
 _STEP_SHARE, _LEVEL_NEAR = 2.5e-7, 1e-3
 # ... or the transmittance equal to 0.5 within its own rounding.
 _LEVEL_MARGIN = 3e-7
+_COARSE = 8e3
+"""Depth in sigmas from which on a rounding of a float32 depth is over 1e-3 of a sigma."""
 # exp(-x / 2) is below 3e-7 beyond this x = sharpness d^2.
 NEGLIGIBLE = 30.0
 _TINY = 1e-30
@@ -307,15 +313,26 @@ def _step_intrinsic(lanes: int) -> Any:
             size = move.abs()
             inside = (moved > low) & (moved < high) & (block.splat(args[1]) <= 0.0)
             sigmas = size * sharpest
-            done = (sigmas < _STEP_SIGMAS) & (sigmas * sigmas * size <= t * _CUBE_SHARE)
+            small = (sigmas < _STEP_SIGMAS) & (t * sharpest < _COARSE)
+            done = small & (sigmas * sigmas * size <= t * _CUBE_SHARE)
             level = excess.abs()
             done = done | (sigmas < _STEP_SIGMAS_ALONE)
             done = done | ((size <= t * _STEP_SHARE) & (level < _LEVEL_NEAR))
             done = done | (level <= _LEVEL_MARGIN) | (high - low <= high * _STEP_SHARE)
-            # Rounding may put a last step on the bracket's end, hence no test for inside.
-            settled = moved.max(low).min(high)
+            # A small last step is taken, and the slope extrapolated over it: log(-log T) is a
+            # parabola before a single Gaussian. Else, or where a rounding of the depth is much of
+            # a sigma, the pixel stays where the slope is known, for its gradient must be that of
+            # the depth that is stored. Rounding may put the step on the bracket's end, hence no
+            # test for inside.
+            settled = small.choose(moved.max(low).min(high), t)
             moved = done.choose(settled, inside.choose(moved, (low + high) * 0.5))
-            final = (slope + growth * (settled - t)).max(
+            over = settled - t
+            depth = (_LOG_2 - excess).max(_LEAST_DEPTH)
+            ratio = slope / depth
+            curl = (growth / depth - ratio * ratio) * over
+            gain = (ratio + curl * 0.5) * over
+            final = (ratio + curl) * depth * ((gain * 0.5 + 1.0) * gain + 1.0)
+            final = small.choose(final, slope).max(
                 solver.read(_AT_CROSSING) * tolerances.SLOPE_FLOOR
             )
             solver.write(low, _LOW)

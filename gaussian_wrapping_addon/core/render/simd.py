@@ -16,7 +16,9 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils
 
-_FLAGS = ("nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc")
+# No reassociation: the same expression then rounds alike in the forward and the backward kernel.
+_FLAGS = ("nnan", "ninf", "nsz", "contract")
+_QUOTIENT_FLAGS = (*_FLAGS, "arcp", "afn", "reassoc")
 _FLOAT = ir.FloatType()
 _WORD = ir.IntType(32)
 _INDEX = ir.IntType(64)
@@ -35,7 +37,8 @@ class Vector:
     def _binary(self, name: str, other: Vector | float, *, swapped: bool = False) -> Vector:
         a, b = self.value, self.block.vector(other).value
         emit = getattr(self.block.builder, name)
-        return Vector(self.block, emit(b, a, flags=_FLAGS) if swapped else emit(a, b, flags=_FLAGS))
+        flags = _QUOTIENT_FLAGS if name == "fdiv" else _FLAGS
+        return Vector(self.block, emit(b, a, flags=flags) if swapped else emit(a, b, flags=flags))
 
     def __add__(self, other: Vector | float) -> Vector:
         return self._binary("fadd", other)
@@ -89,6 +92,15 @@ class Vector:
     def min(self, other: Vector | float) -> Vector:
         """Return the smaller value of each lane."""
         return (self < other).choose(self, other)
+
+    def times(self, other: Vector) -> Vector:
+        """Return the product, rounded before anything is added to it."""
+        return Vector(self.block, self.block.builder.fmul(self.value, other.value))
+
+    def reciprocal(self) -> Vector:
+        """Return 1 over each lane, correctly rounded; ``/`` may be two roundings off."""
+        one = self.block.vector(1.0).value
+        return Vector(self.block, self.block.builder.fdiv(one, self.value))
 
     def sqrt(self) -> Vector:
         """Return the square root of each lane, correctly rounded."""

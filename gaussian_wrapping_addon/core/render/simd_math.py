@@ -94,12 +94,15 @@ def see(block: Block, params: Any, gaussian: Any, left: Any, top: Any) -> Sight:
         (dy * row[9] + row[6] * 2.0) * dy + 1.0
     )
     den = den.max(float(constants.DENOMINATOR_MIN))
-    inverse = 1.0 / den
+    inverse = den.reciprocal()
     raw = exp_short(num * inverse, 0.5) * row[11]
     return Sight(dx, dy, inverse, den, num, raw, raw.min(float(constants.ALPHA_MAX)), row)
 
 
 def peak_depth(sight: Sight) -> Vector:
-    """Return the z-depth of the Gaussian's maximum along each ray."""
+    """Return the z-depth of the Gaussian's maximum along each ray.
+
+    Rounded alike wherever it is used: thin Gaussians tell a depth's last bits apart.
+    """
     row = sight.row
-    return (sight.dx * row[5] + (sight.dy * row[6] + 1.0)) * sight.inverse * row[10]
+    return ((sight.dx * row[5] + (sight.dy * row[6] + 1.0)) * sight.inverse).times(row[10])
