@@ -145,11 +145,11 @@ def blend(
     forward = forward_kernel(view.lanes, depth, weights)
     background = np.asarray(options.background, np.float32)
     limit = np.float32(options.depth_valid_transmittance)
+    longest = int(np.diff(lists.start).max(initial=0)) if depth else 0
 
     def run(first: int, end: int) -> None:
         scratch = buffers.take_scratch()
-        longest = int((lists.start[first + 1 : end + 1] - lists.start[first:end]).max())
-        entries = buffers.take_lists(longest if depth else 0)
+        entries = buffers.take_lists(longest)
         forward(
             first,
             end,

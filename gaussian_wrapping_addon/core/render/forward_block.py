@@ -149,7 +149,7 @@ def _blend_intrinsic(lanes: int, depth: bool, weights: bool) -> Any:
                 contributes = (sight.alpha >= float(ALPHA_MIN)) & (
                     before >= float(TRANSMITTANCE_MIN)
                 )
-                weight = contributes.choose(sight.alpha * before, 0.0)
+                weight = contributes.choose(sight.alpha.times(before), 0.0)
                 after = before - weight
                 light.set(after)
                 for feature, state in enumerate(features):

@@ -48,6 +48,7 @@ _STEP_SIGMAS_ALONE = 1e-5
 _STEP_SHARE, _LEVEL_NEAR = 2.5e-7, 1e-3
 # ... or the transmittance equal to 0.5 within its own rounding.
 _LEVEL_MARGIN = 3e-7
+_LEVEL_FAR, _FLAT = 0.05, 0.02
 _COARSE = 8e3
 """Depth in sigmas from which on a rounding of a float32 depth is over 1e-3 of a sigma."""
 # exp(-x / 2) is below 3e-7 beyond this x = sharpness d^2.
@@ -332,9 +333,12 @@ def _step_intrinsic(lanes: int) -> Any:
             curl = (growth / depth - ratio * ratio) * over
             gain = (ratio + curl * 0.5) * over
             final = (ratio + curl) * depth * ((gain * 0.5 + 1.0) * gain + 1.0)
-            final = small.choose(final, slope).max(
-                solver.read(_AT_CROSSING) * tolerances.SLOPE_FLOOR
-            )
+            final = small.choose(final, slope)
+            # A layer thinner than a rounding of the depth: T jumps over 0.5 where it is flat.
+            # Its gradient is lost; rather let it be too small than a thousand times too large.
+            alone = solver.read(_AT_CROSSING)
+            lost = (level > _LEVEL_FAR) & (slope < alone * _FLAT)
+            final = lost.choose(alone * 2.0, final.max(alone * tolerances.SLOPE_FLOOR))
             solver.write(low, _LOW)
             solver.write(high, _HIGH)
             solver.write(is_open.choose(moved, t), AT_DEPTH)
