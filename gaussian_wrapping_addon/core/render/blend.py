@@ -34,6 +34,15 @@ class RenderBuffers:
     renderers: list[Any] = field(default_factory=list)
     """Idle :class:`~.view_renderer.ViewRenderer` with their memory."""
 
+    def reserve(self, threads: int, entries: int) -> None:
+        """Have memory for every thread, so that it is not a matter of timing who allocates it."""
+        values = entries * LIST_VALUES * TILE
+        self.lists[:] = [kept for kept in self.lists if len(kept) >= values]
+        while len(self.lists) < threads:
+            self.lists.append(aligned_zeros(values * 5 // 4))
+        while len(self.scratch) < threads:
+            self.scratch.append(aligned_zeros(max(FORWARD_SCRATCH, BACKWARD_SCRATCH)))
+
     def take_scratch(self) -> np.ndarray:
         """Return the state of one thread's tile, with any content."""
         try:
@@ -146,6 +155,7 @@ def blend(
     background = np.asarray(options.background, np.float32)
     limit = np.float32(options.depth_valid_transmittance)
     longest = int(np.diff(lists.start).max(initial=0)) if depth else 0
+    buffers.reserve(view.threads, longest)
 
     def run(first: int, end: int) -> None:
         scratch = buffers.take_scratch()
