@@ -32,3 +32,26 @@ QUATERNION_MIN_NORM = 1e-12
 DIRECTION_MIN_NORM = 1e-12
 ORIENTED_MIN_NORM = 0.05
 """Normals shorter than this are treated as not oriented (method.md 11, row 17)."""
+
+# What a row of screen parameters may be (docs/architecture.md, "Screen Gaussians"): a Gaussian
+# outside of these limits is not visible, in the definition as in every kernel. Within them no
+# product that rendering forms overflows float32 (3.4e38).
+FINITE_OFFSET_PX = 2.0**24
+"""Farthest offset of a pixel from the projected mean: float32 numbers single pixels up to here."""
+FINITE_NUM = 1e21
+FINITE_DEN = 1e16
+"""Largest ``num`` and ``den`` in the image, as sums of absolute terms. ``num`` over the least
+``den`` is 1e37. Gaussians of 1e-4 in a distance of 1e5 reach 1e18, discs of 1e6 : 1 reach 1e13."""
+FINITE_SPREAD = 1e16
+"""Largest ``a0 sigma_z^2``. Its inverse is the least ``den`` of any ray, which is why kernels may
+take ``den`` as at least :data:`DENOMINATOR_MIN`. A disc of 1e8 : 1 reaches it."""
+DENOMINATOR_MIN = 1.0 / FINITE_SPREAD
+FINITE_PULL = 1e18
+"""Largest z-depth times sharpness (1 / sigma^2) of any ray: the depth squares it."""
+FINITE_Z_MIN, FINITE_Z_MAX = 1e-9, 1e12
+"""Range of z-depths. The farther one, over the least ``den`` and times the largest ``1 + p.d``
+(1e8, the root of the largest ``den``), is 1e36; gradients contain 1 / z."""
+FINITE_SIGMA_Z = 1e15
+"""Largest sigma_z: its inverse square, the least a0, is a normal float32."""
+FINITE_COLOR = 2.0**24
+"""Beyond, a float32 sum no longer holds a share of white beside it."""
