@@ -71,7 +71,6 @@ def _sums_of_block(
     def plane(number: int) -> Any:
         return block.offset(at, number * STRIDE)
 
-    distance = sight.num * sight.inverse
     before = block.load(state, plane(TRANSMITTANCE))
     contributes = (sight.alpha >= float(constants.ALPHA_MIN)) & (
         before >= float(constants.TRANSMITTANCE_MIN)
@@ -91,7 +90,8 @@ def _sums_of_block(
     g_lin = block.vector(0.0)
     if depth:
         peak = peak_depth(sight)
-        ahead = (peak - block.load(state, plane(DEPTH))).max(0.0)
+        # 0 where nothing counts: the products below may overflow there, and 0 inf is no number.
+        ahead = contributes.choose(peak - block.load(state, plane(DEPTH)), 0.0).max(0.0)
         fall = sight.den * row[12] * ahead
         density = contributes.choose(sight.raw * exp_wide(fall * ahead, 0.5), 0.0)
         below_cap = density < float(constants.ALPHA_MAX)
@@ -103,7 +103,7 @@ def _sums_of_block(
         g_peak = g_log * fall * -1.0
         g_sharpness = g_log * ahead * ahead * -0.5
         g_num = g_distance * sight.inverse
-        g_den = g_sharpness * row[12] - (g_num * distance + g_peak * peak * sight.inverse)
+        g_den = g_sharpness * row[12] - (g_num * sight.distance + g_peak * peak * sight.inverse)
         g_lin = g_peak * sight.inverse * row[10]
         yield LIN, g_lin
         yield LIN + 1, g_lin * dx
@@ -111,7 +111,7 @@ def _sums_of_block(
         yield ALONG, g_sharpness * sight.den
     else:
         g_num = g_distance * sight.inverse
-        g_den = g_num * distance * -1.0
+        g_den = g_num * sight.distance * -1.0
     for base, value in ((NUM, g_num), (DEN, g_den)):
         along_x, along_y = value * dx, value * dy
         yield base, value

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..compiled import kernel
 from .raster_backward import ABS_U, ABS_V
-from .raster_math import ROW_VALUES, ZERO
+from .raster_math import FLOAT32_MAX, ROW_VALUES, ZERO
 
 
 @kernel(fast=False)
@@ -53,13 +53,22 @@ def take_screen_gradients(
 ) -> None:
     """Write the lengths of the gradient on (u, v) and of its sum of absolute values.
 
-    The columns that held the absolute values become 0: params have none there.
+    The columns that held the absolute values become 0: params have none there. So does a row that
+    float32 could not hold.
     """
     for k in range(begin, end):
         i = ids[k]
         row = grad_params[i]
-        grad_px[i] = math.sqrt(row[0] * row[0] + row[1] * row[1])
-        grad_abs_px[i] = math.sqrt(row[ABS_U] * row[ABS_U] + row[ABS_V] * row[ABS_V])
+        size = 0.0
+        for column in range(ROW_VALUES):
+            size += abs(np.float64(row[column]))
+        if not size <= FLOAT32_MAX:
+            row[:] = ZERO
+        # In float64: squares of float32 overflow beyond 1e19.
+        u, v = np.float64(row[0]), np.float64(row[1])
+        grad_px[i] = math.sqrt(u * u + v * v)
+        u, v = np.float64(row[ABS_U]), np.float64(row[ABS_V])
+        grad_abs_px[i] = math.sqrt(u * u + v * v)
         row[ABS_U] = row[ABS_V] = ZERO
 
 

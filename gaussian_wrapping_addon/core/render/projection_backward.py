@@ -54,6 +54,12 @@ _GRAD_QUAT = _GRAD_SCALE + 3 * BLOCK
 _GRAD_ORIENTATION = _GRAD_QUAT + 4 * BLOCK
 _GRAD_LOGIT = _GRAD_ORIENTATION + 4 * BLOCK
 _PLANES = _GRAD_LOGIT // BLOCK + 1
+_WRITTEN_PLANES = _PLANES - _GRAD_MEAN // BLOCK
+
+_GRADIENT_MAX = 1e38
+"""Gradients beyond are not held: a third of float32's largest number, so that squared lengths and
+sums of a few views stay within float64 and float32."""
+_BASIS_MAX = 3.0  # no basis function is larger on the sphere
 
 
 @inline
@@ -249,6 +255,25 @@ def _raw_gradients(m: Any) -> None:
 
 
 @kernel(fast=False, fused=True)
+def _drop_overflows(m: Any) -> None:
+    """Set what is written of a Gaussian to 0 where float32 cannot hold all of it."""
+    for lane in range(BLOCK):
+        # NaN and infinity survive a sum of sizes.
+        red, green = m[_GRAD + 13 * BLOCK + lane], m[_GRAD + 14 * BLOCK + lane]
+        blue = m[_GRAD + 15 * BLOCK + lane]
+        size = _BASIS_MAX * (abs(red) + abs(green) + abs(blue))
+        for plane in range(_WRITTEN_PLANES):
+            size += abs(m[_GRAD_MEAN + plane * BLOCK + lane])
+        held = size < _GRADIENT_MAX
+        for plane in range(_WRITTEN_PLANES):
+            at = _GRAD_MEAN + plane * BLOCK + lane
+            m[at] = m[at] if held else 0.0
+        m[_GRAD + 13 * BLOCK + lane] = red if held else 0.0
+        m[_GRAD + 14 * BLOCK + lane] = green if held else 0.0
+        m[_GRAD + 15 * BLOCK + lane] = blue if held else 0.0
+
+
+@kernel(fast=False, fused=True)
 def backward_range(
     begin: int,
     end: int,
@@ -275,9 +300,9 @@ def backward_range(
 ) -> None:
     """Write the gradients of the Gaussians ``begin .. end``, or of ``ids[begin .. end]``.
 
-    Those that are not visible have none. With ``compact`` row k of the ``grad_`` arrays is
-    overwritten with the gradient of ``ids[k]``; without, ``ids`` is not read and the gradient of
-    Gaussian i is added to row i.
+    Those that are not visible, or whose gradient float32 cannot hold, have none. With ``compact``
+    row k of the ``grad_`` arrays is overwritten with the gradient of ``ids[k]``; without, ``ids``
+    is not read and the gradient of Gaussian i is added to row i.
     """
     m = block_scratch(_PLANES)
     m[_WEIGHT : _WEIGHT + BASIS_COUNT * BLOCK] = 0.0
@@ -325,6 +350,15 @@ def backward_range(
                         + green * np.float64(sh[i, k, 1])
                         + blue * np.float64(sh[i, k, 2])
                     )
+                m[_GRAD + 13 * BLOCK + lane] = red
+                m[_GRAD + 14 * BLOCK + lane] = green
+                m[_GRAD + 15 * BLOCK + lane] = blue
+            _raw_gradients(m)
+            _drop_overflows(m)
+            for lane in range(min(BLOCK, count - first)):
+                row = queue[first + lane]
+                red, green = m[_GRAD + 13 * BLOCK + lane], m[_GRAD + 14 * BLOCK + lane]
+                blue = m[_GRAD + 15 * BLOCK + lane]
                 if compact:
                     for k in range(coefficients):
                         value = m[BASIS + k * BLOCK + lane]
@@ -341,9 +375,6 @@ def backward_range(
                         grad_sh[row, k, 0] += red * value
                         grad_sh[row, k, 1] += green * value
                         grad_sh[row, k, 2] += blue * value
-            _raw_gradients(m)
-            for lane in range(min(BLOCK, count - first)):
-                row = queue[first + lane]
                 if compact:
                     grad_opacity_logits[row] = m[_GRAD_LOGIT + lane]
                     for axis in range(3):

@@ -44,6 +44,7 @@ CAMERA_VALUES = 22
 19-20, near z 21."""
 
 _ALPHA_MIN = tolerances.ALPHA_MIN
+_TILE = float(tolerances.TILE_PX)
 # An ellipsoid that touches the camera plane within rounding is treated as crossing it.
 _PLANE_MARGIN = 1e-12
 _FLOAT32_MAX = 3.0e38
@@ -205,33 +206,33 @@ def _project_shapes(m: Any, camera: Any) -> None:
         m[_PARAM + 16 * BLOCK + lane] = tanh * m[ORIENTATION + lane]
         m[_PARAM + 17 * BLOCK + lane] = tanh * m[ORIENTATION + BLOCK + lane]
         m[_PARAM + 18 * BLOCK + lane] = tanh * m[ORIENTATION + 2 * BLOCK + lane]
-        # Not seen where float32 cannot hold a value; NaN and infinity survive a sum of sizes.
-        total = abs(m[_PARAM + lane])
-        total += abs(m[_PARAM + 1 * BLOCK + lane])
-        total += abs(m[_PARAM + 2 * BLOCK + lane])
-        total += abs(m[_PARAM + 3 * BLOCK + lane])
-        total += abs(m[_PARAM + 4 * BLOCK + lane])
-        total += abs(m[_PARAM + 5 * BLOCK + lane])
-        total += abs(m[_PARAM + 6 * BLOCK + lane])
-        total += abs(m[_PARAM + 7 * BLOCK + lane])
-        total += abs(m[_PARAM + 8 * BLOCK + lane])
-        total += abs(m[_PARAM + 9 * BLOCK + lane])
-        total += abs(m[_PARAM + 10 * BLOCK + lane])
-        total += abs(m[_PARAM + 11 * BLOCK + lane])
-        total += abs(m[_PARAM + 12 * BLOCK + lane])
-        total += abs(m[_PARAM + 16 * BLOCK + lane])
-        total += abs(m[_PARAM + 17 * BLOCK + lane])
-        total += abs(m[_PARAM + 18 * BLOCK + lane])
-        total += abs(m[_PARAM + 19 * BLOCK + lane])
-        total += abs(m[_PARAM + 20 * BLOCK + lane])
-        total += abs(m[_PARAM + 21 * BLOCK + lane])
-        total += abs(m[_PARAM + 22 * BLOCK + lane])
-        total += abs(m[_BOX + lane])
-        total += abs(m[_BOX + 1 * BLOCK + lane])
-        total += abs(m[_BOX + 2 * BLOCK + lane])
-        total += abs(m[_BOX + 3 * BLOCK + lane])
-        seen = m[_SEEN + lane]
-        m[_SEEN + lane] = seen if total < _FLOAT32_MAX else 0.0
+        # Not seen where float32 cannot hold what rendering makes of it (docs/architecture.md).
+        u, v, z = m[_PARAM + lane], m[_PARAM + BLOCK + lane], m[_PARAM + 10 * BLOCK + lane]
+        reach_x = max(abs(u), abs(width - u)) + _TILE
+        reach_y = max(abs(v), abs(height - v)) + _TILE
+        xx, xy, yy = reach_x * reach_x, reach_x * reach_y, reach_y * reach_y
+        num = m[_PARAM + 2 * BLOCK + lane] * xx + m[_PARAM + 4 * BLOCK + lane] * yy
+        num += abs(m[_PARAM + 3 * BLOCK + lane]) * xy
+        den = m[_PARAM + 7 * BLOCK + lane] * xx + m[_PARAM + 9 * BLOCK + lane] * yy
+        den += abs(m[_PARAM + 8 * BLOCK + lane]) * xy + 1.0
+        den += 2.0 * abs(m[_PARAM + 5 * BLOCK + lane]) * reach_x
+        den += 2.0 * abs(m[_PARAM + 6 * BLOCK + lane]) * reach_y
+        a0, sigma_z = m[_PARAM + 12 * BLOCK + lane], m[_PARAM + 22 * BLOCK + lane]
+        # NaN and infinity survive a sum of sizes.
+        total = m[_DEPTH + lane] + abs(m[_BOX + lane]) + abs(m[_BOX + BLOCK + lane])
+        total += abs(m[_BOX + 2 * BLOCK + lane]) + abs(m[_BOX + 3 * BLOCK + lane])
+        total += abs(m[_PARAM + 16 * BLOCK + lane]) + abs(m[_PARAM + 17 * BLOCK + lane])
+        total += abs(m[_PARAM + 18 * BLOCK + lane]) + abs(m[_PARAM + 19 * BLOCK + lane])
+        total += abs(m[_PARAM + 20 * BLOCK + lane]) + abs(m[_PARAM + 21 * BLOCK + lane])
+        skew = m[_SKEW + lane]
+        total += 0.0 if skew == math.inf else abs(skew)
+        holds = (reach_x <= tolerances.FINITE_OFFSET_PX) & (reach_y <= tolerances.FINITE_OFFSET_PX)
+        holds &= (num <= tolerances.FINITE_NUM) & (den <= tolerances.FINITE_DEN)
+        holds &= a0 * sigma_z * sigma_z <= tolerances.FINITE_SPREAD
+        holds &= a0 * den * z <= tolerances.FINITE_PULL
+        holds &= (z >= tolerances.FINITE_Z_MIN) & (z <= tolerances.FINITE_Z_MAX)
+        holds &= (sigma_z <= tolerances.FINITE_SIGMA_Z) & (total < _FLOAT32_MAX)
+        m[_SEEN + lane] = m[_SEEN + lane] if holds else 0.0
 
 
 @inline
@@ -327,7 +328,7 @@ def project_raw_range(
                     red += value * np.float64(sh[i, k, 0])
                     green += value * np.float64(sh[i, k, 1])
                     blue += value * np.float64(sh[i, k, 2])
-                if not abs(red) + abs(green) + abs(blue) < _FLOAT32_MAX:
+                if not max(red, max(green, blue)) <= tolerances.FINITE_COLOR:
                     continue
                 m[_PARAM + 13 * BLOCK + lane] = max(red, 0.0)
                 m[_PARAM + 14 * BLOCK + lane] = max(green, 0.0)

@@ -40,9 +40,10 @@ ALPHA_MIN = np.float32(tolerances.ALPHA_MIN)
 ALPHA_MAX = np.float32(tolerances.ALPHA_MAX)
 TRANSMITTANCE_MIN = np.float32(tolerances.TRANSMITTANCE_MIN)
 ISO_LEVEL = np.float32(tolerances.ISO_LEVEL)
-# Rays that all but miss a Gaussian's half space: keeps 1 / den finite, distances huge.
-DENOMINATOR_MIN = np.float32(1e-20)
+# No ray's den is smaller but by rounding; keeps 1 / den finite.
+DENOMINATOR_MIN = np.float32(tolerances.DENOMINATOR_MIN)
 FAR = np.float32(3e38)
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 # Beyond this many sigma_z before a Gaussian's centre its density is below 3e-7.
 FRONT_SIGMAS = np.float32(5.5)
 LIVENESS_EVERY = 32

@@ -21,7 +21,7 @@ class ReferenceScreen:
 
     params: Tensor  # (n, 24); column 23 is 0
     depths: Tensor  # (n,) distance from the camera to the mean
-    usable: Tensor  # (n,) bool: beyond the near plane, opacity above 1/255, all values finite
+    usable: Tensor  # (n,) bool: beyond the near plane, opacity above 1/255, held by float32
 
 
 def reference_projection(
@@ -79,14 +79,45 @@ def reference_projection(
         torch.stack([scaled[:, 2].norm(dim=1), torch.zeros_like(z)], 1),
     ]
     rows = torch.cat(columns, 1)  # (m, 24)
-    good = (torch.isfinite(rows).all(1) & (opacity > tolerances.ALPHA_MIN)).detach()
+    distance = local.norm(dim=1).detach()
+    good = (opacity > tolerances.ALPHA_MIN).detach() & _held_by_float32(
+        rows.detach(), distance, camera
+    )
     index = torch.nonzero(in_front)[:, 0]
     usable = torch.zeros(len(gaussians), dtype=torch.bool, device=rows.device)
     usable[index] = good
     params = means.new_zeros((len(gaussians), 24)).index_put((index[good],), rows[good])
-    distance = means.new_full((len(gaussians),), torch.inf)
-    distance = distance.index_put((index,), local.norm(dim=1))
-    return ReferenceScreen(params, distance.detach(), usable)
+    distances = means.new_full((len(gaussians),), torch.inf)
+    distances = distances.index_put((index,), distance)
+    return ReferenceScreen(params, distances, usable)
+
+
+def _held_by_float32(rows: Tensor, distance: Tensor, camera: Camera) -> Tensor:
+    """(m,) which rows no product of rendering in float32 overflows (``docs/architecture.md``)."""
+    u, v, qa, qb, qc, px, py, r, s, t, z, _, a0 = rows[:, :13].unbind(1)
+    sigma_z = rows[:, 22]
+    reach_x = torch.maximum(u.abs(), (camera.width - u).abs()) + tolerances.TILE_PX
+    reach_y = torch.maximum(v.abs(), (camera.height - v).abs()) + tolerances.TILE_PX
+
+    def quadratic(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
+        return xx * reach_x**2 + xy.abs() * reach_x * reach_y + yy * reach_y**2
+
+    linear = px.abs() * reach_x + py.abs() * reach_y
+    most_den = 1.0 + 2.0 * linear + quadratic(r, s, t)
+    largest = torch.finfo(torch.float32).max
+    return (
+        (torch.maximum(reach_x, reach_y) <= tolerances.FINITE_OFFSET_PX)
+        & (quadratic(qa, qb, qc) <= tolerances.FINITE_NUM)
+        & (most_den <= tolerances.FINITE_DEN)
+        & (a0 * sigma_z**2 <= tolerances.FINITE_SPREAD)
+        & (a0 * most_den * z <= tolerances.FINITE_PULL)
+        & (z >= tolerances.FINITE_Z_MIN)
+        & (z <= tolerances.FINITE_Z_MAX)
+        & (sigma_z <= tolerances.FINITE_SIGMA_Z)
+        & (rows[:, 13:16] <= tolerances.FINITE_COLOR).all(1)
+        & (rows.abs() < largest).all(1)
+        & (distance < largest)
+    )
 
 
 def _colors(gaussians: OrientedGaussians, camera: Camera, options: RenderOptions) -> Tensor:

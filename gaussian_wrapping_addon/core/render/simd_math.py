@@ -9,23 +9,25 @@ from typing import Any
 from . import raster_math as constants
 from .simd import Block, Vector
 
+SHORT_END, WIDE_END = 8.0 * float(constants.FIT_END), 32.0 * float(constants.FIT_END)
+"""Where :func:`exp_short` (exp(-5.6) < 1/255) and :func:`exp_wide` (exp(-22.4) = 2e-10) end."""
+
 
 def exp_short(x: Vector, scale: float = 1.0) -> Vector:
-    """Return exp(-scale x) for 0 <= scale x <= 5.6, and less than 1/255 above (error 1.6e-6)."""
+    """Return exp(-scale x) for 0 <= scale x <= SHORT_END (relative error 1.6e-6)."""
     return _power(_fit(x * (scale / 8.0)), 3)
 
 
 def exp_wide(x: Vector, scale: float = 1.0) -> Vector:
-    """Return exp(-scale x) for 0 <= scale x <= 22.4, and 0 above (relative error 7e-6).
+    """Return exp(-scale x) for 0 <= scale x <= WIDE_END, and 0 above (relative error 7e-6).
 
     A small value in place of 0 would be magnified by the 1 / sigma^2 of thin Gaussians far behind.
     """
     value = _power(_fit(x * (scale / 32.0)), 5)
-    return (x < 32.0 * float(constants.FIT_END) / scale).choose(value, 0.0)
+    return (x < WIDE_END / scale).choose(value, 0.0)
 
 
 def _fit(y: Vector) -> Vector:
-    y = y.min(float(constants.FIT_END))
     total = y * float(constants.FIT[-1]) + float(constants.FIT[-2])
     for coefficient in reversed(constants.FIT[:-2]):
         total = total * y + float(coefficient)
@@ -46,7 +48,8 @@ class Sight:
     dy: Vector
     inverse: Vector  # 1 / den
     den: Vector
-    num: Vector  # smallest squared Mahalanobis distance on the ray, times den
+    distance: Vector
+    """Smallest squared Mahalanobis distance on the ray; at most what leaves alpha below 1/255."""
     raw: Vector  # opacity on the ray before the cap
     alpha: Vector  # after the cap
     row: Row
@@ -95,8 +98,9 @@ def see(block: Block, params: Any, gaussian: Any, left: Any, top: Any) -> Sight:
     )
     den = den.max(float(constants.DENOMINATOR_MIN))
     inverse = den.reciprocal()
-    raw = exp_short(num * inverse, 0.5) * row[11]
-    return Sight(dx, dy, inverse, den, num, raw, raw.min(float(constants.ALPHA_MAX)), row)
+    distance = (num * inverse).min(2.0 * SHORT_END)
+    raw = exp_short(distance, 0.5) * row[11]
+    return Sight(dx, dy, inverse, den, distance, raw, raw.min(float(constants.ALPHA_MAX)), row)
 
 
 def peak_depth(sight: Sight) -> Vector:
