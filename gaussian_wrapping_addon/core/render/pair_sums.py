@@ -59,7 +59,7 @@ def take_screen_gradients(
     for k in range(begin, end):
         i = ids[k]
         row = grad_params[i]
-        size = 0.0
+        size = np.float64(0.0)
         for column in range(ROW_VALUES):
             size += abs(np.float64(row[column]))
         if not size <= FLOAT32_MAX:
