@@ -328,7 +328,8 @@ def project_raw_range(
                     red += value * np.float64(sh[i, k, 0])
                     green += value * np.float64(sh[i, k, 1])
                     blue += value * np.float64(sh[i, k, 2])
-                if not max(red, max(green, blue)) <= tolerances.FINITE_COLOR:
+                brightest = tolerances.FINITE_COLOR  # which NaN is not below; max() would lose it
+                if not (red <= brightest and green <= brightest and blue <= brightest):
                     continue
                 m[_PARAM + 13 * BLOCK + lane] = max(red, 0.0)
                 m[_PARAM + 14 * BLOCK + lane] = max(green, 0.0)
