@@ -23,16 +23,12 @@ from .backward_block import (
     ALONG,
     BACKWARD_PLANES,
     DEN,
-    DEPTH,
     DEPTH_SUMS,
     DISTANCE,
     FEATURE,
-    G0,
     LIN,
     NUM,
     PLAIN_SUMS,
-    PULL,
-    REMAINING,
     TRANSMITTANCE,
     gradient_of_pair,
 )
@@ -42,7 +38,6 @@ from .raster_math import (
     FEATURES,
     HALF,
     LIVENESS_EVERY,
-    ONE,
     PLANE,
     PREFETCH_AHEAD,
     ROW_VALUES,
@@ -52,6 +47,7 @@ from .raster_math import (
     TWO,
     ZERO,
 )
+from .tile_io import read_row
 from .vector_runs import max_run, prefetch_row
 
 ABS_U, ABS_V = 22, 23
@@ -135,6 +131,8 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
         pairs: np.ndarray,
     ) -> None:
         """Write the gradients of all pairs of the tiles at their slots of ``pairs (p, 24)``."""
+        images = (color, normal, geometric, alpha_image, depth_image, slope_image)
+        grads = (g_color, g_normal, g_geometric, g_alpha, g_depth)
         for tile in range(first_tile, end_tile):
             begin = np.int64(start[tile])
             count = np.int64(start[tile + 1]) - begin
@@ -146,36 +144,13 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
             origin_x = np.float32(tile_x) + HALF
             live_rows = min(height - tile_y, TILE)
             live_columns = min(width - tile_x, TILE)
-            for p in range(_SUMS):
-                m[p] = ZERO
-            for row in range(live_rows):
-                y = tile_y + row
-                for column in range(live_columns):
-                    x = tile_x + column
-                    b = (
-                        (row // block_height * BLOCK_COLUMNS + column // BLOCK_WIDTH) * lanes
-                        + row % block_height * BLOCK_WIDTH
-                        + column % BLOCK_WIDTH
-                    )
-                    # The colour holds the background, so its part of the final T is included.
-                    remaining = -g_alpha[y, x] * (ONE - alpha_image[y, x])
-                    for channel in range(3):
-                        value = g_color[y, x, channel]
-                        m[(G0 + channel) * STRIDE + b] = value
-                        remaining += value * color[y, x, channel]
-                        value = g_normal[y, x, channel]
-                        m[(G0 + 3 + channel) * STRIDE + b] = value
-                        remaining += value * normal[y, x, channel]
-                        value = g_geometric[y, x, channel]
-                        m[(G0 + 6 + channel) * STRIDE + b] = value
-                        remaining += value * geometric[y, x, channel]
-                    m[REMAINING * STRIDE + b] = remaining
-                    m[TRANSMITTANCE * STRIDE + b] = ONE
-                    if depth:
-                        at = depth_image[y, x]
-                        if at > ZERO and g_depth[y, x] != ZERO:
-                            m[DEPTH * STRIDE + b] = at
-                            m[PULL * STRIDE + b] = g_depth[y, x] / slope_image[y, x]
+            for row in range(TILE):
+                place = (
+                    row // block_height * BLOCK_COLUMNS * lanes + row % block_height * BLOCK_WIDTH
+                )
+                inside = live_columns if row < live_rows else 0
+                at = (tile_y + row) * width + tile_x
+                read_row(lanes, depth, m, place, inside, images, grads, at)
             live = np.uint64(0)
             for k in range(begin, begin + count):
                 if (k - begin) % LIVENESS_EVERY == 0:

@@ -22,20 +22,18 @@ from .raster_math import (
     BEST_AT,
     BLOCK_COLUMNS,
     BLOCK_WIDTH,
-    DEPTH,
-    F0,
     FAR,
     FORWARD_PLANES,
     FRONT_SIGMAS,
     HALF,
     ONE,
     PLANE,
-    SLOPE,
     STRIDE,
     TILE,
     TRANSMITTANCE,
     ZERO,
 )
+from .tile_io import write_row
 from .vector_runs import lowest_bit, prefetch_row
 
 FORWARD_SCRATCH = FORWARD_PLANES * STRIDE + SOLVER_VALUES
@@ -89,6 +87,7 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
         visits = np.zeros(blocks * longest, np.int32)
         counts = np.zeros(blocks, np.int64)
         fronts = np.zeros(longest + 1, np.float32)
+        images = (color, normal, geometric, alpha_image, depth_image, slope_image)
         for tile in range(first_tile, end_tile):
             begin = np.int64(start[tile])
             count = np.int64(start[tile + 1]) - begin
@@ -98,16 +97,19 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
             origin_x = np.float32(tile_x) + HALF
             live_rows = min(height - tile_y, TILE)
             live_columns = min(width - tile_x, TILE)
-            for p in range(FORWARD_PLANES * STRIDE):
-                m[p] = ZERO
-            # Pixels outside the image start opaque, so nothing contributes to them.
-            for row in range(live_rows):
-                for column in range(live_columns):
-                    m[
-                        (row // block_height * BLOCK_COLUMNS + column // BLOCK_WIDTH) * lanes
-                        + row % block_height * BLOCK_WIDTH
-                        + column % BLOCK_WIDTH
-                    ] = ONE
+            # Everything else of the scratch is written before it is read.
+            for p in range(PLANE):
+                m[TRANSMITTANCE * STRIDE + p] = ONE
+            if live_rows < TILE or live_columns < TILE:
+                # Pixels outside the image start opaque, so nothing contributes to them.
+                for row in range(TILE):
+                    for column in range(0 if row >= live_rows else live_columns, TILE):
+                        m[
+                            TRANSMITTANCE * STRIDE
+                            + (row // block_height * BLOCK_COLUMNS + column // BLOCK_WIDTH) * lanes
+                            + row % block_height * BLOCK_WIDTH
+                            + column % BLOCK_WIDTH
+                        ] = ZERO
             for block in range(blocks):
                 counts[block] = 0
             for k in range(begin, begin + count):
@@ -139,31 +141,17 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                     solve_block(lanes, m, block * lanes, lists, entries)
             for row in range(live_rows):
                 y = tile_y + row
-                for column in range(live_columns):
-                    x = tile_x + column
-                    b = (
-                        (row // block_height * BLOCK_COLUMNS + column // BLOCK_WIDTH) * lanes
-                        + row % block_height * BLOCK_WIDTH
-                        + column % BLOCK_WIDTH
-                    )
-                    through = m[TRANSMITTANCE * STRIDE + b]
-                    color[y, x, 0] = m[F0 * STRIDE + b] + through * background[0]
-                    color[y, x, 1] = m[(F0 + 1) * STRIDE + b] + through * background[1]
-                    color[y, x, 2] = m[(F0 + 2) * STRIDE + b] + through * background[2]
-                    normal[y, x, 0] = m[(F0 + 3) * STRIDE + b]
-                    normal[y, x, 1] = m[(F0 + 4) * STRIDE + b]
-                    normal[y, x, 2] = m[(F0 + 5) * STRIDE + b]
-                    geometric[y, x, 0] = m[(F0 + 6) * STRIDE + b]
-                    geometric[y, x, 1] = m[(F0 + 7) * STRIDE + b]
-                    geometric[y, x, 2] = m[(F0 + 8) * STRIDE + b]
-                    alpha_image[y, x] = ONE - through
-                    if depth:
-                        depth_image[y, x] = m[DEPTH * STRIDE + b]
-                        slope_image[y, x] = m[SLOPE * STRIDE + b]
-                    if weights:
-                        strongest[y, x] = -1
+                place = (
+                    row // block_height * BLOCK_COLUMNS * lanes + row % block_height * BLOCK_WIDTH
+                )
+                at = y * width + tile_x
+                write_row(lanes, depth, m, place, live_columns, background, images, at)
+                if weights:
+                    for column in range(live_columns):
+                        b = place + column // BLOCK_WIDTH * lanes + column % BLOCK_WIDTH
+                        strongest[y, tile_x + column] = -1
                         if m[BEST * STRIDE + b] > ZERO:
-                            strongest[y, x] = gaussian_ids[
+                            strongest[y, tile_x + column] = gaussian_ids[
                                 begin + np.int64(m[BEST_AT * STRIDE + b])
                             ]
 
