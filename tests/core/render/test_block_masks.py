@@ -66,3 +66,30 @@ def test_unbounded_ellipse_is_everywhere(lanes: int) -> None:
     assert len(found) > 10
     assert found.all()
     assert truth.any()
+
+
+@pytest.mark.parametrize("lanes", [8, 16])
+def test_tiles_are_marked_alone(lanes: int) -> None:
+    gaussians = random_gaussians(300, seed=4, dtype=torch.float32, scale=(0.004, 0.1))
+    camera = look_at((2.2, 1.0, 0.8), width=150, height=90, focal=160.0)
+    screen = project_gaussians(RawArrays.from_gaussians(gaussians), camera, RenderOptions())
+    lists = bin_gaussians(screen, camera.width, camera.height, 1)
+    counts = np.diff(lists.start)
+    assert (counts < 16).any()
+    assert counts.max() > 32
+
+    def marked(first: int, end: int) -> np.ndarray:
+        masks = np.full(len(lists.gaussian_ids), 0xABCDEF, np.uint32)
+        mask_kernel(lanes)(
+            first, end, lists.start, lists.gaussian_ids, screen.boxes, screen.skews,
+            lists.tiles_x, masks,
+        )  # fmt: skip
+        return masks
+
+    whole = marked(0, len(counts))
+    for tile in range(len(counts)):
+        begin, end = lists.start[tile : tile + 2]
+        alone = marked(tile, tile + 1)
+        np.testing.assert_array_equal(alone[begin:end], whole[begin:end])
+        alone[begin:end] = 0xABCDEF
+        assert (alone == 0xABCDEF).all()
