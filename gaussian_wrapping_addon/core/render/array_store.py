@@ -8,6 +8,8 @@ import math
 import numpy as np
 from numpy.typing import DTypeLike
 
+from .large_pages import empty_array
+
 # A buffer that has to grow gets this share more than was asked for, so that slowly growing sets of
 # Gaussians do not allocate in every iteration.
 _GROWTH = 0.25
@@ -48,7 +50,7 @@ class ArrayStore:
             reserved = rows + int(_GROWTH * rows)
             if limit is not None:
                 reserved = max(rows, min(reserved, limit))
-            kept = np.empty(reserved * row_size, dtype)
+            kept = empty_array(reserved * row_size, dtype)
             self._kept[name] = kept
         return kept[:size].reshape(shape)
 

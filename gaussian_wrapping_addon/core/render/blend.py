@@ -12,6 +12,7 @@ import numpy as np
 from ..dataset.camera import Camera
 from ..parallel import even_bounds, run_chunks
 from .isosurface_steps import LIST_VALUES
+from .large_pages import empty_array
 from .projection import RawArrays, ScreenGaussians
 from .raster_backward import BACKWARD_SCRATCH, backward_kernel, sum_pairs
 from .raster_forward import FORWARD_SCRATCH, forward_kernel
@@ -65,7 +66,9 @@ class RenderBuffers:
             kept = self.pairs.pop()
         except IndexError:
             kept = np.zeros((0, ROW_VALUES), np.float32)
-        return kept if len(kept) >= count else np.zeros((count * 5 // 4, ROW_VALUES), np.float32)
+        if len(kept) >= count:
+            return kept
+        return empty_array(count * 5 // 4 * ROW_VALUES, np.float32).reshape(-1, ROW_VALUES)
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,8 @@ from .raster_math import (
     ZERO,
 )
 from .tile_io import write_row
-from .vector_runs import lowest_bit, prefetch_row
+from .vector_runs import prefetch_row, prefetch_row_early
+from .visits import VISITS_ROOM, list_visits
 
 FORWARD_SCRATCH = FORWARD_PLANES * STRIDE + SOLVER_VALUES
 
@@ -84,7 +85,8 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
         longest: Any = 0
         for tile in range(first_tile, end_tile):
             longest = max(longest, np.int64(start[tile + 1]) - np.int64(start[tile]))
-        visits = np.zeros(blocks * longest, np.int32)
+        room = longest + VISITS_ROOM
+        visits = np.empty(blocks * room, np.int32)
         counts = np.zeros(blocks, np.int64)
         fronts = np.zeros(longest + 1, np.float32)
         images = (color, normal, geometric, alpha_image, depth_image, slope_image)
@@ -110,19 +112,13 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                             + row % block_height * BLOCK_WIDTH
                             + column % BLOCK_WIDTH
                         ] = ZERO
-            for block in range(blocks):
-                counts[block] = 0
             for k in range(begin, begin + count):
                 prefetch_row(params, np.int64(gaussian_ids[k]))
                 if weights:
                     pair_weights[pair_slots[k], 0] = ZERO
                     pair_weights[pair_slots[k], 1] = ZERO
-                bits = np.uint64(masks[k])
-                while bits != np.uint64(0):
-                    named = np.int64(lowest_bit(bits)) & (blocks - 1)
-                    visits[named * longest + counts[named]] = k
-                    counts[named] += 1
-                    bits &= bits - np.uint64(1)
+            coming: Any = np.int64(start[min(tile + 2, end_tile)]) - begin - count
+            list_visits(lanes, masks, begin, count, room, visits, counts)
             if depth:
                 # From behind: the nearest point that a pair or any after it reaches back to.
                 front: Any = FAR
@@ -132,9 +128,13 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                     front = min(front, params[i, 10] - FRONT_SIGMAS * params[i, 22])
                     fronts[k] = front
             for block in range(blocks):
+                # The rows of the next tile arrive while this one is blended.
+                next_k = begin + count + block * coming // blocks
+                for k in range(next_k, begin + count + (block + 1) * coming // blocks):
+                    prefetch_row_early(params, np.int64(gaussian_ids[k]))
                 entries = blend_block(
                     lanes, depth, weights, m, block, params, gaussian_ids, pair_slots, visits,
-                    block * longest, counts[block], begin, origin_x, origin_y, lists, fronts,
+                    block * room, counts[block], begin, origin_x, origin_y, lists, fronts,
                     limit, pair_weights,
                 )  # fmt: skip
                 if depth:

@@ -21,7 +21,7 @@ from .cuda.cuda_render import render_cuda
 from .projection import RawArrays, RawGradients, project_backward, project_gaussians
 from .tiles import TileBinning
 from .types import ImageGradients, Render, RenderOptions, RenderStatistics
-from .view_renderer import ViewPass, ViewRenderer, band_view
+from .view_renderer import ViewPass, ViewRenderer, band_view, take_screen
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 
@@ -165,7 +165,7 @@ def _own(statistics: RenderStatistics) -> RenderStatistics:
 def project_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> ScreenView:
     """Project and bin: everything of a view that comes before the pixels."""
     threads, store = options.threads or default_threads(), ArrayStore()
-    screen = project_gaussians(gaussians, camera, options)
+    screen = project_gaussians(gaussians, camera, options, take_screen(len(gaussians), store))
     binning = TileBinning(screen, camera.width, camera.height, threads, store)
     band = (0, binning.tiles_x * binning.tiles_y)
     return band_view(gaussians, camera, options, screen, binning.lists(*band), band, store)

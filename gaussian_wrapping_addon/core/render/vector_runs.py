@@ -91,23 +91,29 @@ def _lowest_bit(typingctx, bits):  # type: ignore[no-untyped-def]
     return types.uint64(types.uint64), generate
 
 
-@intrinsic
-def _prefetch_row(typingctx, rows, row):  # type: ignore[no-untyped-def]
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        byte, word = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [byte, word, word, word])
-        fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        first = builder.mul(args[1], ir.Constant(args[1].type, ROW_VALUES))
-        for offset in (0, ROW_VALUES - 1):  # 96 bytes lie on two cache lines
-            place = builder.gep(data, [builder.add(first, ir.Constant(first.type, offset))])
-            hints = [ir.Constant(word, value) for value in (0, 3, 1)]  # read, keep, data
-            builder.call(fetch, [builder.bitcast(place, byte), *hints])
-        return context.get_dummy_value()
+def _prefetch_intrinsic(locality: int) -> Any:
+    """Make a function that asks for a row: 3 for the nearest cache, 2 for the one behind it."""
 
-    return types.void(rows, types.intp), generate
+    @intrinsic
+    def prefetch(typingctx, rows, row):  # type: ignore[no-untyped-def]
+        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            data = context.make_array(sig.args[0])(context, builder, args[0]).data
+            byte, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+            kind = ir.FunctionType(ir.VoidType(), [byte, word, word, word])
+            fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+            first = builder.mul(args[1], ir.Constant(args[1].type, ROW_VALUES))
+            for offset in (0, ROW_VALUES - 1):  # 96 bytes lie on two cache lines
+                place = builder.gep(data, [builder.add(first, ir.Constant(first.type, offset))])
+                hints = [ir.Constant(word, value) for value in (0, locality, 1)]  # read, data
+                builder.call(fetch, [builder.bitcast(place, byte), *hints])
+            return context.get_dummy_value()
+
+        return types.void(rows, types.intp), generate
+
+    return prefetch
 
 
+_prefetch_near, _prefetch_far = _prefetch_intrinsic(3), _prefetch_intrinsic(2)
 _copy_8, _copy_16 = _copy_intrinsic(8), _copy_intrinsic(16)
 _max_8, _max_16 = _reduce_intrinsic(8, "fmax"), _reduce_intrinsic(16, "fmax")
 _positive_8, _positive_16 = _mask_intrinsic(8), _mask_intrinsic(16)
@@ -142,7 +148,13 @@ def prefetch_row(rows: Any, row: Any) -> None:
     Tiles visit rows in no order that the processor could guess; waiting for them took a third of
     the time.
     """
-    _prefetch_row(rows, row)  # type: ignore[call-arg]
+    _prefetch_near(rows, row)
+
+
+@inline
+def prefetch_row_early(rows: Any, row: Any) -> None:
+    """Ask for a row that is read much later to be brought to the second cache."""
+    _prefetch_far(rows, row)
 
 
 @inline

@@ -36,6 +36,17 @@ _TILE_COST = 16
 _MAX_ZERO_IMAGES = 4
 
 
+def take_screen(count: int, store: ArrayStore) -> ScreenGaussians:
+    """Return room for the projection of Gaussians, with any content."""
+    return ScreenGaussians(
+        store.take("params", (count, ROW_VALUES), np.float32),
+        store.take("boxes", (count, 4), np.float32),
+        store.take("in image", count, np.bool_),
+        store.take("depths", count, np.float32),
+        store.take("skews", count, np.float32),
+    )
+
+
 def band_view(
     gaussians: RawArrays,
     camera: Camera,
@@ -350,23 +361,13 @@ class ViewRenderer:
         threads = options.threads or default_threads()
         store = self.store
         self.rendered += 1
-        screen = project_gaussians(gaussians, camera, options, self._screen(len(gaussians)))
+        screen = project_gaussians(gaussians, camera, options, take_screen(len(gaussians), store))
         binning = TileBinning(screen, camera.width, camera.height, threads, store)
         if images is None:
             images = Images.allocate(camera, options, store.take)
         view = ViewPass(self, gaussians, camera, options, screen, binning, images)
         view.forward()
         return view
-
-    def _screen(self, count: int) -> ScreenGaussians:
-        take = self.store.take
-        return ScreenGaussians(
-            take("params", (count, ROW_VALUES), np.float32),
-            take("boxes", (count, 4), np.float32),
-            take("in image", count, np.bool_),
-            take("depths", count, np.float32),
-            take("skews", count, np.float32),
-        )
 
     def zero_image(self, shape: tuple[int, ...]) -> np.ndarray:
         """Return an image that stays 0."""
