@@ -38,17 +38,16 @@ from .raster_math import (
     FEATURES,
     HALF,
     LIVENESS_EVERY,
-    PLANE,
     PREFETCH_AHEAD,
     ROW_VALUES,
     STRIDE,
     TILE,
-    TRANSMITTANCE_MIN,
     TWO,
     ZERO,
 )
 from .tile_io import read_row
-from .vector_runs import max_run, prefetch_row
+from .vector_runs import prefetch_row
+from .visits import lit_blocks
 
 ABS_U, ABS_V = 22, 23
 """Columns of the pair gradients that hold sums of absolute values, not gradients of params."""
@@ -101,7 +100,6 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
     absolute : bool
         Also sum the absolute gradients on (u, v) per pixel (AbsGS).
     """
-    blocks = PLANE // lanes
     block_height = lanes // BLOCK_WIDTH
 
     @kernel(fast=True)
@@ -154,11 +152,7 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
             live = np.uint64(0)
             for k in range(begin, begin + count):
                 if (k - begin) % LIVENESS_EVERY == 0:
-                    live = np.uint64(0)
-                    for block in range(blocks):
-                        clearest = max_run(lanes, m, TRANSMITTANCE * STRIDE + block * lanes)
-                        if clearest >= TRANSMITTANCE_MIN:
-                            live |= np.uint64(1) << np.uint64(block)
+                    live = lit_blocks(lanes, m, TRANSMITTANCE * STRIDE)
                 ahead: Any = min(k + PREFETCH_AHEAD, begin + count - 1)
                 prefetch_row(params, np.int64(gaussian_ids[ahead]))
                 prefetch_row(pairs, np.int64(pair_slots[ahead]))

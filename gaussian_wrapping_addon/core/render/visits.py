@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""For each block of a tile, the pairs that reach it, from the masks of the pairs."""
+"""Which pairs reach each block of a tile, and which blocks still let light through."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from ..compiled import inline
-from .raster_math import PLANE, TILE
+from .raster_math import PLANE, TILE, TRANSMITTANCE_MIN
+from .simd import Block
 from .vector_runs import lowest_bit
 
 _GROUP = TILE
@@ -101,3 +102,29 @@ def list_visits(
                 visits[named * room + counts[named]] = k
                 counts[named] += 1
                 bits &= bits - np.uint64(1)
+
+
+def _lit_intrinsic(lanes: int) -> Any:
+    @intrinsic
+    def lit(typingctx, m, plane):  # type: ignore[no-untyped-def]
+        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            block, bits = Block(lanes, context, builder), ir.Constant(_INDEX, 0)
+            state = block.data(sig.args[0], args[0])
+            for number in range(PLANE // lanes):
+                light = block.load(state, block.offset(args[1], number * lanes))
+                passes = builder.zext((light >= float(TRANSMITTANCE_MIN)).any(), _INDEX)
+                bits = builder.or_(bits, builder.shl(passes, ir.Constant(_INDEX, number)))
+            return bits
+
+        return types.uint64(m, types.intp), generate
+
+    return lit
+
+
+_lit_16, _lit_8 = _lit_intrinsic(16), _lit_intrinsic(8)
+
+
+@inline
+def lit_blocks(lanes: Any, m: Any, plane: Any) -> Any:
+    """Return as bits the blocks with a pixel whose transmittance, at ``m[plane ..]``, counts."""
+    return _lit_16(m, plane) if lanes == 16 else _lit_8(m, plane)
