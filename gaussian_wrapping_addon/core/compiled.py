@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The one decorator for numba kernels: flags, on-disk cache, and life without a cache."""
+"""The decorators for numba kernels: flags, on-disk cache, and life without a cache."""
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba.core import config
+
+from .kernel_cache import LOCATORS
 
 _logger = logging.getLogger(__name__)
 
@@ -20,6 +24,8 @@ FUSED_MATH = {"contract"}
 def kernel(*, fast: bool, fused: bool = False) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function on first call, with the GIL released.
 
+    Kernels are called from Python and call one another never: see :func:`part`.
+
     Parameters
     ----------
     fast : bool
@@ -30,20 +36,52 @@ def kernel(*, fast: bool, fused: bool = False) -> Callable[[Callable[..., Any]],
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        options: dict[str, Any] = {
-            "nogil": True,
-            "error_model": "numpy",
-            "boundscheck": False,
-            "fastmath": FAST_MATH if fast else (FUSED_MATH if fused else False),
-        }
+        options = {"nogil": True, **_options(fast, fused)}
+        usual, config.CACHE_LOCATOR_CLASSES = config.CACHE_LOCATOR_CLASSES, LOCATORS
         try:
             return numba.njit(cache=True, **options)(function)
         except RuntimeError:
             # numba raises here, at decoration, when no cache folder is writable.
-            _logger.warning("No writable kernel cache: kernels are compiled anew in each run")
+            _warn_without_cache()
             return numba.njit(**options)(function)
+        finally:
+            config.CACHE_LOCATOR_CLASSES = usual
 
     return decorate
+
+
+def part(*, fast: bool, fused: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator for a large helper of kernels: compiled alone, then inlined into each.
+
+    Optimised before its caller is, which keeps long loops packed that LLVM would not recognise
+    amid the caller's other arrays; parameters are those of :func:`kernel`. A kernel that was called
+    by kernels would round differently from run to run. LLVM puts a copy of it, optimised once more,
+    into each caller's machine code, under the same name; which of the copies all callers then
+    reach depends on what was compiled or loaded first in the process. A part leaves no function
+    behind that could be called, and is never taken from the cache itself.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        return numba.njit(forceinline=True, **_options(fast, fused))(function)
+
+    return decorate
+
+
+def _options(fast: bool, fused: bool) -> dict[str, Any]:
+    return {
+        "error_model": "numpy",
+        "boundscheck": False,
+        "fastmath": FAST_MATH if fast else (FUSED_MATH if fused else False),
+    }
+
+
+@functools.cache
+def _warn_without_cache() -> None:
+    """Say it once, not once a kernel."""
+    _logger.warning(
+        "No folder for compiled kernels can be written, so each run compiles them anew: set "
+        "NUMBA_CACHE_DIR to a folder that can."
+    )
 
 
 def inline(function: Callable[..., Any]) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled import kernel
+from ..compiled import kernel, part
 from .window_runs import LANES, RING, TAPS, filter_run, filter_two_runs
 
 WINDOW = TAPS
@@ -31,14 +31,14 @@ STRIDE = (3 * (BLOCK_PX + 2 * REACH) + 2 * _MARGIN + 2 * LANES) // LANES * LANES
 """Values between two rows of scratch; constant, so that LLVM sees that they do not overlap."""
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _filter_along(count, target, target_at, source, source_at, weights):  # type: ignore[no-untyped-def]
     """Filter one row of interleaved colours; writes ``count`` values, rounded up to whole runs."""
     for j in range(0, count, LANES):
         filter_run(target, target_at + j, source, source_at + j, 3, weights)  # type: ignore[call-arg]
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _filter_across(count, kinds, target, ring, first, weights):  # type: ignore[no-untyped-def]
     """Filter a ring of ``kinds`` rows a slot into two times ``kinds`` rows.
 
@@ -67,7 +67,7 @@ def _filter_across(count, kinds, target, ring, first, weights):  # type: ignore[
                 filter_two_runs(target, j, apart, ring, j, apart, weights, 10)  # type: ignore[call-arg]
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _keep_row(mask, row, first, last, keep):  # type: ignore[no-untyped-def]
     """Write 1 or 0 for each value of the pixels [first, last) of a row of the mask."""
     for p in range(last - first):
@@ -77,7 +77,7 @@ def _keep_row(mask, row, first, last, keep):  # type: ignore[no-untyped-def]
         keep[3 * p + 2] = value
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _load_row(row, first, count, image, photo, scale, keep, rows):  # type: ignore[no-untyped-def]
     """Write x, y, x^2 + y^2 and x y of ``count`` values of a row, 0 outside the mask."""
     kind = rows.dtype.type
@@ -94,7 +94,7 @@ def _load_row(row, first, count, image, photo, scale, keep, rows):  # type: igno
         rows[3 * STRIDE + j] = x * y
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _similarity_row(count, means, keep, partial):  # type: ignore[no-untyped-def]
     """Write SSIM of one row of windows, and its derivatives by E[x], E[x^2] and E[x y]."""
     kind = means.dtype.type
@@ -115,7 +115,7 @@ def _similarity_row(count, means, keep, partial):  # type: ignore[no-untyped-def
         partial[3 * STRIDE + _MARGIN + j] = keep[j] * s
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _sum(values):  # type: ignore[no-untyped-def]
     total = values.dtype.type(0.0)
     for j in range(len(values)):
@@ -123,7 +123,7 @@ def _sum(values):  # type: ignore[no-untyped-def]
     return total
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _errors_row(count, x_row, y_row, scale_y, keep):  # type: ignore[no-untyped-def]
     """Return the sums of absolute and squared errors of a row."""
     kind = x_row.dtype.type
@@ -135,7 +135,7 @@ def _errors_row(count, x_row, y_row, scale_y, keep):  # type: ignore[no-untyped-
     return total, total_sq
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _gradient_row(count, x_row, y_row, scale_y, keep, maps, step, scale, out):  # type: ignore[no-untyped-def]
     """Write a row of the gradient from the derivatives' maps, filtered both ways."""
     kind = x_row.dtype.type

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .. import tolerances
-from ..compiled import kernel
+from ..compiled import kernel, part
 from ..gaussians.model import GaussianArrays
 from ..parallel import default_threads, even_bounds, run_chunks
 from .box_grid import EMPTY_KEY, build_box_grid, cell_key, hash_key
@@ -28,7 +28,7 @@ POINTS_PER_CHUNK = 4096
 _LOG_ALPHA, _Q_CUT, _NORMAL, _THICKNESS, _COLUMNS = 12, 13, 14, 17, 18
 
 
-@kernel(fast=False)
+@part(fast=False)
 def _select(values, count, rank):  # type: ignore[no-untyped-def]
     """Return the ``rank``-th smallest of ``values[:count]``; reorders them."""
     low, high = 0, count - 1

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import tolerances
-from ..compiled import kernel
+from ..compiled import kernel, part
 from ..errors import ResourceError
 from ..parallel import even_bounds, run_chunks
 from .depth_order import radix_order
@@ -131,7 +131,7 @@ def sort_positions(positions: np.ndarray, width: int, height: int) -> SortedPosi
     return SortedPositions(places[order], order, start, shift, len(places))
 
 
-@kernel(fast=False)
+@part(fast=False)
 def strip_span(x0: float, y0: float, x1: float, y1: float, skew: float, top: float, bottom: float):  # type: ignore[no-untyped-def]  # numba infers the pair of floats
     """Return the extent in x of an ellipse's part between two heights; (1, 0) where it has none.
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from .. import tolerances
-from ..compiled import inline, kernel
+from ..compiled import inline, kernel, part
 from .area_lists import PIXEL_MARGIN, SHARE_MARGIN, TILE
 from .raster_math import (
     ALPHA_MAX,
@@ -116,7 +116,7 @@ def shrink_range(
         skews[i] *= shrink
 
 
-@kernel(fast=False)
+@part(fast=False)
 def fill_tile(
     tile: int,
     tiles_x: int,
@@ -183,7 +183,7 @@ def _touch(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
         span[_TOUCHED + j] = ONE if touched else ZERO
 
 
-@kernel(fast=True)
+@part(fast=True)
 def fill_cell(
     columns: int,
     part: int,
@@ -257,7 +257,7 @@ def fill_cell(
     return total
 
 
-@kernel(fast=False)
+@part(fast=False)
 def longest_list(
     first_tile: int, end_tile: int, start: np.ndarray, shift: int, cell_start: np.ndarray
 ) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import tolerances
-from ..compiled import inline, kernel
+from ..compiled import inline, part
 from .harmonics_kernels import BASIS_COUNT, write_basis
 from .projection_math import BLOCK, exp_parts, exp_wide
 
@@ -79,7 +79,7 @@ def load_raw(
     m[FILTER + lane] = filter_3d[i]
 
 
-@kernel(fast=False, fused=True)
+@part(fast=False, fused=True)
 def activate_block(m: np.ndarray, camera: np.ndarray) -> None:
     """Fill all planes from ``TURN`` on, and the variances, of a block that was loaded.
 

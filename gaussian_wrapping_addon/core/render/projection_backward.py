@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .. import tolerances
-from ..compiled import inline, kernel
+from ..compiled import inline, kernel, part
 from .harmonics_kernels import BASIS_COUNT, direction_gradient
 from .projection_activation import (
     ACTIVATED_PLANES,
@@ -89,7 +89,7 @@ def _axis_gradient(
     )  # fmt: skip
 
 
-@kernel(fast=False, fused=True)
+@part(fast=False, fused=True)
 def _shape_gradients(m: Any, camera: Any) -> None:
     """From the gradients on columns 0-12 and 19-22 to those on mean, log scales and rotation."""
     c = load_camera_axes(camera)
@@ -198,7 +198,7 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         m[TURN + 8 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
 
 
-@kernel(fast=False, fused=True)
+@part(fast=False, fused=True)
 def _raw_gradients(m: Any) -> None:
     """From the gradients on activated values to those on raw ones, and the viewing direction's."""
     for lane in range(BLOCK):

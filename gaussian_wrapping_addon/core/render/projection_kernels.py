@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from .. import tolerances
-from ..compiled import inline, kernel
+from ..compiled import inline, kernel, part
 from .projection_activation import (
     ACTIVATED_PLANES,
     BASIS,
@@ -92,7 +92,7 @@ def _outward(value: Any, side: Any) -> Any:
     return np.float64(np.float32(value + side * _FLOAT32_STEP * abs(value)))
 
 
-@kernel(fast=False, fused=True)
+@part(fast=False, fused=True)
 def _project_shapes(m: Any, camera: Any) -> None:
     """Fill all of a block but its colours, and whether each is seen."""
     c = load_camera_axes(camera)

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..compiled import kernel
+from ..compiled import kernel, part
 from ..dataset.camera import Camera
 from ..parallel import even_bounds, run_chunks
 from ..progress import Progress
@@ -268,7 +268,7 @@ def _blend(
         views[i] = used
 
 
-@kernel(fast=False)
+@part(fast=False)
 def _weighted_median(values: Any, share: Any, count: int, ranked: Any, mass: Any) -> float:
     """Insertion sort into the scratch arrays, then the value at half of the weight."""
     total = 0.0

@@ -10,7 +10,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from ..compiled import kernel
+from ..compiled import kernel, part
 
 BETA1, BETA2 = 0.9, 0.999
 EPSILON = 1e-15
@@ -194,7 +194,7 @@ def _prefetch(typingctx, values, at):  # type: ignore[no-untyped-def]
     return types.void(values, types.intp), generate
 
 
-@kernel(fast=False)
+@part(fast=False)
 def _has_value(values, first, count):  # type: ignore[no-untyped-def]
     for j in range(first, first + count):  # noqa: SIM110 - numba compiles no generators to loops
         if values[j] != 0.0:

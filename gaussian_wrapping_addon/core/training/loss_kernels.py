@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..compiled import inline, kernel
+from ..compiled import inline, kernel, part
 
 MIN_NORMAL_SQ = 1e-30
 """Cross products whose squared length (scene units^4) is below this give no normal."""
@@ -88,7 +88,7 @@ def normal_rows(begin, end, depth, camera, max_jump, normals, valid):  # type: i
             valid[i, j] = True
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _load_planes(row, first, count, depth, alpha, mask, geometric, learned, planes):  # type: ignore[no-untyped-def]
     """Copy ``count`` pixels of a row and its neighbours to planes; masked and border pixels have
     no keep."""
@@ -125,7 +125,7 @@ def _load_planes(row, first, count, depth, alpha, mask, geometric, learned, plan
         planes[_KEEP + count - 1] = zero
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _agree(  # type: ignore[no-untyped-def]
     first, count, y, camera, rotation, max_jump, weight_geometric, weight_learned, planes
 ):
@@ -197,7 +197,7 @@ def _agree(  # type: ignore[no-untyped-def]
     return total_geometric, total_learned, found
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _store_planes(first, count, planes, by_geometric, by_learned, by_alpha):  # type: ignore[no-untyped-def]
     """Write the gradients on the normals and alpha of ``count`` pixels to a row of the images."""
     normals, others, cover = by_geometric[3 * first :], by_learned[3 * first :], by_alpha[first:]
@@ -213,7 +213,7 @@ def _store_planes(first, count, planes, by_geometric, by_learned, by_alpha):  # 
         cover[j] = planes[_BY_ALPHA + j]
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _spread_planes(first, count, planes, by_up, by_down, by_here):  # type: ignore[no-untyped-def]
     """Write what ``count`` pixels say about the depth above and below; add what they say about the
     depth beside them, a place further right because ``by_here`` begins a pixel early."""
@@ -227,7 +227,7 @@ def _spread_planes(first, count, planes, by_up, by_down, by_here):  # type: igno
         here[j + 2] += planes[_BY_RIGHT + j]
 
 
-@kernel(fast=True)
+@part(fast=True)
 def _sum_rows(count, above, below, here, out):  # type: ignore[no-untyped-def]
     for j in range(count):
         out[j] = above[j] + below[j] + here[1 + j]

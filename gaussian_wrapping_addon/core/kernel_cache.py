@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Where compiled kernels are kept on disk, and when what is kept there has become stale.
+
+numba keeps the machine code of a kernel in the first folder that can be written of
+``NUMBA_CACHE_DIR``, ``__pycache__`` beside the kernel's file and the user's cache folder. Left to
+itself it compiles anew where the kernel's own file has changed. Helpers and constants of other
+files are compiled into a kernel too, so here a kernel is stale as soon as any file changes that its
+file imports, directly or not. numba itself tells apart processors, Pythons and its own versions.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from numba.core import caching
+
+_ROOT = Path(__file__).resolve().parents[1]
+_IMPORT = re.compile(r"^[ \t]*from (\.+)([\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
+_COMMENT = re.compile(r"#[^\n]*")
+
+
+@functools.cache
+def _source(path: Path) -> bytes:
+    return path.read_bytes()
+
+
+@functools.cache
+def _imported(path: Path) -> frozenset[Path]:
+    """Return the package's files that a file imports itself, relative imports only."""
+    return frozenset(p for p in _named(path) if p.is_file() and p.is_relative_to(_ROOT))
+
+
+def _named(path: Path) -> Iterator[Path]:
+    for dots, module, names in _IMPORT.findall(_source(path).decode()):
+        folder = path.parents[len(dots) - 1].joinpath(*filter(None, module.split(".")))
+        yield folder.with_suffix(".py")
+        yield folder / "__init__.py"
+        for name in _COMMENT.sub("", names).strip("()").split(","):
+            if name.strip():
+                yield folder / f"{name.split()[0]}.py"
+
+
+@functools.cache
+def source_stamp(path: Path) -> str:
+    """Return a hash of a file of the package and of all files that it imports, directly or not.
+
+    Files are read once a process: later changes need a new process, as they do for Python.
+    """
+    found, waiting = {path}, [path]
+    while waiting:
+        news = _imported(waiting.pop()) - found
+        found |= news
+        waiting += news
+    state = hashlib.sha256()
+    for one in sorted(found):
+        state.update(hashlib.sha256(_source(one)).digest())
+    return state.hexdigest()
+
+
+class _WatchesImports:
+    """A place for the cache whose content follows from :func:`source_stamp`."""
+
+    _py_file: str
+
+    def get_source_stamp(self) -> str:
+        """Return what numba compares with the stamp it has kept beside the machine code."""
+        return source_stamp(Path(self._py_file).resolve())
+
+
+class ChosenFolder(_WatchesImports, caching.UserProvidedCacheLocator):
+    """``NUMBA_CACHE_DIR``."""
+
+
+class BesideSource(_WatchesImports, caching.InTreeCacheLocator):
+    """``__pycache__`` beside the kernel's file."""
+
+
+class UserFolder(_WatchesImports, caching.UserWideCacheLocator):
+    """The user's cache folder."""
+
+
+LOCATORS = ",".join(
+    f"{__name__}.{place.__name__}" for place in (ChosenFolder, BesideSource, UserFolder)
+)
+"""For ``numba.config.CACHE_LOCATOR_CLASSES``: the places in order."""
