@@ -3,17 +3,12 @@
 
 from __future__ import annotations
 
-import functools
-import logging
 from collections.abc import Callable
 from typing import Any
 
 import numba
-from numba.core import config
 
-from .kernel_cache import LOCATORS
-
-_logger = logging.getLogger(__name__)
+from .kernel_cache import KernelCache, warn_without_cache
 
 # Everything except what would let NaN tests be folded away in code that relies on them.
 FAST_MATH = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
@@ -36,16 +31,12 @@ def kernel(*, fast: bool, fused: bool = False) -> Callable[[Callable[..., Any]],
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        options = {"nogil": True, **_options(fast, fused)}
-        usual, config.CACHE_LOCATOR_CLASSES = config.CACHE_LOCATOR_CLASSES, LOCATORS
+        compiled = numba.njit(nogil=True, **_options(fast, fused))(function)
         try:
-            return numba.njit(cache=True, **options)(function)
+            compiled._cache = KernelCache(function)  # what njit(cache=True) does with its own
         except RuntimeError:
-            # numba raises here, at decoration, when no cache folder is writable.
-            _warn_without_cache()
-            return numba.njit(**options)(function)
-        finally:
-            config.CACHE_LOCATOR_CLASSES = usual
+            warn_without_cache("no folder for them can be written")
+        return compiled
 
     return decorate
 
@@ -73,15 +64,6 @@ def _options(fast: bool, fused: bool) -> dict[str, Any]:
         "boundscheck": False,
         "fastmath": FAST_MATH if fast else (FUSED_MATH if fused else False),
     }
-
-
-@functools.cache
-def _warn_without_cache() -> None:
-    """Say it once, not once a kernel."""
-    _logger.warning(
-        "No folder for compiled kernels can be written, so each run compiles them anew: set "
-        "NUMBA_CACHE_DIR to a folder that can."
-    )
 
 
 def inline(function: Callable[..., Any]) -> Any:

@@ -12,11 +12,15 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from numba.core import caching
+
+_logger = logging.getLogger(__name__)
 
 _ROOT = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(r"^[ \t]*from (\.+)([\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
@@ -71,19 +75,42 @@ class _WatchesImports:
         return source_stamp(Path(self._py_file).resolve())
 
 
-class ChosenFolder(_WatchesImports, caching.UserProvidedCacheLocator):
+class _ChosenFolder(_WatchesImports, caching.UserProvidedCacheLocator):
     """``NUMBA_CACHE_DIR``."""
 
 
-class BesideSource(_WatchesImports, caching.InTreeCacheLocator):
+class _BesideSource(_WatchesImports, caching.InTreeCacheLocator):
     """``__pycache__`` beside the kernel's file."""
 
 
-class UserFolder(_WatchesImports, caching.UserWideCacheLocator):
+class _UserFolder(_WatchesImports, caching.UserWideCacheLocator):
     """The user's cache folder."""
 
 
-LOCATORS = ",".join(
-    f"{__name__}.{place.__name__}" for place in (ChosenFolder, BesideSource, UserFolder)
-)
-"""For ``numba.config.CACHE_LOCATOR_CLASSES``: the places in order."""
+class _Places(caching.CompileResultCacheImpl):
+    """The places in order; raises ``RuntimeError`` where none can be written."""
+
+    _locator_classes = [_ChosenFolder, _BesideSource, _UserFolder]  # noqa: RUF012 - as its base
+
+
+class KernelCache(caching.FunctionCache):
+    """The cache of one kernel; where it cannot be written any more, kernels work without."""
+
+    _impl_class = _Places
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep machine code that was just compiled."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            warn_without_cache(str(error))
+
+
+@functools.cache
+def warn_without_cache(reason: str) -> None:
+    """Tell once, not once a kernel, that kernels are not kept."""
+    _logger.warning(
+        "Compiled kernels cannot be kept, so each run compiles them anew (a minute): %s. Set "
+        "NUMBA_CACHE_DIR to a folder that can be written.",
+        reason,
+    )

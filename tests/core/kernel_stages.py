@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Run every compiled part on tiny scenes and print a hash of each one's results.
 
-``python tests/core/kernel_stages.py STAGE ...`` runs the named stages in the order given, each in
-a scene of its own, and prints ``STAGE HASH`` lines: a process with a fresh kernel cache compiles in
-that order.
+``python tests/core/kernel_stages.py STAGE ...`` runs the named stages in the order given, each on
+a scene of its own, and prints ``STAGE HASH ...`` lines: a process with a fresh kernel cache
+compiles in that order. Functions that compiled code left to be called follow as ``left NAME``.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import gc
 import hashlib
 import sys
 import tempfile
@@ -18,7 +19,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from numba.core.dispatcher import Dispatcher
 
+from gaussian_wrapping_addon.core.evaluation.preview import write_preview
 from gaussian_wrapping_addon.core.field.isosurface_projection import project_to_isosurface
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
@@ -42,6 +45,7 @@ from tests.core.texture.texture_scenes import photograph, ring, scene_of, sphere
 from tests.core.training.small_scene import sphere_gaussians, sphere_scene
 
 THREADS = 1
+PACKAGE = "gaussian_wrapping_addon"
 TRAINING = TrainingSettings(
     iterations=24, max_gaussians=400, max_image_px=64, sh_degree=1, depth_from=0.0,
     densify_every=4, wrap_rounds=2, checkpoint_every_s=1e9,
@@ -92,7 +96,7 @@ def one_view() -> str:
         rates = Schedule(TRAINING, 40).rates(0, 1.0)
         adam.step_rows(gradients, rates, sh_degree=1, threads=THREADS)
         found.append(digest([t for _, t in adam.gaussians().tensors()]))
-    return "-".join(found)
+    return " ".join(found)
 
 
 def autograd() -> str:
@@ -130,7 +134,7 @@ def fields() -> str:
     vacancy = VacancyField(arrays, cameras_around(4), threads=THREADS)
     vectors = VectorField(arrays, threads=THREADS)
     found = project_to_isosurface(points, vacancy, vectors)
-    return "-".join(digest(v) for v in (vacancy.vacancy(points), vectors.evaluate(points), found))
+    return " ".join(digest(v) for v in (vacancy.vacancy(points), vectors.evaluate(points), found))
 
 
 def meshing() -> str:
@@ -145,21 +149,40 @@ def meshing() -> str:
 
 
 def texture() -> str:
-    """The texture of a ball."""
+    """The texture of a ball, and its preview."""
     photos = photograph(ring(4, 3.5, 1.0), [(sphere_hit, waves)])
     with tempfile.TemporaryDirectory() as folder:
         textured = texture_mesh(
             sphere(), scene_of(photos), photos, TextureSettings(size_px=64, gutter_px=2),
             Path(folder), Progress(), threads=THREADS,
         )  # fmt: skip
-    return digest(textured.albedo, textured.corner_uvs)
+        picture = Path(folder) / "preview.png"
+        write_preview(textured, scene_of(photos), photos, picture, threads=THREADS)
+        pixels = np.frombuffer(picture.read_bytes(), np.uint8)
+    return digest(textured.albedo, textured.corner_uvs, pixels)
 
 
 STAGES: dict[str, Callable[[], str]] = {
     f.__name__: f for f in (one_view, autograd, query, training, fields, meshing, texture)
 }
 
+
+def left_functions() -> list[str]:
+    """Return functions of the package, not their own, that kernels compiled here can be asked for.
+
+    LLVM left them uninlined in a kernel's machine code; another kernel may hold another version.
+    """
+    found = set()
+    for dispatcher in [thing for thing in gc.get_objects() if isinstance(thing, Dispatcher)]:
+        own = dispatcher.py_func.__name__
+        for compiled in dispatcher.overloads.values():
+            names = (function.name for function in compiled.library.get_defined_functions())
+            found |= {name for name in names if PACKAGE in name and own not in name}
+    return sorted(found)
+
+
 if __name__ == "__main__":
     for stage in sys.argv[1:]:
         sys.stdout.write(f"{stage} {STAGES[stage]()}\n")
-        sys.stdout.flush()
+    for name in left_functions():
+        sys.stdout.write(f"left {name}\n")

@@ -31,7 +31,9 @@ CROP_MARGIN = 0.15
 MIN_MARGIN_SHARE = 0.02
 
 
-def render_textured(textured: TexturedMesh, camera: Camera, size: tuple[int, int]) -> np.ndarray:
+def render_textured(
+    textured: TexturedMesh, camera: Camera, size: tuple[int, int], *, threads: int = 0
+) -> np.ndarray:
     """Render the mesh with its texture, unlit and antialiased, on plain grey.
 
     Parameters
@@ -42,6 +44,8 @@ def render_textured(textured: TexturedMesh, camera: Camera, size: tuple[int, int
         Any size; its view is resampled.
     size : (width, height)
         Of the picture, pixels.
+    threads : int
+        0 uses every core.
 
     Returns
     -------
@@ -49,7 +53,7 @@ def render_textured(textured: TexturedMesh, camera: Camera, size: tuple[int, int
     """
     width, height = size
     fine = camera.resized(width * SUPERSAMPLING, height * SUPERSAMPLING)
-    threads = default_threads()
+    threads = threads or default_threads()
     vertices = np.ascontiguousarray(textured.mesh.vertices, np.float64)
     faces = np.ascontiguousarray(textured.mesh.faces, np.int32)
     hit = depth_buffer(vertices, faces, fine, threads=threads).face
@@ -136,8 +140,12 @@ def _shade(
             image[row, column, 2] = int(blue + 0.5)
 
 
-def choose_view(textured: TexturedMesh, photos: Photos, count: int) -> int:
-    """Return the photo in which the mesh is large, whole, and seen from its front."""
+def choose_view(textured: TexturedMesh, photos: Photos, count: int, *, threads: int = 0) -> int:
+    """Return the photo in which the mesh is large, whole, and seen from its front.
+
+    0 threads uses every core.
+    """
+    threads = threads or default_threads()
     vertices, faces = textured.mesh.vertices, textured.mesh.faces
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -146,7 +154,7 @@ def choose_view(textured: TexturedMesh, photos: Photos, count: int) -> int:
         full = photos.camera(index, 1)
         scale = CHOICE_LONG_SIDE_PX / max(full.width, full.height)
         camera = full.resized(max(1, round(full.width * scale)), max(1, round(full.height * scale)))
-        hit = depth_buffer(vertices, faces, camera).face
+        hit = depth_buffer(vertices, faces, camera, threads=threads).face
         covered = hit >= 0
         pixels, depth = camera.project(vertices)
         inside = (depth > 0) & (pixels > 0).all(axis=1)
@@ -159,11 +167,12 @@ def choose_view(textured: TexturedMesh, photos: Photos, count: int) -> int:
     return best
 
 
-def _crop(textured: TexturedMesh, camera: Camera) -> tuple[int, int, int, int]:
+def _crop(textured: TexturedMesh, camera: Camera, threads: int) -> tuple[int, int, int, int]:
     """Return left, top, right, bottom of the part of the photo that is worth showing."""
     factor = max(1, max(camera.width, camera.height) // (2 * CHOICE_LONG_SIDE_PX))
     coarse = camera.resized(max(1, camera.width // factor), max(1, camera.height // factor))
-    hit = depth_buffer(textured.mesh.vertices, textured.mesh.faces, coarse).face >= 0
+    mesh = textured.mesh
+    hit = depth_buffer(mesh.vertices, mesh.faces, coarse, threads=threads).face >= 0
     if not hit.any():
         return 0, 0, camera.width, camera.height
     bounds = []
@@ -181,6 +190,7 @@ def write_preview(
     path: Path,
     *,
     view: int | None = None,
+    threads: int = 0,
 ) -> None:
     """Write a PNG: left the part of a photo that shows the mesh, right the mesh from its camera.
 
@@ -195,6 +205,8 @@ def write_preview(
         Its folder must exist.
     view : int or None
         Photo to show; ``None`` chooses the one that shows the mesh best.
+    threads : int
+        0 uses every core.
 
     Raises
     ------
@@ -203,9 +215,11 @@ def write_preview(
     """
     from PIL import Image
 
-    index = choose_view(textured, photos, len(scene.views)) if view is None else view
+    threads = threads or default_threads()
+    count = len(scene.views)
+    index = choose_view(textured, photos, count, threads=threads) if view is None else view
     full = photos.camera(index, 1)
-    left, top, right, bottom = _crop(textured, full)
+    left, top, right, bottom = _crop(textured, full, threads)
     part = dataclasses.replace(
         full, width=right - left, height=bottom - top, cx=full.cx - left, cy=full.cy - top
     )
@@ -214,7 +228,7 @@ def write_preview(
     pixels = photos.photo(index, 1)[top:bottom, left:right]
     resampling = Image.Resampling.LANCZOS
     photo = Image.fromarray(np.ascontiguousarray(pixels)).resize((width, height), resampling)
-    rendered = render_textured(textured, part, (width, height))
+    rendered = render_textured(textured, part, (width, height), threads=threads)
     canvas = np.empty((height, 2 * width + GAP_PX, 3), np.uint8)
     canvas[:] = BACKGROUND
     canvas[:, :width] = np.asarray(photo)

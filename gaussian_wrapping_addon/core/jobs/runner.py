@@ -287,7 +287,7 @@ def _run_texture(
         formats = tuple(f for f in job.settings.export if f != "usd")
         write_textured(textured, stage_folder / "files", formats, scene.world_from_scene)
         progress.update(0.95, "rendering the preview")
-        write_preview(textured, scene, photos, stage_folder / "preview.png")
+        write_preview(textured, scene, photos, stage_folder / "preview.png", threads=threads)
         return {"texture": textured.statistics}
 
     formats = json.dumps(sorted(job.settings.export))
