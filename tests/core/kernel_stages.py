@@ -30,7 +30,7 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.depth_query import query_depth
 from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types import RenderOptions, VisibleGradients
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TextureSettings, TrainingSettings
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
@@ -99,6 +99,27 @@ def one_view() -> str:
     return " ".join(found)
 
 
+def losses() -> str:
+    """Losses and one optimiser step of any numbers, without a renderer."""
+    random = np.random.default_rng(2)
+    camera = sphere_scene(views=3, size_px=40)[0].views[0].camera
+
+    def some(*shape: int) -> np.ndarray:
+        return random.uniform(0.1, 1.0, shape).astype(np.float32)
+
+    photo = random.integers(0, 256, (40, 40, 3)).astype(np.uint8)
+    by_color = color_loss(some(40, 40, 3), photo, None, threads=THREADS)
+    images = 3.0 + some(40, 40), some(40, 40, 3), some(40, 40, 3), some(40, 40)
+    by_normals = normal_losses(*images, camera, threads=THREADS)
+    adam = Adam(sphere_gaussians())
+    shapes = {name: tensor.shape[1:] for name, tensor in adam.gaussians().tensors()}
+    ids = np.arange(0, 150, 2, dtype=np.int32)
+    names = [field.name for field in dataclasses.fields(VisibleGradients)][1:]
+    gradients = VisibleGradients(ids, *(some(len(ids), *shapes[name]) for name in names))
+    adam.step_rows(gradients, Schedule(TRAINING, 40).rates(0, 1.0), sh_degree=1, threads=THREADS)
+    return digest(by_color, by_normals, [t for _, t in adam.gaussians().tensors()])
+
+
 def autograd() -> str:
     """The differentiable entry, without depth."""
     camera, gaussians = sphere_scene(views=3, size_px=40)[0].views[1].camera, sphere_gaussians()
@@ -163,7 +184,7 @@ def texture() -> str:
 
 
 STAGES: dict[str, Callable[[], str]] = {
-    f.__name__: f for f in (one_view, autograd, query, training, fields, meshing, texture)
+    f.__name__: f for f in (one_view, losses, autograd, query, training, fields, meshing, texture)
 }
 
 
