@@ -14,6 +14,7 @@ import functools
 import hashlib
 import logging
 import re
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -94,23 +95,36 @@ class _Places(caching.CompileResultCacheImpl):
 
 
 class KernelCache(caching.FunctionCache):
-    """The cache of one kernel; where it cannot be written any more, kernels work without."""
+    """The cache of one kernel; where it cannot be read or written any more, they work without."""
 
     _impl_class = _Places
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return machine code that was kept, or ``None``."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # whatever a damaged file makes of unpickling
+            warn_without_cache(f"{type(error).__name__}: {error}")
+            return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep machine code that was just compiled."""
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            warn_without_cache(str(error))
+            warn_without_cache(f"{type(error).__name__}: {error}")
 
 
-@functools.cache
+_told = threading.Event()
+
+
 def warn_without_cache(reason: str) -> None:
     """Tell once, not once a kernel, that kernels are not kept."""
+    if _told.is_set():
+        return
+    _told.set()
     _logger.warning(
-        "Compiled kernels cannot be kept, so each run compiles them anew (a minute): %s. Set "
-        "NUMBA_CACHE_DIR to a folder that can be written.",
+        "Compiled kernels cannot be kept on disk, so each run compiles them anew, about a minute: "
+        "%s. Set NUMBA_CACHE_DIR to a folder that can be written.",
         reason,
     )

@@ -158,23 +158,23 @@ def test_without_any_place_kernels_work_and_one_line_says_so(installed: Path) ->
     assert list(chosen.rglob("some_kernel.run-*.nbc"))
 
 
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="nothing is read-only to root"
-)
 def test_a_read_only_package_without_a_home(installed: Path) -> None:
     folders = [installed / PACKAGE.name]
     folders += [p for p in folders[0].rglob("*") if p.is_dir()]
     for folder in folders:
         folder.chmod(0o555)
-    script = "import os; del os.environ['HOME']\n" + RUN
-    cache = {"XDG_CACHE_HOME": NOWHERE}
+    script = "import os; os.environ.pop('HOME', None)\n" + RUN
+    environment = {"XDG_CACHE_HOME": NOWHERE, "LOCALAPPDATA": NOWHERE}
     try:
-        output, errors = finish(start(["-c", script], installed, **cache))
+        if os.access(folders[0], os.W_OK):
+            pytest.skip("to this user nothing is read-only")
+        output, errors = finish(start(["-c", script], installed, **environment))
     finally:
         for folder in folders:
             folder.chmod(0o755)
     assert output == "2.0 0\n"
     assert errors.count("\n") == 1
+    assert "NUMBA_CACHE_DIR" in errors
 
 
 def test_a_disk_that_fills_up_later_stops_nothing(installed: Path) -> None:
@@ -185,3 +185,15 @@ def test_a_disk_that_fills_up_later_stops_nothing(installed: Path) -> None:
     assert output == "2.0 0\n"
     assert errors.count("\n") == 1
     assert "NUMBA_CACHE_DIR" in errors
+
+
+def test_a_damaged_file_is_compiled_anew(installed: Path) -> None:
+    chosen = installed.parent / "chosen"
+    command = ["-c", RUN]
+    assert finish(start(command, installed, NUMBA_CACHE_DIR=str(chosen))) == ("2.0 0\n", "")
+    (kept,) = chosen.rglob("some_kernel.run-*.nbc")
+    kept.write_bytes(kept.read_bytes()[:50])
+    output, errors = finish(start(command, installed, NUMBA_CACHE_DIR=str(chosen)))
+    assert output == "2.0 0\n"
+    assert errors.count("\n") == 1
+    assert finish(start(command, installed, NUMBA_CACHE_DIR=str(chosen))) == ("2.0 1\n", "")
