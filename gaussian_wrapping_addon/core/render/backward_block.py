@@ -76,7 +76,7 @@ def _sums_of_block(
         before >= float(constants.TRANSMITTANCE_MIN)
     )
     alpha = contributes.choose(sight.alpha, 0.0)
-    weight = alpha * before
+    weight = alpha.times(before)
     gradients = [block.load(state, plane(G0 + feature)) for feature in range(FEATURES)]
     q = gradients[0] * row[13]
     for feature in range(1, FEATURES):

@@ -19,6 +19,19 @@ from .raster_forward import FORWARD_SCRATCH, forward_kernel
 from .raster_math import ROW_VALUES, TILE, aligned_zeros
 from .tiles import TileLists
 from .types import RenderOptions
+from .visits import VISITS_ROOM
+
+_MOST_BLOCKS = 32
+"""Blocks of a tile where they have eight pixels."""
+
+
+def _take(pool: list[np.ndarray], count: int, make: Callable[[int], np.ndarray]) -> np.ndarray:
+    """Return an array of at least ``count`` values from a pool, or a new one with some to spare."""
+    try:
+        kept = pool.pop()
+    except IndexError:
+        return make(count * 5 // 4)
+    return kept if len(kept) >= count else make(count * 5 // 4)
 
 
 @dataclass
@@ -31,34 +44,38 @@ class RenderBuffers:
 
     scratch: list[np.ndarray] = field(default_factory=list)
     lists: list[np.ndarray] = field(default_factory=list)
+    visits: list[np.ndarray] = field(default_factory=list)
     pairs: list[np.ndarray] = field(default_factory=list)
     renderers: list[Any] = field(default_factory=list)
     """Idle :class:`~.view_renderer.ViewRenderer` with their memory."""
 
-    def reserve(self, threads: int, entries: int) -> None:
-        """Have memory for every thread, so that it is not a matter of timing who allocates it."""
-        values = entries * LIST_VALUES * TILE
-        self.lists[:] = [kept for kept in self.lists if len(kept) >= values]
-        while len(self.lists) < threads:
-            self.lists.append(aligned_zeros(values * 5 // 4))
-        while len(self.scratch) < threads:
-            self.scratch.append(aligned_zeros(max(FORWARD_SCRATCH, BACKWARD_SCRATCH)))
+    def reserve(self, threads: int, longest: int, *, depth: bool) -> None:
+        """Have memory for every thread, so that it is not a matter of timing who allocates it.
+
+        ``longest`` is the number of pairs of the fullest tile; only the depth needs lists.
+        """
+        spare = [
+            (self.scratch, self.take_scratch()),
+            (self.lists, self.take_lists(longest if depth else 0)),
+            (self.visits, self.take_visits(longest)),
+        ]
+        for pool, array in spare:
+            pool.append(array)
+            while len(pool) < threads:
+                pool.append(array.copy() if pool is self.visits else aligned_zeros(len(array)))
 
     def take_scratch(self) -> np.ndarray:
         """Return the state of one thread's tile, with any content."""
-        try:
-            return self.scratch.pop()
-        except IndexError:
-            return aligned_zeros(max(FORWARD_SCRATCH, BACKWARD_SCRATCH))
+        return _take(self.scratch, max(FORWARD_SCRATCH, BACKWARD_SCRATCH), aligned_zeros)
 
-    def take_lists(self, entries: int) -> np.ndarray:
-        """Return room for the list of a block of one thread, with any content."""
-        values = entries * LIST_VALUES * TILE
-        try:
-            kept = self.lists.pop()
-        except IndexError:
-            kept = aligned_zeros(0)
-        return kept if len(kept) >= values else aligned_zeros(values * 5 // 4)
+    def take_lists(self, longest: int) -> np.ndarray:
+        """Return room for the list of a block of a tile of ``longest`` pairs, with any content."""
+        return _take(self.lists, longest * LIST_VALUES * TILE, aligned_zeros)
+
+    def take_visits(self, longest: int) -> np.ndarray:
+        """Return room for the pairs that reach each block of such a tile, with any content."""
+        count = _MOST_BLOCKS * (longest + VISITS_ROOM)
+        return _take(self.visits, count, lambda size: np.zeros(size, np.int32))
 
     def take_pairs(self, count: int) -> np.ndarray:
         """Return at least ``count`` rows of pair gradients with any content."""
@@ -157,12 +174,13 @@ def blend(
     forward = forward_kernel(view.lanes, depth, weights)
     background = np.asarray(options.background, np.float32)
     limit = np.float32(options.depth_valid_transmittance)
-    longest = int(np.diff(lists.start).max(initial=0)) if depth else 0
-    buffers.reserve(view.threads, longest)
+    longest = int(np.diff(lists.start).max(initial=0))
+    buffers.reserve(view.threads, longest, depth=depth)
 
     def run(first: int, end: int) -> None:
         scratch = buffers.take_scratch()
-        entries = buffers.take_lists(longest)
+        entries = buffers.take_lists(longest if depth else 0)
+        visits = buffers.take_visits(longest)
         forward(
             first,
             end,
@@ -178,6 +196,7 @@ def blend(
             limit,
             scratch,
             entries,
+            visits,
             images.color,
             images.normal,
             images.geometric,
@@ -189,6 +208,7 @@ def blend(
         )
         buffers.scratch.append(scratch)
         buffers.lists.append(entries)
+        buffers.visits.append(visits)
 
     run_chunks(run, view.bounds, view.threads)
     return pair_weights

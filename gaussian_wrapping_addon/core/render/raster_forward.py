@@ -72,6 +72,7 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
         limit: float,
         m: np.ndarray,
         lists: np.ndarray,
+        visits: np.ndarray,
         color: np.ndarray,
         normal: np.ndarray,
         geometric: np.ndarray,
@@ -81,12 +82,11 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
         pair_weights: np.ndarray,
         strongest: np.ndarray,
     ) -> None:
-        """Render tiles; ``lists`` has room for an entry of every pair of the longest tile."""
+        """Render tiles; ``lists`` and, for each block, ``visits`` have room for the longest one."""
         longest: Any = 0
         for tile in range(first_tile, end_tile):
             longest = max(longest, np.int64(start[tile + 1]) - np.int64(start[tile]))
         room = longest + VISITS_ROOM
-        visits = np.empty(blocks * room, np.int32)
         counts = np.zeros(blocks, np.int64)
         fronts = np.zeros(longest + 1, np.float32)
         images = (color, normal, geometric, alpha_image, depth_image, slope_image)
