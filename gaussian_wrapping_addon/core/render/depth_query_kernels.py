@@ -64,23 +64,29 @@ _TILE_COLUMNS = 22
 _FLOAT_MARGIN = np.float32(4e-6)
 """Several roundings of a float32, in shares of what is rounded."""
 
-# Converged: a Newton step below this share of the thinnest Gaussian's sigma along the ray, where
-# the slope can be extrapolated from the last step or need not be ...
-_STEP_SIGMAS, _STEP_SIGMAS_ALONE = np.float32(2e-4), np.float32(1e-5)
-_NEAR_SIGMAS = np.float32(0.1)
-# ... or below the rounding of the depth itself ...
-_STEP_SHARE = np.float32(1.2e-7)
-# ... or a transmittance equal to 0.5 within its own rounding.
+# Converged: a step so small beside the thinnest Gaussian's sigma along the ray that log T is its
+# Taylor series, to second order, to float32's precision ...
+_STEP_SIGMAS = np.float32(5e-4)
+# ... or a transmittance equal to 0.5 within its own rounding ...
 _LEVEL_MARGIN = np.float32(1.2e-7)
-_DENOMINATORS = np.float32(16.0)
-"""Larger than the squared inverse sigma along any ray that meets a Gaussian, in shares of a0."""
+# ... or a bracket of a few roundings of the depth. A step below that rounding alone proves nothing:
+# a layer may be steep there and yet end before the level is reached.
+_BRACKET_SHARE = np.float32(2.5e-7)
+_LEAST_SHARE = np.float32(2e-7)
+"""Steps are at least this share of the depth, so that they can close the bracket."""
+_POLISH_SIGMAS = np.float32(0.05)
+"""Where T is 0.5 within its rounding, a last step is taken up to this length: where T is all but
+flat its rounding would lead far astray."""
+_LEAST_SLOPE = np.float32(1e-12)
+"""Keeps a step finite; it leaves the bracket then."""
+# Halley's correction of a Newton step stays within these factors.
+_LEAST_BEND, _MOST_BEND = HALF, TWO
 _NEWTON_STEPS = 8
 """From here on every second step is a bisection, which bounds the number of steps."""
 _MAX_STEPS = 80
-_NEWTON_FLOOR = np.float32(1e-6)
 SLOPE_FLOOR = np.float32(tolerances.SLOPE_FLOOR)
-"""Floor of -d(log T)/dt in shares of the position's largest 1/sigma along the ray (method.md
-2.5)."""
+"""Floor of -d(log T)/dt in shares of the 1/sigma along the ray of the Gaussian at which the
+blending crosses 0.5 (method.md 2.5)."""
 # exp(-x) is below 3e-7 beyond this x = s d^2.
 _NEGLIGIBLE = np.float32(30.0)
 _THIRD, _FIFTH = np.float32(1.0 / 3.0), np.float32(0.2)
@@ -192,7 +198,6 @@ def fill_cell(
     tile_spans: np.ndarray,
     spans: np.ndarray,
     fronts: np.ndarray,
-    sharpest: np.ndarray,
     members: np.ndarray,
 ) -> int:
     """Lay out those Gaussians of a tile that reach one of its cells; return their number.
@@ -212,8 +217,6 @@ def fill_cell(
     fronts : (s + 1,) float32
         Receives the z-depth before which no Gaussian of this span or a later one has a density
         worth counting.
-    sharpest : (s + 1,) float32
-        Receives the largest a0 of this span and the later ones.
     members : (g,) int64
         Receives the place of each Gaussian in the tile's list.
     """
@@ -239,10 +242,8 @@ def fill_cell(
                 lane = total % _SPAN
                 for column in range(GEOMETRY):
                     target[column * _SPAN + lane] = source[column * _SPAN + j]
-                front, a0 = source[_FRONT + j], source[_A0 + j]
-                to = total // _SPAN
+                front, to = source[_FRONT + j], total // _SPAN
                 fronts[to] = front if lane == 0 else min(fronts[to], front)
-                sharpest[to] = a0 if lane == 0 else max(sharpest[to], a0)
                 members[total] = at * _SPAN + j
                 total += 1
     last = (total + _SPAN - 1) // _SPAN
@@ -250,10 +251,8 @@ def fill_cell(
         for column in range(columns):
             spans[last - 1, column * _SPAN + k % _SPAN] = ZERO
     fronts[last] = FAR
-    sharpest[last] = ZERO
     for at in range(last - 1, -1, -1):
         fronts[at] = min(fronts[at], fronts[at + 1])
-        sharpest[at] = max(sharpest[at], sharpest[at + 1])
     return total
 
 
@@ -313,56 +312,56 @@ def _log_twice(value: Any) -> Any:
 
 
 @inline
+def _bend(count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
+    """Return T, the slope -d(log T)/dt and its growth with t, at depth t."""
+    product, slope, growth = ONE, ZERO, ZERO
+    for c in range(count):
+        ahead = max(peaks[c] - t, ZERO)
+        sharpness = sharpnesses[c] if ahead > ZERO else ZERO
+        pull = sharpness * ahead
+        density = min(alphas[c] * exp_wide(HALF * pull * ahead), ALPHA_MAX)
+        keep = ONE - density
+        product *= keep
+        odds = density / keep
+        slope += odds * pull
+        growth += odds * (pull * pull / keep - sharpness)
+    return product, slope, growth
+
+
+@inline
 def _solve(
-    count: Any, alphas: Any, peaks: Any, sharpnesses: Any, low: Any, high: Any, guess: Any,
-    sharpest: Any,
-) -> Any:  # fmt: skip
-    """Return where T crosses 0.5 between ``low`` and ``high``, and -d(log T)/dt there."""
-    t = guess
-    last_t, last_slope, found_slope = ZERO, -ONE, ZERO
+    count: Any, alphas: Any, peaks: Any, sharpnesses: Any, high: Any, guess: Any, sharpest: Any
+) -> Any:
+    """Return where T crosses 0.5 between 0 and ``high``, and -d(log T)/dt there."""
+    t, low, found_slope = guess, ZERO, ZERO
     for number in range(_MAX_STEPS):
-        product, slope = _evaluate(False, count, t, alphas, peaks, sharpnesses)
+        product, slope, growth = _bend(count, t, alphas, peaks, sharpnesses)
         excess = _log_twice(max(product, _TINY))
         if excess > ZERO:
             low = t
         else:
             high = t
-        step = excess / max(slope, _NEWTON_FLOOR * sharpest)
-        apart = abs(t - last_t) * sharpest
-        smooth = last_slope >= ZERO and apart < _NEAR_SIGMAS and apart > _STEP_SIGMAS_ALONE
-        bend = ZERO
-        if smooth:
-            bend = (slope - last_slope) / (t - last_t)
-        share = _STEP_SIGMAS if smooth else _STEP_SIGMAS_ALONE
-        moved = t + step
-        # Rounding may put a step this small on the bracket's end, hence no test for inside.
-        done = abs(step) <= max(share / sharpest, _STEP_SHARE * t)
-        done = done or abs(excess) <= _LEVEL_MARGIN or high - low <= _STEP_SHARE * high
+        turns = ONE / max(slope, _LEAST_SLOPE)
+        newton = excess * turns
+        bend = min(max(ONE + HALF * newton * growth * turns, _LEAST_BEND), _MOST_BEND)
+        step = newton / bend
+        size = abs(step)
+        sigmas = size * sharpest
         found_slope = slope
-        if done:
-            moved = min(max(moved, low), high)
-            found_slope = slope + bend * (moved - t)
-            t = moved
+        level = abs(excess) <= _LEVEL_MARGIN
+        if level or sigmas < _STEP_SIGMAS or high - low <= _BRACKET_SHARE * high:
+            # Rounding may put a step this small on the bracket's end.
+            if sigmas < _POLISH_SIGMAS or not level:
+                moved = min(max(t + step, low), high)
+                found_slope = max(slope + growth * (moved - t), ZERO)
+                t = moved
             break
-        last_t, last_slope = t, slope
-        newton = moved > low and moved < high and (number < _NEWTON_STEPS or number % 2 == 0)
-        t = moved if newton else HALF * (low + high)
+        least = _LEAST_SHARE * t
+        moved = t + (step if size > least else (least if excess > ZERO else -least))
+        newton_next = moved > low and moved < high
+        newton_next = newton_next and (number < _NEWTON_STEPS or number % 2 == 0)
+        t = moved if newton_next else HALF * (low + high)
     return t, found_slope
-
-
-@inline
-def _sharpest_behind(first: Any, total: Any, spans: Any, x: Any, y: Any, through: Any) -> Any:
-    """Return the largest sharpness of the contributors from span ``first`` on."""
-    largest = ZERO
-    for at in range(first, (total + _SPAN - 1) // _SPAN):
-        span = spans[at]
-        _cast(span, x, y)
-        for j in range(_SPAN):
-            raw = span[_RAW + j]
-            if raw > ZERO and through >= TRANSMITTANCE_MIN:
-                largest = max(largest, span[_SHARPNESS + j])
-                through -= min(raw, ALPHA_MAX) * through
-    return largest
 
 
 @functools.cache
@@ -404,7 +403,6 @@ def query_kernel(solve: bool) -> Any:
         tile_spans = np.empty((room, _TILE_COLUMNS * _SPAN), np.float32)
         spans = np.empty((room, _FORWARD_COLUMNS * _SPAN), np.float32)
         fronts = np.empty(room + 1, np.float32)
-        sharpest_a0 = np.empty(room + 1, np.float32)
         members = np.empty(longest, np.int64)
         alphas = np.empty(room * _SPAN, np.float32)
         peaks = np.empty(room * _SPAN, np.float32)
@@ -421,7 +419,7 @@ def query_kernel(solve: bool) -> Any:
                 filled = tile
             total = fill_cell(
                 _FORWARD_COLUMNS, cell & ((1 << (2 * shift)) - 1), shift,
-                start[tile + 1] - start[tile], tile_spans, spans, fronts, sharpest_a0, members,
+                start[tile + 1] - start[tile], tile_spans, spans, fronts, members,
             )  # fmt: skip
             for p in range(cell_start[cell], cell_start[cell + 1]):
                 x, y = places[p, 0], places[p, 1]
@@ -430,11 +428,9 @@ def query_kernel(solve: bool) -> Any:
                 count: Any = 0
                 stop: Any = total
                 end = depths[p]
-                behind: Any = (total + _SPAN - 1) // _SPAN
                 for at in range((total + _SPAN - 1) // _SPAN):
                     if solve:
                         if through <= limit and through < ISO_LEVEL and fronts[at] >= high:
-                            behind = at
                             break
                     elif fronts[at] >= end:
                         break
@@ -476,14 +472,16 @@ def query_kernel(solve: bool) -> Any:
                 kept = 0
                 for c in range(count):
                     sharpness, peak = sharpnesses[c], peaks[c]
-                    sharpest = max(sharpest, sharpness)
                     beyond = max(peak - high, ZERO)
+                    matters = sharpness * beyond * beyond < _NEGLIGIBLE
                     if c == crossing:
                         crossing = kept
                     alphas[kept] = alphas[c]
                     peaks[kept] = peak
                     sharpnesses[kept] = sharpness
-                    kept += 1 if sharpness * beyond * beyond < _NEGLIGIBLE else 0
+                    if matters:
+                        sharpest = max(sharpest, sharpness)
+                        kept += 1
                 if fronts[0] <= ZERO:
                     # Some Gaussian may reach the camera: light must pass at depth 0.
                     product, _ = _evaluate(False, kept, ZERO, alphas, peaks, sharpnesses)
@@ -498,14 +496,10 @@ def query_kernel(solve: bool) -> Any:
                 if not (guess > ZERO and guess < high):
                     guess = HALF * high
                 t, slope = _solve(
-                    kept, alphas, peaks, sharpnesses, ZERO, high, guess,
-                    math.sqrt(max(sharpest, _TINY)),
-                )  # fmt: skip
-                # What lies behind only counts where it may be thin enough to raise the floor.
-                if slope < SLOPE_FLOOR * math.sqrt(sharpest_a0[behind] * _DENOMINATORS):
-                    sharpest = max(sharpest, _sharpest_behind(behind, total, spans, x, y, through))
+                    kept, alphas, peaks, sharpnesses, high, guess, math.sqrt(max(sharpest, _TINY))
+                )
                 values[p] = t
-                slopes[p] = max(slope, SLOPE_FLOOR * math.sqrt(max(sharpest, _TINY)))
+                slopes[p] = max(slope, SLOPE_FLOOR * math.sqrt(max(sharpnesses[crossing], _TINY)))
 
     return query_range
 
@@ -597,7 +591,6 @@ def pull_range(
     tile_spans = np.empty((room, _TILE_COLUMNS * _SPAN), np.float32)
     spans = np.empty((room, _GRADIENT_COLUMNS * _SPAN), np.float32)
     fronts = np.empty(room + 1, np.float32)
-    sharpest_a0 = np.empty(room + 1, np.float32)
     members = np.empty(longest, np.int64)
     filled = -1
     for cell in range(first_tile << (2 * shift), end_tile << (2 * shift)):
@@ -614,7 +607,7 @@ def pull_range(
             filled = tile
         total = fill_cell(
             _GRADIENT_COLUMNS, cell & ((1 << (2 * shift)) - 1), shift,
-            start[tile + 1] - start[tile], tile_spans, spans, fronts, sharpest_a0, members,
+            start[tile + 1] - start[tile], tile_spans, spans, fronts, members,
         )  # fmt: skip
         for at in range((total + _SPAN - 1) // _SPAN):
             spans[at, _G:] = ZERO

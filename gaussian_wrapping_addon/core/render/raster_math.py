@@ -71,6 +71,7 @@ FIT = np.array(
 FIT_END = np.float32(0.7)
 _C0, _C1, _C2, _C3, _C4, _C5, _C6 = FIT
 _EIGHTH, _THIRTY_SECOND = np.float32(1.0 / 8.0), np.float32(1.0 / 32.0)
+_WIDE_END = np.float32(32.0) * FIT_END
 
 
 @inline
@@ -90,13 +91,17 @@ def exp_short(x: Any) -> Any:
 
 @inline
 def exp_wide(x: Any) -> Any:
-    """Return exp(-x) for 0 <= x <= 22.4, and 2e-10 above (relative error 7e-6)."""
+    """Return exp(-x) for 0 <= x <= 22.4, and 0 above (relative error 7e-6).
+
+    A small value in place of 0 would be magnified by the 1 / sigma^2 of thin Gaussians far behind.
+    """
     p = _exp_fit(min(x * _THIRTY_SECOND, FIT_END))
     p = p * p
     p = p * p
     p = p * p
     p = p * p
-    return p * p
+    p = p * p
+    return p if x <= _WIDE_END else ZERO
 
 
 @functools.lru_cache(maxsize=1)
