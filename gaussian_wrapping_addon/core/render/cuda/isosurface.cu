@@ -54,9 +54,11 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
         const float alpha = fminf(hit.raw, ALPHA_MAX);
         const float sharpness = row[3].x * hit.den;
         const float front = c.z - FRONT_SIGMAS * row[5].z;
-        const float before = through;
+        const float before = through, beyond = fmaxf(peak - high, 0.0f);
         through = fmaf(-alpha, through, through);
-        sharpest = fmaxf(sharpest, sharpness);
+        // Behind the bracket a Gaussian must be seen from its end to count.
+        if (before > ISO_LEVEL || sharpness * beyond * beyond < NEGLIGIBLE)
+            sharpest = fmaxf(sharpest, sharpness);
         nearest = fminf(nearest, front);
         if (before > ISO_LEVEL) {
             high = fmaxf(high, peak);
@@ -79,20 +81,23 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
         if (!(t > low && t < high)) t = 0.5f * (low + high);
     }
 
-    // T and its derivative at the depth `where` of every pixel in `wanted`.
-    float product, derivative;
+    // T, the slope of -log T and its growth at the depth `where` of every pixel in `wanted`.
+    float product = 1.0f, steep = 0.0f, growth = 0.0f;
     auto transmit = [&](float where, unsigned wanted) {
         product = 1.0f;
-        derivative = 0.0f;
+        steep = growth = 0.0f;
         walk(params, gaussian_ids, masks, begin, end, warp, lane, wanted, [&](int64, const float4* row) {
             const float4 b = row[1], c = row[2];
             const Hit hit = evaluate(row[0], b, c, at_x, at_y);
             const float ahead = fmaxf(peak_depth(hit, b, c.z) - where, 0.0f);
-            const float pull = row[3].x * hit.den * ahead;
+            const float sharpness = ahead > 0.0f ? row[3].x * hit.den : 0.0f;
+            const float pull = sharpness * ahead;
             const float density = fminf(hit.raw * __expf(-0.5f * pull * ahead), ALPHA_MAX);
             const float keep = 1.0f - density;
-            derivative = derivative * keep - product * density * pull;
+            const float odds = __fdividef(density, keep);
             product *= keep;
+            steep = fmaf(odds, pull, steep);
+            growth = fmaf(odds, __fdividef(pull * pull, keep) - sharpness, growth);
         });
     };
     // Some Gaussian may reach the camera: light must pass at depth 0 for a crossing to exist.
@@ -108,20 +113,33 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
         transmit(t, wanted);
         if (!open) continue;
         const float excess = logf(fmaxf(product, TINY) / ISO_LEVEL);
-        slope = -derivative / fmaxf(product, TINY);
-        const float step = excess / fmaxf(slope, SOLVER_SLOPE_FLOOR * sharpest);
         if (excess > 0.0f) low = t;
         else high = t;
-        const float moved = t + step;
-        const bool done = fabsf(step) <= fmaxf(SOLVER_STEP_SIGMAS / sharpest, SOLVER_STEP_SHARE * t)
-            || fabsf(excess) <= SOLVER_LEVEL_MARGIN || high - low <= SOLVER_STEP_SHARE * high;
+        slope = steep;
+        // A Newton step with Halley's correction, within a factor of two.
+        const float turns = 1.0f / fmaxf(slope, SOLVER_LEAST_SLOPE);
+        const float newton = excess * turns;
+        const float step = newton / fminf(fmaxf(1.0f + 0.5f * newton * growth * turns, 0.5f), 2.0f);
+        const float sigmas = fabsf(step) * sharpest;
+        const bool level = fabsf(excess) <= SOLVER_LEVEL_MARGIN;
+        if (level || sigmas < SOLVER_STEP_SIGMAS || high - low <= SOLVER_BRACKET_SHARE * high) {
+            // Where T is all but flat its rounding would lead far astray.
+            if (sigmas < SOLVER_POLISH_SIGMAS || !level) {
+                const float moved = fminf(fmaxf(t + step, low), high);
+                slope = fmaxf(fmaf(growth, moved - t, slope), 0.0f);
+                t = moved;
+            }
+            open = false;
+            continue;
+        }
+        // Long enough to close the bracket; a layer that is steep may end before the level.
+        const float least = SOLVER_LEAST_SHARE * t;
+        const float moved = t + (fabsf(step) > least ? step : copysignf(least, excess));
         // After some Newton steps every second one is a bisection, which bounds their number.
         const bool bisect = steps >= SOLVER_NEWTON_STEPS && (steps & 1) != 0;
-        if (done) t = fminf(fmaxf(moved, low), high);
-        else t = moved > low && moved < high && !bisect ? moved : 0.5f * (low + high);
-        open = !done;
+        t = moved > low && moved < high && !bisect ? moved : 0.5f * (low + high);
     }
     if (!inside) return;
     depth_image[pixel] = t;
-    slope_image[pixel] = t > 0.0f ? fmaxf(slope, SLOPE_FLOOR * sharpest) : 1.0f;
+    slope_image[pixel] = t > 0.0f ? fmaxf(slope, SLOPE_FLOOR * sqrtf(cross_sharpness)) : 1.0f;
 }

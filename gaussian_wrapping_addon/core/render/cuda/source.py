@@ -54,12 +54,14 @@ _SINGLE = {
     # whose rounding at this size stays a tenth of the margin.
     "NARROW_PX": 2048.0,
     "NARROW_MARGIN": 0.05,
-    # Newton's method has converged below this share of the thinnest Gaussian's sigma, or below
-    # the rounding of the depth, or where the transmittance is 0.5 within its own rounding.
-    "SOLVER_STEP_SIGMAS": 1e-5,
-    "SOLVER_STEP_SHARE": 2.5e-7,
+    # As in depth_query_kernels.py, where they are explained.
+    "NEGLIGIBLE": 30.0,
+    "SOLVER_STEP_SIGMAS": 5e-4,
     "SOLVER_LEVEL_MARGIN": 3e-7,
-    "SOLVER_SLOPE_FLOOR": 1e-6,
+    "SOLVER_BRACKET_SHARE": 2.5e-7,
+    "SOLVER_LEAST_SHARE": 2e-7,
+    "SOLVER_POLISH_SIGMAS": 0.05,
+    "SOLVER_LEAST_SLOPE": 1e-12,
 }
 _DOUBLE = {
     "ALPHA_MIN_WIDE": tolerances.ALPHA_MIN,
