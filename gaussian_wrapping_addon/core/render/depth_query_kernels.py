@@ -31,6 +31,7 @@ from .raster_math import (
     PREFETCH_AHEAD,
     TRANSMITTANCE_MIN,
     TWO,
+    WIDE_END,
     ZERO,
     exp_short,
     exp_wide,
@@ -317,9 +318,11 @@ def _bend(count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
     product, slope, growth = ONE, ZERO, ZERO
     for c in range(count):
         ahead = max(peaks[c] - t, ZERO)
-        sharpness = sharpnesses[c] if ahead > ZERO else ZERO
+        fall = HALF * sharpnesses[c] * ahead * ahead
+        density = min(alphas[c] * exp_wide(fall), ALPHA_MAX)
+        # 0 where nothing changes with t; far behind, the square below could overflow.
+        sharpness = sharpnesses[c] if ahead > ZERO and fall <= WIDE_END else ZERO
         pull = sharpness * ahead
-        density = min(alphas[c] * exp_wide(HALF * pull * ahead), ALPHA_MAX)
         keep = ONE - density
         product *= keep
         odds = density / keep

@@ -71,7 +71,8 @@ FIT = np.array(
 FIT_END = np.float32(0.7)
 _C0, _C1, _C2, _C3, _C4, _C5, _C6 = FIT
 _EIGHTH, _THIRTY_SECOND = np.float32(1.0 / 8.0), np.float32(1.0 / 32.0)
-_WIDE_END = np.float32(32.0) * FIT_END
+WIDE_END = np.float32(32.0) * FIT_END
+"""Where :func:`exp_wide` ends."""
 
 
 @inline
@@ -101,7 +102,7 @@ def exp_wide(x: Any) -> Any:
     p = p * p
     p = p * p
     p = p * p
-    return p if x <= _WIDE_END else ZERO
+    return p if x <= WIDE_END else ZERO
 
 
 @functools.lru_cache(maxsize=1)

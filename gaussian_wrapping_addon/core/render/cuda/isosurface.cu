@@ -91,8 +91,9 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
             const Hit hit = evaluate(row[0], b, c, at_x, at_y);
             const float ahead = fmaxf(peak_depth(hit, b, c.z) - where, 0.0f);
             const float sharpness = ahead > 0.0f ? row[3].x * hit.den : 0.0f;
-            const float pull = sharpness * ahead;
-            const float density = fminf(hit.raw * __expf(-0.5f * pull * ahead), ALPHA_MAX);
+            const float pull = sharpness * ahead, fall = 0.5f * pull * ahead;
+            if (!(fall < FALL_END)) return; // nothing yet; the square below could overflow
+            const float density = fminf(hit.raw * __expf(-fall), ALPHA_MAX);
             const float keep = 1.0f - density;
             const float odds = __fdividef(density, keep);
             product *= keep;

@@ -56,6 +56,7 @@ _SINGLE = {
     "NARROW_MARGIN": 0.05,
     # As in depth_query_kernels.py, where they are explained.
     "NEGLIGIBLE": 30.0,
+    "FALL_END": 22.4,
     "SOLVER_STEP_SIGMAS": 5e-4,
     "SOLVER_LEVEL_MARGIN": 3e-7,
     "SOLVER_BRACKET_SHARE": 2.5e-7,
