@@ -202,9 +202,12 @@ def _backward(ctx: Any, grads: tuple[Tensor | None, ...]) -> list[Tensor]:
         )
         blocks = -(-len(params) // WARPS)
         kernels.launch("sum_pairs", blocks, len(params), pairs, band.pair_offsets, grad_params)
+    # A row that float32 could not hold counts as nothing.
+    grad_params.masked_fill_(~grad_params.isfinite().all(1, keepdim=True), 0.0)
     if statistics is not None:
-        statistics.grad_px[:] = grad_params[:, 0:2].norm(dim=1).cpu().numpy()
-        statistics.grad_abs_px[:] = grad_params[:, 22:24].norm(dim=1).cpu().numpy()
+        # In float64: squares of float32 overflow beyond 1e19.
+        statistics.grad_px[:] = grad_params[:, 0:2].double().norm(dim=1).cpu().numpy()
+        statistics.grad_abs_px[:] = grad_params[:, 22:24].double().norm(dim=1).cpu().numpy()
     raw = ctx.raw
     found = [torch.zeros_like(getattr(raw.gaussians, trained)) for trained in _TRAINED]
     kernels.launch_each(

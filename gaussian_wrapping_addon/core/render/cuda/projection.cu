@@ -128,16 +128,34 @@ __device__ __forceinline__ bool project_shape(
     const double u = x / z, v = y / z, zz = z * z;
     const ShapeSums s = shape_sums(axes, variances, u, v);
     const double inverse_a0 = 1.0 / s.a0;
-    row[0] = (float)(fx * u + cx);
-    row[1] = (float)(fy * v + cy);
-    row[2] = (float)(zz * s.fyy * inverse_a0 / (fx * fx));
-    row[3] = (float)(-2.0 * zz * s.fxy * inverse_a0 / (fx * fy));
-    row[4] = (float)(zz * s.fxx * inverse_a0 / (fy * fy));
-    row[5] = (float)(s.hx * inverse_a0 / fx);
-    row[6] = (float)(s.hy * inverse_a0 / fy);
-    row[7] = (float)(s.bxx * inverse_a0 / (fx * fx));
-    row[8] = (float)(2.0 * s.bxy * inverse_a0 / (fx * fy));
-    row[9] = (float)(s.byy * inverse_a0 / (fy * fy));
+    const double at_x = fx * u + cx, at_y = fy * v + cy;
+    const double qa = zz * s.fyy * inverse_a0 / (fx * fx), qb = -2.0 * zz * s.fxy * inverse_a0 / (fx * fy);
+    const double qc = zz * s.fxx * inverse_a0 / (fy * fy);
+    const double px = s.hx * inverse_a0 / fx, py = s.hy * inverse_a0 / fy;
+    const double dr = s.bxx * inverse_a0 / (fx * fx), ds = 2.0 * s.bxy * inverse_a0 / (fx * fy);
+    const double dt = s.byy * inverse_a0 / (fy * fy);
+    const double sigma_z = sqrt(s.cov_zz);
+    // Hidden where float32 could not hold what rendering makes of the row (docs/architecture.md).
+    const double reach_x = fmax(fabs(at_x), fabs(width - at_x)) + TILE;
+    const double reach_y = fmax(fabs(at_y), fabs(height - at_y)) + TILE;
+    const double num = qa * reach_x * reach_x + fabs(qb) * reach_x * reach_y + qc * reach_y * reach_y;
+    const double most_den = 1.0 + 2.0 * (fabs(px) * reach_x + fabs(py) * reach_y)
+        + dr * reach_x * reach_x + fabs(ds) * reach_x * reach_y + dt * reach_y * reach_y;
+    if (!(reach_x <= FINITE_OFFSET_PX && reach_y <= FINITE_OFFSET_PX && num <= FINITE_NUM
+          && most_den <= FINITE_DEN && s.a0 * s.cov_zz <= FINITE_SPREAD
+          && s.a0 * most_den * z <= FINITE_PULL && z >= FINITE_Z_MIN && z <= FINITE_Z_MAX
+          && sigma_z <= FINITE_SIGMA_Z))
+        return false;
+    row[0] = (float)at_x;
+    row[1] = (float)at_y;
+    row[2] = (float)qa;
+    row[3] = (float)qb;
+    row[4] = (float)qc;
+    row[5] = (float)px;
+    row[6] = (float)py;
+    row[7] = (float)dr;
+    row[8] = (float)ds;
+    row[9] = (float)dt;
     row[10] = (float)z;
     row[11] = (float)opacity;
     row[12] = (float)s.a0;
@@ -147,7 +165,7 @@ __device__ __forceinline__ bool project_shape(
     for (int column = 0; column < 3; ++column)
         row[19 + column] = (float)(camera.v[column] * hx + camera.v[3 + column] * hy
             + camera.v[6 + column] * hz);
-    row[22] = (float)sqrt(s.cov_zz);
+    row[22] = (float)sigma_z;
     row[23] = 0.0f;
     *depth = (float)sqrt(x * x + y * y + zz);
 
@@ -213,7 +231,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_gaussians(
         for (int channel = 0; channel < 3; ++channel) {
             const double value = harmonics_color(
                 sh + (int64)i * coefficients * 3, (degree + 1) * (degree + 1), basis, channel);
-            row[13 + channel] = value <= 0.0 ? 0.0f : (float)value; // NaN stays and hides the row
+            seen = seen && value <= FINITE_COLOR; // not so for NaN
+            row[13 + channel] = (float)fmax(value, 0.0);
         }
         const double n0 = orientation[4 * (int64)i], n1 = orientation[4 * (int64)i + 1];
         const double n2 = orientation[4 * (int64)i + 2];
@@ -226,6 +245,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_gaussians(
         for (int column = 0; column < 24; ++column) seen = seen && fabsf(row[column]) < FLOAT32_LARGE;
 #pragma unroll
         for (int column = 0; column < 4; ++column) seen = seen && fabsf(box[column]) < FLOAT32_LARGE;
+        seen = seen && depth < FLOAT32_LARGE && (skew == INFINITE || fabsf(skew) < FLOAT32_LARGE);
     }
     if (!seen) {
 #pragma unroll

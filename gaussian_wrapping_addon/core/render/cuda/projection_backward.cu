@@ -63,17 +63,17 @@ __device__ __forceinline__ void shape_gradient(
 }
 
 // Gradient on a raw quaternion of length `norm` from the one on its rotation g (row by row).
-__device__ __forceinline__ void quat_gradient(const float* quat, double norm, const double* g, float* out) {
+__device__ __forceinline__ void quat_gradient(const float* quat, double norm, const double* g, double* out) {
     const double w = quat[0] / norm, x = quat[1] / norm, y = quat[2] / norm, z = quat[3] / norm;
     const double o0 = 2.0 * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]));
     const double o1 = 2.0 * (w * (g[7] - g[5]) + y * (g[1] + g[3]) + z * (g[2] + g[6]) - 2.0 * x * (g[4] + g[8]));
     const double o2 = 2.0 * (w * (g[2] - g[6]) + x * (g[1] + g[3]) + z * (g[5] + g[7]) - 2.0 * y * (g[0] + g[8]));
     const double o3 = 2.0 * (w * (g[3] - g[1]) + x * (g[2] + g[6]) + y * (g[5] + g[7]) - 2.0 * z * (g[0] + g[4]));
     const double along = o0 * w + o1 * x + o2 * y + o3 * z;
-    out[0] = (float)((o0 - along * w) / norm);
-    out[1] = (float)((o1 - along * x) / norm);
-    out[2] = (float)((o2 - along * y) / norm);
-    out[3] = (float)((o3 - along * z) / norm);
+    out[0] = (o0 - along * w) / norm;
+    out[1] = (o1 - along * x) / norm;
+    out[2] = (o2 - along * y) / norm;
+    out[3] = (o3 - along * z) / norm;
 }
 
 // out = sum_k c[k] times the partial derivatives of harmonic k, x, y and z independent.
@@ -101,7 +101,8 @@ __device__ __forceinline__ void harmonics_pull(
         + SH_C3E * (xx - yy) * c[14];
 }
 
-// Writes the rows of visible Gaussians; the others must hold 0 before.
+// Writes the rows of visible Gaussians; the others must hold 0 before, and so stay those whose
+// gradient float32 cannot hold.
 extern "C" __global__ void __launch_bounds__(BLOCK) project_backward(
     int count, const float* means, const float* log_scales, const float* quats,
     const float* opacity_logits, const float* sh, int coefficients, int degree,
@@ -141,11 +142,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_backward(
     double grad_axes[9], grad_logs[3], grad_local[3];
     shape_gradient(local, variances, camera, axes, grad, grad_axes, grad_logs, grad_local);
     const double g_log_opacity = grad[11] * opacity;
-    grad_opacity_logits[i] = (float)(g_log_opacity * fade);
-#pragma unroll
-    for (int k = 0; k < 3; ++k)
-        // d(effective log scale) = kept d(log scale); the filter also dims the opacity.
-        grad_log_scales[3 * i + k] = (float)(kept[k] * grad_logs[k] + (1.0 - kept[k]) * g_log_opacity);
+    double g_quat[4] = {0.0, 0.0, 0.0, 0.0};
     if (norm > 0.0) {
         double grad_rotation[9];
 #pragma unroll
@@ -154,7 +151,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_backward(
             for (int k = 0; k < 3; ++k)
                 grad_rotation[3 * row + k] = camera.v[row] * grad_axes[k]
                     + camera.v[3 + row] * grad_axes[3 + k] + camera.v[6 + row] * grad_axes[6 + k];
-        quat_gradient(quats + 4 * i, norm, grad_rotation, grad_quats + 4 * i);
+        quat_gradient(quats + 4 * i, norm, grad_rotation, g_quat);
     }
 
     // Colour, through the coefficients and through the viewing direction.
@@ -162,31 +159,23 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_backward(
     const double distance = sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
     d[0] /= distance, d[1] /= distance, d[2] /= distance;
     const int used = (degree + 1) * (degree + 1);
-    double basis[16], pull[16], g[3];
+    double basis[16], pull[16], g[3], g_color[3];
     harmonics(degree, d[0], d[1], d[2], basis);
 #pragma unroll
     for (int k = 0; k < 16; ++k) pull[k] = 0.0;
 #pragma unroll
     for (int channel = 0; channel < 3; ++channel) {
         const float* stored = sh + i * coefficients * 3;
-        if (harmonics_color(stored, used, basis, channel) < 0.0) continue;
-        const double g_color = grad[13 + channel];
+        g_color[channel] = harmonics_color(stored, used, basis, channel) < 0.0 ? 0.0 : grad[13 + channel];
 #pragma unroll
         for (int k = 0; k < 16; ++k)
-            if (k < used) {
-                grad_sh[(i * coefficients + k) * 3 + channel] = (float)(g_color * basis[k]);
-                pull[k] += g_color * (double)stored[3 * k + channel];
-            }
+            if (k < used) pull[k] += g_color[channel] * (double)stored[3 * k + channel];
     }
     harmonics_pull(degree, d[0], d[1], d[2], pull, g);
     const double along = g[0] * d[0] + g[1] * d[1] + g[2] * d[2];
-#pragma unroll
-    for (int column = 0; column < 3; ++column)
-        grad_means[3 * i + column] = (float)(camera.v[column] * grad_local[0]
-            + camera.v[3 + column] * grad_local[1] + camera.v[6 + column] * grad_local[2]
-            + (g[column] - along * d[column]) / distance);
 
     // Learned normal tanh(s) d / |d|.
+    double g_orientation[4] = {0.0, 0.0, 0.0, 0.0};
     double n[3] = {orientation[4 * i], orientation[4 * i + 1], orientation[4 * i + 2]};
     const double length = sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
     if (length > DIRECTION_MIN_NORM) {
@@ -195,7 +184,42 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_backward(
         const double toward = grad[16] * n[0] + grad[17] * n[1] + grad[18] * n[2];
 #pragma unroll
         for (int column = 0; column < 3; ++column)
-            grad_orientation[4 * i + column] = (float)(gain * (grad[16 + column] - toward * n[column]) / length);
-        grad_orientation[4 * i + 3] = (float)((1.0 - gain * gain) * toward);
+            g_orientation[column] = gain * (grad[16 + column] - toward * n[column]) / length;
+        g_orientation[3] = (1.0 - gain * gain) * toward;
     }
+
+    // The mean and the log scales last, in place; then all at once, or nothing.
+    const double g_logit = g_log_opacity * fade;
+    double total = fabs(g_logit);
+#pragma unroll
+    for (int k = 0; k < 3; ++k) {
+        // d(effective log scale) = kept d(log scale); the filter also dims the opacity.
+        grad_logs[k] = kept[k] * grad_logs[k] + (1.0 - kept[k]) * g_log_opacity;
+        d[k] = camera.v[k] * grad_local[0] + camera.v[3 + k] * grad_local[1]
+            + camera.v[6 + k] * grad_local[2] + (g[k] - along * d[k]) / distance;
+        total += fabs(grad_logs[k]) + fabs(d[k]);
+#pragma unroll
+        for (int j = 0; j < 16; ++j)
+            if (j < used) total += fabs(g_color[k] * basis[j]);
+    }
+#pragma unroll
+    for (int k = 0; k < 4; ++k) total += fabs(g_quat[k]) + fabs(g_orientation[k]);
+    if (!(total < FLOAT32_LARGE)) return;
+    grad_opacity_logits[i] = (float)g_logit;
+#pragma unroll
+    for (int k = 0; k < 3; ++k) {
+        grad_log_scales[3 * i + k] = (float)grad_logs[k];
+        grad_means[3 * i + k] = (float)d[k];
+    }
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+        grad_quats[4 * i + k] = (float)g_quat[k];
+        grad_orientation[4 * i + k] = (float)g_orientation[k];
+    }
+#pragma unroll
+    for (int k = 0; k < 16; ++k)
+        if (k < used)
+#pragma unroll
+            for (int channel = 0; channel < 3; ++channel)
+                grad_sh[(i * coefficients + k) * 3 + channel] = (float)(g_color[channel] * basis[k]);
 }

@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 from ... import tolerances
-from ..raster_math import DENOMINATOR_MIN, FRONT_SIGMAS
+from ..raster_math import FRONT_SIGMAS
 
 PARTS = (
     "common.cu",
@@ -44,7 +44,7 @@ _SINGLE = {
     "ALPHA_MAX": tolerances.ALPHA_MAX,
     "TRANSMITTANCE_MIN": tolerances.TRANSMITTANCE_MIN,
     "ISO_LEVEL": tolerances.ISO_LEVEL,
-    "DENOMINATOR_MIN": float(DENOMINATOR_MIN),
+    "DENOMINATOR_MIN": tolerances.DENOMINATOR_MIN,
     "FRONT_SIGMAS": float(FRONT_SIGMAS),
     "SLOPE_FLOOR": tolerances.SLOPE_FLOOR,
     "TINY": 1e-30,
@@ -68,6 +68,15 @@ _DOUBLE = {
     "ALPHA_MIN_WIDE": tolerances.ALPHA_MIN,
     "QUATERNION_MIN_NORM": tolerances.QUATERNION_MIN_NORM,
     "DIRECTION_MIN_NORM": tolerances.DIRECTION_MIN_NORM,
+    "FINITE_OFFSET_PX": tolerances.FINITE_OFFSET_PX,
+    "FINITE_NUM": tolerances.FINITE_NUM,
+    "FINITE_DEN": tolerances.FINITE_DEN,
+    "FINITE_SPREAD": tolerances.FINITE_SPREAD,
+    "FINITE_PULL": tolerances.FINITE_PULL,
+    "FINITE_Z_MIN": tolerances.FINITE_Z_MIN,
+    "FINITE_Z_MAX": tolerances.FINITE_Z_MAX,
+    "FINITE_SIGMA_Z": tolerances.FINITE_SIGMA_Z,
+    "FINITE_COLOR": tolerances.FINITE_COLOR,
     # As in projection_kernels.py and tile_kernels.py.
     "PLANE_MARGIN": 1e-12,
     "FLOAT32_STEP": 2.0**-23,
