@@ -139,9 +139,14 @@ def depth_weights(
 
 
 def relative_l2(a: Tensor, b: Tensor) -> float:
-    """Return |a - b| / |b|, or |a| where b is 0."""
+    """Return |a - b| / |b|, or |a| where b is 0.
+
+    Below the normal range of float32, as a saturated opacity's gradient, digits are lost: such a
+    length counts as the end of that range.
+    """
     scale = float(b.double().norm())
-    return float((a.double() - b.double()).norm()) / (scale or 1.0)
+    scale = max(scale, float(torch.finfo(torch.float32).tiny)) if scale > 0.0 else 1.0
+    return float((a.double() - b.double()).norm()) / scale
 
 
 def assert_same_images(found: Outcome, wanted: Outcome, tolerance: float = 2e-6) -> None:
