@@ -190,7 +190,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_backward(
 
     // The mean and the log scales last, in place; then all at once, or nothing.
     const double g_logit = g_log_opacity * fade;
-    double total = fabs(g_logit);
+    double total = fabs(g_logit) + BASIS_MAX * (fabs(g_color[0]) + fabs(g_color[1]) + fabs(g_color[2]));
 #pragma unroll
     for (int k = 0; k < 3; ++k) {
         // d(effective log scale) = kept d(log scale); the filter also dims the opacity.
@@ -198,13 +198,10 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_backward(
         d[k] = camera.v[k] * grad_local[0] + camera.v[3 + k] * grad_local[1]
             + camera.v[6 + k] * grad_local[2] + (g[k] - along * d[k]) / distance;
         total += fabs(grad_logs[k]) + fabs(d[k]);
-#pragma unroll
-        for (int j = 0; j < 16; ++j)
-            if (j < used) total += fabs(g_color[k] * basis[j]);
     }
 #pragma unroll
     for (int k = 0; k < 4; ++k) total += fabs(g_quat[k]) + fabs(g_orientation[k]);
-    if (!(total < FLOAT32_LARGE)) return;
+    if (!(total < GRADIENT_MAX)) return;
     grad_opacity_logits[i] = (float)g_logit;
 #pragma unroll
     for (int k = 0; k < 3; ++k) {

@@ -77,6 +77,9 @@ _DOUBLE = {
     "FINITE_Z_MAX": tolerances.FINITE_Z_MAX,
     "FINITE_SIGMA_Z": tolerances.FINITE_SIGMA_Z,
     "FINITE_COLOR": tolerances.FINITE_COLOR,
+    # As in projection_backward.py.
+    "GRADIENT_MAX": 1e38,
+    "BASIS_MAX": 3.0,
     # As in projection_kernels.py and tile_kernels.py.
     "PLANE_MARGIN": 1e-12,
     "FLOAT32_STEP": 2.0**-23,
