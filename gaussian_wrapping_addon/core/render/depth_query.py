@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .. import tolerances
 from ..dataset.camera import Camera
 from ..errors import UsageError
 from ..gaussians.model import OrientedGaussians
@@ -362,11 +363,45 @@ def _project_finely(
 
     def shrink(begin: int, end: int) -> None:
         shrink_range(
-            begin, end, float(scale), screen.params, screen.boxes, screen.skews, screen.visible
-        )
+            begin, end, float(scale), camera.width, camera.height,
+            screen.params, screen.boxes, screen.skews, screen.visible,
+        )  # fmt: skip
 
     run_chunks(shrink, even_bounds(len(screen), threads), threads)
+    _add_far_ones(gaussians, camera, options, scale, screen)
     return screen
+
+
+def _add_far_ones(
+    gaussians: RawArrays,
+    camera: Camera,
+    options: RenderOptions,
+    scale: int,
+    screen: ScreenGaussians,
+) -> None:
+    """Add what is hidden only because the finer screen numbers its pixels no farther.
+
+    These project more than a hundred images aside.
+    """
+    hidden = np.flatnonzero(~screen.visible)
+    pose = camera.cam_from_world
+    with np.errstate(all="ignore"):
+        local = gaussians.means[hidden].astype(np.float64) @ pose[:, :3].T + pose[:, 3]
+        aside = np.abs(
+            local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        )
+    limit = (
+        tolerances.FINITE_OFFSET_PX / scale - max(camera.width, camera.height) - tolerances.TILE_PX
+    )
+    far = hidden[(local[:, 2] > 0.0) & (aside.max(1) > limit)]
+    if len(far) == 0:
+        return
+    names = [field.name for field in dataclasses.fields(RawArrays)]
+    some = RawArrays(**{name: getattr(gaussians, name)[far] for name in names})
+    coarse = project_gaussians(some, camera, options)
+    seen = far[coarse.visible]
+    for field in dataclasses.fields(ScreenGaussians):
+        getattr(screen, field.name)[seen] = getattr(coarse, field.name)[coarse.visible]
 
 
 def _sorted(view: QueryView, positions: np.ndarray) -> SortedPositions:

@@ -41,8 +41,8 @@ from .vector_runs import lowest_bit, positive_run, prefetch_row
 GEOMETRY = 13
 """Leading columns of params that a ray's transmittance depends on."""
 
-_FIRST_QUADRATIC = 2
-"""Columns before this one are pixels; those up to 9 are per pixel, 5 and 6, or per its square."""
+_BOX_END = 0.999e9
+"""Projection cuts boxes off at 1e9 pixels."""
 
 _SPAN = 32
 _RUN = 16
@@ -99,6 +99,8 @@ def shrink_range(
     begin: int,
     end: int,
     scale: float,
+    width: int,
+    height: int,
     params: np.ndarray,
     boxes: np.ndarray,
     skews: np.ndarray,
@@ -106,21 +108,37 @@ def shrink_range(
 ) -> None:
     """Turn the rows ``begin .. end`` of a screen ``scale`` times as fine into pixels.
 
-    Rows that overflow are hidden: they would not have been visible on the coarser screen.
+    Rows that the image of ``width`` x ``height`` hides, because float32 could not hold what
+    rendering makes of them (docs/architecture.md), are hidden.
     """
-    shrink, square = np.float32(1.0 / scale), np.float32(scale * scale)
-    grow = np.float32(scale)
     for i in range(begin, end):
         if not visible[i]:
             continue
-        for column in range(_FIRST_QUADRATIC):
-            params[i, column] *= shrink
-        for column in range(_FIRST_QUADRATIC, 10):
-            params[i, column] *= grow if 5 <= column <= 6 else square
-            visible[i] &= abs(params[i, column]) < FAR
+        # No column but these depends on the size of a pixel.
+        u, v = params[i, 0] / scale, params[i, 1] / scale
+        reach_x = max(abs(u), abs(width - u)) + TILE
+        reach_y = max(abs(v), abs(height - v)) + TILE
+        xx, xy, yy = reach_x * reach_x, reach_x * reach_y, reach_y * reach_y
+        square = scale * scale
+        qa, qb, qc = params[i, 2] * square, params[i, 3] * square, params[i, 4] * square
+        px, py = params[i, 5] * scale, params[i, 6] * scale
+        r, s, t = params[i, 7] * square, params[i, 8] * square, params[i, 9] * square
+        den = 1.0 + 2.0 * (abs(px) * reach_x + abs(py) * reach_y) + r * xx + abs(s) * xy + t * yy
+        holds = reach_x <= tolerances.FINITE_OFFSET_PX and reach_y <= tolerances.FINITE_OFFSET_PX
+        holds &= qa * xx + abs(qb) * xy + qc * yy <= tolerances.FINITE_NUM
+        holds &= den <= tolerances.FINITE_DEN
+        holds &= params[i, 12] * den * params[i, 10] <= tolerances.FINITE_PULL
+        visible[i] = holds
+        if not holds:
+            continue
+        for column, value in enumerate((u, v, qa, qb, qc, px, py, r, s, t)):
+            params[i, column] = value
+        skews[i] /= scale
         for column in range(4):
-            boxes[i, column] *= shrink
-        skews[i] *= shrink
+            if abs(boxes[i, column]) > _BOX_END:
+                # Cut off, far beyond the image: no longer the box of the ellipse.
+                skews[i] = math.inf
+            boxes[i, column] /= scale
 
 
 @part(fast=False)

@@ -6,15 +6,26 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.render.depth_query import query_depth
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.render.depth_query import (
+    query_depth,
+    query_transmittance,
+    query_view,
+)
+from gaussian_wrapping_addon.core.render.projection import RawArrays
 from gaussian_wrapping_addon.core.render.reference import reference_depth_at
+from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 
 from .comparisons import leaves, narrowed, relative_l2
 from .depth_scenes import SCENES, WIDE, assert_depth, ball_before_disc, scene
 from .first_principles import FirstPrinciples
+from .scenes import front_camera, one_gaussian
+from .test_properties import cameras, steady, wild_gaussians
 
 OPTIONS = RenderOptions(threads=1)
 SHAPES = ("means", "log_scales", "quats", "opacity_logits")
@@ -57,3 +68,51 @@ def test_a_hidden_thin_disc_leaves_the_gradient_alone(thickness: float) -> None:
         assert relative_l2(fast, exact, whole) < 1e-4
     # The disc itself gets none.
     assert not any(grad[0].any() for grad in grads[0][: len(SHAPES)])
+
+
+@pytest.mark.parametrize("aside", [300.0, 3000.0])
+def test_a_gaussian_that_projects_far_aside_is_seen(aside: float) -> None:
+    # Hundreds of images aside, beyond where a finer screen numbers its pixels.
+    gaussians = narrowed(one_gaussian((3 * aside, 0.1, 3 * aside), 0.98, (aside, -3.5, 0.0)))
+    camera = front_camera(40, 36, focal=45.0)
+    positions = pixel_centres(camera)
+    with torch.no_grad():
+        found = query_depth(leaves(gaussians, torch.float32), camera, positions, OPTIONS)
+        exact = reference_depth_at(gaussians, camera, positions, OPTIONS)
+    assert (exact > 0).all()
+    assert ((found - exact).abs() < 1e-5 * exact).all()
+
+
+@pytest.mark.parametrize("length", [1e3, 1e5, 1e8])
+def test_a_slanted_beam_of_any_length_is_seen_whole(length: float) -> None:
+    # Its box is cut off far beyond the image, and is no longer that of the ellipse.
+    gaussians = narrowed(one_gaussian((length, 0.01, 0.3), 0.98, turn=0.6, axis=1))
+    camera = front_camera(40, 36, focal=45.0)
+    positions = pixel_centres(camera)
+    with torch.no_grad():
+        found = query_depth(leaves(gaussians, torch.float32), camera, positions, OPTIONS)
+        exact = reference_depth_at(gaussians, camera, positions, OPTIONS)
+    assert (exact > 0).sum() > 300
+    assert torch.equal(found > 0, exact > 0)
+    assert ((found - exact).abs() <= 1e-5 * exact).all()
+
+
+@steady(60)
+@given(gaussians=wild_gaussians(), camera=cameras(), near_z=st.sampled_from([0.2, 0.0, -1.0]))
+def test_what_the_image_hides_is_hidden(
+    gaussians: OrientedGaussians, camera: Camera, near_z: float
+) -> None:
+    options = RenderOptions(near_z=near_z, sh_degree=0, threads=1)
+    usable = reference_projection(gaussians, camera, options).usable
+    leaf = leaves(gaussians, torch.float32)
+    view = query_view(RawArrays.from_gaussians(leaf), camera, options)
+    assert not view.screen.visible[~usable.numpy()].any()
+    at = pixel_centres(camera).float().requires_grad_()
+    depth = query_depth(leaf, camera, at, options)
+    through = query_transmittance(leaf, camera, at, torch.ones(len(at)), options)
+    assert torch.isfinite(depth).all()
+    assert ((through >= 0) & (through <= 1)).all()
+    (depth.sum() + through.sum()).backward()
+    for grad in [*(getattr(leaf, name).grad for name in SHAPES), at.grad]:
+        assert grad is not None
+        assert torch.isfinite(grad).all()
