@@ -113,7 +113,7 @@ def test_the_gpu_equals_the_cpu(gpu: str, count: int, width: int, height: int) -
     options = RenderOptions(background=(0.2, 0.5, 0.1), statistics=True)
     found, wanted = on_both(gaussians, camera, options)
     assert found.render.color.device.type == gpu
-    assert_same_images(found, wanted, 4e-6)
+    assert_same_images(found, wanted, 4e-6, decided=1e-4 if width * height > 10_000 else 0.0)
     assert_same_gradients(found, wanted)
     for name in STATISTICS:
         a = torch.as_tensor(getattr(found.render.statistics, name)).double()
