@@ -70,14 +70,15 @@ _FLOAT_MARGIN = np.float32(4e-6)
 _STEP_SIGMAS = np.float32(5e-4)
 # ... or a transmittance equal to 0.5 within its own rounding ...
 _LEVEL_MARGIN = np.float32(1.2e-7)
-# ... or a bracket of a few roundings of the depth. A step below that rounding alone proves nothing:
+# ... or a bracket of one rounding of the depth. A step below that rounding alone proves nothing:
 # a layer may be steep there and yet end before the level is reached.
-_BRACKET_SHARE = np.float32(2.5e-7)
-_LEAST_SHARE = np.float32(2e-7)
+_BRACKET_SHARE = np.float32(1.25e-7)
+_LEAST_SHARE = np.float32(1.25e-7)
 """Steps are at least this share of the depth, so that they can close the bracket."""
-_POLISH_SIGMAS = np.float32(0.05)
-"""Where T is 0.5 within its rounding, a last step is taken up to this length: where T is all but
-flat its rounding would lead far astray."""
+_POLISH_SIGMAS = np.float32(3e-3)
+"""A last step is taken up to this length. A longer one would leave the place at which the slope is
+known, by which gradients at the stored depth are divided; where T is all but flat, its rounding
+would lead far astray."""
 _LEAST_SLOPE = np.float32(1e-12)
 """Keeps a step finite; it leaves the bracket then."""
 # Halley's correction of a Newton step stays within these factors.
@@ -369,10 +370,10 @@ def _solve(
         size = abs(step)
         sigmas = size * sharpest
         found_slope = slope
-        level = abs(excess) <= _LEVEL_MARGIN
-        if level or sigmas < _STEP_SIGMAS or high - low <= _BRACKET_SHARE * high:
+        closed = abs(excess) <= _LEVEL_MARGIN or high - low <= _BRACKET_SHARE * high
+        if closed or sigmas < _STEP_SIGMAS:
             # Rounding may put a step this small on the bracket's end.
-            if sigmas < _POLISH_SIGMAS or not level:
+            if sigmas < _POLISH_SIGMAS:
                 moved = min(max(t + step, low), high)
                 found_slope = max(slope + growth * (moved - t), ZERO)
                 t = moved

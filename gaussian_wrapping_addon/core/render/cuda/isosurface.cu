@@ -122,10 +122,10 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
         const float newton = excess * turns;
         const float step = newton / fminf(fmaxf(1.0f + 0.5f * newton * growth * turns, 0.5f), 2.0f);
         const float sigmas = fabsf(step) * sharpest;
-        const bool level = fabsf(excess) <= SOLVER_LEVEL_MARGIN;
-        if (level || sigmas < SOLVER_STEP_SIGMAS || high - low <= SOLVER_BRACKET_SHARE * high) {
-            // Where T is all but flat its rounding would lead far astray.
-            if (sigmas < SOLVER_POLISH_SIGMAS || !level) {
+        if (sigmas < SOLVER_STEP_SIGMAS || fabsf(excess) <= SOLVER_LEVEL_MARGIN
+            || high - low <= SOLVER_BRACKET_SHARE * high) {
+            // A longer step would leave the place at which the slope is known.
+            if (sigmas < SOLVER_POLISH_SIGMAS) {
                 const float moved = fminf(fmaxf(t + step, low), high);
                 slope = fmaxf(fmaf(growth, moved - t, slope), 0.0f);
                 t = moved;
