@@ -79,6 +79,9 @@ _POLISH_SIGMAS = np.float32(3e-3)
 """A last step is taken up to this length. A longer one would leave the place at which the slope is
 known, by which gradients at the stored depth are divided; where T is all but flat, its rounding
 would lead far astray."""
+_LEVEL_FAR, _FLAT = np.float32(0.05), np.float32(0.02)
+"""A layer thinner than a rounding of the depth: T jumps over 0.5 from where it is flat. Its
+gradient is lost; rather let it be too small than a thousand times too large."""
 _LEAST_SLOPE = np.float32(1e-12)
 """Keeps a step finite; it leaves the bracket then."""
 # Halley's correction of a Newton step stays within these factors.
@@ -352,9 +355,10 @@ def _bend(count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
 
 @inline
 def _solve(
-    count: Any, alphas: Any, peaks: Any, sharpnesses: Any, high: Any, guess: Any, sharpest: Any
-) -> Any:
-    """Return where T crosses 0.5 between 0 and ``high``, and -d(log T)/dt there."""
+    count: Any, alphas: Any, peaks: Any, sharpnesses: Any, high: Any, guess: Any, sharpest: Any,
+    alone: Any,
+) -> Any:  # fmt: skip
+    """Return where T crosses 0.5 between 0 and ``high``, and -d(log T)/dt there, floored."""
     t, low, found_slope = guess, ZERO, ZERO
     for number in range(_MAX_STEPS):
         product, slope, growth = _bend(count, t, alphas, peaks, sharpnesses)
@@ -375,15 +379,18 @@ def _solve(
             # Rounding may put a step this small on the bracket's end.
             if sigmas < _POLISH_SIGMAS:
                 moved = min(max(t + step, low), high)
-                found_slope = max(slope + growth * (moved - t), ZERO)
+                found_slope = slope + growth * (moved - t)
                 t = moved
+            found_slope = max(found_slope, SLOPE_FLOOR * alone)
+            if abs(excess) > _LEVEL_FAR and slope < _FLAT * alone:
+                found_slope = TWO * alone
             break
         least = _LEAST_SHARE * t
         moved = t + (step if size > least else (least if excess > ZERO else -least))
         newton_next = moved > low and moved < high
         newton_next = newton_next and (number < _NEWTON_STEPS or number % 2 == 0)
         t = moved if newton_next else HALF * (low + high)
-    return t, found_slope
+    return t, max(found_slope, SLOPE_FLOOR * alone)
 
 
 @functools.cache
@@ -517,11 +524,10 @@ def query_kernel(solve: bool) -> Any:
                 guess = peaks[crossing] - ahead
                 if not (guess > ZERO and guess < high):
                     guess = HALF * high
-                t, slope = _solve(
-                    kept, alphas, peaks, sharpnesses, high, guess, math.sqrt(max(sharpest, _TINY))
-                )
-                values[p] = t
-                slopes[p] = max(slope, SLOPE_FLOOR * math.sqrt(max(sharpnesses[crossing], _TINY)))
+                values[p], slopes[p] = _solve(
+                    kept, alphas, peaks, sharpnesses, high, guess,
+                    math.sqrt(max(sharpest, _TINY)), math.sqrt(max(sharpnesses[crossing], _TINY)),
+                )  # fmt: skip
 
     return query_range
 

@@ -73,6 +73,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
     open = open && cross_before > 0.0f;
     float low = fmaxf(nearest, 0.0f);
     sharpest = sqrtf(fmaxf(sharpest, TINY));
+    const float alone = sqrtf(fmaxf(cross_sharpness, TINY));
     if (open) {
         // Alone, that Gaussian lets 0.5 through where exp(-s d^2 / 2) = ratio.
         const float ratio = (cross_before - ISO_LEVEL) / fmaxf(cross_alpha * cross_before, TINY);
@@ -124,12 +125,15 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
         const float sigmas = fabsf(step) * sharpest;
         if (sigmas < SOLVER_STEP_SIGMAS || fabsf(excess) <= SOLVER_LEVEL_MARGIN
             || high - low <= SOLVER_BRACKET_SHARE * high) {
+            const bool lost = fabsf(excess) > SOLVER_LEVEL_FAR && slope < SOLVER_FLAT * alone;
             // A longer step would leave the place at which the slope is known.
             if (sigmas < SOLVER_POLISH_SIGMAS) {
                 const float moved = fminf(fmaxf(t + step, low), high);
-                slope = fmaxf(fmaf(growth, moved - t, slope), 0.0f);
+                slope = fmaf(growth, moved - t, slope);
                 t = moved;
             }
+            // A layer thinner than a rounding of the depth has no gradient to trust.
+            if (lost) slope = 2.0f * alone;
             open = false;
             continue;
         }
@@ -142,5 +146,5 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
     }
     if (!inside) return;
     depth_image[pixel] = t;
-    slope_image[pixel] = t > 0.0f ? fmaxf(slope, SLOPE_FLOOR * sqrtf(cross_sharpness)) : 1.0f;
+    slope_image[pixel] = t > 0.0f ? fmaxf(slope, SLOPE_FLOOR * alone) : 1.0f;
 }
