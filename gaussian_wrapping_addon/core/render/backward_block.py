@@ -90,15 +90,16 @@ def _sums_of_block(
     g_lin = block.vector(0.0)
     if depth:
         peak = peak_depth(sight)
-        # 0 where nothing counts: the products below may overflow there, and 0 inf is no number.
-        ahead = contributes.choose(peak - block.load(state, plane(DEPTH)), 0.0).max(0.0)
+        ahead = (peak - block.load(state, plane(DEPTH))).max(0.0)
+        # At most FINITE_PULL on any lane, so that 0 stays 0 in what follows; the exponential's
+        # argument may overflow where nothing counts.
         fall = sight.den * row[12] * ahead
-        density = contributes.choose(sight.raw * exp_wide(fall * ahead, 0.5), 0.0)
-        below_cap = density < float(constants.ALPHA_MAX)
+        density = sight.raw * exp_wide(fall * ahead, 0.5)
+        pulled = contributes & (density < float(constants.ALPHA_MAX))
         density = density.min(float(constants.ALPHA_MAX))
         # On log G, through log(1 - G).
         g_log = block.load(state, plane(PULL)) * density / (density - 1.0)
-        g_log = below_cap.choose(g_log, 0.0)
+        g_log = pulled.choose(g_log, 0.0)
         g_distance = g_distance - g_log * 0.5
         g_peak = g_log * fall * -1.0
         g_sharpness = g_log * ahead * ahead * -0.5
