@@ -32,14 +32,33 @@ def reference_projection(
     Rows that are not usable hold zeros and carry no gradient.
     """
     means = gaussians.means
+    # First without gradients: what overflows in a row that is not usable must not reach them.
+    with torch.no_grad():
+        axis, shift = camera.cam_from_world[2, :3], camera.cam_from_world[2, 3]
+        index = torch.nonzero(means @ means.new_tensor(axis) + shift > options.near_z)[:, 0]  # (m,)
+        rows, distance = _project(gaussians.select(index), camera, options)
+        faint = rows[:, 11] <= tolerances.ALPHA_MIN
+        index, distance = (
+            part[_held_by_float32(rows, distance, camera) & ~faint] for part in (index, distance)
+        )
+    rows, _ = _project(gaussians.select(index), camera, options)
+    usable = torch.zeros(len(gaussians), dtype=torch.bool, device=rows.device)
+    usable[index] = True
+    params = means.new_zeros((len(gaussians), 24)).index_put((index,), rows)
+    distances = means.new_full((len(gaussians),), torch.inf)
+    return ReferenceScreen(params, distances.index_put((index,), distance), usable)
+
+
+def _project(
+    chosen: OrientedGaussians, camera: Camera, options: RenderOptions
+) -> tuple[Tensor, Tensor]:
+    """(m, 24) rows of params and (m,) distances of Gaussians before the camera."""
+    means = chosen.means
     rotation = means.new_tensor(camera.rotation)  # (3, 3)
     translation = means.new_tensor(camera.cam_from_world[:, 3])  # (3,)
     focal = means.new_tensor([camera.fx, camera.fy])  # (2,)
     offset = means.new_tensor([camera.cx, camera.cy])  # (2,)
-
-    in_front = (means @ rotation[2] + translation[2]).detach() > options.near_z
-    chosen = gaussians.select(in_front)
-    local = chosen.means @ rotation.T + translation  # (m, 3)
+    local = means @ rotation.T + translation  # (m, 3)
     z = local[:, 2]
     ray = local / z[:, None]  # (m, 3) = (u, v, 1)
     axes = rotation @ chosen.rotations()  # (m, 3, 3) columns, camera frame
@@ -78,18 +97,7 @@ def reference_projection(
         geometric,
         torch.stack([scaled[:, 2].norm(dim=1), torch.zeros_like(z)], 1),
     ]
-    rows = torch.cat(columns, 1)  # (m, 24)
-    distance = local.norm(dim=1).detach()
-    good = (opacity > tolerances.ALPHA_MIN).detach() & _held_by_float32(
-        rows.detach(), distance, camera
-    )
-    index = torch.nonzero(in_front)[:, 0]
-    usable = torch.zeros(len(gaussians), dtype=torch.bool, device=rows.device)
-    usable[index] = good
-    params = means.new_zeros((len(gaussians), 24)).index_put((index[good],), rows[good])
-    distances = means.new_full((len(gaussians),), torch.inf)
-    distances = distances.index_put((index,), distance)
-    return ReferenceScreen(params, distances, usable)
+    return torch.cat(columns, 1), local.norm(dim=1)
 
 
 def _held_by_float32(rows: Tensor, distance: Tensor, camera: Camera) -> Tensor:
