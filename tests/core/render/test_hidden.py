@@ -142,7 +142,7 @@ SANE = {
         LARGE,
     ),
     "a mean far aside whose Gaussian reaches the camera": (
-        single(means=[300.0, 0.0, 0.2], log_scales=sigmas(200.0, 200.0, 200.0)),
+        single(means=[100.0, 0.0, 0.2], log_scales=sigmas(60.0, 60.0, 60.0)),
         LARGE,
     ),
     "lights of 1e6": (single(sh=1e6), CENTERED),

@@ -194,6 +194,22 @@ ABSURD = {
     "mean at the camera": (one_wild(means=[0.3, -3.0, 0.2]), PLAIN),
     "filter of 3e38": (one_wild(filter_3d=3e38), PLAIN),
     "filter of 1e-45": (one_wild(filter_3d=1e-45, log_scales=-1e30), PLAIN),
+    "largest values everywhere": (
+        one_wild(sh=3e38, log_scales=3e38, quats=3e38, orientation=3e38, opacity_logits=3e38),
+        PLAIN,
+    ),
+    # Its least den is 3e-12, far below the rounding of den's terms: gradients overflow.
+    "sigma of 1e12 around everything": (
+        one_wild(
+            log_scales=[27.25, 27.05, 31.4], filter_3d=0.0, quats=[0.9, 0.3, 0.1, 0.2], sh=1e6
+        ),
+        PLAIN,
+    ),
+    "disc of 1e9 : 1": (
+        one_wild(log_scales=[0.0, 0.0, -20.7], filter_3d=0.0, quats=[0.9, 0.3, 0.1, 0.2]),
+        PLAIN,
+    ),
+    "harmonics at their limit": (one_wild(sh=4e7), PLAIN),
 }
 
 
