@@ -254,7 +254,7 @@ def _raw_gradients(m: Any) -> None:
         m[_GRAD_MEAN + 2 * BLOCK + lane] += (g2 - along * d2) * inverse
 
 
-@kernel(fast=False, fused=True)
+@part(fast=False, fused=True)
 def _drop_overflows(m: Any) -> None:
     """Set what is written of a Gaussian to 0 where float32 cannot hold all of it."""
     for lane in range(BLOCK):

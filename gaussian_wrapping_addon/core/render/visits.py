@@ -92,7 +92,7 @@ def list_visits(
                 n += np.int64((masks[k] >> np.uint32(block)) & np.uint32(1))
             counts[block] = n - at
     else:
-        # Without instructions that pack vectors, bit by bit is the fastest of what we tried.
+        # Without instructions that pack vectors, elsewhere bit by bit.
         for block in range(blocks):
             counts[block] = 0
         for k in range(begin, begin + count):
