@@ -24,6 +24,11 @@ def joined(*parts: OrientedGaussians) -> OrientedGaussians:
     )
 
 
+def doubled(gaussians: OrientedGaussians) -> OrientedGaussians:
+    """Return the same values in float64."""
+    return gaussians.replaced(**{name: value.double() for name, value in gaussians.tensors()})
+
+
 def ball_before_disc(thickness: float) -> OrientedGaussians:
     """A ball of sigma 0.4 at depth 3.5, a disc at depth 5 behind it, a cloud at depth 6."""
     disc = one_gaussian((1.5, thickness, 1.5), 0.95, (0.0, 1.0, 0.0))
