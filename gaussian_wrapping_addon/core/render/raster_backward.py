@@ -194,23 +194,3 @@ def sum_pairs(
         total[ABS_V] = ZERO
         for column in range(ROW_VALUES):
             grad_params[i, column] = total[column]
-
-
-@kernel(fast=False)
-def sum_weights(
-    first: int,
-    end: int,
-    pair_weights: np.ndarray,
-    pair_offsets: np.ndarray,
-    weight_sum: np.ndarray,
-    weight_max: np.ndarray,
-) -> None:
-    """Combine the blending weights of the pairs of the Gaussians ``first .. end``."""
-    for i in range(first, end):
-        total = ZERO
-        largest = ZERO
-        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
-            total += pair_weights[slot, 0]
-            largest = max(largest, pair_weights[slot, 1])
-        weight_sum[i] = total
-        weight_max[i] = largest

@@ -43,29 +43,6 @@ def _copy_intrinsic(lanes: int) -> Any:
     return copy
 
 
-def _reduce_intrinsic(lanes: int, operation: str) -> Any:
-    """Make a function that returns the sum or the largest of ``lanes`` float32, none of them NaN.
-
-    LLVM does not recognise a maximum in numba's loops as a reduction, and unrolls short sums.
-    """
-
-    @intrinsic
-    def reduced(typingctx, source, source_at):  # type: ignore[no-untyped-def]
-        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            run = _run_pointer(lanes, context, builder, sig.args[0], args[0], args[1])
-            single, vector = ir.FloatType(), ir.VectorType(ir.FloatType(), lanes)
-            first = [ir.Constant(single, 0.0)] if operation == "fadd" else []
-            kind = ir.FunctionType(single, [value.type for value in first] + [vector])
-            name = f"llvm.vector.reduce.{operation}.v{lanes}f32"
-            reduce = cgutils.get_or_insert_function(builder.module, kind, name)
-            values = [*first, builder.load(run, align=4)]
-            return builder.call(reduce, values, fastmath=("nnan", "nsz", "reassoc"))
-
-        return types.float32(source, types.intp), generate
-
-    return reduced
-
-
 def _mask_intrinsic(lanes: int) -> Any:
     """Make a function that returns as bits which of ``lanes`` float32 are positive."""
 
@@ -115,9 +92,7 @@ def _prefetch_intrinsic(locality: int) -> Any:
 
 _prefetch_near, _prefetch_far = _prefetch_intrinsic(3), _prefetch_intrinsic(2)
 _copy_8, _copy_16 = _copy_intrinsic(8), _copy_intrinsic(16)
-_max_8, _max_16 = _reduce_intrinsic(8, "fmax"), _reduce_intrinsic(16, "fmax")
 _positive_8, _positive_16 = _mask_intrinsic(8), _mask_intrinsic(16)
-_sum_8, _sum_16 = _reduce_intrinsic(8, "fadd"), _reduce_intrinsic(16, "fadd")
 
 
 @inline
@@ -127,12 +102,6 @@ def copy_run(lanes: Any, target: Any, target_at: Any, source: Any, source_at: An
         _copy_16(target, target_at, source, source_at)
     else:
         _copy_8(target, target_at, source, source_at)
-
-
-@inline
-def max_run(lanes: Any, source: Any, source_at: Any) -> Any:
-    """Return the largest value of one run of 8 or 16 float32."""
-    return _max_16(source, source_at) if lanes == 16 else _max_8(source, source_at)
 
 
 @inline
@@ -155,12 +124,6 @@ def prefetch_row(rows: Any, row: Any) -> None:
 def prefetch_row_early(rows: Any, row: Any) -> None:
     """Ask for a row that is read much later to be brought to the second cache."""
     _prefetch_far(rows, row)
-
-
-@inline
-def sum_run(lanes: Any, source: Any, source_at: Any) -> Any:
-    """Return the sum of one run of 8 or 16 float32."""
-    return _sum_16(source, source_at) if lanes == 16 else _sum_8(source, source_at)
 
 
 @inline
