@@ -21,6 +21,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
 
+from gaussian_wrapping_addon.core.evaluation.plot import Panel, Series, write_svg
 from gaussian_wrapping_addon.core.parallel import default_threads
 
 from .error_tables import (
@@ -34,7 +35,6 @@ from .hard_scenes import hard_scenes
 from .kernel_results import BACKWARD, FORWARD, Result, Workload
 from .kernel_speed import measure_in_child, measure_workload, own_instructions
 from .methods import Method, measure_methods, method_table
-from .plot import Panel, Series, write_svg
 from .speed_tables import (
     acceptance_lines,
     evaluation_table,

@@ -7,16 +7,15 @@ import math
 from pathlib import Path
 from xml.etree import ElementTree
 
-import numpy as np
 import pytest
 
 from benchmarks.fma_peak import _chains
 from benchmarks.kernel_results import BACKWARD, FORWARD, Result, Workload
 from benchmarks.kernel_speed import measure_workload
 from benchmarks.kernels import PARTS, main, panels, speed_sections
-from benchmarks.plot import Panel, Series, write_svg
 from benchmarks.tables import Table
 from benchmarks.timing import measure
+from gaussian_wrapping_addon.core.evaluation.plot import write_svg
 
 
 @pytest.fixture(scope="module")
@@ -88,17 +87,3 @@ def test_table_is_markdown() -> None:
     assert lines[5] == "| bc   |   nan |"
     assert lines[-1] == "note"
     assert len({len(line) for line in lines[2:7]}) == 1
-
-
-def test_plot_places_points_on_logarithmic_axes(tmp_path: Path) -> None:
-    points = [(1.0, 10.0), (10.0, 100.0), (100.0, 1000.0), (0.0, 5.0)]
-    write_svg([Panel("t", "x & y", "y", [Series("a < b", points)])], tmp_path / "p.svg")
-    root = ElementTree.parse(tmp_path / "p.svg").getroot()
-    space = "{http://www.w3.org/2000/svg}"
-    (line,) = root.findall(f"{space}polyline")
-    places = np.array([pair.split(",") for pair in line.get("points", "").split()], float)
-    assert len(places) == 3  # 0 has no logarithm
-    assert np.allclose(np.diff(places, 2, axis=0), 0.0, atol=0.11)
-    assert places[0, 0] < places[2, 0]
-    assert places[0, 1] > places[2, 1]
-    assert "a < b" in [text.text for text in root.findall(f"{space}text")]

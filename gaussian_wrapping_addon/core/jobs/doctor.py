@@ -24,7 +24,7 @@ DOCTOR_DEADLINE_S = 120.0
 REQUIRED = {
     "numpy": "numpy", "torch": "torch", "numba": "numba", "scipy": "scipy", "shull": "shull",
     "pycolmap": "pycolmap", "xatlas": "xatlas",
-    "PIL": "pillow",
+    "PIL": "pillow", "trimesh": "trimesh", "igl": "libigl",
 }  # fmt: skip
 
 
