@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Cameras solved from a scene's photos alone, against the exact ones."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gaussian_wrapping_addon.core.evaluation.pose_error import pose_errors
+
+from gaussian_wrapping_addon.core.dataset.load import load_scene
+from gaussian_wrapping_addon.core.errors import WorkerError
+from gaussian_wrapping_addon.core.files import read_json, write_json
+from gaussian_wrapping_addon.core.progress import Progress
+
+from .runs import LAST_LINES, ROOT, Settings
+
+
+def solve(scene: Path, folder: Path, threads: int) -> dict[str, Any]:
+    """Solve the cameras of ``scene/images`` and return their errors and the seconds it took."""
+    folder.mkdir(parents=True, exist_ok=True)
+    begun_s = time.monotonic()
+    solved = load_scene(scene / "images", folder, Progress(), seed=0, threads=threads)
+    seconds = time.monotonic() - begun_s
+    exact = load_scene(scene, folder, Progress(), seed=0, threads=threads)
+    errors = pose_errors(
+        [camera.moved(solved.world_from_scene) for camera in solved.cameras],
+        [camera.moved(exact.world_from_scene) for camera in exact.cameras],
+    )
+    return {
+        "seconds": seconds,
+        "photos": len(exact.cameras),
+        "solved": len(solved.cameras),
+        "errors": errors.to_json(),
+    }
+
+
+def pose_scores(name: str, scene: Path, settings: Settings) -> dict[str, Any]:
+    """Solve in a process of its own (the solver keeps memory), or read what was found before."""
+    folder = settings.folder / f"{name}-poses"
+    path = folder / "poses.json"
+    if not (settings.reuse and path.is_file()):
+        command = [
+            sys.executable, "-m", "benchmarks.speed_error.poses", str(scene), str(folder),
+            "--threads", str(settings.threads),
+        ]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+        if done.returncode != 0:
+            words = "\n".join((done.stdout + done.stderr).splitlines()[-LAST_LINES:])
+            raise WorkerError(f"Solving the cameras of {name} failed: {words}")
+    return dict(read_json(path))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write ``poses.json`` into the folder."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--threads", type=int, default=0)
+    options = parser.parse_args(arguments)
+    found = solve(options.scene, options.folder, options.threads)
+    write_json(options.folder / "poses.json", found)
+
+
+if __name__ == "__main__":
+    main()

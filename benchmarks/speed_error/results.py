@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One measured run with its scores, and how to read figures out of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from .plan import Run, Variant
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What a run measured of itself, and how it was judged."""
+
+    run: Run
+    variant: Variant | None
+    measured: dict[str, Any]
+    scores: dict[str, Any]
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The job's own report."""
+        return dict(self.measured["report"])
+
+    @property
+    def region(self) -> dict[str, Any]:
+        """The figures of the region in the job's own report."""
+        return dict(self.report["regions"][self.measured["region"]])
+
+    def seconds(self, stage: str) -> float:
+        """Return the seconds of the stage whose name begins so, as the job measured them."""
+        return math.fsum(
+            entry["seconds"] for entry in self.report["stages"] if entry["name"].startswith(stage)
+        )
+
+    @property
+    def wall_s(self) -> float:
+        """Time on the clock of the whole command."""
+        return float(self.measured["wall_s"])
+
+    @property
+    def memory_gib(self) -> float:
+        """Largest resident size of the worker and its largest helper, GiB; NaN if unknown."""
+        peaks = self.report["peak_memory_bytes"]
+        return max(peaks.values()) / 2**30 if peaks else math.nan
+
+    def surface(self, protocol: str, name: str) -> Any:
+        """Return a figure of the surface scores."""
+        return self.scores["surface"][protocol][name]
+
+    def f1(self, protocol: str, index: int) -> float:
+        """Return the F1 score at a threshold."""
+        return float(self.surface(protocol, "f1")[index])
+
+    def distance_share(self, name: str) -> float:
+        """Return a distance of the uniform protocol as a share of the diagonal; NaN if unknown."""
+        value = self.surface("uniform", name)
+        return math.nan if value is None else float(value) / float(self.scores["diagonal"])
+
+
+def mean_and_spread(values: Sequence[float]) -> str:
+    """Return ``mean ± standard deviation`` (of the sample), in words for a table."""
+    if len(values) < 2:
+        return f"{values[0]:.3f}"
+    return f"{statistics.fmean(values):.3f} ± {statistics.stdev(values):.3f}"
+
+
+def pick(results: Sequence[Result], keep: Callable[[Result], bool]) -> list[Result]:
+    """Return the results that a condition holds for, in the order of their varied parameter."""
+
+    def parameter(result: Result) -> int:
+        return result.variant.parameter if result.variant else result.run.parameter
+
+    return sorted((r for r in results if keep(r)), key=parameter)
+
+
+def plain(result: Result) -> bool:
+    """Tell whether a result is a preset as it is, with seed 0."""
+    return not result.run.name and result.run.seed == 0 and result.variant is None

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Run jobs through the command line, as a user would, and keep what they measured."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from gaussian_wrapping_addon.core.errors import WorkerError
+from gaussian_wrapping_addon.core.files import read_json, write_json
+
+from .plan import Run, Variant
+
+_logger = logging.getLogger(__name__)
+
+ROOT = Path(__file__).resolve().parents[2]
+BATCH = ROOT / "gaussian_wrapping_addon" / "batch.py"
+LAST_LINES = 12
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How runs are made."""
+
+    folder: Path
+    """Where runs are kept."""
+    threads: int
+    reuse: bool
+    """Keep finished runs of the same name; whoever sets it answers for the code being the same."""
+
+
+def run_wrap(run: Run, scene: Path, settings: Settings) -> Path:
+    """Wrap a scene and return the run's folder, which holds ``out/`` and ``measured.json``.
+
+    Raises
+    ------
+    WorkerError
+        With the last lines of the job's output.
+    """
+    folder = settings.folder / run.identity
+    if settings.reuse and (folder / "measured.json").is_file():
+        return folder
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    arguments = [
+        "wrap", str(scene), "--out", str(folder / "out"), "--preset", run.preset,
+        "--seed", str(run.seed), "--region", str(scene / "region.json"), *run.arguments,
+    ]  # fmt: skip
+    _batch(arguments, folder, settings)
+    return folder
+
+
+def run_variant(variant: Variant, base: Path, scene: Path, settings: Settings) -> Path:
+    """Mesh or texture the training of ``base`` once more; return the variant's folder."""
+    folder = base / f"{variant.name}{variant.parameter}"
+    if settings.reuse and (folder / "measured.json").is_file():
+        return folder
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    arguments = [
+        "mesh", "--out", str(base / "out"), "--region", str(scene / "region.json"),
+        *variant.arguments,
+    ]  # fmt: skip
+    _batch(arguments, folder, settings, out=base / "out")
+    return folder
+
+
+def _batch(arguments: list[str], folder: Path, settings: Settings, out: Path | None = None) -> None:
+    """Run the command and keep its result (without the Gaussians) and its wall time."""
+    out = out or folder / "out"
+    command = [
+        sys.executable, str(BATCH), *arguments, "--export", "ply", "--no-blend",
+        "--threads", str(settings.threads),
+    ]  # fmt: skip
+    begun_s = time.monotonic()
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    wall_s = time.monotonic() - begun_s
+    if done.returncode != 0:
+        words = "\n".join((done.stdout + done.stderr).splitlines()[-LAST_LINES:])
+        raise WorkerError(f"A run failed with exit code {done.returncode}: {words}", f"See {out}.")
+    report = read_json(out / "result" / "report.json")
+    (name,) = _region_names(out)
+    result = folder / "mesh"
+    shutil.copytree(out / "result" / name, result)
+    values = {
+        "command": ["batch.py", *_without_paths(arguments)],
+        "wall_s": wall_s,
+        "report": report,
+    }
+    write_json(folder / "measured.json", {**values, "region": name})
+
+
+def _region_names(out: Path) -> list[str]:
+    return sorted(path.parent.name for path in (out / "result").glob("*/mesh.npz"))
+
+
+def _without_paths(arguments: list[str]) -> list[str]:
+    """Return the arguments with folders' names only, for the record."""
+    return [Path(a).name if "/" in a or "\\" in a else a for a in arguments]
+
+
+def measured(folder: Path) -> dict[str, Any]:
+    """Return what a run measured of itself."""
+    return dict(read_json(folder / "measured.json"))
+
+
+def score(folder: Path, scene: Path, settings: Settings, *, stages: bool) -> dict[str, Any]:
+    """Judge a run's mesh against the ground truth, in a process of its own, or read the scores.
+
+    Parameters
+    ----------
+    stages : bool
+        Also judge what lies before the mesh: Gaussians, depth, vacancy.
+    """
+    path = folder / "scores.json"
+    if not (settings.reuse and path.is_file()):
+        module = "benchmarks.speed_error.score"
+        job = folder if stages else folder.parent
+        command = [
+            sys.executable, "-m", module, str(folder), str(scene), str(job / "out"),
+            "--threads", str(settings.threads), *(["--stages"] if stages else []),
+        ]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+        if done.returncode != 0:
+            words = "\n".join((done.stdout + done.stderr).splitlines()[-LAST_LINES:])
+            raise WorkerError(f"Scoring {folder.name} failed: {words}")
+    return dict(json.loads(path.read_text(encoding="utf-8")))
