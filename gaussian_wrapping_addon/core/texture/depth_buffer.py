@@ -14,7 +14,8 @@ from ..parallel import even_bounds, run_chunks
 from ..tolerances import SCENE_RADIUS
 
 NEAR_DEPTH = 1e-3 * SCENE_RADIUS
-"""Surfaces nearer than this are cut away, so that a camera inside of a mesh sees past it."""
+"""Surfaces nearer than this are cut away, so that a camera inside of a mesh sees past it; scene
+units, other frames give their own."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,12 @@ class DepthBuffer:
 
 
 def depth_buffer(
-    vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, threads: int = 1
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    camera: Camera,
+    *,
+    threads: int = 1,
+    near: float = NEAR_DEPTH,
 ) -> DepthBuffer:
     """Rasterise a mesh; front and back sides alike hide what lies behind them.
 
@@ -41,10 +47,12 @@ def depth_buffer(
         Decides the size of the buffer.
     threads : int
         Threads to use; the result does not depend on it (ties go to the lower face).
+    near : float
+        z-depth > 0 below which nothing is seen, in units of the camera's world frame.
     """
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
     face = np.full((camera.height, camera.width), -1, np.int32)
-    triangles, ids = _in_front(camera.to_camera(vertices), faces)
+    triangles, ids = _in_front(camera.to_camera(vertices), faces, near)
     inverse = 1.0 / triangles[..., 2]
     screen = np.empty_like(triangles)  # (t, 3, 3): x, y, 1 / z; linear in each other
     screen[..., 0] = camera.fx * triangles[..., 0] * inverse + camera.cx
@@ -61,10 +69,10 @@ def depth_buffer(
     return DepthBuffer(depth, face)
 
 
-def _in_front(local: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _in_front(local: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
     """Return (t, 3, 3) triangles beyond the near plane, cut where they cross it, and faces."""
     ids = np.arange(len(faces), dtype=np.int32)
-    front = local[:, 2] > NEAR_DEPTH
+    front = local[:, 2] > near
     inside = front[faces].sum(axis=1)
     whole = local[faces[inside == 3]]
     pieces, owners = [whole], [ids[inside == 3]]
@@ -72,10 +80,10 @@ def _in_front(local: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
         corners = local[faces[face]]
         polygon: list[np.ndarray] = []
         for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            if a[2] > NEAR_DEPTH:
+            if a[2] > near:
                 polygon.append(a)
-            if (a[2] > NEAR_DEPTH) != (b[2] > NEAR_DEPTH):
-                polygon.append(a + (b - a) * ((NEAR_DEPTH - a[2]) / (b[2] - a[2])))
+            if (a[2] > near) != (b[2] > near):
+                polygon.append(a + (b - a) * ((near - a[2]) / (b[2] - a[2])))
         for k in range(1, len(polygon) - 1):
             pieces.append(np.stack([polygon[0], polygon[k], polygon[k + 1]])[None])
             owners.append(ids[face : face + 1])

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Distances of points to a mesh and to a cloud, precise at huge coordinates."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+from scipy.spatial import cKDTree
+
+
+def distances_to_mesh(
+    points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Measure from each point to the nearest point of a triangle mesh.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+    vertices : (v, 3) float64
+    faces : (f, 3) int
+        Degenerate faces count as the segment or point that they are.
+
+    Returns
+    -------
+    distances : (n,) float64
+        Infinite where the mesh has no faces.
+    face : (n,) int64
+        The face of the nearest point, -1 without faces.
+    closest : (n, 3) float64
+        The nearest point itself, infinite without faces.
+    """
+    points = np.asarray(points, np.float64).reshape(-1, 3)
+    count = len(points)
+    if count == 0 or len(faces) == 0:
+        return np.full(count, np.inf), np.full(count, -1), np.full((count, 3), np.inf)
+    vertices = np.asarray(vertices, np.float64)
+    used, inverse = np.unique(faces, return_inverse=True)
+    corners = vertices[used]
+    # Projections multiply coordinates: 4e6 squared would leave millimetres.
+    origin = (corners.min(0) + corners.max(0)) / 2
+    local = np.ascontiguousarray(points - origin)
+    triangles = np.ascontiguousarray(inverse.reshape(-1, 3), np.int64)
+    _, face, closest = igl.point_mesh_squared_distance(
+        local, np.ascontiguousarray(corners - origin), triangles
+    )
+    return np.linalg.norm(local - closest, axis=1), face, closest + origin
+
+
+def distances_to_cloud(points: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Measure from each point to the nearest point of a cloud.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+    cloud : (m, 3) float64
+
+    Returns
+    -------
+    distances : (n,) float64
+        Infinite where the cloud is empty.
+    index : (n,) int64
+        Row of ``cloud``, -1 where it is empty.
+    """
+    points = np.asarray(points, np.float64).reshape(-1, 3)
+    if len(cloud) == 0 or len(points) == 0:
+        return np.full(len(points), np.inf), np.full(len(points), -1)
+    tree = cKDTree(np.asarray(cloud, np.float64))
+    distances, index = tree.query(points, workers=-1)
+    return distances, index
