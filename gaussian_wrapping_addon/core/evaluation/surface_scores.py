@@ -32,6 +32,14 @@ Shares = tuple[float, ...]
 _Mesh = tuple[np.ndarray, np.ndarray]
 
 
+def finite_json(values: dict[str, Any]) -> dict[str, Any]:
+    """Replace infinite numbers by ``None``: JSON has none."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in values.items()
+    }
+
+
 @dataclass(frozen=True)
 class SurfaceScore:
     """Scores of one surface under one protocol; conventions: :func:`score_surface`."""
@@ -65,11 +73,7 @@ class SurfaceScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        values = dataclasses.asdict(self)
-        return {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in values.items()
-        }
+        return finite_json(dataclasses.asdict(self))
 
 
 @dataclass(frozen=True)
@@ -89,11 +93,7 @@ class CloudScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        values = dataclasses.asdict(self)
-        return {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in values.items()
-        }
+        return finite_json(dataclasses.asdict(self))
 
 
 def score_surface(
