@@ -4,140 +4,24 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ..compiled import kernel
 from ..dataset.camera import Camera
 from ..dataset.scene import Scene
-from ..errors import ResourceError
-from ..files import write_bytes
-from ..parallel import default_threads, even_bounds, run_chunks
+from ..parallel import default_threads
 from ..texture.bake import Photos
 from ..texture.depth_buffer import depth_buffer
-from ..texture.sampling import pyramid, trilinear
 from ..texture.textured_mesh import TexturedMesh
+from .side_by_side import write_side_by_side
+from .textured_rendering import TexturedRenderer
 
-BACKGROUND = (92, 92, 94)
-SUPERSAMPLING = 3
 LONG_SIDE_PX = 900
-GAP_PX = 12
 CHOICE_LONG_SIDE_PX = 120
 MAX_CHOICES = 64
 CROP_MARGIN = 0.15
 MIN_MARGIN_SHARE = 0.02
-
-
-def render_textured(
-    textured: TexturedMesh, camera: Camera, size: tuple[int, int], *, threads: int = 0
-) -> np.ndarray:
-    """Render the mesh with its texture, unlit and antialiased, on plain grey.
-
-    Parameters
-    ----------
-    textured : TexturedMesh
-        In the camera's world frame.
-    camera : Camera
-        Any size; its view is resampled.
-    size : (width, height)
-        Of the picture, pixels.
-    threads : int
-        0 uses every core.
-
-    Returns
-    -------
-    (height, width, 3) uint8
-    """
-    width, height = size
-    fine = camera.resized(width * SUPERSAMPLING, height * SUPERSAMPLING)
-    threads = threads or default_threads()
-    vertices = np.ascontiguousarray(textured.mesh.vertices, np.float64)
-    faces = np.ascontiguousarray(textured.mesh.faces, np.int32)
-    hit = depth_buffer(vertices, faces, fine, threads=threads).face
-    texture = pyramid(textured.albedo)
-    local = fine.to_camera(vertices)
-    intrinsics = np.array([fine.fx, fine.fy, fine.cx, fine.cy])
-    uvs = np.ascontiguousarray(textured.corner_uvs, np.float64)
-    image = np.empty((fine.height, fine.width, 3), np.uint8)
-    image[:] = BACKGROUND
-
-    def band(begin: int, end: int) -> None:
-        _shade(
-            hit, begin, end, local, faces, uvs, intrinsics, texture.pixels, texture.levels, image
-        )
-
-    run_chunks(band, even_bounds(fine.height, threads), threads)
-    blocks = image.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 3)
-    total = blocks.sum(axis=(1, 3), dtype=np.uint32)
-    return ((total + SUPERSAMPLING**2 // 2) // SUPERSAMPLING**2).astype(np.uint8)
-
-
-@kernel(fast=False)
-def _shade(
-    hit: Any,
-    begin: int,
-    end: int,
-    local: Any,
-    faces: Any,
-    uvs: Any,
-    intrinsics: Any,
-    pixels: Any,
-    levels: Any,
-    image: Any,
-) -> None:
-    side_x, side_y = float(levels[0, 1]), float(levels[0, 2])
-    normal = np.empty(3)
-    for row in range(begin, end):
-        for column in range(hit.shape[1]):
-            face = hit[row, column]
-            if face < 0:
-                continue
-            a, b, c = local[faces[face, 0]], local[faces[face, 1]], local[faces[face, 2]]
-            e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-            g0, g1, g2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-            normal[0] = e1 * g2 - e2 * g1
-            normal[1] = e2 * g0 - e0 * g2
-            normal[2] = e0 * g1 - e1 * g0
-            double_area2 = normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2
-            dx = (column + 0.5 - intrinsics[2]) / intrinsics[0]
-            dy = (row + 0.5 - intrinsics[3]) / intrinsics[1]
-            slope = normal[0] * dx + normal[1] * dy + normal[2]
-            if double_area2 <= 0.0 or slope == 0.0:
-                continue
-            z = (normal[0] * a[0] + normal[1] * a[1] + normal[2] * a[2]) / slope
-            p0, p1, p2 = z * dx - a[0], z * dy - a[1], z - a[2]
-            # Barycentric weights from areas of the sub-triangles, signed along the normal.
-            wc = (
-                normal[0] * (e1 * p2 - e2 * p1)
-                + normal[1] * (e2 * p0 - e0 * p2)
-                + normal[2] * (e0 * p1 - e1 * p0)
-            ) / double_area2
-            wb = (
-                normal[0] * (p1 * g2 - p2 * g1)
-                + normal[1] * (p2 * g0 - p0 * g2)
-                + normal[2] * (p0 * g1 - p1 * g0)
-            ) / double_area2
-            wb = min(max(wb, 0.0), 1.0)
-            wc = min(max(wc, 0.0), 1.0 - wb)
-            wa = 1.0 - wb - wc
-            uv = uvs[face]
-            u = (wa * uv[0, 0] + wb * uv[1, 0] + wc * uv[2, 0]) * side_x
-            v = (1.0 - (wa * uv[0, 1] + wb * uv[1, 1] + wc * uv[2, 1])) * side_y
-            # Texels of this face in one pixel: ratio of its areas in the texture and in space.
-            uv_area = abs(
-                (uv[1, 0] - uv[0, 0]) * (uv[2, 1] - uv[0, 1])
-                - (uv[2, 0] - uv[0, 0]) * (uv[1, 1] - uv[0, 1])
-            )
-            texels = uv_area * side_x * side_y / np.sqrt(double_area2)
-            footprint = (z / intrinsics[0]) ** 2
-            level = 0.5 * np.log2(max(texels * footprint, 1.0))
-            red, green, blue = trilinear(pixels, levels, level, u, v)
-            image[row, column, 0] = int(red + 0.5)
-            image[row, column, 1] = int(green + 0.5)
-            image[row, column, 2] = int(blue + 0.5)
 
 
 def choose_view(textured: TexturedMesh, photos: Photos, count: int, *, threads: int = 0) -> int:
@@ -228,17 +112,5 @@ def write_preview(
     pixels = photos.photo(index, 1)[top:bottom, left:right]
     resampling = Image.Resampling.LANCZOS
     photo = Image.fromarray(np.ascontiguousarray(pixels)).resize((width, height), resampling)
-    rendered = render_textured(textured, part, (width, height), threads=threads)
-    canvas = np.empty((height, 2 * width + GAP_PX, 3), np.uint8)
-    canvas[:] = BACKGROUND
-    canvas[:, :width] = np.asarray(photo)
-    canvas[:, width + GAP_PX :] = rendered
-    stream = io.BytesIO()
-    Image.fromarray(canvas).save(stream, format="PNG")
-    try:
-        write_bytes(path, stream.getvalue())
-    except OSError as error:
-        raise ResourceError(
-            f"{path} cannot be written: {error.strerror or error}.",
-            "Check that the folder exists, is not read-only, and that the disk has room.",
-        ) from error
+    rendered = TexturedRenderer(textured, threads=threads).render(part, (width, height)).image
+    write_side_by_side(path, np.asarray(photo), rendered)

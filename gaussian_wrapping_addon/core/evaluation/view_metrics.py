@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How close a rendered view is to its photo: PSNR and SSIM, over the pixels of a mask."""
+"""How close a rendered view is to its photo: PSNR, SSIM and LPIPS, over the pixels of a mask."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,29 @@ from ..errors import UsageError
 from ..parallel import even_bounds, run_chunks
 from .ssim_kernels import BLOCK_PX, RADIUS, WINDOW, compare_rows
 
+if TYPE_CHECKING:
+    from .lpips import Lpips
+
+PSNR_CAP_DB = 100.0
+"""Stands for the infinite PSNR of equal images wherever figures are averaged or written."""
+
 _NO_MASK = np.zeros((0, 0), np.bool_)
+
+
+@dataclass(frozen=True)
+class ViewScores:
+    """How close an image is to its photo."""
+
+    psnr: float
+    """dB, at most :data:`PSNR_CAP_DB`."""
+    ssim: float
+    lpips: float | None = None
+    """``None`` where it was not measured."""
+
+    def to_json(self) -> dict[str, float]:
+        """Return plain JSON values; ``lpips`` only where it was measured."""
+        values = {"psnr": self.psnr, "ssim": self.ssim}
+        return values if self.lpips is None else {**values, "lpips": self.lpips}
 
 
 @dataclass(frozen=True)
@@ -58,7 +81,7 @@ def psnr(image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -
     """
     a = np.clip(as_unit_floats(image, np.float64), 0.0, 1.0)
     b = as_unit_floats(photo, np.float64)
-    _check(a, b, mask)
+    check_sizes(a, b, mask)
     error = (a - b) ** 2 if mask is None else (a - b)[np.asarray(mask, bool)] ** 2
     mean = float(error.mean())
     return math.inf if mean == 0.0 else -10.0 * math.log10(mean)
@@ -73,6 +96,42 @@ def ssim(
     """
     a = np.clip(as_unit_floats(image, np.float64), 0.0, 1.0)
     return compare(a, photo, mask, threads=threads).similarity
+
+
+def score_images(
+    image: np.ndarray,
+    photo: np.ndarray,
+    mask: np.ndarray | None = None,
+    *,
+    lpips: Lpips | None = None,
+    threads: int = 1,
+) -> ViewScores:
+    """Return all figures of an image beside its photo.
+
+    Parameters
+    ----------
+    image, photo : (h, w, 3)
+        uint8, or floats whose white is 1. The image is clamped to [0, 1] as a display would.
+    mask : (h, w) bool, optional
+        Pixels to compare. PSNR is over these; SSIM over the windows centred on them, both images
+        black elsewhere (1 where there are none: see :func:`has_windows`); LPIPS is of the whole
+        picture, the photo standing in both elsewhere.
+    lpips : Lpips, optional
+        Without it, or where the picture is too small for it, LPIPS is not measured.
+
+    Raises
+    ------
+    UsageError
+        If the shapes differ or no pixel is left.
+    """
+    distance = None
+    decibels = min(psnr(image, photo, mask), PSNR_CAP_DB)
+    if lpips is not None and lpips.fits(photo.shape):
+        shown, target = as_unit_floats(image), as_unit_floats(photo)
+        if mask is not None:
+            shown = np.where(np.asarray(mask, np.bool_)[..., None], shown, target)
+        distance = lpips.distance(shown, target)
+    return ViewScores(decibels, ssim(image, photo, mask, threads=threads), distance)
 
 
 def has_windows(shape: tuple[int, ...], mask: np.ndarray | None = None) -> bool:
@@ -119,7 +178,7 @@ def compare(
         If the shapes differ.
     """
     image, photo = np.ascontiguousarray(image), np.ascontiguousarray(photo)
-    _check(image, photo, mask, may_be_empty=True)
+    check_sizes(image, photo, mask, may_be_empty=True)
     if photo.dtype != np.uint8:
         photo = photo.astype(image.dtype, copy=False)
     height, width = image.shape[:2]
@@ -159,9 +218,10 @@ def compare(
     )
 
 
-def _check(
+def check_sizes(
     image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None, *, may_be_empty: bool = False
 ) -> None:
+    """Raise ``UsageError`` if the shapes differ, or if no pixel is left where some must be."""
     if image.shape != photo.shape or (mask is not None and mask.shape != image.shape[:2]):
         raise UsageError(
             f"Image {image.shape}, photo {photo.shape} and mask differ in size.",

@@ -25,7 +25,7 @@ from .stages import Stage, note_interrupted, run_stage, source_fingerprint, stag
 _logger = logging.getLogger(__name__)
 
 # Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
-STAGE_VERSIONS = {"cameras": 1, "train": 3, "mesh": 1, "texture": 1}
+STAGE_VERSIONS = {"cameras": 1, "train": 3, "mesh": 1, "texture": 2}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
@@ -122,7 +122,7 @@ def run_job(
             threads,
         )  # fmt: skip
         textured = _run_texture(
-            folder, job, name, cameras, meshed,
+            folder, job, name, cameras, trained, meshed,
             overall.stage("texture", _Span(cut, start + share)), threads,
         )  # fmt: skip
         regions.append((name, meshed, textured))
@@ -262,6 +262,7 @@ def _run_texture(
     job: JobFile,
     name: str,
     cameras: Stage,
+    trained: Stage,
     meshed: Stage,
     progress: Progress,
     threads: int,
@@ -272,6 +273,7 @@ def _run_texture(
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         from ..dataset.photos import PhotoStore
         from ..dataset.scene_file import load_saved_scene
+        from ..evaluation.photo_comparison import compare_with_photos
         from ..evaluation.preview import write_preview
         from ..limits import MAX_IMAGE_SIDE_PX
         from ..meshing.mesh_file import load_mesh
@@ -286,9 +288,14 @@ def _run_texture(
         )
         formats = tuple(f for f in job.settings.export if f != "usd")
         write_textured(textured, stage_folder / "files", formats, scene.world_from_scene)
-        progress.update(0.95, "rendering the preview")
+        progress.update(0.92, "comparing with photos")
+        held_out = {figure["name"] for figure in trained.done["held_out"]}
+        rendering = compare_with_photos(
+            textured, scene, photos, held_out, stage_folder, threads=threads
+        )
+        progress.update(0.97, "rendering the preview")
         write_preview(textured, scene, photos, stage_folder / "preview.png", threads=threads)
-        return {"texture": textured.statistics}
+        return {"texture": textured.statistics, "mesh_rendering": rendering}
 
     formats = json.dumps(sorted(job.settings.export))
     return run_stage(folder.stages, f"texture-{name}", stage_key(key, formats), progress, work)

@@ -18,7 +18,7 @@ from .. import tolerances
 from ..dataset.camera import Camera
 from ..dataset.scene import Scene
 from ..errors import Cancelled, DatasetError, WrapError
-from ..evaluation.view_metrics import psnr, ssim
+from ..evaluation.view_metrics import score_images
 from ..gaussians.initialisation import initial_gaussians
 from ..gaussians.mip_filter import mip_filter
 from ..gaussians.model import OrientedGaussians
@@ -388,11 +388,7 @@ class _Trainer:
                 continue
             image = self.renderer.render(raw, self.photos.camera(view, 1), options).color
             photo = self.photos.photo(view, 1)
-            figures.append(
-                HeldOutFigure(
-                    self.scene.views[view].camera.name,
-                    min(psnr(image, photo, mask), 100.0),
-                    ssim(image, photo, mask, threads=self.threads),
-                )
-            )
+            scores = score_images(image, photo, mask, threads=self.threads)
+            name = self.scene.views[view].camera.name
+            figures.append(HeldOutFigure(name, scores.psnr, scores.ssim))
         return figures
