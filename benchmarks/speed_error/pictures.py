@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from gaussian_wrapping_addon.core.evaluation.surface_distance import distances_to_mesh
-from gaussian_wrapping_addon.core.evaluation.truth import read_truth
 from PIL import Image, ImageDraw
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
-from gaussian_wrapping_addon.core.evaluation.preview import BACKGROUND, render_textured
+from gaussian_wrapping_addon.core.evaluation.surface_distance import distances_to_mesh
+from gaussian_wrapping_addon.core.evaluation.textured_rendering import BACKGROUND, TexturedRenderer
+from gaussian_wrapping_addon.core.evaluation.truth import read_truth
 from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.texture.depth_buffer import depth_buffer
 
@@ -55,7 +55,7 @@ def write_comparison(scene: Path, runs: Sequence[tuple[str, Path]], path: Path) 
             true = frame.inverse().points(truth.vertices)
             grey = np.full((len(truth.faces), 3), 200.0)
             bottom.append(("true surface", shade(true, truth.faces, grey, camera, size)))
-        top.append((label, render_textured(textured, camera, size)))
+        top.append((label, TexturedRenderer(textured).render(camera, size).image))
         mesh = textured.mesh
         centres = frame.points(mesh.vertices[mesh.faces].mean(1))
         distance = distances_to_mesh(centres, truth.vertices, truth.faces)[0] / diagonal

@@ -128,7 +128,7 @@ def stage_table(results: Sequence[Result], poses: dict[str, dict[str, Any]]) -> 
     header = (
         "scene", "preset", "solved poses, median deg", "depth median %",
         f"depth in {SHARES[MIDDLE]}",
-        "vacancy offset %", "|offset| %", f"in {SHARES[MIDDLE]}", "mesh median %",
+        "vacancy offset %", "offset size %", f"in {SHARES[MIDDLE]}", "mesh median %",
         f"mesh recall {SHARES[MIDDLE]}", f"thin recall {SHARES[MIDDLE]}",
         "Gaussians less texture dB",
     )  # fmt: skip
