@@ -17,32 +17,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .. import tolerances
 from ..dataset.camera import Camera
 from ..errors import UsageError
 from ..gaussians.model import OrientedGaussians
 from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
 from .area_lists import AreaLists, SortedPositions, list_areas, sort_positions
 from .blend import ScreenView
-from .depth_query_kernels import (
-    GEOMETRY,
-    add_pair_gradients,
-    pull_range,
-    query_kernel,
-    shrink_range,
-)
-from .projection import (
-    RawArrays,
-    RawGradients,
-    ScreenGaussians,
-    project_backward,
-    project_gaussians,
-)
+from .depth_query_gradient import add_pair_gradients, pull_range
+from .depth_query_kernels import query_kernel
+from .fine_screen import project_finely
+from .projection import RawArrays, RawGradients, ScreenGaussians, project_backward
+from .query_spans import GEOMETRY
 from .types import RenderOptions
 
-_FINE_SIDE_PX = 65536
-"""Longer side of the screen that Gaussians are projected onto for queries. Projection drops those
-that lie between pixel centres; at this size that loses none that matters."""
 _DEEPEST = 1e18
 """Depths beyond this count as this; squares of it still fit a float32."""
 _POSITION_COST = 256
@@ -96,7 +83,7 @@ def query_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> 
     threads = options.threads or default_threads()
     # Colours do not matter here.
     lean = dataclasses.replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, :1]))
-    screen = _project_finely(lean, camera, options)
+    screen = project_finely(lean, camera, options)
     lists = list_areas(screen, camera.width, camera.height, threads)
     return QueryView(lean, camera, options, screen, lists, threads)
 
@@ -348,60 +335,6 @@ class _Query(torch.autograd.Function):
             None,
             None,
         )
-
-
-def _project_finely(
-    gaussians: RawArrays, camera: Camera, options: RenderOptions
-) -> ScreenGaussians:
-    """Project onto a finer screen, by a power of two, and bring the rows back to pixels."""
-    threads = options.threads or default_threads()
-    scale = 1
-    while scale * max(camera.width, camera.height) < _FINE_SIDE_PX:
-        scale *= 2
-    fine = camera.resized(camera.width * scale, camera.height * scale)
-    screen = project_gaussians(gaussians, fine, options)
-
-    def shrink(begin: int, end: int) -> None:
-        shrink_range(
-            begin, end, float(scale), camera.width, camera.height,
-            screen.params, screen.boxes, screen.skews, screen.visible,
-        )  # fmt: skip
-
-    run_chunks(shrink, even_bounds(len(screen), threads), threads)
-    _add_far_ones(gaussians, camera, options, scale, screen)
-    return screen
-
-
-def _add_far_ones(
-    gaussians: RawArrays,
-    camera: Camera,
-    options: RenderOptions,
-    scale: int,
-    screen: ScreenGaussians,
-) -> None:
-    """Add what is hidden only because the finer screen numbers its pixels no farther.
-
-    These project more than a hundred images aside.
-    """
-    hidden = np.flatnonzero(~screen.visible)
-    pose = camera.cam_from_world
-    with np.errstate(all="ignore"):
-        local = gaussians.means[hidden].astype(np.float64) @ pose[:, :3].T + pose[:, 3]
-        aside = np.abs(
-            local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-        )
-    limit = (
-        tolerances.FINITE_OFFSET_PX / scale - max(camera.width, camera.height) - tolerances.TILE_PX
-    )
-    far = hidden[(local[:, 2] > 0.0) & (aside.max(1) > limit)]
-    if len(far) == 0:
-        return
-    names = [field.name for field in dataclasses.fields(RawArrays)]
-    some = RawArrays(**{name: getattr(gaussians, name)[far] for name in names})
-    coarse = project_gaussians(some, camera, options)
-    seen = far[coarse.visible]
-    for field in dataclasses.fields(ScreenGaussians):
-        getattr(screen, field.name)[seen] = getattr(coarse, field.name)[coarse.visible]
 
 
 def _sorted(view: QueryView, positions: np.ndarray) -> SortedPositions:

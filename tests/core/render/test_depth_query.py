@@ -35,7 +35,8 @@ from gaussian_wrapping_addon.core.render.depth_query import (
     query_view_of,
     solve_depths,
 )
-from gaussian_wrapping_addon.core.render.depth_query_kernels import pull_range, query_kernel
+from gaussian_wrapping_addon.core.render.depth_query_gradient import pull_range
+from gaussian_wrapping_addon.core.render.depth_query_kernels import query_kernel
 from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
     RawGradients,

@@ -54,7 +54,7 @@ _SINGLE = {
     # whose rounding at this size stays a tenth of the margin.
     "NARROW_PX": 2048.0,
     "NARROW_MARGIN": 0.05,
-    # As in depth_query_kernels.py, where they are explained.
+    # As in ray_solver.py, where they are explained.
     "NEGLIGIBLE": 30.0,
     "FALL_END": 22.4,
     "SOLVER_STEP_SIGMAS": 5e-4,
