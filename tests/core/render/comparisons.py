@@ -90,12 +90,15 @@ def random_weights(
     return weights
 
 
-def relative_l2(found: np.ndarray, wanted: np.ndarray, whole: float = 0.0) -> float:
+def relative_l2(
+    found: np.ndarray | torch.Tensor, wanted: np.ndarray | torch.Tensor, whole: float = 0.0
+) -> float:
     """Return |found - wanted| / |wanted|.
 
     A gradient that vanishes by symmetry (a round Gaussian's rotation) is a difference of terms as
     large as the other parameters': it is judged by ``whole``, the length of the whole gradient.
     """
+    found, wanted = np.asarray(found), np.asarray(wanted)
     size = float(np.linalg.norm(wanted.astype(np.float64)))
     error = float(np.linalg.norm((found - wanted).astype(np.float64)))
     size = size if size > 1e-15 * whole else whole

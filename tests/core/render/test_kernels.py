@@ -25,21 +25,11 @@ from gaussian_wrapping_addon.core.render.render import (
 )
 from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
 
+from .comparisons import leaves, relative_l2
+from .first_principles import IMAGES, TRAINED
 from .scenes import isotropic, look_at, random_gaussians
 
-TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
-IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")
 BACKGROUND = (0.2, 0.5, 0.1)
-
-
-def leaves(gaussians: OrientedGaussians, dtype: torch.dtype) -> OrientedGaussians:
-    """Return copies that collect gradients."""
-    return gaussians.replaced(
-        **{
-            name: tensor.to(dtype).clone().requires_grad_(name != "filter_3d")
-            for name, tensor in gaussians.tensors()
-        }
-    )
 
 
 def depth_weights(
@@ -74,11 +64,6 @@ def both_losses(
         sums[0] = sums[0] + (a.double() * weight).sum()
         sums[1] = sums[1] + (b * weight).sum()
     return sums[0], sums[1]
-
-
-def relative_l2(a: torch.Tensor, b: torch.Tensor) -> float:
-    """Return |a - b| / |b|."""
-    return float((a.double() - b).norm() / b.norm())
 
 
 @pytest.mark.parametrize("lanes", [8, 16])

@@ -1,42 +1,31 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled projection: against torch, 60-digit arithmetic, autograd, and hard cases."""
+"""Compiled projection: columns and boxes against torch, for any threads, memory and neighbours."""
 
 from __future__ import annotations
 
 import dataclasses
 import tracemalloc
 
-import mpmath
 import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.projection import (
     RawArrays,
-    RawGradients,
     ScreenGaussians,
     allocate_visible,
     project_arrays,
-    project_backward,
     project_backward_visible,
     project_gaussians,
 )
 from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
 from gaussian_wrapping_addon.core.render.types import RenderOptions
-from tests.core.render.scenes import isotropic, look_at, random_gaussians
 
-NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
-CAMERA = look_at((2.0, 0.6, 0.9))
-OPTIONS = RenderOptions(threads=1)
-
-
-def project(
-    gaussians: OrientedGaussians, camera: Camera = CAMERA, options: RenderOptions = OPTIONS
-) -> ScreenGaussians:
-    return project_gaussians(RawArrays.from_gaussians(gaussians), camera, options)
+from .first_principles import TRAINED
+from .projections import CAMERA, OPTIONS, project
+from .scenes import random_gaussians
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -67,57 +56,6 @@ def test_used_degree_can_be_lowered() -> None:
     np.testing.assert_array_equal(low.params, cut.params)
     with pytest.raises(UsageError, match="coefficients"):
         project(gaussians.replaced(sh=gaussians.sh[:, :5]))
-
-
-@pytest.mark.parametrize("degree", [0, 3])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_backward_equals_autograd(degree: int, seed: int) -> None:
-    gaussians = random_gaussians(200, seed, sh_degree=degree, filter_size=0.08)
-    # Bright and dark colours: some are clamped.
-    gaussians = gaussians.replaced(sh=gaussians.sh * 3.0)
-    raw = RawArrays.from_gaussians(gaussians)
-    screen = project(gaussians)
-    grad_params = np.random.default_rng(seed).normal(size=(200, 24))
-    leaves = {
-        name: t.clone().requires_grad_(name != "filter_3d") for name, t in gaussians.tensors()
-    }
-    reference = reference_projection(OrientedGaussians(**leaves), CAMERA, OPTIONS)
-    weights = torch.from_numpy(np.where(screen.visible[:, None], grad_params, 0.0))
-    (reference.params * weights).sum().backward()
-    grads = RawGradients.zeros(raw)
-    project_backward(raw, CAMERA, OPTIONS, screen, grad_params, grads)
-    assert (screen.params[screen.visible, 13:16] == 0.0).any()
-    for name in NAMES:
-        wanted = leaves[name].grad.numpy()  # type: ignore[union-attr]
-        got = getattr(grads, name)
-        rows = (len(wanted), -1)
-        size = np.abs(wanted.reshape(rows)).max(1)
-        error = np.abs(got - wanted).reshape(rows).max(1)
-        assert (error <= 1e-10 * (size + 1e-6 * size.max())).all(), name
-        assert not got[~screen.visible].any()
-
-
-def test_backward_adds_and_float32_is_close() -> None:
-    gaussians = random_gaussians(100, 2)
-    raw = RawArrays.from_gaussians(gaussians)
-    screen = project(gaussians)
-    grad_params = np.random.default_rng(0).normal(size=(100, 24)).astype(np.float32)
-    once, twice = RawGradients.zeros(raw), RawGradients.zeros(raw)
-    wide = grad_params.astype(np.float64)
-    project_backward(raw, CAMERA, OPTIONS, screen, wide, once)
-    for _ in range(2):
-        project_backward(raw, CAMERA, OPTIONS, screen, wide, twice)
-    narrow = RawArrays(
-        **{f.name: getattr(raw, f.name).astype(np.float32) for f in dataclasses.fields(raw)}
-    )
-    small = RawGradients.zeros(narrow)
-    project_backward(narrow, CAMERA, OPTIONS, screen, grad_params, small)
-    for name in NAMES:
-        wanted = getattr(once, name)
-        np.testing.assert_array_equal(getattr(twice, name), 2.0 * wanted)
-        got = getattr(small, name)
-        assert got.dtype == np.float32
-        assert np.abs(got - wanted).max() <= 1e-4 * np.abs(wanted).max(), name
 
 
 def test_boxes_are_those_of_the_conic() -> None:
@@ -216,261 +154,9 @@ def test_no_value_depends_on_neighbours(dtype: torch.dtype) -> None:
         grads = project_backward_visible(
             RawArrays.from_gaussians(part), CAMERA, OPTIONS, screen, grad_params[chosen], ids[:size]
         )
-        for name in NAMES:
+        for name in TRAINED:
             np.testing.assert_array_equal(getattr(grads, name), getattr(every, name)[chosen])
             assert np.isfinite(getattr(grads, name)).all()
-
-
-# -- hard cases -----------------------------------------------------------------------------------
-
-AXIS = Camera("axis", 64, 48, 60.0, 66.0, 32.5, 23.5, np.eye(3, 4))
-
-
-def single(**changes: object) -> OrientedGaussians:
-    """One Gaussian in front of AXIS, with entries exchanged."""
-    gaussians = isotropic([(0.1, -0.2, 3.0)], [0.1], [0.8])
-    values = {k: torch.tensor([v], dtype=torch.float64) for k, v in changes.items()}
-    return gaussians.replaced(**values)
-
-
-Exact = dict[str, list[mpmath.mpf]]
-
-
-def exact_values(gaussians: OrientedGaussians) -> Exact:
-    """Parameters of one Gaussian that its shape on the screen depends on."""
-    names = ("means", "log_scales", "quats")
-    return {name: [mpmath.mpf(v) for v in getattr(gaussians, name)[0].tolist()] for name in names}
-
-
-def exact_columns(raw: Exact, camera: Camera) -> list[mpmath.mpf]:
-    """Columns 0-10, 12 and 19-22 of one unfiltered Gaussian with 60 digits."""
-    with mpmath.workdps(60):
-        w, x, y, z = raw["quats"]
-        n = mpmath.sqrt(w * w + x * x + y * y + z * z)
-        w, x, y, z = w / n, x / n, y / n, z / n
-        turn = mpmath.matrix(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        pose = mpmath.matrix(camera.cam_from_world.tolist())
-        view = pose[:, 0:3]
-        mean = view * mpmath.matrix(raw["means"]) + pose[:, 3]
-        axes = view * turn
-        variance = mpmath.diag([mpmath.exp(2 * s) for s in raw["log_scales"]])
-        covariance = axes * variance * axes.T
-        precision = axes * variance**-1 * axes.T
-        ray = mean / mean[2]
-        slant = precision * ray
-        a0 = (ray.T * slant)[0]
-        fx, fy = mpmath.mpf(camera.fx), mpmath.mpf(camera.fy)
-        kx, ky = slant[0] / fx, slant[1] / fy
-        bxx, bxy, byy = precision[0, 0] / fx**2, precision[0, 1] / fx / fy, precision[1, 1] / fy**2
-        zz = mean[2] ** 2
-        normal = view.T * slant * (-1 / mpmath.norm(slant))
-        return [
-            fx * ray[0] + camera.cx, fy * ray[1] + camera.cy,
-            zz * (bxx - kx * kx / a0), 2 * zz * (bxy - kx * ky / a0), zz * (byy - ky * ky / a0),
-            kx / a0, ky / a0, bxx / a0, 2 * bxy / a0, byy / a0, mean[2], a0,
-            normal[0], normal[1], normal[2], mpmath.sqrt(covariance[2, 2]),
-        ]  # fmt: skip
-
-
-EXACT_COLUMNS = [*range(11), 12, *range(19, 23)]
-
-
-def exact_gradient(raw: Exact, camera: Camera, weights: np.ndarray) -> dict[str, np.ndarray]:
-    """Gradient of the weighted sum of the exact columns, by central differences of 60 digits."""
-    with mpmath.workdps(60):
-        step = mpmath.mpf(10) ** -20
-
-        def total(name: str, k: int, change: mpmath.mpf) -> mpmath.mpf:
-            values = {**raw, name: [v + change * (j == k) for j, v in enumerate(raw[name])]}
-            columns = exact_columns(values, camera)
-            return mpmath.fsum(w * c for w, c in zip(weights.tolist(), columns, strict=True))
-
-        return {
-            name: np.array(
-                [
-                    float((total(name, k, step) - total(name, k, -step)) / (2 * step))
-                    for k in range(len(values))
-                ]
-            )
-            for name, values in raw.items()
-        }
-
-
-EDGE_ON = {"log_scales": [0.0, 0.0, np.log(1e-6)], "quats": [1.0, 1.0, 0.0, 0.0]}
-
-
-HARD_SHAPES: list[dict[str, object]] = [
-    {},
-    {"log_scales": [0.0, -0.5, np.log(1e-6)], "quats": [0.9, 0.1, 0.3, -0.2]},
-    {"log_scales": [np.log(1e-6), np.log(2e-6), -1.0], "quats": [0.2, 0.5, 0.7, -0.6]},
-    {"log_scales": [np.log(1e-6), np.log(2e-6), -1.0], "quats": [1.0, 0.0, 0.0, 0.0]},
-    EDGE_ON,
-    EDGE_ON | {"means": [0.0, 0.0, 3.0]},
-    {"log_scales": [np.log(1e-4)] * 3, "means": [0.0, 0.0, 1e3]},
-    {"log_scales": [np.log(3e-4), np.log(1e-4), np.log(1e-4)], "means": [50.0, 9.0, 1e3]},
-    {"log_scales": [4.0, 3.0, 2.0], "means": [4.0, 3.0, 20.0], "quats": [0.9, 0.1, 0.3, 0.1]},
-]
-
-
-def wide_camera(gaussians: OrientedGaussians) -> Camera:
-    """AXIS moved so that a pixel centre lies on the first mean."""
-    u = AXIS.fx * float(gaussians.means[0, 0] / gaussians.means[0, 2])
-    v = AXIS.fy * float(gaussians.means[0, 1] / gaussians.means[0, 2])
-    return dataclasses.replace(AXIS, cx=32.5 - u, cy=23.5 - v)
-
-
-@pytest.mark.parametrize("changes", HARD_SHAPES)
-def test_hard_shapes_against_sixty_digits(changes: dict[str, object]) -> None:
-    gaussians = single(**changes)
-    camera = wide_camera(gaussians)
-    screen = project(gaussians, camera)
-    assert screen.visible.all()
-    wanted = np.array([float(v) for v in exact_columns(exact_values(gaussians), camera)])
-    got = screen.params[0, EXACT_COLUMNS].astype(np.float64)
-    size = np.abs(wanted)
-    for block in ((2, 5), (5, 7), (7, 10), (12, 15)):
-        size[slice(*block)] = size[slice(*block)].max()
-    slack = np.full(len(size), 1e-9)
-    # A rounding of the axes by eps turns the gradient of an edge-on disc by eps (1e6)^2.
-    slack[[5, 6, 12, 13, 14]] += 1e-15 * np.exp(2.0 * np.ptp(gaussians.log_scales.numpy()))
-    assert (np.abs(got - wanted) <= 1e-7 * size + slack).all()
-    assert np.isfinite(screen.boxes).all()
-
-    raw = RawArrays.from_gaussians(gaussians)
-    grads = RawGradients.zeros(raw)
-    project_backward(raw, camera, OPTIONS, screen, np.ones((1, 24)), grads)
-    assert all(np.isfinite(getattr(grads, name)).all() for name in NAMES)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("changes", HARD_SHAPES)
-def test_gradients_of_hard_shapes_against_sixty_digits(
-    changes: dict[str, object], dtype: torch.dtype
-) -> None:
-    gaussians = single(**changes)
-    camera = wide_camera(gaussians)
-    gaussians = OrientedGaussians(**{name: t.to(dtype) for name, t in gaussians.tensors()})
-    exact = exact_values(gaussians)
-    # Every column counts: weights are those that make the columns' shares of the sum alike.
-    columns = np.abs(np.array([float(v) for v in exact_columns(exact, camera)]))
-    weights = np.random.default_rng(3).uniform(0.5, 1.5, len(columns)) / (columns + 1e-6)
-    weights = weights.astype(np.float32).astype(np.float64)
-    raw = RawArrays.from_gaussians(gaussians)
-    grad_params = np.zeros((1, 24), raw.means.dtype)
-    grad_params[0, EXACT_COLUMNS] = weights
-    screen = project(gaussians, camera)
-    assert screen.visible.all()
-    grads = RawGradients.zeros(raw)
-    project_backward(raw, camera, OPTIONS, screen, grad_params, grads)
-    wanted = exact_gradient(exact, camera, weights)
-    rounding = 2.0**-24 if dtype == torch.float32 else 0.0
-    whole = np.linalg.norm(np.concatenate(list(wanted.values())))
-    for name, value in wanted.items():
-        error = np.linalg.norm(getattr(grads, name)[0] - value)
-        assert error <= (1e-13 + rounding) * np.linalg.norm(value) + 1e-13 * whole, name
-
-
-def test_zero_quaternion_is_the_identity_and_gets_no_gradient() -> None:
-    scales = {"log_scales": [-1.0, -2.0, -3.0]}
-    zero, unit = single(quats=[0.0] * 4, **scales), single(quats=[1.0, 0.0, 0.0, 0.0], **scales)
-    np.testing.assert_array_equal(project(zero, AXIS).params, project(unit, AXIS).params)
-    raw = RawArrays.from_gaussians(zero)
-    grads = RawGradients.zeros(raw)
-    project_backward(raw, AXIS, OPTIONS, project(zero, AXIS), np.ones((1, 24)), grads)
-    assert not grads.quats.any()
-    assert np.isfinite(grads.log_scales).all()
-
-
-@pytest.mark.parametrize(
-    ("logit", "seen"), [(20.0, True), (800.0, True), (-20.0, False), (-5.6, False), (-5.5, True)]
-)
-def test_extreme_opacities(logit: float, seen: bool) -> None:
-    screen = project(single(opacity_logits=logit), AXIS)
-    assert screen.visible[0] == seen
-    if seen:
-        assert screen.params[0, 11] == np.float32(1.0 / (1.0 + np.exp(-logit)))
-
-
-def test_filter_dims_and_widens() -> None:
-    screen = project(single(filter_3d=0.1, log_scales=[np.log(0.1)] * 3), AXIS)
-    assert screen.params[0, 11] == pytest.approx(0.8 * 2.0**-1.5, rel=1e-6)
-    assert screen.params[0, 22] == pytest.approx(0.1 * 2.0**0.5, rel=1e-6)
-    # A vanishing scale leaves nothing of the opacity and is not visible.
-    assert not project(single(filter_3d=0.1, log_scales=[-400.0] * 3), AXIS).visible[0]
-
-
-@pytest.mark.parametrize(
-    "name", ["means", "log_scales", "quats", "opacity_logits", "sh", "orientation", "filter_3d"]
-)
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_values_that_are_not_finite_hide_the_gaussian(name: str, value: float) -> None:
-    gaussians = isotropic([(0.1, -0.2, 3.0), (0.2, 0.1, 3.0)], [0.1, 0.1], [0.8, 0.8])
-    broken = getattr(gaussians, name).clone()
-    broken[0] = value
-    screen = project(gaussians.replaced(**{name: broken}), AXIS)
-    if name == "opacity_logits" and value == np.inf:
-        assert screen.params[0, 11] == 1.0  # an opaque limit that is well defined
-    else:
-        assert not screen.visible[0]
-        assert not screen.params[0].any()
-    assert screen.visible[1]
-    assert np.isfinite(screen.params).all()
-
-
-def test_around_and_behind_the_camera() -> None:
-    near = {"log_scales": [0.0] * 3}
-    around = project(single(means=[0.0, 0.0, 0.5], **near), AXIS)
-    assert around.visible[0]
-    np.testing.assert_array_equal(around.boxes[0], [0.0, 0.0, 64.0, 48.0])
-    assert np.isinf(around.skews[0])
-    for z in (0.2, 0.0, -1.0):
-        assert not project(single(means=[0.0, 0.0, z], **near), AXIS).visible[0]
-    # Bounded as soon as the ellipsoid at 1/255 clears the camera plane.
-    reach = np.sqrt(2.0 * np.log(255.0 * 0.8))
-    assert np.isinf(project(single(means=[0.0, 0.0, 0.999 * reach], **near), AXIS).skews[0])
-    assert np.isfinite(project(single(means=[0.0, 0.0, 1.001 * reach], **near), AXIS).skews[0])
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_culling_leaves_out_only_what_is_not_seen(seed: int) -> None:
-    """Exactly those are visible whose box, by the reference's columns, holds a pixel centre."""
-    gaussians = random_gaussians(3000, seed, spread=4.0, scale=(0.003, 1.5), filter_size=0.05)
-    # Also around the limit of what is too faint.
-    gaussians.opacity_logits[::3] = torch.linspace(-6.0, -5.0, 1000, dtype=torch.float64)
-    camera = dataclasses.replace(CAMERA, cx=-7.0 if seed == 1 else CAMERA.cx)
-    screen = project(gaussians, camera)
-    reference = reference_projection(gaussians, camera, OPTIONS)
-    opacity = torch.exp(gaussians.log_opacities())
-    local = gaussians.means @ torch.from_numpy(camera.rotation).T
-    local += torch.from_numpy(camera.cam_from_world[:, 3])
-    axes = torch.from_numpy(camera.rotation) @ gaussians.rotations()
-    scaled = axes * gaussians.scales()[:, None]
-    covariance = scaled @ scaled.transpose(1, 2)
-    # Dual conic of the ellipsoid at 1/255 as a plane sees it: K (m m^T - threshold Sigma) K^T.
-    threshold = 2.0 * torch.log(opacity * 255.0)[:, None, None]
-    dual = local[:, :, None] * local[:, None] - threshold * covariance
-    lens = torch.tensor(
-        [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]],
-        dtype=torch.float64,
-    )
-    dual = (lens @ dual @ lens.T).numpy()
-    usable = reference.usable.numpy()
-    bounded = usable & (dual[:, 2, 2] > 0.0)
-    assert (usable & ~bounded).sum() > 10
-    with np.errstate(invalid="ignore", divide="ignore"):
-        middle = dual[:, [0, 1], 2] / dual[:, 2:, 2]
-        half = np.sqrt(middle**2 - dual[:, [0, 1], [0, 1]] / dual[:, 2:, 2])
-        first = np.maximum(np.ceil(middle - half - 0.5), 0.0)
-        last = np.minimum(np.floor(middle + half - 0.5), [camera.width - 1.0, camera.height - 1.0])
-        wanted = usable & (~bounded | (first <= last).all(1))
-    np.testing.assert_array_equal(screen.visible, wanted)
-    assert 100 < wanted.sum() < 2500
 
 
 def test_reused_output_allocates_no_arrays() -> None:
@@ -486,54 +172,3 @@ def test_reused_output_allocates_no_arrays() -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20_000  # bytes: less than one for each Gaussian
-
-
-def test_off_the_image_or_between_pixel_centres_is_not_visible() -> None:
-    assert not project(single(means=[9.0, 0.0, 3.0]), AXIS).visible[0]
-    tiny = {"log_scales": [np.log(1e-5)] * 3}
-    on_center = project(single(means=[0.0, 0.0, 3.0], **tiny), AXIS)
-    assert on_center.visible[0]
-    between = dataclasses.replace(AXIS, cx=32.0)
-    assert not project(single(means=[0.0, 0.0, 3.0], **tiny), between).visible[0]
-
-
-# -- gradients of the visible Gaussians only ------------------------------------------------------
-
-
-def test_compact_rows_are_the_dense_ones() -> None:
-    gaussians = random_gaussians(300, 4, dtype=torch.float32)
-    gaussians = gaussians.replaced(means=gaussians.means * 2.0)
-    raw = RawArrays.from_gaussians(gaussians)
-    options = RenderOptions(threads=1, sh_degree=1)
-    screen = project(gaussians, options=options)
-    grad_params = np.random.default_rng(0).normal(size=(300, 24)).astype(np.float32)
-    dense = RawGradients.zeros(raw)
-    project_backward(raw, CAMERA, options, screen, grad_params, dense)
-    seen = np.flatnonzero(screen.visible).astype(np.int32)
-    assert 50 < len(seen) < 290
-    scratch = allocate_visible(raw, 300)
-    for ids in (seen, seen[3:50], seen[:1], seen[:0], np.arange(300, dtype=np.int32)):
-        for name in NAMES:
-            getattr(scratch, name)[:] = np.nan
-        for threads in (1, 3):
-            chosen = dataclasses.replace(options, threads=threads)
-            part = project_backward_visible(raw, CAMERA, chosen, screen, grad_params, ids, scratch)
-            assert part.ids is ids
-            for name in NAMES:
-                got = getattr(part, name)
-                np.testing.assert_array_equal(got, getattr(dense, name)[ids], err_msg=name)
-                assert np.isnan(getattr(scratch, name)[len(ids) :]).all()
-                assert np.shares_memory(got, getattr(scratch, name)) or not len(ids)
-            # Coefficients above the degree used.
-            assert not part.sh[:, 4:].any()
-
-
-def test_scratch_of_another_shape_is_refused() -> None:
-    raw = RawArrays.from_gaussians(random_gaussians(9, 4, dtype=torch.float32))
-    screen = project_gaussians(raw, CAMERA, OPTIONS)
-    ids, grad = np.arange(9, dtype=np.int32), np.zeros((9, 24), np.float32)
-    small = allocate_visible(raw, 8)
-    other = allocate_visible(dataclasses.replace(raw, sh=raw.sh[:, :4]), 9)
-    for scratch in (small, other):
-        with pytest.raises(UsageError, match="scratch"):
-            project_backward_visible(raw, CAMERA, OPTIONS, screen, grad, ids, scratch)

@@ -15,10 +15,15 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.render import raster_backward, raster_forward
+from gaussian_wrapping_addon.core.render.depth_query import query_depth
+from gaussian_wrapping_addon.core.render.depth_query_gradient import pull_range
+from gaussian_wrapping_addon.core.render.depth_query_kernels import query_kernel
 from gaussian_wrapping_addon.core.render.raster_math import aligned_zeros, vector_lanes
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 
+from .comparisons import leaves
+from .query_scenes import scene
 from .scenes import look_at, random_gaussians
 
 PACKED = re.compile(r"\bvfn?m(?:add|sub)\d+ps\b.*%[yz]mm")
@@ -79,6 +84,16 @@ def test_isosurface_is_packed() -> None:
     assert packed >= 3 * 19 + 9
     assert packed > blending
     assert single < packed
+
+
+def test_queries_use_packed_arithmetic() -> None:
+    gaussians, camera = scene("generic")
+    leaf = leaves(gaussians, torch.float32)
+    query_depth(leaf, camera, torch.full((1, 2), 20.0)).sum().backward()
+    for kernel, least in ((query_kernel(True), 30), (pull_range, 40)):
+        packed, single = fused_instructions(kernel)
+        assert packed >= least
+        assert single < packed
 
 
 def test_no_reference_is_counted_in_the_inner_loops() -> None:
