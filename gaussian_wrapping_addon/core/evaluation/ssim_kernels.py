@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled import kernel, part
+from ..compiled import inline, kernel, part
 from .window_runs import LANES, RING, TAPS, filter_run, filter_two_runs
 
 WINDOW = TAPS
@@ -38,6 +38,13 @@ def _filter_along(count, target, target_at, source, source_at, weights):  # type
         filter_run(target, target_at + j, source, source_at + j, 3, weights)  # type: ignore[call-arg]
 
 
+@inline
+def _filter_rings(at, count, apart, target, ring, weights, first):  # type: ignore[no-untyped-def]
+    """Filter one kind of row; ``first`` is a constant, see ``filter_two_runs``."""
+    for j in range(at, at + count, LANES):
+        filter_two_runs(target, j, apart, ring, j, apart, weights, first)  # type: ignore[call-arg]
+
+
 @part(fast=True)
 def _filter_across(count, kinds, target, ring, first, weights):  # type: ignore[no-untyped-def]
     """Filter a ring of ``kinds`` rows a slot into two times ``kinds`` rows.
@@ -48,23 +55,17 @@ def _filter_across(count, kinds, target, ring, first, weights):  # type: ignore[
     for q in range(kinds):
         at = q * STRIDE
         if first == 0:
-            for j in range(at, at + count, LANES):
-                filter_two_runs(target, j, apart, ring, j, apart, weights, 0)  # type: ignore[call-arg]
+            _filter_rings(at, count, apart, target, ring, weights, 0)
         elif first == 2:
-            for j in range(at, at + count, LANES):
-                filter_two_runs(target, j, apart, ring, j, apart, weights, 2)  # type: ignore[call-arg]
+            _filter_rings(at, count, apart, target, ring, weights, 2)
         elif first == 4:
-            for j in range(at, at + count, LANES):
-                filter_two_runs(target, j, apart, ring, j, apart, weights, 4)  # type: ignore[call-arg]
+            _filter_rings(at, count, apart, target, ring, weights, 4)
         elif first == 6:
-            for j in range(at, at + count, LANES):
-                filter_two_runs(target, j, apart, ring, j, apart, weights, 6)  # type: ignore[call-arg]
+            _filter_rings(at, count, apart, target, ring, weights, 6)
         elif first == 8:
-            for j in range(at, at + count, LANES):
-                filter_two_runs(target, j, apart, ring, j, apart, weights, 8)  # type: ignore[call-arg]
+            _filter_rings(at, count, apart, target, ring, weights, 8)
         elif first == 10:
-            for j in range(at, at + count, LANES):
-                filter_two_runs(target, j, apart, ring, j, apart, weights, 10)  # type: ignore[call-arg]
+            _filter_rings(at, count, apart, target, ring, weights, 10)
 
 
 @part(fast=True)

@@ -102,6 +102,14 @@ class ScreenView:
     bounds: np.ndarray  # tiles of about equal cost
     threads: int
 
+    def arguments(self) -> tuple[np.ndarray | int, ...]:
+        """Return what the raster kernels read of a view, in their order."""
+        lists, camera = self.lists, self.camera
+        return (
+            self.screen.params, lists.start, lists.gaussian_ids, lists.pair_slots, self.masks,
+            lists.tiles_x, camera.width, camera.height,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Images:
@@ -148,6 +156,10 @@ class Images:
             images.depth.fill(0.0)
         return images
 
+    def arguments(self) -> tuple[np.ndarray, ...]:
+        """Return the images that the gradient reads too, in the raster kernels' order."""
+        return self.color, self.normal, self.geometric, self.alpha, self.depth, self.slope
+
 
 def blend(
     view: ScreenView,
@@ -167,7 +179,7 @@ def blend(
     (pairs, 2) float32
         Sum and maximum of the blending weight of each pair, by slot; (0, 2) without statistics.
     """
-    options, lists, camera = view.options, view.lists, view.camera
+    options, lists = view.options, view.lists
     depth, weights = options.depth, options.statistics
     if pair_weights is None:
         pair_weights = np.zeros((len(lists.gaussian_ids) if weights else 0, 2), np.float32)
@@ -184,25 +196,13 @@ def blend(
         forward(
             first,
             end,
-            view.screen.params,
-            lists.start,
-            lists.gaussian_ids,
-            lists.pair_slots,
-            view.masks,
-            lists.tiles_x,
-            camera.width,
-            camera.height,
+            *view.arguments(),
             background,
             limit,
             scratch,
             entries,
             visits,
-            images.color,
-            images.normal,
-            images.geometric,
-            images.alpha,
-            images.depth,
-            images.slope,
+            *images.arguments(),
             pair_weights,
             images.strongest,
         )
@@ -229,8 +229,6 @@ def pair_gradients(
     ``depth`` tells that the gradient of the depth is not all 0, ``absolute`` that the sums of
     absolute values are wanted.
     """
-    lists, camera = view.lists, view.camera
-    g_color, g_normal, g_geometric, g_alpha, g_depth = grads
     backward = backward_kernel(view.lanes, view.options.depth and depth, absolute)
 
     def run(first: int, end: int) -> None:
@@ -238,25 +236,9 @@ def pair_gradients(
         backward(
             first,
             end,
-            view.screen.params,
-            lists.start,
-            lists.gaussian_ids,
-            lists.pair_slots,
-            view.masks,
-            lists.tiles_x,
-            camera.width,
-            camera.height,
-            images.color,
-            images.normal,
-            images.geometric,
-            images.alpha,
-            images.depth,
-            images.slope,
-            g_color,
-            g_normal,
-            g_geometric,
-            g_alpha,
-            g_depth,
+            *view.arguments(),
+            *images.arguments(),
+            *grads,
             scratch,
             pairs,
         )

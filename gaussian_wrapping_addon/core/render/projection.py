@@ -50,6 +50,13 @@ class RawArrays:
 
         return cls(**{name: array(tensor) for name, tensor in gaussians.tensors()})
 
+    def arguments(self) -> tuple[np.ndarray, ...]:
+        """Return the arrays in the order in which kernels take them."""
+        return (
+            self.means, self.log_scales, self.quats, self.opacity_logits, self.sh,
+            self.orientation, self.filter_3d,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class RawGradients:
@@ -105,6 +112,10 @@ class ScreenGaussians:
             np.full(count, np.inf, np.float32),
             np.zeros(count, np.float32),
         )
+
+    def arguments(self) -> tuple[np.ndarray, ...]:
+        """Return the arrays in the order in which kernels take them."""
+        return self.params, self.boxes, self.visible, self.depths, self.skews
 
 
 def pack_camera(camera: Camera, near_z: float) -> np.ndarray:
@@ -169,20 +180,10 @@ def project_gaussians(
         project_raw_range(
             begin,
             end,
-            gaussians.means,
-            gaussians.log_scales,
-            gaussians.quats,
-            gaussians.opacity_logits,
-            gaussians.sh,
-            gaussians.orientation,
-            gaussians.filter_3d,
+            *gaussians.arguments(),
             degree,
             packed,
-            screen.params,
-            screen.boxes,
-            screen.visible,
-            screen.depths,
-            screen.skews,
+            *screen.arguments(),
         )
 
     run_chunks(run, even_bounds(count, threads), threads)
@@ -213,11 +214,7 @@ def project_arrays(
             arrays.log_opacities,
             arrays.normals,
             packed,
-            screen.params,
-            screen.boxes,
-            screen.visible,
-            screen.depths,
-            screen.skews,
+            *screen.arguments(),
         )
 
     run_chunks(run, even_bounds(count, threads), threads)
@@ -343,13 +340,7 @@ def _backward(
             end,
             _NO_IDS if ids is None else ids,
             ids is not None,
-            gaussians.means,
-            gaussians.log_scales,
-            gaussians.quats,
-            gaussians.opacity_logits,
-            gaussians.sh,
-            gaussians.orientation,
-            gaussians.filter_3d,
+            *gaussians.arguments(),
             degree,
             packed,
             screen.params,

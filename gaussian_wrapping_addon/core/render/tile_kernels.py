@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .. import tolerances
-from ..compiled import kernel
+from ..compiled import inline, kernel
 
 _TILE = tolerances.TILE_PX
 # Rounding of the float32 box and skew, in shares of the half width and in pixels.
@@ -233,6 +233,19 @@ def rank_records(
             ranked[k, column] = records[record, column]
 
 
+@inline
+def _scatter(
+    filled: Any, tiles: Any, slots: Any, ids: Any, heads: Any, gaussian_ids: Any, pair_slots: Any
+) -> None:
+    """Move the listed pairs to the heads of their tiles."""
+    for pair in range(filled):
+        listed_tile = np.uint64(tiles[pair])
+        place = np.uint64(heads[listed_tile])
+        heads[listed_tile] = place + np.uint64(1)
+        gaussian_ids[place] = ids[pair]
+        pair_slots[place] = slots[pair]
+
+
 @kernel(fast=False)
 def scatter_tiles(
     first_tile: int,
@@ -288,16 +301,6 @@ def scatter_tiles(
             filled += np.uint64(listed)
             slot += width
             if filled >= np.uint64(_FLUSH_PAIRS):
-                for pair in range(filled):
-                    listed_tile = np.uint64(tiles[pair])
-                    place = np.uint64(heads[listed_tile])
-                    heads[listed_tile] = place + np.uint64(1)
-                    gaussian_ids[place] = ids[pair]
-                    pair_slots[place] = slots[pair]
+                _scatter(filled, tiles, slots, ids, heads, gaussian_ids, pair_slots)
                 filled = np.uint64(0)
-    for pair in range(filled):
-        listed_tile = np.uint64(tiles[pair])
-        place = np.uint64(heads[listed_tile])
-        heads[listed_tile] = place + np.uint64(1)
-        gaussian_ids[place] = ids[pair]
-        pair_slots[place] = slots[pair]
+    _scatter(filled, tiles, slots, ids, heads, gaussian_ids, pair_slots)
