@@ -10,11 +10,11 @@ from bpy.props import EnumProperty, StringProperty
 from ..core.errors import UsageError
 from . import known_jobs, materials, tags
 from .camera_objects import look_through
-from .reporting import ReportsErrors
+from .reporting import NeedsObjectMode, ReportsErrors
 from .scene_objects import import_result
 
 
-class GWRAP_OT_import_result(ReportsErrors, bpy.types.Operator):
+class GWRAP_OT_import_result(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.import_result"
     bl_label = "Import Result"
     bl_description = "Show a finished job's meshes, cameras and regions, or bring them up to date"
@@ -22,13 +22,6 @@ class GWRAP_OT_import_result(ReportsErrors, bpy.types.Operator):
 
     directory: StringProperty(name="Result Folder", subtype="DIR_PATH", options={"SKIP_SAVE"})  # type: ignore[valid-type]
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Leave the current mode first")
-            return False
-        return True
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if self.directory:
@@ -49,17 +42,21 @@ class GWRAP_OT_import_result(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_open_report(ReportsErrors, bpy.types.Operator):
-    bl_idname = "gwrap.open_report"
-    bl_label = "Open Report Folder"
-    bl_description = "Show the folder with report.md, the meshes and the textures"
+class _NeedsResult:
+    """Mixin: the operator is about the scene's current result."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if tags.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene holds no result")
+            cls.poll_message_set("The scene holds no result")  # type: ignore[attr-defined]
             return False
         return True
+
+
+class GWRAP_OT_open_report(_NeedsResult, ReportsErrors, bpy.types.Operator):
+    bl_idname = "gwrap.open_report"
+    bl_label = "Open Report Folder"
+    bl_description = "Show the folder with report.md, the meshes and the textures"
 
     def work(self, context: bpy.types.Context) -> set[str]:
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
@@ -77,7 +74,7 @@ class GWRAP_OT_open_report(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_set_shading(bpy.types.Operator):
+class GWRAP_OT_set_shading(_NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.set_shading"
     bl_label = "Set Shading"
     bl_description = "Show the photo texture lit by the scene's lights, or as photographed"
@@ -89,13 +86,6 @@ class GWRAP_OT_set_shading(bpy.types.Operator):
             ("UNLIT", "Unlit", "The texture as photographed, whatever the lights"),
         )
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if tags.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene holds no result")
-            return False
-        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)

@@ -20,7 +20,7 @@ from .region_objects import (
     scene_from_blender,
     transformed,
 )
-from .reporting import ReportsErrors
+from .reporting import NeedsObjectMode, ReportsErrors
 
 # Half the side of a box at the cursor in scene units; the cameras of a scene lie within 5.
 _CURSOR_BOX_HALF = 0.5
@@ -47,16 +47,7 @@ def _target(context: bpy.types.Context) -> tuple[bpy.types.Object | None, bpy.ty
     return None, context.scene.collection
 
 
-class _NeedsObjectMode(ReportsErrors):
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Leave the current mode first")  # type: ignore[attr-defined]
-            return False
-        return True
-
-
-class GWRAP_OT_add_region_box(_NeedsObjectMode, bpy.types.Operator):
+class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.add_region_box"
     bl_label = "Add Region Box"
     bl_description = "Add a box that can be moved, turned and scaled; what it encloses is meshed"
@@ -94,7 +85,7 @@ class GWRAP_OT_add_region_box(_NeedsObjectMode, bpy.types.Operator):
         return transformed(scene_from_blender(frame), hull_in_blender(regions[0])[0])
 
 
-class GWRAP_OT_select_region(_NeedsObjectMode, bpy.types.Operator):
+class GWRAP_OT_select_region(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.select_region"
     bl_label = "Select Region"
     bl_description = "Select this region; Shift adds it to the selection"
@@ -149,7 +140,7 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_import_region(_NeedsObjectMode, bpy.types.Operator):
+class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.import_region"
     bl_label = "Import Region"
     bl_description = "Read a bounding-volume JSON in world coordinates as a region"
@@ -174,7 +165,7 @@ class GWRAP_OT_import_region(_NeedsObjectMode, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_use_as_region(_NeedsObjectMode, bpy.types.Operator):
+class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.use_as_region"
     bl_label = "Use Mesh as Region"
     bl_description = "Use the convex hull of the active mesh as a region"

@@ -30,3 +30,15 @@ class ReportsErrors:
             _logger.exception("%s", type(self).__name__)
             self.report({"ERROR"}, f"{error.strerror}: {error.filename}")  # type: ignore[attr-defined]
         return {"CANCELLED"}
+
+
+class NeedsObjectMode(ReportsErrors):
+    """Mixin: the operator works in Object Mode only."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run; Blender calls this."""
+        if context.mode != "OBJECT":
+            cls.poll_message_set("Leave the current mode first")  # type: ignore[attr-defined]
+            return False
+        return True
