@@ -177,7 +177,7 @@ def _find_files() -> tuple[Path, Path]:
     heads = _first_file([*given, *weights], HEADS_PATTERN)
     missing = []
     if backbone is None:
-        missing.append(f"AlexNet's weights ({BACKBONE_PATTERN}) are not in {cache}")
+        missing.append(f"AlexNet's weights ({BACKBONE_PATTERN}) are not in torch's hub cache")
     if heads is None:
         missing.append(f"the linear heads ({HEADS_PATTERN}) of the package lpips are not installed")
     if backbone is None or heads is None:

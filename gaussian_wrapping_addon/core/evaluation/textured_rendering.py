@@ -79,12 +79,18 @@ class TexturedRenderer:
 
         run_chunks(band, even_bounds(fine.height, self._threads), self._threads)
         rays = SUPERSAMPLING**2
-        blocks = image.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 3)
-        total = blocks.sum(axis=(1, 3), dtype=np.uint32)
-        met = (hit >= 0).reshape(height, SUPERSAMPLING, width, SUPERSAMPLING).sum(axis=(1, 3))
         return TexturedView(
-            ((total + rays // 2) // rays).astype(np.uint8), (met / rays).astype(np.float32)
+            ((_pixel_sums(image) + rays // 2) // rays).astype(np.uint8),
+            _pixel_sums(hit >= 0).astype(np.float32) / np.float32(rays),
         )
+
+
+def _pixel_sums(rays: np.ndarray) -> np.ndarray:
+    """Sum what the rays of each pixel brought: (3 h, 3 w, ...) bool or uint8 to (h, w, ...)."""
+    total = rays[::SUPERSAMPLING, ::SUPERSAMPLING].astype(np.uint16)
+    for row, column in list(np.ndindex(SUPERSAMPLING, SUPERSAMPLING))[1:]:
+        total += rays[row::SUPERSAMPLING, column::SUPERSAMPLING]
+    return total
 
 
 @kernel(fast=False)
