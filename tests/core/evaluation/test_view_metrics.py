@@ -10,7 +10,13 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.evaluation.ssim_kernels import BLOCK_PX
-from gaussian_wrapping_addon.core.evaluation.view_metrics import compare, psnr, ssim
+from gaussian_wrapping_addon.core.evaluation.view_metrics import (
+    PSNR_CAP_DB,
+    compare,
+    psnr,
+    score_images,
+    ssim,
+)
 
 
 def images(height: int = 19, width: int = 23, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -164,3 +170,33 @@ def test_wrong_shapes_and_empty_masks_are_refused() -> None:
         psnr(image, photo, np.zeros(photo.shape[:2], bool))
     with pytest.raises(UsageError):
         ssim(image, photo, np.ones((3, 3), bool))
+
+
+class MeanDifference:
+    """Stands for LPIPS: shows which pixels a distance is given."""
+
+    @staticmethod
+    def fits(shape: tuple[int, ...]) -> bool:
+        return min(shape[:2]) > 12
+
+    @staticmethod
+    def distance(image: np.ndarray, photo: np.ndarray) -> float:
+        return float(np.abs(image - photo).mean())
+
+
+def test_all_figures_of_an_image_at_once() -> None:
+    image, photo = images()
+    mask = np.random.default_rng(1).uniform(size=photo.shape[:2]) < 0.6
+    for part in (None, mask):
+        scores = score_images(image, photo, part, lpips=MeanDifference())
+        assert (scores.psnr, scores.ssim) == (psnr(image, photo, part), ssim(image, photo, part))
+        counted = np.ones_like(mask) if part is None else part
+        expected = np.abs(image - photo)[counted].sum() / photo.size
+        assert scores.lpips == pytest.approx(expected, rel=1e-5)
+        assert set(scores.to_json()) == {"psnr", "ssim", "lpips"}
+    assert set(score_images(image, photo).to_json()) == {"psnr", "ssim"}
+    assert score_images(image[:12], photo[:12], lpips=MeanDifference()).lpips is None
+    equal = score_images(photo, photo)
+    assert (equal.psnr, equal.ssim) == (PSNR_CAP_DB, pytest.approx(1.0))
+    with pytest.raises(UsageError):
+        score_images(image, photo, np.zeros(photo.shape[:2], bool))
