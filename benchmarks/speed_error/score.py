@@ -14,9 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gaussian_wrapping_addon.core.evaluation.mesh_rendering import render_views
-from gaussian_wrapping_addon.core.evaluation.surface_scores import score_protocols
-from gaussian_wrapping_addon.core.evaluation.truth import Truth, read_truth
 from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
@@ -24,7 +21,10 @@ from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.evaluation.field_errors import depth_errors, vacancy_errors
-from gaussian_wrapping_addon.core.evaluation.view_metrics import psnr, ssim
+from gaussian_wrapping_addon.core.evaluation.mesh_rendering import render_views
+from gaussian_wrapping_addon.core.evaluation.surface_scores import score_protocols
+from gaussian_wrapping_addon.core.evaluation.truth import Truth, read_truth
+from gaussian_wrapping_addon.core.evaluation.view_metrics import score_images
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
@@ -39,7 +39,6 @@ from .plan import THRESHOLD_SHARES
 
 SURFACE_SAMPLES = 200_000
 VACANCY_SAMPLES = 4000
-PSNR_CAP_DB = 100.0
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -126,10 +125,11 @@ def judge_stages(
     for (camera, photo), mask in zip(views, masks, strict=True):
         options = RenderOptions(depth=False, threads=threads)
         image = render(gaussians, camera, options).color.numpy()
-        whole.append(min(psnr(image, photo), PSNR_CAP_DB))
-        similar.append(ssim(image, photo, threads=threads))
+        figures = score_images(image, photo, threads=threads)
+        whole.append(figures.psnr)
+        similar.append(figures.ssim)
         if mask.any():
-            inside.append(min(psnr(image, photo, mask), PSNR_CAP_DB))
+            inside.append(score_images(image, photo, mask, threads=threads).psnr)
     depth = depth_errors(
         gaussians, [c for c, _ in views], inverse.points(truth.vertices), truth.faces, limits,
         threads=threads,
