@@ -21,6 +21,7 @@ from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.evaluation.field_errors import depth_errors, vacancy_errors
+from gaussian_wrapping_addon.core.evaluation.lpips import lpips_if_ready
 from gaussian_wrapping_addon.core.evaluation.mesh_rendering import render_views
 from gaussian_wrapping_addon.core.evaluation.surface_scores import score_protocols
 from gaussian_wrapping_addon.core.evaluation.truth import Truth, read_truth
@@ -88,8 +89,9 @@ def judge(mesh: Path, scene_folder: Path, job: Path, threads: int, stages: bool)
     true_vertices = world.inverse().points(truth.vertices)
     masks = [true_mask(true_vertices, truth.faces, camera, threads) for camera, _ in views]
     rendered = render_views(
-        textured, [c for c, _ in views], [i for _, i in views], masks=masks, threads=threads
-    )
+        textured, [c for c, _ in views], [i for _, i in views], masks=masks,
+        lpips=lpips_if_ready()[0], threads=threads,
+    )  # fmt: skip
     scores: dict[str, Any] = {
         "diagonal": diagonal,
         "thresholds": thresholds,
