@@ -68,7 +68,9 @@ class ObservationMask:
     def observed(self, points: np.ndarray) -> np.ndarray:
         """Tell which of (n, 3) points lie in an observed voxel, (n,) bool."""
         # Clipped before the cast: far points would not fit an integer.
-        place = np.clip(np.rint((points - self.low) / self.resolution), -1.0, self.volume.shape)
+        place = np.clip(
+            np.floor((points - self.low) / self.resolution + 0.5), -1.0, self.volume.shape
+        )
         index = place.astype(np.int64)  # (n, 3)
         inside = ((index >= 0) & (index < self.volume.shape)).all(1)
         result = np.zeros(len(points), np.bool_)
