@@ -179,12 +179,13 @@ def scan_virtually(
     normals, _ = face_normals(local, faces)
     points, directions = [np.zeros((0, 3))], [np.zeros((0, 3))]
     to_local = Similarity(translation=-origin)
+    used = np.unique(faces)
     for camera in cameras:
         moved = camera.moved(to_local).resized(
             max(1, round(camera.width / step_px)), max(1, round(camera.height / step_px))
         )
         seen = moved.to_camera(local)
-        near = SCAN_NEAR_SHARE * float(np.abs(seen[np.unique(faces)]).max())
+        near = SCAN_NEAR_SHARE * float(np.abs(seen[used]).max())
         buffer = depth_buffer(local, faces, moved, threads=threads, near=near)
         hit = buffer.face >= 0  # (h, w)
         face = buffer.face[hit]
@@ -233,12 +234,39 @@ def thin_out(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
     UsageError
         ``voxel`` is not a positive number, or so small that cells cannot be numbered.
     """
-    if not (np.isfinite(voxel) and voxel > 0):
-        raise UsageError(f"A cell of {voxel} cannot be used to thin out.", "Give a length > 0.")
+    group, members = _cells(samples.points, voxel)
     if len(samples) == 0:
         return samples
     low = samples.points.min(0)
-    local = samples.points - low  # (n, 3), precise sums at huge coordinates
+    normals = _means(samples.normals, group, members)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    known = length > 1e-9  # shorter means are those of normals that cancel, up to rounding
+    normals = np.where(known, normals / np.where(known, length, 1.0), 0.0)
+    return SurfaceSamples(_means(samples.points - low, group, members) + low, normals)
+
+
+def choose_per_cell(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
+    """Keep in each cell of a grid the sample nearest to the mean of those there.
+
+    As even as :func:`thin_out`, whose means leave a curved surface: these samples stay on it.
+    Same grid, order and errors; ties go to the earlier sample.
+    """
+    group, members = _cells(samples.points, voxel)
+    if len(samples) == 0:
+        return samples
+    local = samples.points - samples.points.min(0)
+    away = ((local - _means(local, group, members)[group]) ** 2).sum(1)  # (n,)
+    order = np.lexsort((away, group))  # stable: equal ones stay in order
+    return samples.kept(order[np.cumsum(members) - members])
+
+
+def _cells(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Number of the occupied cell of each point (n,), and how many points each has (c,)."""
+    if not (np.isfinite(voxel) and voxel > 0):
+        raise UsageError(f"A cell of {voxel} cannot be used to thin out.", "Give a length > 0.")
+    if len(points) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    local = points - points.min(0)
     cells = np.floor(local / voxel + 0.5)  # (n, 3)
     size = cells.max(0) + 1
     if not np.prod(size) < 2.0**62:
@@ -249,17 +277,13 @@ def thin_out(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
     whole, sides = cells.astype(np.int64), size.astype(np.int64)
     key = (whole[:, 0] * sides[1] + whole[:, 1]) * sides[2] + whole[:, 2]
     _, group, members = np.unique(key, return_inverse=True, return_counts=True)
-    count = len(members)
+    return group, members
 
-    def mean(values: np.ndarray) -> np.ndarray:
-        sums = [np.bincount(group, values[:, k], count) for k in range(3)]
-        return np.stack(sums, 1) / members[:, None]
 
-    normals = mean(samples.normals)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    known = length > 1e-9  # shorter means are those of normals that cancel, up to rounding
-    normals = np.where(known, normals / np.where(known, length, 1.0), 0.0)
-    return SurfaceSamples(mean(local) + low, normals)
+def _means(values: np.ndarray, group: np.ndarray, members: np.ndarray) -> np.ndarray:
+    """Mean of the rows (n, 3) of each group, (c, 3)."""
+    sums = [np.bincount(group, values[:, k], len(members)) for k in range(3)]
+    return np.stack(sums, 1) / members[:, None]
 
 
 def _checked(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

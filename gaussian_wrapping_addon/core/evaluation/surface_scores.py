@@ -16,6 +16,7 @@ from ..errors import UsageError
 from .surface_distance import distances_to_cloud, distances_to_mesh
 from .surface_samples import (
     SurfaceSamples,
+    choose_per_cell,
     face_normals,
     sample_legacy,
     sample_uniformly,
@@ -25,6 +26,9 @@ from .surface_samples import (
 from .truth import MIN_CAMERAS, Truth
 
 PROTOCOLS = ("uniform", "scan", "legacy")
+
+SCAN_RAYS = 4_000_000
+"""Rays of a virtual scan unless a step is given: some 400 MB of points at most."""
 
 Shares = tuple[float, ...]
 """One number in [0, 1] for each threshold."""
@@ -102,6 +106,7 @@ def score_surface(
     truth: Truth,
     thresholds: Sequence[float],
     *,
+    reached: SurfaceSamples | None = None,
     min_cameras: int = MIN_CAMERAS,
 ) -> SurfaceScore:
     """Compare samples of a surface with the truth.
@@ -111,9 +116,10 @@ def score_surface(
 
     - precision: share of judged predicted samples within the threshold (``<=``) of the truth's
       mesh, or of its cloud where it has no mesh;
-    - recall: share of judged true samples within it of ``predicted_mesh``, or of the predicted
-      samples where that is ``None``; visible recall: of those that at least ``min_cameras``
-      cameras see; thin recall: of those that are thin and, where that is known, visible;
+    - recall: share of judged true samples within it of ``predicted_mesh``, or where that is
+      ``None`` of the samples ``reached``, or else of those predicted; visible recall: of those
+      that at least ``min_cameras`` cameras see; thin recall: of those that are thin and, where
+      that is known, visible;
     - F1: harmonic mean of the two, 0 where both are 0;
     - normals: over all judged samples of either side, whatever their distance, as far as both the
       sample and its nearest counterpart have one. 0 where no pair has;
@@ -129,6 +135,8 @@ def score_surface(
     truth : Truth
     thresholds : sequence of float
         Distances > 0 in the truth's frame.
+    reached : SurfaceSamples, optional
+        A denser set out of which ``predicted`` was chosen to be even.
     min_cameras : int
         Not used where ``truth.seen`` is boolean.
 
@@ -148,7 +156,8 @@ def score_surface(
 
     accuracy, there = _nearest(shown, truth.mesh, truth.samples)
     if len(shown):
-        completeness, back = _nearest(true, predicted_mesh, predicted)
+        cloud = predicted if reached is None else reached
+        completeness, back = _nearest(true, predicted_mesh, cloud)
     else:
         completeness, back = np.full(len(true), np.inf), np.zeros((len(true), 3))
     visible = truth.visible(min_cameras)[judged]
@@ -196,17 +205,19 @@ def score_protocols(
     seed: int = 0,
     threads: int = 1,
     protocols: Sequence[str] = PROTOCOLS,
-    step_px: float = 1.0,
+    step_px: float | None = None,
     min_cameras: int = MIN_CAMERAS,
 ) -> dict[str, SurfaceScore]:
     """Judge a mesh by several protocols (method.md 9.1).
 
     - ``uniform``: ``count`` samples spread evenly over the mesh; recall is measured against the
       mesh itself, so it does not depend on their density. Inner sides and hidden parts count.
-    - ``scan``: what the cameras see of the mesh; recall is measured against these points, and over
-      those true samples only that at least ``min_cameras`` cameras see (all, where that is not
-      known), because a scan cannot reach others. Hidden parts do not count on either side. The
-      distance between neighbouring rays on the surface has to be below the thresholds.
+    - ``scan``: what the cameras see of the mesh, thinned out to one point in each cell of half the
+      smallest threshold, so that parts near to many cameras do not weigh more. Recall is measured
+      against all that they see, and over those true samples only that at least ``min_cameras``
+      cameras see (all, where that is not known), because a scan cannot reach others. Hidden parts
+      do not count on either side. The distance between neighbouring points of the scan has to be
+      well below the thresholds.
     - ``legacy``: vertices and centres of faces; recall is measured against these points. Biased by
       tessellation: reported to be compared with older figures only.
 
@@ -225,8 +236,9 @@ def score_protocols(
         Threads to use; the result does not depend on it.
     protocols : sequence of str
         Out of :data:`PROTOCOLS`.
-    step_px : float
-        See :func:`~.surface_samples.scan_virtually`.
+    step_px : float, optional
+        See :func:`~.surface_samples.scan_virtually`; the smallest with :data:`SCAN_RAYS` rays in
+        all unless given.
 
     Returns
     -------
@@ -241,9 +253,10 @@ def score_protocols(
     MeshingError
         A vertex is not finite.
     """
+    limits = _checked(thresholds)
     result: dict[str, SurfaceScore] = {}
     for protocol in protocols:
-        judged, mesh = truth, None
+        judged, mesh, reached = truth, None, None
         if protocol == "uniform":
             predicted, mesh = _uniform(vertices, faces, count, seed), (vertices, faces)
         elif protocol == "scan":
@@ -257,17 +270,18 @@ def score_protocols(
             judged = truth.kept(visible)
             predicted = SurfaceSamples.none()
             if len(faces):
-                predicted = scan_virtually(
-                    vertices, faces, cameras, threads=threads, step_px=step_px
-                )
+                step = _scan_step(cameras) if step_px is None else step_px
+                reached = scan_virtually(vertices, faces, cameras, threads=threads, step_px=step)
+                predicted = choose_per_cell(reached, min(limits) / 2)
         elif protocol == "legacy":
             predicted = sample_legacy(vertices, faces) if len(faces) else SurfaceSamples.none()
         else:
             raise UsageError(f"Protocol {protocol!r} is unknown.", f"Use {', '.join(PROTOCOLS)}.")
         # An area that lies on nothing but degenerate faces is as empty as no faces.
         result[protocol] = score_surface(
-            predicted, mesh if len(predicted) else None, judged, thresholds, min_cameras=min_cameras
-        )
+            predicted, mesh if len(predicted) else None, judged, limits,
+            reached=reached, min_cameras=min_cameras,
+        )  # fmt: skip
     return result
 
 
@@ -317,6 +331,11 @@ def score_clouds(
     )  # fmt: skip
 
 
+def _scan_step(cameras: Sequence[Camera]) -> float:
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    return max(1.0, math.sqrt(pixels / SCAN_RAYS))
+
+
 def _uniform(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> SurfaceSamples:
     if len(faces) == 0 or (
         np.isfinite(vertices[np.unique(faces)]).all() and not face_normals(vertices, faces)[1].any()
@@ -347,7 +366,7 @@ def _nearest(
 
 def _checked(thresholds: Sequence[float]) -> tuple[float, ...]:
     limits = tuple(float(value) for value in thresholds)
-    if not all(math.isfinite(value) and value > 0 for value in limits):
+    if not limits or not all(math.isfinite(value) and value > 0 for value in limits):
         raise UsageError(f"Thresholds of {limits} cannot be used.", "Give lengths > 0.")
     return limits
 

@@ -13,6 +13,7 @@ from gaussian_wrapping_addon.core.errors import MeshingError, UsageError
 from gaussian_wrapping_addon.core.evaluation.surface_distance import distances_to_mesh
 from gaussian_wrapping_addon.core.evaluation.surface_samples import (
     SurfaceSamples,
+    choose_per_cell,
     face_normals,
     sample_legacy,
     sample_uniformly,
@@ -222,6 +223,23 @@ def test_thinning_takes_the_mean_of_each_cell() -> None:
     far = thin_out(SurfaceSamples(points + OFFSET, normals), voxel)
     assert len(far.points) == len(thin.points)
     assert np.abs(far.points - OFFSET - thin.points).max() < 2e-9
+
+
+def test_the_chosen_sample_is_the_nearest_to_the_mean_of_its_cell() -> None:
+    rng = np.random.default_rng(2)
+    points = np.repeat(rng.uniform(-1, 1, (300, 3)), 2, 0)  # each twice: ties
+    samples = SurfaceSamples(points, np.arange(1800.0).reshape(600, 3))
+    means, chosen = thin_out(samples, 0.5), choose_per_cell(samples, 0.5)
+    assert len(chosen) == len(means) < 200
+    cell = np.floor((points - points.min(0)) / 0.5 + 0.5)
+    for mean, point, normal in zip(means.points, chosen.points, chosen.normals, strict=True):
+        row = int(normal[0]) // 3
+        assert (points[row] == point).all()
+        assert row % 2 == 0
+        others = (cell == cell[row]).all(1)
+        nearest = np.linalg.norm(points[others] - mean, axis=1).min()
+        assert np.linalg.norm(point - mean) == pytest.approx(nearest, abs=1e-12)
+    assert len(choose_per_cell(SurfaceSamples.none(), 0.5)) == 0
 
 
 def test_thinning_at_the_ends_of_its_range() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError, UsageError
+from gaussian_wrapping_addon.core.evaluation import surface_scores
 from gaussian_wrapping_addon.core.evaluation.surface_samples import (
     SurfaceSamples,
     face_normals,
@@ -171,6 +172,32 @@ def test_uniform_punishes_a_hidden_shell_and_a_scan_does_not() -> None:
     assert scores["scan"].recall[0] > 0.999
 
 
+def test_cameras_that_crowd_do_not_weigh_more_in_a_scan() -> None:
+    upper, lower = halves(ball(4))
+    mesh = joined(upper, (lower[0] * 1.05, lower[1]))
+    truth = truth_of(ball(4), 2000)
+    crowd = [camera for camera in CAMERAS if camera.center[2] > 1] * 4
+    assert len(crowd) > 12
+    few, many = (
+        score_protocols(*mesh, truth, cameras, [0.03], protocols=["scan"])["scan"]
+        for cameras in (CAMERAS, CAMERAS + crowd)
+    )
+    assert few.precision[0] == pytest.approx(1 / (1 + 1.05**2), abs=0.02)
+    assert many.precision[0] == pytest.approx(few.precision[0], abs=2e-3)
+
+
+def test_a_scan_of_many_pixels_takes_larger_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, cameras = ball(3), CAMERAS[:4]
+    truth = truth_of(mesh, 2000)
+    rays = sum(camera.width * camera.height for camera in cameras)
+    monkeypatch.setattr(surface_scores, "SCAN_RAYS", rays / 4)
+    automatic, coarse, fine = (
+        score_protocols(*mesh, truth, cameras, [0.01], protocols=["scan"], **options)["scan"]
+        for options in ({}, {"step_px": 2.0}, {"step_px": 1.0})
+    )
+    assert automatic == coarse != fine
+
+
 def test_a_scan_asks_only_for_what_cameras_see() -> None:
     outer, inner = ball(4), (ball(3)[0] * 0.5, ball(3)[1])
     solid = joined(outer, inner)
@@ -323,7 +350,7 @@ def test_scores_are_the_same_in_every_frame() -> None:
 
 def test_what_cannot_be_scored_is_refused() -> None:
     mesh, truth = ball(2), truth_of(ball(2), 100)
-    for thresholds in ([0.0], [0.1, -1.0], [np.nan], [np.inf]):
+    for thresholds in ([], [0.0], [0.1, -1.0], [np.nan], [np.inf]):
         with pytest.raises(UsageError, match="Thresholds"):
             uniform(mesh, truth, *thresholds)
     with pytest.raises(UsageError, match="unknown"):
