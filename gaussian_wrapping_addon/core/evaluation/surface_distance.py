@@ -36,7 +36,7 @@ def distances_to_mesh(
     vertices = np.asarray(vertices, np.float64)
     used, inverse = np.unique(faces, return_inverse=True)
     corners = vertices[used]
-    # Projections multiply coordinates: 4e6 squared would leave millimetres.
+    # Measured where the mesh is: nearest points would be rounded to the last digit of 4e6.
     origin = (corners.min(0) + corners.max(0)) / 2
     local = np.ascontiguousarray(points - origin)
     triangles = np.ascontiguousarray(inverse.reshape(-1, 3), np.int64)

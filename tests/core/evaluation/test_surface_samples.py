@@ -32,6 +32,10 @@ from tests.core.evaluation.surface_scenes import (
 )
 
 OFFSET = np.array([5e5, 4e6, -300.0])
+FAR = np.array([2.0**19, 2.0**22, -300.0])
+"""Coordinates that are multiples of 2^-24 below 2 stay exact when this is added."""
+HALF_DIGIT = 2.0**-31
+"""Rounding of a coordinate between 2^22 and 2^23."""
 ONE_FACE = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
 
 
@@ -180,9 +184,13 @@ def test_a_scan_does_not_depend_on_threads_and_thins_by_its_step() -> None:
     assert len(scan_virtually(*mesh, [camera_at((4, 0, 0), target=(8, 0, 0))])) == 0
 
 
+def exact(points: np.ndarray) -> np.ndarray:
+    return np.round(points * 2.0**24) / 2.0**24
+
+
 def test_samples_are_the_same_at_huge_coordinates() -> None:
-    vertices, faces = ball(3)
-    there = vertices + OFFSET
+    vertices, faces = exact(ball(3)[0]), ball(3)[1]
+    there = vertices + FAR
     cameras = cameras_around()[:2]
     pairs = [
         (
@@ -192,12 +200,24 @@ def test_samples_are_the_same_at_huge_coordinates() -> None:
         (sample_legacy(vertices, faces), sample_legacy(there, faces)),
     ]
     for here, far in pairs:
-        assert np.abs(far.points - OFFSET - here.points).max() < 4e-9
-        assert np.abs(far.normals - here.normals).max() < 1e-7
+        # What a coordinate of this size can hold, and no error of calculation besides.
+        assert np.abs(far.points - FAR - here.points).max() <= HALF_DIGIT
+        assert (far.normals == here.normals).all()
     here = scan_virtually(vertices, faces, cameras)
-    far = scan_virtually(there, faces, [moved_camera(camera, OFFSET) for camera in cameras])
+    far = scan_virtually(there, faces, [moved_camera(camera, FAR) for camera in cameras])
     assert len(far) == pytest.approx(len(here), abs=20)
-    assert distances_to_mesh(far.points, there, faces)[0].max() < 2e-9
+    assert distances_to_mesh(far.points, there, faces)[0].max() < 2 * HALF_DIGIT
+
+
+def test_distances_are_exactly_the_same_at_huge_coordinates() -> None:
+    vertices, faces = exact(ball(4)[0]), ball(4)[1]
+    points = exact(np.random.default_rng(0).uniform(-1.9, 1.9, (3000, 3)))
+    here, far = (
+        distances_to_mesh(points + offset, vertices + offset, faces)[0] for offset in (0.0, FAR)
+    )
+    assert here.max() > 1
+    # Centring is exact in both frames, but not around the same point.
+    assert np.abs(far - here).max() < 1e-15
 
 
 def test_thinning_takes_the_mean_of_each_cell() -> None:

@@ -298,6 +298,13 @@ def test_the_crop_chooses_what_is_judged_not_what_it_is_measured_against() -> No
     # The surface just beyond the boundary still finds the truth.
     shifted = uniform((mesh[0] - np.array([0, 0, 0.02]), mesh[1]), cropped, 0.0205)
     assert shifted.precision == shifted.recall == (1.0,)
+    # Also where the truth is a cloud: no sample inside is farther from it than in the whole.
+    cloud = exact_sphere(5000)
+    guess = exact_sphere(4000)
+    whole = score_surface(guess.kept(guess.points[:, 2] >= 0.3), None, Truth(cloud), [0.1])
+    part = score_surface(guess, None, Truth(cloud, crop=crop), [0.1])
+    assert part.predicted_count == whole.predicted_count < 4000
+    assert part.accuracy_mean == whole.accuracy_mean
     outside = dataclasses.replace(cropped, crop=RegionCrop(Region.box("off", [5] * 3, [6] * 3)))
     with pytest.raises(UsageError, match="inside of the crop"):
         uniform(mesh, outside, 0.01)
