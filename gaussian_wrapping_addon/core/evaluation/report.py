@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report of a job: ``report.json`` for programs, ``report.md`` for people."""
+"""The report of a job: ``report.json`` for programs, ``report.md`` for people, a headline."""
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Any
 
 from ..files import write_bytes, write_json
+from .report_markdown import report_markdown
+from .report_region import closedness
+from .report_text import duration, finite, items, measured, number, part, percent, plural
+from .report_warnings import collect_warnings
 
 
 def write_report(result: Path, summary: dict[str, Any], regions: dict[str, Any]) -> None:
-    """Write both files into the result folder.
+    """Write both files into the result folder; the pictures must lie there already.
 
     Parameters
     ----------
@@ -20,114 +23,35 @@ def write_report(result: Path, summary: dict[str, Any], regions: dict[str, Any])
     summary : dict
         What was measured of the whole job: machine, stages, cameras, training.
     regions : dict
-        For each region: mesh statistics, residuals, texture coverage, seconds.
+        For each region: mesh statistics, residuals, size in world units, texture coverage,
+        renderings of the mesh, seconds.
     """
-    report = {"version": 1, **summary, "regions": regions}
+    report = finite({"version": 1, **summary, "regions": regions})
+    report["warnings"] = [warning.to_json() for warning in collect_warnings(report)]
     write_json(result / "report.json", report)
-    write_bytes(result / "report.md", _markdown(report).encode())
+    write_bytes(result / "report.md", report_markdown(report, result).encode())
 
 
 def headline(report: dict[str, Any]) -> list[str]:
     """Return the few figures of a report that a person wants first, one line each."""
-    training = report["training"]
-    lines = [f"time: {report['wall_seconds']:.0f} s, {training['gaussians']} Gaussians"]
-    if training["held_out"]:
-        count = len(training["held_out"])
-        lines.append(f"held-out photos: PSNR {training['held_out_psnr']:.2f} dB ({count} photos)")
-    for name, region in report["regions"].items():
-        statistics = region["statistics"]
-        closed = "closed" if statistics["closed"] else "not closed"
-        coverage = region["texture"]["coverage"]
-        lines.append(
-            f"region {name}: {statistics['faces']} faces, {closed}, "
-            f"{100 * coverage:.1f} % of the texture seen by photos"
-        )
+    training = part(report, "training")
+    gaussians = number(training.get("gaussians"), "Gaussians")
+    lines = [f"time: {duration(report.get('wall_seconds'))}, {gaussians}"]
+    psnr, held_out = measured(training.get("held_out_psnr")), items(training.get("held_out"))
+    if psnr is not None and held_out:
+        count = plural(len(held_out), "photo")
+        lines.append(f"held-out photos: PSNR {psnr:.2f} dB ({count})")
+    else:
+        lines.append("held-out photos: not measured")
+    for name, region in part(report, "regions").items():
+        statistics = part(region, "statistics")
+        line = f"region {name}: {number(statistics.get('faces'), 'faces')}, "
+        line += f"{closedness(statistics)}, "
+        line += f"{percent(part(region, 'texture').get('coverage'))} of the texture seen by photos"
+        rendered = measured(part(region, "mesh_rendering").get("psnr"))
+        if rendered is not None:
+            line += f", textured mesh PSNR {rendered:.2f} dB"
+        lines.append(line)
+    warnings = collect_warnings(report)
+    lines += [f"warning ({warning.stage}): {warning.text}" for warning in warnings]
     return lines
-
-
-def _markdown(report: dict[str, Any]) -> str:
-    cameras, training = report["cameras"], report["training"]
-    machine, settings = report["machine"], report["settings"]
-    memory = report["peak_memory_bytes"]
-    date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(report["started_unix_s"]))
-    lines = [
-        f"# Report: {report['source']}",
-        "",
-        f"Preset {settings['preset']}, seed {settings['seed']}, {date}.",
-        f"{machine['processor']}, {machine['threads']} threads, Python {machine['python']}.",
-        "",
-        "![preview](preview.png)",
-        "",
-        "## Time and memory",
-        "",
-        "| stage | seconds | |",
-        "|---|---:|---|",
-        *(
-            f"| {s['name']} | {s['seconds']:.1f} | {'finished before' if s['reused'] else ''} |"
-            for s in report["stages"]
-        ),
-        f"| this run, all in all | {report['wall_seconds']:.1f} | |",
-        "",
-        *(f"Peak memory, {k.replace('_', ' ')}: {v / 2**30:.2f} GiB." for k, v in memory.items()),
-        "",
-        "## Photos and cameras",
-        "",
-        f"{cameras['views']} photos used, {cameras['points']} sparse points.",
-        "",
-        *(f"- {k.replace('_', ' ')}: {v}" for k, v in cameras["facts"].items()),
-        *(f"- Warning: {w}" for w in cameras["warnings"]),
-        "",
-        "## Training",
-        "",
-        f"{training['gaussians']} Gaussians after {training['iterations']} iterations.",
-        "",
-        *_held_out(training),
-        *_warnings(training),
-    ]
-    for name, region in report["regions"].items():
-        lines += ["", f"## Region {name}", "", *_region(region)]
-    return "\n".join(lines) + "\n"
-
-
-def _held_out(training: dict[str, Any]) -> list[str]:
-    held_out = training["held_out"]
-    if not held_out:
-        return ["No photo was held out: there are too few. No PSNR is claimed."]
-    lines = [
-        f"Held-out photos (never trained on): PSNR {training['held_out_psnr']:.2f} dB,",
-        f"SSIM {training['held_out_ssim']:.4f}, mean of {len(held_out)}.",
-        "",
-        "| photo | PSNR dB | SSIM |",
-        "|---|---:|---:|",
-    ]
-    return lines + [f"| {p['name']} | {p['psnr']:.2f} | {p['ssim']:.4f} |" for p in held_out]
-
-
-def _warnings(values: dict[str, Any]) -> list[str]:
-    return [f"- Warning: {w}" for w in values.get("warnings", [])]
-
-
-def _region(region: dict[str, Any]) -> list[str]:
-    rows = [
-        *(("mesh: " + k, v) for k, v in region["statistics"].items()),
-        *((k, v) for k, v in _flat(region["provenance"]).items()),
-        *(("texture: " + k, v) for k, v in _flat(region["texture"]).items()),
-        *((f"seconds, {k}", v) for k, v in region["seconds"].items()),
-    ]
-    return ["| figure | value |", "|---|---:|", *(f"| {k} | {_text(v)} |" for k, v in rows)]
-
-
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, dict):
-            flat.update(_flat(value, f"{prefix}{key}, "))
-        else:
-            flat[prefix + key] = value
-    return flat
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    return str(value)

@@ -5,10 +5,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 from typing import Any
 
+from ..dataset.similarity import Similarity
 from ..evaluation.report import write_report
-from ..files import read_json, write_json
+from ..evaluation.report_markdown import CURVE, PICTURES
+from ..evaluation.report_text import finite
+from ..files import read_json, resolve_inside, write_json
 from ..progress import Progress
 from .job_file import JobFile
 from .job_folder import JobFolder
@@ -51,14 +55,19 @@ def export_results(
             shutil.rmtree(target)
         shutil.copytree(textured.folder / "files", target)
         shutil.copy2(meshed.folder / "region.json", target / "region.json")
-        write_json(target / "figures.json", _region_figures(trained, meshed, textured))
+        for picture in sorted(textured.folder.glob("comparison-*.jpg")):
+            shutil.copy2(picture, target / picture.name)
+        figures = _region_figures(trained, meshed, textured)
+        figures["world"] = _in_world_units(meshed, figures, scene.world_from_scene)
+        write_json(target / "figures.json", _plain(figures))
     shutil.copy2(regions[0][2].folder / "preview.png", result / "preview.png")
     for name, _, textured in regions:
         shutil.copy2(textured.folder / "preview.png", result / name / "preview.png")
     progress.update(0.9, "writing the report")
-    figures = {path.parent.name: read_json(path) for path in sorted(result.glob("*/figures.json"))}
+    _training_pictures(trained, result / PICTURES)
+    known = {path.parent.name: read_json(path) for path in sorted(result.glob("*/figures.json"))}
     # Regions of an earlier training stay on disk; this report is about this training.
-    all_regions = {n: f for n, f in figures.items() if f.get("training") == trained.key}
+    all_regions = {n: f for n, f in known.items() if f.get("training") == trained.key}
     write_report(result, _plain({**summary, **_whole(cameras, trained, regions)}), all_regions)
 
 
@@ -82,6 +91,32 @@ def _region_figures(trained: Stage, meshed: Stage, textured: Stage) -> dict[str,
     return _plain(figures)
 
 
+def _in_world_units(
+    meshed: Stage, figures: dict[str, Any], world_from_scene: Similarity
+) -> dict[str, Any]:
+    from ..evaluation.mesh_size import sizes_in_world
+    from ..meshing.mesh_file import load_mesh
+
+    mesh = load_mesh(meshed.folder / "mesh.npz")
+    texels = figures.get("texture", {}).get("texels_used", 0)
+    return sizes_in_world(mesh.vertices, mesh.faces, world_from_scene, texels)
+
+
+def _training_pictures(trained: Stage, folder: Path) -> None:
+    """Bring the pictures of the training there; those of an earlier training go."""
+    from ..evaluation.report_pictures import write_learning_curve
+
+    # Only these files: a region may have the name of this folder.
+    folder.mkdir(exist_ok=True)
+    for old in (*folder.glob("held-out-*.jpg"), folder / CURVE):
+        old.unlink(missing_ok=True)
+    for picture in trained.done.get("pictures", []):
+        source = resolve_inside(trained.folder, picture["file"])
+        if source is not None and source.is_file():
+            shutil.copy2(source, folder / source.name)
+    write_learning_curve(trained.done, folder / CURVE)
+
+
 def _plain(values: Any) -> Any:
-    """Return the values as JSON would read them back, so that a report is never half numpy."""
-    return json.loads(json.dumps(values))
+    """Return the values as JSON would read them back: no tuples, and nothing that is not finite."""
+    return json.loads(json.dumps(finite(values)))

@@ -177,8 +177,9 @@ def _run_training(
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         from ..dataset.photos import PhotoStore
         from ..dataset.scene_file import load_saved_scene
+        from ..evaluation.report_pictures import write_held_out
         from ..gaussians.gaussian_file import save_gaussians
-        from ..training.trainer import train
+        from ..training.trainer import held_out_views, train
 
         scene = load_saved_scene(cameras.folder)
         photos = PhotoStore(scene, training.max_image_px)
@@ -192,7 +193,14 @@ def _run_training(
             note_interrupted(folder.stages, "train", key, time.monotonic() - begun_s)
             raise
         save_gaussians(stage_folder / "gaussians.npz", result.gaussians)
-        return result.to_json()
+        measured = {figure.name: figure.psnr for figure in result.held_out}
+        shown = [
+            (index, scene.views[index].camera.name, measured[scene.views[index].camera.name])
+            for index in held_out_views(scene, training.holdout_every)
+            if scene.views[index].camera.name in measured
+        ]
+        pictures = write_held_out(result.gaussians, photos, shown, stage_folder, threads=threads)
+        return {**result.to_json(), "pictures": pictures}
 
     span = _Span(SHARES["cameras"], SHARES["cameras"] + SHARES["train"])
     return run_stage(folder.stages, "train", key, overall.stage("train", span), work)

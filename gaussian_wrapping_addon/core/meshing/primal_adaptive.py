@@ -187,6 +187,8 @@ def _distance_to_level(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> 
     away = np.abs(vacancy.vacancy(on_surface).vacancy.astype(np.float64) - tolerances.ISO_LEVEL)
     return {
         "level_error_mean": float(away.mean()),
+        "level_error_median": float(np.median(away)),
         "level_error_p95": float(np.quantile(away, 0.95)),
+        "level_error_p99": float(np.quantile(away, 0.99)),
         "level_error_max": float(away.max()),
     }

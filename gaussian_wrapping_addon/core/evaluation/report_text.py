@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Words of a report: numbers with units, spans of time, escaped Markdown, tables, bars."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+NOT_MEASURED = "not measured"
+
+BAR_CHARACTERS = 24
+_MARKUP = str.maketrans(
+    {c: f"\\{c}" for c in "\\`*_[]#~|"} | {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
+)
+
+
+def part(values: Any, *keys: str) -> dict[str, Any]:
+    """Return a dictionary inside of dictionaries; empty where a key is missing or other."""
+    for key in keys:
+        values = values.get(key) if isinstance(values, dict) else None
+    return values if isinstance(values, dict) else {}
+
+
+def items(values: Any) -> list[Any]:
+    """Return a list as it is, anything else as an empty one."""
+    return values if isinstance(values, list) else []
+
+
+def measured(value: Any) -> float | None:
+    """Return a finite number, or ``None`` for everything else (booleans and NaN too)."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def finite(values: Any) -> Any:
+    """Return JSON values with ``None`` for every number that is not finite."""
+    if isinstance(values, dict):
+        return {str(key): finite(value) for key, value in values.items()}
+    if isinstance(values, (list, tuple)):
+        return [finite(value) for value in values]
+    if isinstance(values, float) and not math.isfinite(values):
+        return None
+    return values
+
+
+def number(value: Any, unit: str = "", *, digits: int | None = None) -> str:
+    """Return a number with its unit, or :data:`NOT_MEASURED`.
+
+    Parameters
+    ----------
+    value : any
+        What a report holds; only finite numbers count as measured.
+    unit : str
+    digits : int, optional
+        Digits after the point; by default whole numbers are written whole and others with four
+        significant digits.
+    """
+    found = measured(value)
+    if found is None:
+        return NOT_MEASURED
+    if digits is not None:
+        text = f"{found:,.{digits}f}"
+    elif found == int(found) and abs(found) < 1e15:
+        text = f"{int(found):,}"
+    else:
+        text = f"{found:,.4g}" if 1e-3 <= abs(found) < 1e4 else f"{found:.3e}"
+        if 1e4 <= abs(found) < 1e9:
+            text = f"{found:,.0f}"
+    return f"{text} {unit}" if unit else text
+
+
+def plural(count: Any, one: str, many: str = "") -> str:
+    """Return a count with its noun, as ``1 photo`` or ``3 photos``."""
+    return number(count, one if count == 1 else many or one + "s")
+
+
+def percent(value: Any, digits: int = 1) -> str:
+    """Return a share as per cent; never 0 % or 100 % unless it is."""
+    share = measured(value)
+    if share is None:
+        return NOT_MEASURED
+    text = f"{100.0 * share:.{digits}f}"
+    step = 10.0**-digits
+    if share > 0.0 and float(text) == 0.0:
+        return f"less than {step:g} %"
+    if share < 1.0 and float(text) >= 100.0:
+        return f"{100.0 - step:.{digits}f} %"
+    return f"{text} %"
+
+
+def duration(seconds: Any) -> str:
+    """Return a span of time as a person would say it."""
+    found = measured(seconds)
+    if found is None:
+        return NOT_MEASURED
+    whole = max(0, round(found))
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    if minutes < 10:
+        return f"{minutes} min {rest:02d} s"
+    hours, minutes = divmod(minutes + (rest >= 30), 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
+
+
+def bytes_text(value: Any) -> str:
+    """Return bytes as MiB or GiB."""
+    found = measured(value)
+    if found is None or found <= 0:
+        return NOT_MEASURED
+    return f"{found / 2**30:.2f} GiB" if found >= 2**30 else f"{found / 2**20:.0f} MiB"
+
+
+def escaped(text: Any) -> str:
+    """Return text that Markdown shows as it is, on one line, also inside of a table."""
+    return " ".join(str(text).split()).translate(_MARKUP)
+
+
+def bar(share: float) -> str:
+    """Return a bar of text for a share of 1; anything above 0 shows."""
+    full = max(0.0, min(1.0, share)) * BAR_CHARACTERS
+    count = max(1, round(full)) if share > 0 else 0
+    return "█" * count + "░" * (BAR_CHARACTERS - count)
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], align: str) -> list[str]:
+    """Return the lines of a Markdown table.
+
+    Parameters
+    ----------
+    header : sequence of str
+    rows : sequence of sequences of str
+        Cells as Markdown: what comes from outside must be :func:`escaped` before.
+    align : str
+        One of ``l`` and ``r`` for each column.
+    """
+    marks = {"l": "---", "r": "---:"}
+    lines = [header, [marks[a] for a in align], *rows]
+    for row in lines:
+        if len(row) != len(align):
+            raise ValueError(f"a row of {len(row)} cells in a table of {len(align)} columns")
+    return [f"| {' | '.join(row)} |" for row in lines]
