@@ -9,8 +9,15 @@ from typing import Any, Final
 
 import bpy
 
-from .ops import doctor, import_operators, job_operators, job_timer, region_operators
-from .ui import panels, preferences, properties
+from .ops import (
+    doctor,
+    import_operators,
+    job_operators,
+    job_timer,
+    region_operators,
+    report_operators,
+)
+from .ui import panels, preferences, properties, report_panel
 
 _logger = logging.getLogger(__name__)
 
@@ -20,7 +27,9 @@ CLASSES: Final[tuple[type, ...]] = (
     *job_operators.CLASSES,
     *region_operators.CLASSES,
     *import_operators.CLASSES,
+    *report_operators.CLASSES,
     *panels.CLASSES,
+    *report_panel.CLASSES,
 )
 
 HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (

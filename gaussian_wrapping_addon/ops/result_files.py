@@ -17,6 +17,7 @@ from ..core.dataset.similarity import Similarity
 from ..core.errors import DatasetError, ParseError
 from ..core.files import read_json
 from .region_geometry import vertices_of_region
+from .report_data import figures_of_report
 
 # An import of this size already takes minutes; a larger claim is a broken or hostile file.
 MAX_MESH_BYTES = 4 * 2**30
@@ -87,7 +88,7 @@ def read_result(folder: Path) -> ResultFiles:
         radius,
         hashlib.sha256(scene_path.read_bytes()).hexdigest()[:16],
         regions,
-        report_figures(report),
+        figures_of_report(report),
     )
 
 
@@ -166,43 +167,3 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ParseError(path, "faces", "an index is out of range.", hint)
     return vertices, faces.astype(np.int32), corner_uvs
-
-
-def report_figures(report: Any) -> dict[str, Any]:
-    """Pick the figures that the panel shows; what a report lacks is left out.
-
-    Returns
-    -------
-    figures : dict
-        ``seconds``, ``gaussians``, ``psnr`` (held-out photos), and ``regions``: for each name
-        ``faces``, ``closed``, ``coverage``.
-    """
-    figures: dict[str, Any] = {}
-    training = _dict(report, "training")
-    for name, value in (
-        ("seconds", _dict(report).get("wall_seconds")),
-        ("gaussians", training.get("gaussians")),
-        ("psnr", training.get("held_out_psnr") if training.get("held_out") else None),
-    ):
-        if isinstance(value, (int, float)):
-            figures[name] = value
-    regions = {}
-    for name, region in _dict(report, "regions").items():
-        statistics, texture = _dict(region, "statistics"), _dict(region, "texture")
-        regions[name] = {
-            key: value
-            for key, value in (
-                ("faces", statistics.get("faces")),
-                ("closed", statistics.get("closed")),
-                ("coverage", texture.get("coverage")),
-            )
-            if isinstance(value, (int, float))
-        }
-    if regions:
-        figures["regions"] = regions
-    return figures
-
-
-def _dict(values: Any, key: str | None = None) -> dict[str, Any]:
-    inner = values if key is None or not isinstance(values, dict) else values.get(key)
-    return inner if isinstance(inner, dict) else {}

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import bpy
 
@@ -21,7 +20,7 @@ FINGERPRINT = "gwrap_fingerprint"
 WORLD_FROM_SCENE = "gwrap_world_from_scene"
 """On the frame: the similarity as JSON text, in float64, which object matrices are not."""
 FIGURES = "gwrap_figures"
-"""On the frame: figures of the report as JSON text."""
+"""On the frame: figures of the report as JSON text (``report_data.py``)."""
 REGION = "gwrap_region"
 """On meshes and regions: the name of the region in the result folder."""
 STAMP = "gwrap_stamp"
@@ -92,19 +91,7 @@ def world_from_scene(frame: bpy.types.Object) -> Similarity:
         ) from None
 
 
-def figures_of(frame: bpy.types.Object) -> dict[str, Any]:
-    """Return the figures of the report; empty where there are none."""
-    try:
-        values = json.loads(frame.get(FIGURES, "{}"))
-    except (TypeError, ValueError, RecursionError):
-        return {}
-    figures = _numbers(values)
-    regions = values.get("regions") if isinstance(values, dict) else None
-    if isinstance(regions, dict):
-        figures["regions"] = {name: _numbers(region) for name, region in regions.items()}
-    return figures
-
-
-def _numbers(values: Any) -> dict[str, Any]:
-    pairs = values.items() if isinstance(values, dict) else ()
-    return {key: value for key, value in pairs if isinstance(value, (int, float))}
+def figures_of(frame: bpy.types.Object | None) -> str:
+    """Return the figures of the report as JSON text; ``""`` where there are none."""
+    value = frame.get(FIGURES, "") if frame is not None else ""
+    return value if isinstance(value, str) else ""

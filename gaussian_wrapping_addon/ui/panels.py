@@ -9,7 +9,7 @@ from ..ops import job_timer, tags
 from ..ops.import_operators import materials_of
 from ..ops.materials import shading_of
 from ..ops.scene_objects import cameras_of
-from .text import characters_of, progress_text, time_span, wrapped_label
+from .text import characters_of, progress_text, wrapped_label
 
 _FINDING_ICONS: Final = {"error": "CANCEL", "warning": "ERROR", "fact": "INFO", "info": "INFO"}
 _MAX_FINDINGS: Final = 12
@@ -181,7 +181,6 @@ class GWRAP_PT_result(_Panel, bpy.types.Panel):
         if frame is None:
             layout.label(text="No result yet", icon="INFO")
         else:
-            self._figures(layout, tags.figures_of(frame))
             found = materials_of(frame)
             if found:
                 shading = shading_of(found[0])
@@ -199,35 +198,6 @@ class GWRAP_PT_result(_Panel, bpy.types.Panel):
         column = layout.column(align=True)
         column.operator("gwrap.open_report", icon="FILE_FOLDER")
         column.operator("gwrap.import_result", icon="IMPORT")
-
-    def _figures(self, layout: Any, figures: dict[str, Any]) -> None:
-        rows = []
-        if "psnr" in figures:
-            rows.append(("Held-Out PSNR", f"{figures['psnr']:.1f} dB"))
-        if "gaussians" in figures:
-            rows.append(("Gaussians", f"{figures['gaussians']:,}"))
-        if "seconds" in figures:
-            rows.append(("Time of Last Job", time_span(figures["seconds"])))
-        self._table(layout, rows)
-        for name, region in figures.get("regions", {}).items():
-            rows = []
-            if "faces" in region:
-                closed = {True: ", closed", False: ", open"}.get(region.get("closed"), "")
-                rows.append(("Faces", f"{region['faces']:,}{closed}"))
-            if "coverage" in region:
-                rows.append(("Texture Seen", f"{100 * region['coverage']:.1f} %"))
-            box = layout.box()
-            box.label(text=name, icon="MESH_DATA", translate=False)
-            self._table(box, rows)
-
-    def _table(self, layout: Any, rows: list[tuple[str, str]]) -> None:
-        column = layout.column(align=True)
-        for name, value in rows:
-            split = column.split(factor=0.55)
-            split.label(text=name)
-            right = split.row()
-            right.alignment = "RIGHT"
-            right.label(text=value, translate=False)
 
 
 CLASSES: Final = (

@@ -6,6 +6,8 @@ from __future__ import annotations
 import textwrap
 from typing import Any
 
+from ..core.evaluation.report_text import duration
+
 # Width of an average character of Blender's interface font at scale 1, pixels.
 _CHARACTER_PX = 6.6
 _MARGIN_PX = 60
@@ -30,14 +32,7 @@ def wrapped_label(layout: Any, text: str, characters: int, *, icon: str = "NONE"
 
 def time_span(seconds: float) -> str:
     """Return a span of time as a person would say it."""
-    whole = max(0, round(seconds))
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
-    if minutes < 10:
-        return f"{minutes} min {rest:02d} s"
-    hours, minutes = divmod(minutes + (rest >= 30), 60)
-    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
+    return duration(seconds)
 
 
 def progress_text(stage: str, fraction: float, seconds_left: float | None) -> str:

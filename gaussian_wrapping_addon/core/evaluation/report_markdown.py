@@ -25,6 +25,7 @@ from .report_text import (
     percent,
     plural,
     table,
+    words,
 )
 from .report_warnings import FEW_HELD_OUT, collect_warnings, warning_lines
 
@@ -70,7 +71,7 @@ def report_markdown(report: dict[str, Any], result: Path) -> str:
     """
     picture = _pictures_of(result)
     lines = [
-        f"# Report: {escaped(report.get('source', 'job'))}",
+        f"# Report: {words(report.get('source'), 'job')}",
         "",
         *picture("preview.png", "Left: part of a photo. Right: the textured mesh."),
         *_summary(report),
@@ -122,8 +123,8 @@ def _pictures_of(result: Path) -> Picture:
 def _summary(report: dict[str, Any]) -> list[str]:
     cameras, training = part(report, "cameras"), part(report, "training")
     preset = part(report, "settings").get("preset")
-    photos = plural(cameras.get("views"), "photo")
-    made = f"From {photos}, {number(training.get('gaussians'), 'Gaussians')} were trained"
+    made = f"Photos used: {number(cameras.get('views'))}. "
+    made += f"Gaussians trained on them: {number(training.get('gaussians'))}"
     if preset:
         made += f" (preset {escaped(preset)})"
     lines = ["## Summary", "", f"- **What was made.** {made}."]
@@ -144,7 +145,7 @@ def _how_long(report: dict[str, Any]) -> str:
     stages = [(s, measured(s.get("seconds"))) for s in map(part, items(report.get("stages")))]
     known = [(s, seconds) for s, seconds in stages if seconds is not None]
     total = sum(seconds for _, seconds in known)
-    text = f"This run took {duration(report.get('wall_seconds'))}."
+    text = f"Time of this run: {duration(report.get('wall_seconds'))}."
     reused = [_stage_name(s) for s, _ in stages if s.get("reused") is True]
     if reused:
         text = f"{text[:-1]}; taken over from an earlier run: {', '.join(reused)}."
@@ -161,7 +162,8 @@ def _how_exact(training: dict[str, Any]) -> str:
     held_out = items(training.get("held_out"))
     psnr = measured(training.get("held_out_psnr"))
     if not held_out or psnr is None:
-        return "No photo was held out, so how exact new views are was not measured."
+        why = "No photo was held out: how" if training.get("held_out") == [] else "How"
+        return f"{why} exact new views are was {NOT_MEASURED}."
     text = (
         f"{plural(len(held_out), 'photo')} never trained on "
         f"{'is' if len(held_out) == 1 else 'are'} reproduced by the Gaussians with a PSNR of "
@@ -201,7 +203,7 @@ def _how_seen(report: dict[str, Any]) -> str:
 
 
 def _stage_name(stage: dict[str, Any]) -> str:
-    kind, _, region = str(stage.get("name", "?")).partition("-")
+    kind, _, region = str(stage.get("name") or "unknown").partition("-")
     return f"{_STAGES.get(kind, escaped(kind))} {escaped(region)}".strip()
 
 
@@ -226,10 +228,10 @@ def _time(report: dict[str, Any]) -> list[str]:
     lines = table(("stage", "time", "share", ""), rows, "lrrl")
     memory = part(report, "peak_memory_bytes")
     lines += ["", "Largest memory in use in this run:", ""]
-    for key, words in _MEMORY.items():
+    for key, process in _MEMORY.items():
         value = memory.get(key)
         text = "none ran" if key != "worker" and value == 0 else bytes_text(value)
-        lines.append(f"- {words}: {text}")
+        lines.append(f"- {process}: {text}")
     return lines
 
 
@@ -241,16 +243,16 @@ def _cameras(cameras: dict[str, Any]) -> list[str]:
     ]
     if "mean_reprojection_error_px" not in facts:
         rows.append((_FACTS["mean_reprojection_error_px"][0], NOT_MEASURED))
-    for key, (words, unit) in _FACTS.items():
+    for key, (name, unit) in _FACTS.items():
         if key not in facts:
             continue
         value = facts[key]
         if measured(value) is not None:
             text = number(value, unit)
         else:
-            words_of_value = ", ".join(map(str, value)) if isinstance(value, list) else value
-            text = f"{escaped(words_of_value)} {unit}".strip()
-        rows.append((words, text))
+            listed = ", ".join(str(v) for v in value if v) if isinstance(value, list) else value
+            text = f"{words(listed)} {unit}".strip()
+        rows.append((name, text))
     lines = table(("photos and cameras", "figure"), rows, "lr")
     if facts.get("kind") == "photos":
         lines += [
@@ -275,7 +277,8 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
         *picture(f"{PICTURES}/{CURVE}", "How training went."),
     ]
     if not held_out:
-        return [*lines, f"No photo was held out: PSNR and SSIM of new views were {NOT_MEASURED}."]
+        why = "No photo was held out: " if training.get("held_out") == [] else ""
+        return [*lines, f"{why}PSNR and SSIM of new views were {NOT_MEASURED}."]
     lines += [
         (
             "Photos held out were never trained on; they tell how well the Gaussians know views "
@@ -284,7 +287,7 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
         "",
     ]
     perceptual = any(measured(figure.get("lpips")) is not None for figure in held_out)
-    rows = [_held_out_row(escaped(f.get("name", "?")), f, perceptual) for f in held_out]
+    rows = [_held_out_row(words(f.get("name")), f, perceptual) for f in held_out]
     mean = {key: training.get(f"held_out_{key}") for key in ("psnr", "ssim", "lpips")}
     rows.append(_held_out_row("**mean**", mean, perceptual))
     header = ["photo held out", "PSNR", "typical error", "SSIM (1 is equal)"]
@@ -294,14 +297,15 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
     shown: list[str] = []
     for entry in map(part, items(training.get("pictures"))):
         psnr = number(entry.get("psnr"), "dB", digits=1)
-        shown += picture(f"{PICTURES}/{entry.get('file', '')}", f"{entry.get('name')}, {psnr}")
+        caption = f"{entry.get('name') or 'photo'}, {psnr}"
+        shown += picture(f"{PICTURES}/{entry.get('file')}", caption)
     if not shown:
         return [*lines, "", "There are no pictures of the photos held out."]
     lines += [
         "",
         (
             "Left the photo, in the middle what the Gaussians show from the same place, right the "
-            "error: black is none, violet about 6 %, red 12 %, orange 19 %, and ivory a quarter "
+            "error: black is none, violet about 6 %, red 12 %, orange 19 %, and white a quarter "
             "of full brightness or more. The worst photo comes first."
         ),
         "",
@@ -323,16 +327,16 @@ def _machine(report: dict[str, Any]) -> list[str]:
     if started is not None:
         date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(started))
     packages = part(machine, "packages")
-    versions = ", ".join(f"{escaped(k)} {escaped(v)}" for k, v in packages.items())
+    versions = ", ".join(f"{escaped(k)} {words(v)}" for k, v in packages.items())
     threads = f"{number(machine.get('threads'), 'threads')} used"
-    system, python = machine.get("system", "unknown"), machine.get("python", "unknown")
-    preset, seed = settings.get("preset", "unknown"), settings.get("seed", "unknown")
-    processor, cores = machine.get("processor", "unknown"), number(machine.get("cores"), "cores")
+    system, python = words(machine.get("system")), words(machine.get("python"))
+    preset, seed = words(settings.get("preset")), words(settings.get("seed"))
+    processor, cores = words(machine.get("processor")), number(machine.get("cores"), "cores")
     return [
         f"- Started: {date}",
-        f"- Processor: {escaped(processor)}, {cores}, {threads}",
+        f"- Processor: {processor}, {cores}, {threads}",
         f"- Memory of the machine: {bytes_text(machine.get('memory_bytes'))}",
-        f"- System: {escaped(system)}, Python {escaped(python)}",
+        f"- System: {system}, Python {python}",
         f"- Packages: {versions or 'unknown'}",
-        f"- Preset: {escaped(preset)}; seed: {escaped(seed)}",
+        f"- Preset: {preset}; seed: {seed}",
     ]

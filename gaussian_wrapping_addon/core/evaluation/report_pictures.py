@@ -153,7 +153,10 @@ def write_held_out(
         columns = [
             ("Photo", photo),
             (f"Gaussians, {psnr:.1f} dB", np.rint(255.0 * rendering).astype(np.uint8)),
-            (f"Error x {ERROR_GAIN:g}", error_map(photo, rendering, mask)),
+            (
+                f"Error x {ERROR_GAIN:g} (white: {1 / ERROR_GAIN:.0%} or more)",
+                error_map(photo, rendering, mask),
+            ),
         ]
         file = f"held-out-{number}.jpg"
         write_bytes(folder / file, strip(columns))
@@ -188,8 +191,8 @@ def write_learning_curve(training: dict[str, Any], path: Path) -> bool:
         curves.append(Series("photos held out (mean, at the end)", [(end, held_out)], line=False))
     growth = [Series("Gaussians", count, dots=dots)]
     panels = [
-        Panel("Likeness to the photos", "iteration", "PSNR (dB)", curves, True, False, False),
-        Panel("Growth", "iteration", "Gaussians (thousands)", growth, True, False, False),
+        Panel("Likeness to the photos", "iteration", "PSNR (dB)", curves, False, False, False),
+        Panel("Growth", "iteration", "Gaussians (thousands)", growth, False, False, False),
     ]
     write_svg(panels, path)
     return True

@@ -17,6 +17,7 @@ from .report_text import (
     percent,
     plural,
     table,
+    words,
 )
 
 Picture = Callable[[str, str], list[str]]
@@ -165,10 +166,15 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
         "mask": "Counted are the pixels inside of the photos' masks.",
         "covered": "Counted are only the pixels that the mesh covers.",
     }.get(str(rendering.get("pixels")), "")
-    rows = [_view_row(escaped(view.get("name", "?")), view, perceptual) for view in views]
+    rows = [_view_row(words(view.get("name")), view, perceptual) for view in views]
     rows.append(_view_row("**mean**", rendering, perceptual))
     header = ["photo", "PSNR", "SSIM (1 is equal)", "of the photo covered"]
-    lines = [f"Unlit, as baked, seen from the photos' cameras. {where}".strip(), ""]
+    trained = {
+        "True": "The Gaussians were not trained on these photos.",
+        "False": "The Gaussians were trained on these photos.",
+    }.get(str(rendering.get("held_out")), "")
+    intro = ("The textured mesh, unlit, seen from the photos' cameras.", where, trained)
+    lines = [" ".join(filter(None, intro)), ""]
     lines += table(header + ["LPIPS (0 is equal)"] * perceptual, rows, "lrrr" + "r" * perceptual)
     left_out = measured(rendering.get("left_out"))
     if left_out:
@@ -191,8 +197,9 @@ def _notes(rendering: dict[str, Any]) -> list[str]:
     lines = []
     for key, begin in (("note", ""), ("lpips_note", f"LPIPS was {NOT_MEASURED}: ")):
         text = rendering.get(key)
-        if isinstance(text, str) and text:
-            lines += ["", begin + escaped(text)]
+        if isinstance(text, str) and text.strip():
+            sentence = begin + text.strip().rstrip(".")
+            lines += ["", escaped(sentence[:1].upper() + sentence[1:]) + "."]
     return lines
 
 
@@ -200,5 +207,5 @@ def _comparisons(name: str, region: dict[str, Any], picture: Picture) -> list[st
     lines = []
     for file in items(part(region, "mesh_rendering").get("pictures")):
         if isinstance(file, str):
-            lines += picture(f"{name}/{file}", "Photo, textured mesh, and error.")
+            lines += picture(f"{name}/{file}", "Left the photo, right the textured mesh.")
     return lines

@@ -122,6 +122,11 @@ def escaped(text: Any) -> str:
     return " ".join(str(text).split()).translate(_MARKUP)
 
 
+def words(value: Any, instead: str = "unknown") -> str:
+    """Return text from outside, escaped, or other words where there is none."""
+    return instead if value is None or value == "" else escaped(value)
+
+
 def bar(share: float) -> str:
     """Return a bar of text for a share of 1; anything above 0 shows."""
     full = max(0.0, min(1.0, share)) * BAR_CHARACTERS

@@ -111,9 +111,9 @@ def _judge_cameras(facts: dict[str, Any]) -> list[ReportWarning]:
 
 
 def _judge_training(training: dict[str, Any]) -> list[ReportWarning]:
-    if not training:
+    if not isinstance(training.get("held_out"), list):
         return []
-    count = len(items(training.get("held_out")))
+    count = len(training["held_out"])
     if count == 0:
         text = "No photo was held out: how exact new views are was not measured."
         return [ReportWarning("training", text, "Take more photos, or allow held-out photos.")]

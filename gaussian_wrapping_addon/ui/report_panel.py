@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The sub-panel "Report" of the result: times, exactness, regions, warnings."""
+
+from typing import Any, Final
+
+import bpy
+
+from ..ops import tags
+from ..ops.report_data import Row, report_of
+from .text import characters_of, wrapped_label
+
+_MAX_WARNINGS: Final = 8
+
+
+class GWRAP_PT_report(bpy.types.Panel):
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "Gaussian Wrapping"
+    bl_parent_id = "GWRAP_PT_result"
+    bl_label = "Report"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        frame = tags.current_frame(context.scene, context.view_layer.objects.active)
+        report = report_of(tags.figures_of(frame))
+        if not report.known:
+            layout.label(text="No report yet", icon="INFO")
+            return
+        self._table(layout, report.rows)
+        if report.stages:
+            box = layout.box()
+            box.label(text="Time of the Stages", icon="TIME")
+            self._table(box, report.stages)
+        for region in report.regions:
+            box = layout.box()
+            box.label(text=region.name, icon="MESH_DATA", translate=False)
+            self._table(box, region.rows)
+        self._warnings(layout, report.warnings, characters_of(context))
+        column = layout.column(align=True)
+        column.operator("gwrap.read_report", icon="TEXT")
+        column.operator("gwrap.show_pictures", icon="IMAGE_DATA")
+
+    def _warnings(self, layout: Any, warnings: tuple[str, ...], characters: int) -> None:
+        if not warnings:
+            layout.label(text="No warnings", icon="CHECKMARK")
+            return
+        box = layout.box()
+        for text in warnings[:_MAX_WARNINGS]:
+            wrapped_label(box, text, characters - 4, icon="ERROR")
+        more = len(warnings) - _MAX_WARNINGS
+        if more > 0:
+            box.label(text=f"and {more} more in the report", translate=False)
+
+    def _table(self, layout: Any, rows: tuple[Row, ...]) -> None:
+        column = layout.column(align=True)
+        for name, value in rows:
+            split = column.split(factor=0.55)
+            split.label(text=name, translate=False)
+            right = split.row()
+            right.alignment = "RIGHT"
+            right.label(text=value, translate=False)
+
+
+CLASSES: Final = (GWRAP_PT_report,)
