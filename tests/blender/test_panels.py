@@ -13,7 +13,7 @@ from gaussian_wrapping_addon.core.jobs.doctor import Diagnosis
 from gaussian_wrapping_addon.core.jobs.job_folder import STATES, JobStatus
 from gaussian_wrapping_addon.ops import doctor, job_timer, tags
 from gaussian_wrapping_addon.ops.scene_objects import import_result
-from gaussian_wrapping_addon.ui import panels, preferences
+from gaussian_wrapping_addon.ui import panels, preferences, report_panel
 from gaussian_wrapping_addon.ui.text import progress_text, time_span
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.synthetic_result import write_result
@@ -42,7 +42,7 @@ def show(status: JobStatus, command: str = "WRAP") -> None:
     job_timer.watch(scene, Path("/tmp/gwrap-none"), FakeClient(status), imports=False)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("panel", panels.CLASSES)
+@pytest.mark.parametrize("panel", [*panels.CLASSES, *report_panel.CLASSES])
 def test_every_panel_draws_in_an_empty_file(panel: type) -> None:
     layout = draw(panel)
     assert layout.log
@@ -95,7 +95,7 @@ def test_region_and_result_panels_with_a_result(tmp_path: Path) -> None:
     bpy.context.view_layer.update()
     assert "auto region" in draw(panels.GWRAP_PT_region).texts
     layout = draw(panels.GWRAP_PT_result)
-    assert "Held-Out PSNR" in layout.texts
+    assert "Show Photo Cameras" in layout.texts
     assert layout.operators.count("gwrap.set_shading") == 2
     assert "gwrap.view_photo" not in layout.operators
     bpy.context.view_layer.objects.active = imported.cameras[0]
@@ -110,7 +110,7 @@ def test_result_panel_survives_edited_properties(tmp_path: Path, text: str) -> N
     imported.frame[tags.FIGURES] = text
     imported.frame[tags.RESULT] = 5
     imported.meshes[0].data.materials.clear()
-    for panel in panels.CLASSES:
+    for panel in (*panels.CLASSES, *report_panel.CLASSES):
         draw(panel)
 
 

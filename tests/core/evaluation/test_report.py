@@ -21,6 +21,7 @@ from gaussian_wrapping_addon.core.evaluation.report_text import (
     bar,
     duration,
     escaped,
+    finite,
     number,
     percent,
     table,
@@ -272,7 +273,7 @@ def test_every_number_of_the_table_has_a_unit() -> None:
 
 @pytest.mark.parametrize("value", [None, math.nan, "x"])
 def test_one_bad_figure_never_breaks_a_report(tmp_path: Path, value: Any) -> None:
-    """Whatever single value is missing or not finite, both files are written and stay sober."""
+    """Whatever single value is missing or not finite, the report is written and stays sober."""
     whole = {**full_summary(), "regions": {REGION: full_region()}}
     for path in leaves(whole):
         report = copy.deepcopy(whole)
@@ -280,15 +281,25 @@ def test_one_bad_figure_never_breaks_a_report(tmp_path: Path, value: Any) -> Non
         for key in path[:-1]:
             place = place[key]
         place[path[-1]] = value
-        regions = report.pop("regions")
-        if path[:2] != ("training", "pictures"):
-            values, text = write(tmp_path, report, regions)
-            body = text[: text.index("<details>")]
-            body = body.replace("none ran", "").replace("black is none", "")
-            assert WRONG_NUMBER.search(body) is None, path
-            assert headline(values)
-            for lines in tables(text):
-                assert len({len(cells(line)) for line in lines}) == 1
+        if path[:2] == ("training", "pictures"):
+            continue
+        values = finite(report)
+        text = report_markdown(values, tmp_path)
+        body = text[: text.index("<details>")].replace("none ran", "").replace("black is none", "")
+        assert WRONG_NUMBER.search(body) is None, path
+        assert headline(values)
+        json.dumps([w.to_json() for w in collect_warnings(values)], allow_nan=False)
+        for lines in tables(text):
+            assert len({len(cells(line)) for line in lines}) == 1
+
+
+def test_files_hold_no_number_that_is_not_finite(tmp_path: Path) -> None:
+    summary, region = full_summary(), full_region()
+    summary["training"]["held_out_psnr"] = math.nan
+    region["world"]["edge_mean"] = math.inf
+    values, text = write(tmp_path, summary, {REGION: region})
+    assert values["training"]["held_out_psnr"] is None
+    assert row(text, "Edge length, mean") == NOT_MEASURED
 
 
 @pytest.mark.parametrize("report", [{}, {"regions": {"a": {}}}, {"training": 3, "stages": {}}])

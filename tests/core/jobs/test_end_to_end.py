@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder
@@ -112,9 +114,34 @@ def test_result_files_are_there_and_agree(wrapped: tuple[BallScene, Path, str]) 
         "cameras", "train", "mesh-ball", "texture-ball",
     }  # fmt: skip
     assert figures["texture"]["coverage"] > 0.6
+    world = figures["world"]
+    mesh = world_mesh(root, "ball")
+    np.testing.assert_allclose(world["size"], np.ptp(mesh.vertices, axis=0), rtol=1e-6)
+    assert world["area"] == pytest.approx(mesh.area, rel=1e-6)
+    provenance = figures["provenance"]
+    residuals = [provenance[f"level_error_{k}"] for k in ("median", "p95", "p99", "max")]
+    assert residuals == sorted(residuals)
     ply = trimesh.load(result / "ball" / "mesh.ply", process=False)
     assert np.abs(ply.vertices - world_mesh(root, "ball").vertices).max() < 1e-6 * SCALE
     assert "PSNR" in output
+    assert "warning (" in output or not report["warnings"]
+
+
+def test_every_picture_of_the_report_is_there(wrapped: tuple[BallScene, Path, str]) -> None:
+    _, root, _ = wrapped
+    result = root / "out" / "result"
+    text = (result / "report.md").read_text(encoding="utf-8")
+    links = re.findall(r"!\[[^\n]*?\]\(([^)\s]+)\)", text)
+    pictures = json.loads((result / "report.json").read_text())["training"]["pictures"]
+    wanted = ["preview.png", "report/learning-curve.svg", "ball/preview.png"]
+    wanted += [f"report/{picture['file']}" for picture in pictures]
+    assert pictures
+    assert set(wanted) <= set(links)
+    for link in links:
+        assert (result / link).stat().st_size > 0, link
+    for picture in pictures:
+        with Image.open(result / "report" / picture["file"]) as image:
+            assert image.width <= 1500
 
 
 def test_another_region_and_resolution_needs_no_training(
