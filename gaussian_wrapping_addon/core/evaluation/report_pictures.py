@@ -105,7 +105,7 @@ def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX)
         ImageDraw.Draw(head).text((4, 3), caption, fill=_INK, font=font)
         canvas.paste(head, (left, 0))
     stream = io.BytesIO()
-    canvas.save(stream, format="JPEG", quality=JPEG_QUALITY)
+    canvas.save(stream, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
     return stream.getvalue()
 
 
