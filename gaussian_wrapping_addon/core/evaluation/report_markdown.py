@@ -184,6 +184,9 @@ def _mesh_exact(report: dict[str, Any]) -> str:
             text += f" For the textured mesh of {escaped(name)} this was {NOT_MEASURED}."
         else:
             views = plural(len(items(rendering.get("views"))), "photo")
+            note = rendering.get("note")
+            if isinstance(note, str) and note.strip():
+                views += f"; {escaped(note.strip().rstrip('.'))}"
             text += f" The textured mesh of {escaped(name)}: {psnr:.1f} dB ({views})."
     return text
 

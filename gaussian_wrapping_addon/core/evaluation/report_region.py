@@ -195,17 +195,27 @@ def _view_row(name: str, view: dict[str, Any], perceptual: bool) -> list[str]:
 
 def _notes(rendering: dict[str, Any]) -> list[str]:
     lines = []
-    for key, begin in (("note", ""), ("lpips_note", f"LPIPS was {NOT_MEASURED}: ")):
+    for key in ("note", "lpips_note"):
         text = rendering.get(key)
-        if isinstance(text, str) and text.strip():
-            sentence = begin + text.strip().rstrip(".")
-            lines += ["", escaped(sentence[:1].upper() + sentence[1:]) + "."]
+        if not isinstance(text, str) or not text.strip():
+            continue
+        text = text.strip().rstrip(".")
+        if key == "lpips_note" and not text.startswith("LPIPS"):
+            text = f"LPIPS was {NOT_MEASURED}: {text}"
+        lines += ["", escaped(text[:1].upper() + text[1:]) + "."]
     return lines
 
 
 def _comparisons(name: str, region: dict[str, Any], picture: Picture) -> list[str]:
+    rendering = part(region, "mesh_rendering")
+    shown = {view.get("picture"): view for view in map(part, items(rendering.get("views")))}
     lines = []
-    for file in items(part(region, "mesh_rendering").get("pictures")):
-        if isinstance(file, str):
-            lines += picture(f"{name}/{file}", "Left the photo, right the textured mesh.")
+    for file in items(rendering.get("pictures")):
+        if not isinstance(file, str):
+            continue
+        caption = "Left the photo, right the textured mesh."
+        if file in shown:
+            psnr = number(shown[file].get("psnr"), "dB", digits=1)
+            caption = f"{shown[file].get('name') or 'photo'}, {psnr}. {caption}"
+        lines += picture(f"{name}/{file}", caption)
     return lines

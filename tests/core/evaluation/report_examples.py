@@ -133,7 +133,13 @@ def full_region() -> dict[str, Any]:
         },
         "mesh_rendering": {
             "views": [
-                {"name": "p|q.jpg", "psnr": 18.5, "ssim": 0.45, "covered": 0.75},
+                {
+                    "name": "p|q.jpg",
+                    "psnr": 18.5,
+                    "ssim": 0.45,
+                    "covered": 0.75,
+                    "picture": "comparison-1.jpg",
+                },
                 {"name": "r.jpg", "psnr": 21.5, "ssim": 0.55, "covered": 0.5},
             ],
             "psnr": 20.0,

@@ -177,7 +177,7 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         "PSNR of 23.0 dB",
         "typical error of 7.1 % of full brightness",  # 10 ** (-23 / 20)
         "photos saw 25.0 % of the texture",
-        "20.0 dB (2 photos)",
+        "20.0 dB (2 photos; the texture was baked from all photos, these included)",
         "too few to trust",
     ):
         assert words in summary, words
@@ -224,6 +224,7 @@ def test_pictures_are_linked_exactly_where_they_are(tmp_path: Path) -> None:
     _, text = write(tmp_path)
     links = [urllib.parse.unquote(link) for link in LINK.findall(text)]
     assert sorted(links) == sorted(PICTURES)
+    assert r"*p\|q.jpg, 18.5 dB. Left the photo, right the textured mesh.*" in text
     summary = full_summary()
     summary["training"]["pictures"] = [{"file": "../../secret.jpg", "name": "x", "psnr": 1.0}]
     (tmp_path.parent / "secret.jpg").write_bytes(b"x")
