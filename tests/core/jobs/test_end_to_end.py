@@ -132,11 +132,15 @@ def test_every_picture_of_the_report_is_there(wrapped: tuple[BallScene, Path, st
     result = root / "out" / "result"
     text = (result / "report.md").read_text(encoding="utf-8")
     links = re.findall(r"!\[[^\n]*?\]\(([^)\s]+)\)", text)
-    pictures = json.loads((result / "report.json").read_text())["training"]["pictures"]
+    report = json.loads((result / "report.json").read_text())
+    pictures = report["training"]["pictures"]
+    comparisons = report["regions"]["ball"]["mesh_rendering"]["pictures"]
     wanted = ["preview.png", "report/learning-curve.svg", "ball/preview.png"]
     wanted += [f"report/{picture['file']}" for picture in pictures]
+    wanted += [f"ball/{name}" for name in comparisons]
     assert pictures
-    assert set(wanted) <= set(links)
+    assert comparisons
+    assert sorted(set(links)) == sorted(wanted)
     for link in links:
         assert (result / link).stat().st_size > 0, link
     for picture in pictures:
