@@ -30,7 +30,7 @@ ALLOWED = {
 
 # Blender's own process has only the standard library and numpy: what it loads may import no more.
 BLENDER_SIDE = ("core.jobs.client", "core.jobs.job_file", "core.dataset.check", "core.settings")
-HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "embreex")
+HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl")
 
 
 def imports_of(path: Path) -> list[tuple[int, str]]:

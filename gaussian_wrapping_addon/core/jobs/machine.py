@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 PACKAGES = (
-    "numpy", "torch", "numba", "scipy", "pycolmap", "xatlas", "shull",
+    "numpy", "torch", "numba", "scipy", "pycolmap", "xatlas", "shull", "pillow", "trimesh",
+    "libigl",
 )  # fmt: skip
 
 
