@@ -15,6 +15,7 @@ import numpy as np
 
 from ..dataset.similarity import Similarity
 from ..errors import DatasetError
+from .surface_samples import SurfaceSamples, thin_out
 
 COLLINEAR_SHARE = 1e-6
 """Second over first extent below which points count as collinear: the rotation about their line
@@ -373,9 +374,9 @@ def refine_as_tanks(
         if voxels:
             # Voxels are of the target's frame, so that both sets are equally dense.
             moving = transform.inverse().points(
-                voxel_means(transform.points(moving), voxels * threshold)
+                _thinned(transform.points(moving), voxels * threshold)
             )
-            aim = voxel_means(aim, voxels * threshold)
+            aim = _thinned(aim, voxels * threshold)
         else:
             moving, aim = _every_kth(moving), _every_kth(aim)
         stages.append(
@@ -393,15 +394,9 @@ def refine_as_tanks(
     return TanksRefinement(transform, tuple(stages))
 
 
+def _thinned(points: np.ndarray, voxel: float) -> np.ndarray:
+    return thin_out(SurfaceSamples(points, np.zeros_like(points)), voxel).points
+
+
 def _every_kth(points: np.ndarray) -> np.ndarray:
     return points[:: max(1, -(-len(points) // TANKS_MAX_POINTS))]
-
-
-def voxel_means(points: np.ndarray, voxel: float) -> np.ndarray:
-    """Return the mean of the (n, 3) points of every occupied voxel, in order of the voxels."""
-    corner = points.min(0)
-    cells = np.floor((points - corner) / voxel).astype(np.int64)
-    _, inverse, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    inverse = inverse.reshape(-1)
-    sums = [np.bincount(inverse, points[:, axis] - corner[axis]) for axis in range(3)]
-    return np.stack(sums, 1) / counts[:, None] + corner

@@ -14,7 +14,6 @@ from gaussian_wrapping_addon.core.evaluation.alignment import (
     refine_as_tanks,
     umeyama,
     umeyama_ransac,
-    voxel_means,
 )
 from gaussian_wrapping_addon.core.evaluation.pose_error import pose_errors
 
@@ -168,18 +167,12 @@ def test_the_three_stages_find_a_surface_that_is_sampled_elsewhere() -> None:
     source = nudge.inverse().points(other)
     source = np.concatenate([source, source[:300] + 4.0])  # debris outside of the crop
     found = refine_as_tanks(
-        source, target, Similarity(), 0.02, inside=lambda p: np.linalg.norm(p, axis=1) < 2.0
+        source, target, Similarity(), 0.05, inside=lambda p: np.linalg.norm(p, axis=1) < 2.0
     )
     assert len(found.stages) == 3
     assert found.stages[-1].fitness == 1.0
     # The surfaces are met to a tenth of the threshold, though no two samples coincide.
-    assert np.abs(found.transform.points(source[:17_001]) - other).max() < 0.1 * 0.02
-
-
-def test_voxel_means_are_the_means_of_their_points() -> None:
-    points = np.array([[0.0, 0, 0], [0.4, 0.2, 0], [1.5, 0, 0], [1.7, 0, 0.5]]) + 1e6
-    expected = np.array([[0.2, 0.1, 0], [1.6, 0, 0.25]]) + 1e6
-    np.testing.assert_allclose(voxel_means(points, 1.0), expected, atol=1e-9)
+    assert np.abs(found.transform.points(source[:17_001]) - other).max() < 0.1 * 0.05
 
 
 def camera(name: str, rotation: np.ndarray, center: np.ndarray) -> Camera:
