@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import logging
+import math
 import sys
 import time
 from argparse import ArgumentParser, Namespace
@@ -95,12 +96,43 @@ def _parser() -> ArgumentParser:
     for command in (wrap, mesh, resume):
         command.add_argument("--no-blend", action="store_true", help="needs no bpy")
 
+    _add_evaluate(commands.add_parser("evaluate", help="a mesh or a job against a ground truth"))
+
     check = commands.add_parser("check", help="findings about an input, without starting anything")
     check.add_argument("input", type=Path)
     check.set_defaults(run=_check)
     doctor = commands.add_parser("doctor", help="findings about the worker's Python")
     doctor.set_defaults(run=_doctor)
     return parser
+
+
+def _add_evaluate(parser: ArgumentParser) -> None:
+    parser.add_argument("mesh", type=Path, metavar="MESH_OR_JOB")
+    parser.add_argument("--truth", type=Path, required=True, metavar="PATH")
+    parser.add_argument(
+        "--layout", choices=("auto", "scene", "mesh", "tanks", "dtu"), default="auto"
+    )
+    parser.add_argument("--scan", type=int, help="number of the DTU scan")
+    parser.add_argument("--region", help="of the job, where it has several")
+    parser.add_argument("--cameras", type=Path, help="cameras of a mesh file: COLMAP, transforms")
+    parser.add_argument(
+        "--thresholds", type=_floats, help="shares of the truth's diagonal, comma separated"
+    )
+    parser.add_argument("--distances", type=_floats, help="lengths instead, comma separated")
+    parser.add_argument("--align", choices=("none", "cameras", "icp"))
+    parser.add_argument("--protocols", help="comma separated, of uniform,scan,legacy")
+    parser.add_argument("--samples", type=int)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=0, help="0 uses every core")
+    parser.add_argument("--out", type=Path, metavar="FILE.json")
+    parser.set_defaults(run=_evaluate)
+
+
+def _floats(text: str) -> list[float]:
+    values = [float(word) for word in text.split(",") if word]
+    if not all(math.isfinite(value) for value in values):
+        raise ValueError(text)
+    return values
 
 
 def _wrap(options: Namespace) -> int:
@@ -172,6 +204,30 @@ def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
         meshing=replace(settings.meshing, edge_length=options.edge_length, points=options.points),
         texture=replace(settings.texture, size_px=0 if size == "auto" else int(size)),
     )
+
+
+def _evaluate(options: Namespace) -> int:
+    from .core.jobs.client import worker_python
+    from .core.jobs.evaluate import run_in_worker
+
+    protocols = options.protocols
+    request = {
+        "mesh": str(options.mesh),
+        "truth": str(options.truth),
+        "layout": options.layout,
+        "scan": options.scan,
+        "region": options.region,
+        "cameras": None if options.cameras is None else str(options.cameras),
+        "shares": options.thresholds,
+        "distances": options.distances,
+        "align": options.align,
+        "protocols": None if protocols is None else [p for p in protocols.split(",") if p],
+        "samples": options.samples,
+        "seed": options.seed,
+        "threads": options.threads,
+        "out": None if options.out is None else str(options.out),
+    }
+    return run_in_worker(request, python=worker_python())
 
 
 def _check(options: Namespace) -> int:

@@ -66,7 +66,7 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
         ) from None
     options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
     try:
-        loaded = trimesh.load(path, process=False, force="mesh", **options)
+        loaded: Any = trimesh.load(path, process=False, force="mesh", **options)
         vertices = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
         faces = np.asarray(loaded.faces, np.int64).reshape(-1, 3)
     except Exception as error:  # a broken file can make a foreign reader raise anything

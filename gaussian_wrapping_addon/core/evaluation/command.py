@@ -1,0 +1,427 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Judge one mesh against one ground truth: what ``evaluate`` of the command line does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..dataset.camera import Camera
+from ..dataset.similarity import Similarity
+from ..dataset.source_kind import read_poses, source_kind
+from ..errors import DatasetError, ParseError, UsageError
+from ..files import read_json
+from ..progress import Progress
+from .alignment import IcpResult, icp
+from .dtu_chamfer import DENSITY_MM, MAX_DISTANCE_MM, PATCH_MM
+from .dtu_layout import align_to_scan, is_dtu_folder, read_dtu, score_dtu
+from .mesh_input import is_cloud, read_cloud, read_mesh
+from .pose_error import pose_errors
+from .surface_samples import SurfaceSamples, sample_uniformly
+from .surface_scores import PROTOCOLS, score_protocols
+from .tanks_layout import SAMPLES as TANKS_SAMPLES
+from .tanks_layout import align_to_log, is_tanks_folder, read_tanks, score_tanks
+from .truth import TRUTH_FILE, Truth, read_truth
+
+LAYOUTS = ("auto", "scene", "mesh", "tanks", "dtu")
+ALIGNMENTS = ("none", "cameras", "icp")
+SHARES = (0.0025, 0.005, 0.01)
+"""Thresholds as shares of the truth's diagonal, where none are given."""
+SAMPLES = 200_000
+ICP_REACH = (0.05, 0.01)
+"""Largest distance of pairs in the two stages of ``--align icp``, shares of the diagonal."""
+
+
+@dataclass(frozen=True)
+class EvaluationRequest:
+    """What was asked for; ``None`` means the layout's own habit."""
+
+    truth: Path
+    layout: str = "auto"
+    scan: int | None = None
+    shares: tuple[float, ...] | None = None
+    distances: tuple[float, ...] | None = None
+    align: str | None = None
+    protocols: tuple[str, ...] | None = None
+    samples: int | None = None
+    seed: int = 0
+    threads: int = 1
+
+    def checked(self) -> EvaluationRequest:
+        """Return itself.
+
+        Raises
+        ------
+        UsageError
+            An option has a value that means nothing.
+        """
+        for name, value, known in (
+            ("--layout", self.layout, LAYOUTS),
+            ("--align", self.align, ALIGNMENTS),
+        ):
+            if value is not None and value not in known:
+                raise UsageError(f"{name} {value} is not known.", f"Use {', '.join(known)}.")
+        for protocol in self.protocols or ():
+            if protocol not in PROTOCOLS:
+                raise UsageError(
+                    f"Protocol {protocol!r} is not known.", f"Use {', '.join(PROTOCOLS)}."
+                )
+        for name, values in (("--thresholds", self.shares), ("--distances", self.distances)):
+            good = values is None or (values and all(0 < v < float("inf") for v in values))
+            if not good:
+                raise UsageError(f"{name} holds no positive numbers.", "Give them with commas.")
+        if self.shares is not None and self.distances is not None:
+            raise UsageError("--thresholds and --distances were both given.", "Give one of them.")
+        if self.samples is not None and self.samples < 1:
+            raise UsageError(f"--samples {self.samples} is too few.", "Give at least 1.")
+        return self
+
+
+def find_layout(request: EvaluationRequest) -> str:
+    """Return the layout of the truth: as asked for, or by what lies there.
+
+    Raises
+    ------
+    DatasetError
+        The path does not exist, or is none of the layouts.
+    """
+    path = request.truth
+    if not path.exists():
+        raise DatasetError(f"{path} does not exist.", "Check the path after --truth.")
+    if request.layout != "auto":
+        return request.layout
+    if path.is_file():
+        return "mesh"
+    if (path / TRUTH_FILE).is_file():
+        return "scene"
+    if is_tanks_folder(path):
+        return "tanks"
+    if is_dtu_folder(path):
+        return "dtu"
+    raise DatasetError(
+        f"{path.name} is no ground truth that is known.",
+        f"Give a mesh or cloud, a folder with {TRUTH_FILE}, a scene of Tanks and Temples "
+        "(NAME_trans.txt and the files beside it), or a DTU folder (Points/stl, ObsMask).",
+    )
+
+
+def read_cameras(path: Path) -> list[Camera]:
+    """Read the cameras of a COLMAP project or transforms.json, in the frame of the file.
+
+    Of a lens with distortion its focal length and centre are taken: enough for alignment and for
+    the virtual scan, which asks only what is in sight.
+
+    Raises
+    ------
+    DatasetError, ParseError
+    """
+    cameras = []
+    for photo in read_poses(source_kind(path)).photos:
+        if photo.lens is None:
+            raise DatasetError(
+                f"The camera of {photo.name} has no photo size.", "Add w and h to transforms.json."
+            )
+        (fx, fy), (cx, cy) = photo.lens.focal, photo.lens.principal_point
+        size = photo.lens.width, photo.lens.height
+        cameras.append(Camera(photo.name, *size, fx, fy, cx, cy, photo.cam_from_world))
+    return cameras
+
+
+def evaluate_mesh(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: Sequence[Camera],
+    request: EvaluationRequest,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Align and score a mesh.
+
+    Parameters
+    ----------
+    vertices, faces : (v, 3), (f, 3)
+    cameras : sequence of Camera
+        Those of the reconstruction, in the mesh's frame; empty where not known.
+
+    Returns
+    -------
+    dict
+        Plain JSON values: layout, truth, thresholds, alignment, and the scores.
+
+    Raises
+    ------
+    UsageError, DatasetError, ParseError
+    """
+    request = request.checked()
+    layout = find_layout(request)
+    if layout == "tanks":
+        result = _tanks(vertices, faces, cameras, request, progress)
+    elif layout == "dtu":
+        result = _dtu(vertices, faces, cameras, request, progress)
+    else:
+        result = _surface(vertices, faces, cameras, request, layout, progress)
+    return {"layout": layout, "seed": request.seed, **result}
+
+
+def _require_cameras(cameras: Sequence[Camera], what: str) -> None:
+    if not cameras:
+        raise UsageError(
+            f"{what} by cameras needs the cameras of the reconstruction.",
+            "Evaluate the job folder instead of its mesh, give --cameras, or place the mesh "
+            "yourself and use --align none.",
+        )
+
+
+def _protocols(request: EvaluationRequest, cameras: Sequence[Camera]) -> tuple[str, ...]:
+    """Return the protocols asked for, or all that can be followed."""
+    if request.protocols is not None:
+        return request.protocols
+    return tuple(p for p in PROTOCOLS if p != "scan" or cameras)
+
+
+def _surface(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: Sequence[Camera],
+    request: EvaluationRequest,
+    layout: str,
+    progress: Progress,
+) -> dict[str, Any]:
+    progress.update(0.0, "reading the truth")
+    true_cameras: list[Camera] = []
+    if layout == "scene":
+        truth, diagonal = read_truth(request.truth), _scene_diagonal(request.truth / "scene.json")
+        true_cameras = read_cameras(request.truth)
+    else:
+        truth, diagonal = _mesh_truth(request)
+    align = request.align or "none"
+    transform = Similarity()
+    alignment: dict[str, Any] = {"method": align}
+    poses = None
+    if align == "cameras" or (align == "icp" and cameras and true_cameras):
+        if layout == "mesh":
+            raise UsageError(
+                "A mesh or cloud as truth has no cameras to align by.", "Use --align icp or none."
+            )
+        _require_cameras(cameras, "Alignment")
+        poses = pose_errors(cameras, true_cameras)
+        transform = poses.transform
+    if align == "icp":
+        progress.update(0.1, "aligning by nearest points")
+        transform, stages = _icp(vertices, faces, truth, transform, diagonal, request)
+        alignment["stages"] = [
+            {"fitness": s.fitness, "rmse": s.rmse, "iterations": s.iterations} for s in stages
+        ]
+    if poses is None and cameras and true_cameras:
+        poses = pose_errors(cameras, true_cameras)
+    viewers = true_cameras or [camera.moved(transform) for camera in cameras]
+    protocols = _protocols(request, viewers)
+    shares = request.shares or (None if request.distances else SHARES)
+    distances = request.distances or tuple(s * diagonal for s in shares or ())
+    progress.update(0.3, "measuring distances")
+    scores = score_protocols(
+        transform.points(vertices), faces, truth, viewers, distances,
+        count=request.samples or SAMPLES, seed=request.seed, threads=request.threads,
+        protocols=protocols,
+    )  # fmt: skip
+    return {
+        "diagonal": diagonal,
+        "distances": list(distances),
+        "shares_of_diagonal": None if shares is None else list(shares),
+        "samples": request.samples or SAMPLES,
+        "truth_samples": len(truth.samples),
+        "alignment": {**alignment, "transform": transform.to_json()},
+        "pose_errors": None if poses is None else poses.to_json(),
+        "scan_cameras": len(viewers) if "scan" in protocols else 0,
+        "scores": {name: score.to_json() for name, score in scores.items()},
+    }
+
+
+def _scene_diagonal(path: Path) -> float:
+    try:
+        values = read_json(path)
+    except OSError as error:
+        raise ParseError(
+            path, "whole file", f"cannot be read: {error.strerror}.", "Make the scene again."
+        ) from None
+    diagonal = values.get("diagonal") if isinstance(values, dict) else None
+    if isinstance(diagonal, bool) or not isinstance(diagonal, (int, float)) or not diagonal > 0:
+        raise ParseError(path, "diagonal", "a length was expected.", "Make the scene again.")
+    return float(diagonal)
+
+
+def _mesh_truth(request: EvaluationRequest) -> tuple[Truth, float]:
+    path = request.truth
+    if not path.is_file():
+        raise DatasetError(f"{path} is not a file.", "Give a mesh or a cloud, or another --layout.")
+    if is_cloud(path):
+        points = read_cloud(path)
+        truth = Truth(SurfaceSamples(points, np.zeros_like(points)))
+    else:
+        mesh = read_mesh(path)
+        count = request.samples or SAMPLES
+        # Another seed than the prediction's: equal samples would flatter equal meshes.
+        truth = Truth(sample_uniformly(*mesh, count, seed=request.seed + 1), *mesh)
+        points = mesh[0][np.unique(mesh[1])]
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    if not diagonal > 0:
+        raise ParseError(path, "vertices", "all lie in one place.", "Export the file again.")
+    return truth, diagonal
+
+
+def _icp(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    truth: Truth,
+    start: Similarity,
+    diagonal: float,
+    request: EvaluationRequest,
+) -> tuple[Similarity, list[IcpResult]]:
+    """Two stages of ICP with scale on even samples, from far pairs to near ones."""
+    points = sample_uniformly(
+        vertices, faces, min(request.samples or SAMPLES, SAMPLES), seed=request.seed
+    ).points
+    stages: list[IcpResult] = []
+    for reach in ICP_REACH:
+        moving = points
+        if truth.crop is not None:
+            moving = points[truth.crop.inside(start.points(points))]
+        stages.append(
+            icp(
+                moving,
+                truth.samples.points,
+                start,
+                max_distance=reach * diagonal,
+                with_scale=True,
+                threads=request.threads,
+            )
+        )
+        start = stages[-1].transform
+    return start, stages
+
+
+def _tanks(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: Sequence[Camera],
+    request: EvaluationRequest,
+    progress: Progress,
+) -> dict[str, Any]:
+    if request.shares is not None or len(request.distances or (0.0,)) > 1:
+        raise UsageError(
+            "Tanks and Temples judges at one distance.", "Give it with --distances, or leave it."
+        )
+    progress.update(0.0, "reading the truth")
+    scene = read_tanks(request.truth, request.distances[0] if request.distances else None)
+    align = request.align or "icp"
+    start = Similarity()
+    alignment: dict[str, Any] = {"method": align}
+    if align == "cameras" or (align == "icp" and (cameras or request.align is None)):
+        _require_cameras(cameras, "Alignment")
+        found = align_to_log(cameras, scene, seed=request.seed)
+        start = found.transform
+        alignment["cameras"] = {
+            "matched": len(found.inliers),
+            "agreeing": int(found.inliers.sum()),
+            "rmse": found.rmse,
+            "transform": start.to_json(),
+        }
+    samples = request.samples or TANKS_SAMPLES
+    protocols = _protocols(request, cameras)
+    scores = score_tanks(
+        vertices, faces, cameras, scene, start,
+        refine=align == "icp", protocols=protocols, samples=samples,
+        seed=request.seed, threads=request.threads, progress=progress.span(0.1, 1.0),
+    )  # fmt: skip
+    return {
+        "scene": scene.name,
+        "distances": [scene.threshold],
+        "voxel": scene.threshold / 2,
+        "samples": samples,
+        "truth_samples": len(scene.cloud),
+        "alignment": alignment,
+        "scan_cameras": len(cameras) if "scan" in protocols else 0,
+        "scores": scores,
+    }
+
+
+def _dtu(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: Sequence[Camera],
+    request: EvaluationRequest,
+    progress: Progress,
+) -> dict[str, Any]:
+    if request.scan is None:
+        raise UsageError("A DTU folder holds many scans.", "Say which: --scan 24.")
+    if request.shares or request.distances or request.protocols or request.samples:
+        raise UsageError(
+            "DTU has its own protocol.", "Leave --thresholds, --distances, --protocols, --samples."
+        )
+    align = request.align or "cameras"
+    if align == "icp":
+        raise UsageError("DTU is aligned by its known cameras.", "Use --align cameras or none.")
+    progress.update(0.0, "reading the truth")
+    truth = read_dtu(request.truth, request.scan)
+    transform = Similarity()
+    alignment: dict[str, Any] = {"method": align}
+    if align == "cameras":
+        _require_cameras(cameras, "Alignment")
+        found = align_to_scan(cameras, truth)
+        transform = found.transform
+        alignment |= {"source": truth.camera_source, **found.to_json()}
+    progress.update(0.2, "measuring distances")
+    score = score_dtu(vertices, faces, truth, transform, seed=request.seed)
+    return {
+        "scan": truth.scan,
+        "density_mm": DENSITY_MM,
+        "patch_mm": PATCH_MM,
+        "max_distance_mm": MAX_DISTANCE_MM,
+        "truth_samples": len(truth.cloud),
+        "alignment": {"transform": transform.to_json(), **alignment},
+        "scores": {"dtu": score.to_json()},
+    }
+
+
+def table(result: dict[str, Any]) -> list[str]:
+    """Return the scores as lines for a terminal."""
+    align = result["alignment"]["method"]
+    lines = [f"layout {result['layout']}, alignment {align}, seed {result['seed']}"]
+    if result["layout"] == "dtu":
+        score = result["scores"]["dtu"]
+        for name in ("accuracy", "completeness", "overall"):
+            lines.append(f"{name:13s} {_figure(score[name])} mm")
+        return lines
+    lines.append(f"{'protocol':9s} {'distance':>10s} {'precision':>9s} {'recall':>9s} {'F1':>9s}")
+    for protocol, entry in result["scores"].items():
+        if result["layout"] == "tanks":
+            score = entry["score"]
+            rows = [(score["threshold"], score["precision"], score["recall"], score["f1"])]
+        else:
+            names = ("thresholds", "precision", "recall", "f1")
+            rows = list(zip(*(entry[name] for name in names), strict=True))
+        for distance, *figures in rows:
+            texts = " ".join(f"{figure:9.4f}" for figure in figures)
+            lines.append(f"{protocol:9s} {distance:10.4g} {texts}")
+    if result["layout"] != "tanks":
+        for protocol, entry in result["scores"].items():
+            lines.append(
+                f"{protocol:9s} Chamfer mean {_figure(entry['chamfer_mean'])}, "
+                f"median {_figure(entry['chamfer_median'])}, "
+                f"normal consistency {entry['normal_consistency']:.4f}"
+            )
+    poses = result.get("pose_errors")
+    if poses:
+        lines.append(
+            f"poses     centres {100 * poses['center_share_median']:.3g} % of the spread, "
+            f"rotations {poses['rotation_degrees_median']:.3g} degrees (medians of "
+            f"{poses['cameras']})"
+        )
+    return lines
+
+
+def _figure(value: float | None) -> str:
+    return "infinite" if value is None else f"{value:.4g}"

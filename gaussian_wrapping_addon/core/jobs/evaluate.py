@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``evaluate`` of the command line: judges a mesh or a job in the worker's Python.
+
+The caller's side needs neither scipy nor libigl; the child reports on stdout, one JSON object a
+line: ``{"message"}`` while it works, ``{"line"}`` for the table, ``{"error", "hint"}`` at the end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import logging
+import os
+import subprocess
+import tempfile
+import threading
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import (
+    EXIT_CANCELLED,
+    EXIT_DONE,
+    EXIT_OTHER,
+    EXIT_RESOURCES,
+    DatasetError,
+    ParseError,
+    UsageError,
+    WorkerError,
+    WrapError,
+)
+from ..files import read_json, write_json
+from ..helper_process import child_command, child_environment, emit, kill_group
+from .job_folder import MARKER, JobFolder
+
+if TYPE_CHECKING:
+    from ..dataset.camera import Camera
+
+_logger = logging.getLogger("gaussian_wrapping")
+
+PARENT_POLL_S = 1.0
+LAST_WORDS_BYTES = 2000
+_EXTRA_PACKAGES = ("libigl", "trimesh")
+
+
+def run_in_worker(request: dict[str, Any], *, python: str) -> int:
+    """Start the child, show what it says, and return its exit code.
+
+    Parameters
+    ----------
+    request : dict
+        ``mesh`` (path of a mesh or a job folder), ``region``, ``cameras``, ``out``, and the
+        entries of :class:`~..evaluation.command.EvaluationRequest`; plain JSON values.
+    python : str
+        The worker's interpreter.
+
+    Raises
+    ------
+    WorkerError
+        It does not start, or ends without a word.
+    """
+    text = json.dumps({**request, "parent": os.getpid()}, allow_nan=False)
+    with tempfile.TemporaryFile() as words:
+        try:
+            process = subprocess.Popen(
+                child_command("jobs.evaluate", text, python=python),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=words,
+                env=child_environment(),
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise WorkerError(
+                f"{python} does not run: {error}.", "Choose another Python."
+            ) from None
+        spoken = False
+        try:
+            assert process.stdout is not None
+            for raw in process.stdout:
+                spoken = _show(raw) or spoken
+            code = process.wait()
+        except KeyboardInterrupt:
+            _logger.info("cancelled")
+            return EXIT_CANCELLED
+        finally:
+            kill_group(process)
+        if code not in (EXIT_DONE, *range(EXIT_OTHER, EXIT_CANCELLED + 1)) or (code and not spoken):
+            words.seek(max(0, words.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
+            last = words.read().decode(errors="replace").strip().splitlines()
+            reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
+            raise WorkerError(
+                f"The evaluation {reason}: {last[-1] if last else 'no output'}.",
+                "See whether batch.py doctor finds something.",
+            )
+        return code
+
+
+def _show(raw: bytes) -> bool:
+    """Log one line of the child; tell whether it was its error."""
+    try:
+        values = json.loads(raw)
+    except ValueError:
+        return False
+    if not isinstance(values, dict):
+        return False
+    if "error" in values:
+        _logger.error("error: %s", f"{values['error']} {values.get('hint', '')}".strip())
+        return True
+    if "line" in values:
+        _logger.info("%s", values["line"])
+    elif "message" in values:
+        _logger.info("[%5.1f %%] %s", 100 * float(values.get("fraction", 0)), values["message"])
+    return False
+
+
+def main(arguments: list[str]) -> int:
+    """Evaluate ``arguments = [request as JSON]`` in this process; return the exit code."""
+    try:
+        request = json.loads(arguments[0])
+        threading.Thread(target=_end_with, args=(int(request["parent"]),), daemon=True).start()
+        report, lines = _evaluate(request)
+        if request["out"]:
+            out = Path(request["out"])
+            write_json(out, report)
+            lines.append(f"written to {out}")
+    except WrapError as error:
+        emit(error=error.message, hint=error.hint)
+        return error.exit_code
+    except MemoryError:
+        emit(error="Not enough memory.", hint="Use fewer --samples or close other programs.")
+        return EXIT_RESOURCES
+    except OSError as error:
+        emit(error=f"{error}.", hint="Check the path and its permissions.")
+        return EXIT_OTHER
+    except ImportError as error:
+        emit(
+            error=f"The worker's Python lacks a package: {error}.",
+            hint="pip install -r requirements-worker.txt there.",
+        )
+        return EXIT_OTHER
+    for line in lines:
+        emit(line=line)
+    return EXIT_DONE
+
+
+def _end_with(parent: int) -> None:
+    """End this process when the one that asked has gone: nobody waits for the answer."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_POLL_S)
+    os._exit(EXIT_CANCELLED)
+
+
+def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return the report and its table."""
+    from ..evaluation.command import EvaluationRequest, evaluate_mesh, read_cameras, table
+    from ..evaluation.mesh_input import read_mesh
+    from ..parallel import default_threads
+    from ..progress import Progress, ProgressEvent
+    from .machine import describe_machine, peak_memory_bytes
+
+    begun_s, begun_unix_s = time.monotonic(), time.time()
+
+    def shares(name: str) -> tuple[Any, ...] | None:
+        return None if asked[name] is None else tuple(asked[name])
+
+    request = EvaluationRequest(
+        Path(asked["truth"]), asked["layout"], asked["scan"], shares("shares"),
+        shares("distances"), asked["align"], shares("protocols"), asked["samples"], asked["seed"],
+        asked["threads"] or default_threads(),
+    ).checked()  # fmt: skip
+    source = Path(asked["mesh"])
+    cameras: list[Camera] = []
+    if source.is_dir():
+        path = job_mesh(source, asked["region"])
+        cameras = job_cameras(source)
+    else:
+        if asked["region"]:
+            raise UsageError(f"{source.name} has no regions.", "Leave --region, or give a job.")
+        path = source
+    if asked["cameras"]:
+        place = Path(asked["cameras"])
+        cameras = job_cameras(place) if (place / MARKER).exists() else read_cameras(place)
+
+    def say(event: ProgressEvent) -> None:
+        emit(fraction=event.fraction, message=event.message)
+
+    vertices, faces = read_mesh(path)
+    result = evaluate_mesh(vertices, faces, cameras, request, Progress("evaluate", say))
+    machine = describe_machine(request.threads)
+    for name in _EXTRA_PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            machine["packages"][name] = importlib.metadata.version(name)
+    report = {
+        "version": 1,
+        "started_unix_s": begun_unix_s,
+        "seconds": time.monotonic() - begun_s,
+        "mesh": {"path": str(path.resolve()), "vertices": len(vertices), "faces": len(faces)},
+        "truth": str(request.truth.resolve()),
+        "cameras": len(cameras),
+        "asked": {**asdict(request), "truth": str(request.truth)},
+        **result,
+        "machine": machine,
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+    return report, [f"{path.name}: {len(vertices)} vertices, {len(faces)} faces", *table(result)]
+
+
+def job_mesh(folder: Path, region: str | None) -> Path:
+    """Return the world-frame mesh of a job's region.
+
+    Raises
+    ------
+    UsageError
+        The job has several regions and none was named, or lacks the one named.
+    DatasetError
+        The folder is no job, or a job without results.
+    """
+    if not (folder / MARKER).exists():
+        raise DatasetError(
+            f"{folder.name} is no job folder.", "Give the folder of --out, or a mesh file."
+        )
+    found = {path.parent.name: path for path in sorted(folder.glob("result/*/mesh.ply"))}
+    if not found:
+        raise DatasetError(f"The job {folder.name} has no mesh yet.", "Resume it first.")
+    if region is None and len(found) > 1:
+        raise UsageError(
+            f"The job {folder.name} has the regions {', '.join(found)}.", "Say which: --region."
+        )
+    if region is not None and region not in found:
+        raise UsageError(
+            f"The job {folder.name} has no region {region}.", f"It has {', '.join(found)}."
+        )
+    return found[region] if region is not None else next(iter(found.values()))
+
+
+def job_cameras(folder: Path) -> list[Camera]:
+    """Return the cameras of a job's ``result/scene.json``, in world coordinates.
+
+    Raises
+    ------
+    DatasetError
+        The job has no results yet.
+    ParseError
+        The file is not what a job writes.
+    """
+    from ..dataset.camera import Camera
+    from ..dataset.similarity import Similarity
+
+    path = JobFolder(folder).result / "scene.json"
+    if not path.is_file():
+        raise DatasetError(f"The job {folder.name} has no {path.name} yet.", "Resume it first.")
+    values = read_json(path)
+    try:
+        world_from_scene = Similarity.from_json(values["world_from_scene"])
+        return [
+            Camera.from_json({k: v for k, v in entry.items() if k != "photo"}).moved(
+                world_from_scene
+            )
+            for entry in values["cameras"]
+        ]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ParseError(
+            path, "cameras", f"not as expected ({error}).", "Export the job again with resume."
+        ) from None
