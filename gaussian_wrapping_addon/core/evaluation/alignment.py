@@ -123,7 +123,9 @@ def _pairs(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _require_plane(points: np.ndarray, name: str) -> None:
-    extents = np.linalg.svd(points - points.mean(0), compute_uv=False) / np.sqrt(len(points))
+    local = points - points.mean(0)
+    variances = np.linalg.eigvalsh(local.T @ local / len(local))[::-1]
+    extents = np.sqrt(np.maximum(variances, 0.0))
     rounding = 8 * np.finfo(np.float64).eps * np.abs(points).max()
     if extents[1] <= max(COLLINEAR_SHARE * extents[0], rounding):
         what = "in one place" if extents[0] <= rounding else "on one line"

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``evaluate`` against meshes, clouds and ground-truth scenes, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from gaussian_wrapping_addon import batch
+from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
+from gaussian_wrapping_addon.core.evaluation.command import (
+    EvaluationRequest,
+    evaluate_mesh,
+    find_layout,
+    table,
+)
+from gaussian_wrapping_addon.core.evaluation.mesh_input import is_cloud, read_cloud, read_mesh
+from gaussian_wrapping_addon.core.evaluation.surface_samples import sample_uniformly
+from gaussian_wrapping_addon.core.jobs.evaluate import job_cameras, job_mesh
+from gaussian_wrapping_addon.core.meshing.region import Region, write_region
+from gaussian_wrapping_addon.core.progress import Progress
+from tests.core.evaluation.layouts import (
+    JOB_FROM_TRUTH,
+    bumpy_sphere,
+    ring_of_cameras,
+    rotation_about,
+    write_cloud,
+    write_job,
+)
+
+MESH = bumpy_sphere(1.0, 4)
+NAMES = [f"{i}.png" for i in range(8)]
+CAMERAS = ring_of_cameras(NAMES, 4.0, np.zeros(3))
+CORNERS = np.array([[x, y, z] for x in (-2, 2) for y in (-2, 2) for z in (-2, 2)], float)
+
+
+def write_ply(path: Path, mesh: tuple[np.ndarray, np.ndarray]) -> Path:
+    path.write_bytes(trimesh.Trimesh(*mesh, process=False).export(file_type="ply"))
+    return path
+
+
+def write_scene(folder: Path) -> Path:
+    """Write a ground-truth scene folder."""
+    (folder / "sparse" / "0").mkdir(parents=True)
+    samples = sample_uniformly(*MESH, 20_000, seed=1)
+    np.savez(
+        folder / "truth.npz", vertices=MESH[0], faces=MESH[1], points=samples.points,
+        normals=samples.normals, thin=np.zeros(20_000, bool), seen=np.full(20_000, 5, np.int32),
+    )  # fmt: skip
+    write_region(folder / "crop.json", Region("crop", CORNERS))
+    diagonal = float(np.linalg.norm([4, 4, 4]))
+    (folder / "scene.json").write_text(json.dumps({"version": 1, "diagonal": diagonal}))
+    cameras, images = [], []
+    for i, camera in enumerate(CAMERAS, 1):
+        numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
+        cameras.append(f"{i} PINHOLE 96 96 " + " ".join(map(repr, numbers)))
+        # Quaternion w x y z of a rotation matrix, from its eigenvector.
+        r = camera.rotation
+        w = 0.5 * np.sqrt(max(0.0, 1 + np.trace(r)))
+        q = np.array([w, *(r[[2, 0, 1], [1, 2, 0]] - r[[1, 2, 0], [2, 0, 1]]) / (4 * w)])
+        pose = [*q, *camera.cam_from_world[:, 3]]
+        images.append(f"{i} {' '.join(f'{v:.17g}' for v in pose)} {i} {camera.name}\n")
+    model = folder / "sparse" / "0"
+    (model / "cameras.txt").write_text("\n".join(cameras) + "\n")
+    (model / "images.txt").write_text("\n".join(images) + "\n")
+    (model / "points3D.txt").write_text("1 0 0 0 9 9 9 0.1\n")
+    return folder
+
+
+def evaluate(mesh: tuple, truth: Path, cameras: list = [], **options: object) -> dict:  # noqa: B006
+    request = EvaluationRequest(truth, **options)  # type: ignore[arg-type]
+    return evaluate_mesh(*mesh, cameras, request, Progress())
+
+
+def test_a_job_against_a_scene_by_its_cameras(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    job = write_job(tmp_path / "job", MESH, CAMERAS, JOB_FROM_TRUTH)
+    out = tmp_path / "scores.json"
+    arguments = ["evaluate", str(job), "--truth", str(scene), "--align", "cameras"]
+    options = ["--protocols", "uniform,legacy", "--samples", "20000", "--out", str(out)]
+    assert batch.main([*arguments, *options]) == 0
+    report = json.loads(out.read_text())
+    assert report["layout"] == "scene"
+    np.testing.assert_allclose(
+        report["distances"], np.array([0.0025, 0.005, 0.01]) * 48**0.5, rtol=1e-12
+    )
+    uniform = report["scores"]["uniform"]
+    assert uniform["f1"] == [1.0, 1.0, 1.0]
+    assert uniform["chamfer_mean"] < 1e-6
+    assert uniform["normal_consistency"] > 0.999
+    assert report["scores"]["legacy"]["f1"][0] < 1.0
+    poses = report["pose_errors"]
+    assert poses["cameras"] == 8
+    assert poses["rotation_degrees_max"] < 1e-5
+    assert report["mesh"]["faces"] == len(MESH[1])
+    assert report["seconds"] > 0
+
+
+def test_nearest_points_undo_a_nudge_that_is_not_told(tmp_path: Path) -> None:
+    truth = write_ply(tmp_path / "truth.ply", MESH)
+    nudge = Similarity(1.01, rotation_about([1, 0, 1], 1.5), np.array([0.02, 0.01, -0.01]))
+    moved = nudge.points(MESH[0]), MESH[1]
+    left = evaluate(moved, truth, samples=20_000)
+    found = evaluate(moved, truth, samples=20_000, align="icp")
+    assert left["scores"]["uniform"]["f1"][0] < 0.9
+    assert found["scores"]["uniform"]["f1"][0] > 0.999
+    assert "scan" not in found["scores"]  # no camera is known
+    lines = table(found)
+    assert any(line.startswith("uniform") and "1.0000" in line for line in lines)
+
+
+def test_clouds_are_judged_against_as_well(tmp_path: Path) -> None:
+    cloud = tmp_path / "cloud.ply"
+    points = sample_uniformly(*MESH, 30_000, seed=5).points
+    write_cloud(cloud, points)
+    assert is_cloud(cloud)
+    np.testing.assert_array_equal(read_cloud(cloud), points)
+    grown = 1.1 * MESH[0], MESH[1]
+    result = evaluate(grown, cloud, distances=(0.2, 0.04), protocols=("uniform",), samples=20_000)
+    score = result["scores"]["uniform"]
+    assert score["f1"] == [1.0, pytest.approx(0.0, abs=0.01)]
+    assert result["shares_of_diagonal"] is None
+    bare = evaluate(MESH, cloud, distances=(0.04,), protocols=("uniform",), samples=20_000)
+    assert bare["scores"]["uniform"]["f1"] == [1.0]
+
+
+def test_what_contradicts_itself_is_refused(tmp_path: Path) -> None:
+    truth = write_ply(tmp_path / "truth.ply", MESH)
+    for options, words in (
+        ({"align": "cameras"}, "no cameras to align by"),
+        ({"shares": (0.1,), "distances": (1.0,)}, "both given"),
+        ({"distances": (-1.0,)}, "no positive numbers"),
+        ({"protocols": ("scan",)}, "needs cameras"),
+        ({"protocols": ("best",)}, "not known"),
+        ({"samples": 0}, "too few"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            evaluate(MESH, truth, **options)
+    with pytest.raises(DatasetError, match="no ground truth that is known"):
+        find_layout(EvaluationRequest(tmp_path))
+    with pytest.raises(DatasetError, match="does not exist"):
+        find_layout(EvaluationRequest(tmp_path / "none"))
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb", "stl", "off"])
+def test_every_mesh_format_is_read(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"mesh.{suffix}"
+    data = trimesh.Trimesh(*MESH, process=False).export(file_type=suffix)
+    path.write_bytes(data if isinstance(data, bytes) else data.encode())
+    vertices, faces = read_mesh(path)
+    np.testing.assert_allclose(vertices[faces], MESH[0][MESH[1]], atol=1e-6)
+
+
+def test_broken_meshes_and_clouds_are_named(tmp_path: Path) -> None:
+    mesh = write_ply(tmp_path / "mesh.ply", MESH)
+    whole = mesh.read_bytes()
+    for bad, place in (
+        (whole[:-40], "whole file"),
+        (whole.replace(b"element face 5120", b"element face 0   "), r"whole file|faces"),
+        (b"ply\nformat", "whole file"),
+    ):
+        mesh.write_bytes(bad)
+        with pytest.raises(ParseError, match=rf"mesh\.ply, ({place})"):
+            read_mesh(mesh)
+    broken = MESH[0].copy()
+    broken[7, 1] = np.nan
+    with pytest.raises(ParseError, match=r"vertex 7: is not finite"):
+        read_mesh(write_ply(mesh, (broken, MESH[1])))
+    with pytest.raises(ParseError, match=r"names a vertex that does not exist"):
+        read_mesh(write_ply(mesh, (MESH[0], MESH[1] + 9)))
+    with pytest.raises(ParseError, match="not a known mesh format"):
+        read_mesh(tmp_path / "mesh.fbx")
+    cloud = tmp_path / "cloud.ply"
+    write_cloud(cloud, np.zeros((0, 3)))
+    with pytest.raises(ParseError, match="the cloud is empty"):
+        read_cloud(cloud)
+    write_cloud(cloud, np.array([[0, 0, 0], [np.inf, 0, 0]]))
+    with pytest.raises(ParseError, match="1 of 2 are not finite"):
+        read_cloud(cloud)
+
+
+def test_a_job_tells_its_region_and_world_cameras(tmp_path: Path) -> None:
+    job = write_job(tmp_path / "job", MESH, CAMERAS, JOB_FROM_TRUTH)
+    assert job_mesh(job, None) == job / "result" / "auto" / "mesh.ply"
+    for camera, true in zip(job_cameras(job), CAMERAS, strict=True):
+        np.testing.assert_allclose(camera.center, JOB_FROM_TRUTH.points(true.center[None])[0])
+        assert camera.name == true.name
+    with pytest.raises(UsageError, match="no region head"):
+        job_mesh(job, "head")
+    (job / "result" / "head").mkdir()
+    (job / "result" / "head" / "mesh.ply").write_bytes(b"")
+    with pytest.raises(UsageError, match="auto, head"):
+        job_mesh(job, None)
+    with pytest.raises(DatasetError, match="no job folder"):
+        job_mesh(tmp_path, None)
+
+
+def test_the_exit_code_tells_bad_data(tmp_path: Path) -> None:
+    mesh = write_ply(tmp_path / "mesh.ply", MESH)
+    mesh.write_bytes(mesh.read_bytes()[:-9])
+    assert batch.main(["evaluate", str(mesh), "--truth", str(mesh)]) == 3
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="interrupts are sent otherwise there")
+def test_an_interrupt_ends_it_and_its_child(tmp_path: Path) -> None:
+    mesh = write_ply(tmp_path / "mesh.ply", MESH)
+    out = tmp_path / "scores.json"
+    entry = Path(batch.__file__)
+    process = subprocess.Popen(
+        [
+            sys.executable, str(entry), "evaluate", str(mesh), "--truth", str(mesh),
+            "--samples", "30000000", "--out", str(out),
+        ],
+        stdout=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert b"%]" in process.stdout.readline()  # the child has begun
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    child = int(children.read_text().split()[0]) if children.exists() else 0
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60) == 5
+    assert not out.exists()
+    deadline_s = time.monotonic() + 20
+    while child and time.monotonic() < deadline_s and _lives(child):
+        time.sleep(0.1)
+    assert not (child and _lives(child))
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
