@@ -29,7 +29,10 @@ ALLOWED = {
 }  # fmt: skip
 
 # Blender's own process has only the standard library and numpy: what it loads may import no more.
-BLENDER_SIDE = ("core.jobs.client", "core.jobs.job_file", "core.dataset.check", "core.settings")
+BLENDER_SIDE = (
+    "core.jobs.client", "core.jobs.evaluate", "core.jobs.job_file", "core.dataset.check",
+    "core.settings",
+)  # fmt: skip
 HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl")
 
 

@@ -13,7 +13,9 @@ import trimesh
 from scipy.io import savemat
 
 from gaussian_wrapping_addon import batch
-from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
+from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
+from gaussian_wrapping_addon.core.evaluation.command import EvaluationRequest, evaluate_mesh
 from gaussian_wrapping_addon.core.evaluation.dtu_layout import (
     align_to_scan,
     read_dtu,
@@ -21,6 +23,7 @@ from gaussian_wrapping_addon.core.evaluation.dtu_layout import (
     read_plane,
     score_dtu,
 )
+from gaussian_wrapping_addon.core.progress import Progress
 from tests.core.evaluation.layouts import (
     JOB_FROM_TRUTH,
     Mesh,
@@ -97,12 +100,7 @@ def test_points_below_the_ground_are_not_asked_for(folder: Path) -> None:
     np.testing.assert_array_equal(points @ truth.plane[:3] + truth.plane[3] > 0, above)
     vertices, faces = ball(RADIUS, MIDDLE, 5)
     kept = faces[vertices[faces].mean(1)[:, 2] > MIDDLE[2] - 10.2]
-    score = score_dtu(
-        vertices,
-        kept,
-        truth,
-        replace(JOB_FROM_TRUTH.inverse(), scale=1.0, rotation=np.eye(3), translation=np.zeros(3)),
-    )
+    score = score_dtu(vertices, kept, truth, Similarity())
     assert score.completeness < 0.12
     assert score.completeness_count == above.sum()
 
@@ -171,6 +169,12 @@ def test_wrong_files_are_refused_by_place(folder: Path, tmp_path: Path) -> None:
         read_dtu(folder, 25)
 
 
-def test_a_scan_has_to_be_named(folder: Path, tmp_path: Path) -> None:
-    job = write_job(tmp_path / "job", ball(1.0, MIDDLE, 1), CAMERAS, JOB_FROM_TRUTH)
-    assert batch.main(["evaluate", str(job), "--truth", str(folder)]) == 2
+def test_a_scan_has_to_be_named(folder: Path) -> None:
+    mesh = ball(1.0, MIDDLE, 1)
+    with pytest.raises(UsageError, match="--scan 24"):
+        evaluate_mesh(*mesh, CAMERAS, EvaluationRequest(folder), Progress())
+    request = EvaluationRequest(folder, scan=SCAN, protocols=("scan",))
+    with pytest.raises(UsageError, match="its own protocol"):
+        evaluate_mesh(*mesh, CAMERAS, request, Progress())
+    with pytest.raises(UsageError, match="needs the cameras"):
+        evaluate_mesh(*mesh, [], EvaluationRequest(folder, scan=SCAN), Progress())

@@ -12,7 +12,7 @@ import pytest
 
 from gaussian_wrapping_addon import batch
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError, WrapError
+from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.evaluation.surface_samples import face_normals
 from gaussian_wrapping_addon.core.evaluation.tanks_layout import (
     THRESHOLDS,
@@ -222,11 +222,3 @@ def test_a_cut_cloud_is_refused(copied: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ParseError, match=r"Courthouse\.ply, header"):
         read_tanks(copied)
-
-
-def test_errors_of_the_command_line_have_their_exit_code(copied: Path, tmp_path: Path) -> None:
-    (copied / "Courthouse_trans.txt").write_text("1 2 3")
-    job = write_job(tmp_path / "job", MESH, CAMERAS, JOB_FROM_TRUTH)
-    assert batch.main(["evaluate", str(job), "--truth", str(copied)]) == 3
-    assert batch.main(["evaluate", str(job), "--truth", str(copied), "--layout", "x"]) == 2
-    assert issubclass(ParseError, WrapError)
