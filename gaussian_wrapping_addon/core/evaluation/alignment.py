@@ -28,6 +28,9 @@ RANSAC_POLISH = 20
 ICP_ITERATIONS = 100
 ICP_TOLERANCE = 1e-6
 """Relative change of fitness and rmse under which ICP has converged."""
+TANKS_TOLERANCE = 1e-4
+"""The same for the three stages: at an rmse of a third of the threshold, this is a change of 3e-5
+thresholds an iteration, which no share within the threshold shows."""
 TANKS_STAGES = ((1.0, 80.0), (0.5, 20.0), (0.0, 2.0))
 """Voxel and largest distance of each refinement stage in thresholds (method.md 9.1); voxel 0 takes
 every k-th point instead."""
@@ -389,6 +392,7 @@ def refine_as_tanks(
                 max_distance=reach * threshold,
                 iterations=iterations,
                 with_scale=True,
+                tolerance=TANKS_TOLERANCE,
                 threads=threads,
             )
         )

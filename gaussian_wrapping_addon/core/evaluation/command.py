@@ -413,6 +413,9 @@ def table(result: dict[str, Any]) -> list[str]:
                 f"median {_figure(entry['chamfer_median'])}, "
                 f"normal consistency {entry['normal_consistency']:.4f}"
             )
+            if entry["thin_recall"] is not None:
+                shares = " ".join(f"{share:.4f}" for share in entry["thin_recall"])
+                lines.append(f"{protocol:9s} recall of thin parts {shares}")
     poses = result.get("pose_errors")
     if poses:
         lines.append(
