@@ -14,16 +14,14 @@ import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from gaussian_wrapping_addon.core.parallel import default_threads
 
 from .scenes import ensure_scene
 from .speed_error.document import write_document
-from .speed_error.plan import Plan, full_plan, quick_plan
-from .speed_error.poses import pose_scores
-from .speed_error.results import Result
-from .speed_error.runs import ROOT, Settings, measured, run_variant, run_wrap, score
+from .speed_error.plan import Plan, Run, full_plan, quick_plan
+from .speed_error.results import Outcome, Result
+from .speed_error.runs import ROOT, Settings, judged_by, measured, run_variant, run_wrap, warm_up
 
 _logger = logging.getLogger("benchmarks")
 
@@ -49,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     out.mkdir(parents=True, exist_ok=True)
     plan = quick_plan() if options.quick else full_plan()
     begun_s = time.monotonic()
-    folders, results, poses = carry_out(plan, settings, options.scenes)
+    outcome = carry_out(plan, settings, options.scenes)
     facts = {
         "command": f"python -m benchmarks.speed_vs_error{' --quick' if options.quick else ''}",
         "date": datetime.date.today().isoformat(),
@@ -58,41 +56,54 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "photos": plan.photos,
         "runs": settings.folder,
     }
-    write_document(out, results, poses, folders, facts)
+    write_document(out, outcome, facts)
     _logger.info("report: %s", out / "README.md")
 
 
-def carry_out(
-    plan: Plan, settings: Settings, only: Sequence[str] | None = None
-) -> tuple[dict[str, Path], list[Result], dict[str, dict[str, Any]]]:
-    """Render, run and score everything; return the scenes' folders, results and pose errors."""
+def carry_out(plan: Plan, settings: Settings, only: Sequence[str] | None = None) -> Outcome:
+    """Render, run and score everything that is planned."""
     runs = [run for run in plan.runs if not only or run.scene in only]
-    names = dict.fromkeys(run.scene for run in runs)
     photos = plan.photos
     folders = {}
-    for name in names:
-        _logger.info("scene %s", name)
+    for name in dict.fromkeys(run.scene for run in runs):
+        begun_s = time.monotonic()
         folders[name] = ensure_scene(
             name, photos=photos.count, width=photos.width, height=photos.height
         )
+        _logger.info("scene %s: %.0f s", name, time.monotonic() - begun_s)
+    warm_up(next(iter(folders.values())), settings)
     results = []
     for number, run in enumerate(runs):
-        scene = folders[run.scene]
-        folder = run_wrap(run, scene, settings)
-        scores = score(folder, scene, settings, stages=True)
-        results.append(Result(run, None, measured(folder), scores))
-        _log(f"{number + 1}/{len(runs)} {run.identity}", results[-1])
-        for variant in run.variants:
-            made = run_variant(variant, folder, scene, settings)
-            judged = score(made, scene, settings, stages=False)
-            results.append(Result(run, variant, measured(made), {**scores, **judged}))
-            _log(f"  {variant.name} {variant.parameter}", results[-1])
-    poses = {}
-    for name in plan.pose_scenes:
-        if name in folders:
-            poses[name] = pose_scores(name, folders[name], settings)
+        results += carry_out_run(run, folders[run.scene], settings)
+        _log(f"{number + 1}/{len(runs)} {run.identity}", results[-1 - len(run.variants)])
+    poses, ceilings = {}, {}
+    for name, scene in folders.items():
+        path = settings.folder / f"{name}-truth.json"
+        ceilings[name] = judged_by("score", [str(scene), str(path)], path, settings)
+        if name in plan.pose_scenes:
+            path = settings.folder / f"{name}-poses" / "poses.json"
+            arguments = [str(scene), str(path.parent)]
+            poses[name] = judged_by("poses", arguments, path, settings)
             _logger.info("poses of %s: %.0f s", name, poses[name]["seconds"])
-    return folders, results, poses
+    return Outcome(folders, results, poses, ceilings)
+
+
+def carry_out_run(run: Run, scene: Path, settings: Settings) -> list[Result]:
+    """Return the result of a run and those of its variants."""
+    folder = run_wrap(run, scene, settings)
+    job = ["--job", str(folder / "out")]
+    path = folder / "scores.json"
+    arguments = [str(scene), str(path), "--mesh", str(folder / "mesh"), *job, "--stages"]
+    scores = judged_by("score", arguments, path, settings)
+    results = [Result(run, None, measured(folder), scores)]
+    for variant in run.variants:
+        made = run_variant(variant, folder, scene, settings)
+        path = made / "scores.json"
+        arguments = [str(scene), str(path), "--mesh", str(made / "mesh"), *job]
+        judged = judged_by("score", arguments, path, settings)
+        results.append(Result(run, variant, measured(made), {**scores, **judged}))
+        _log(f"  {variant.name} {variant.parameter}", results[-1])
+    return results
 
 
 def _log(name: str, result: Result) -> None:

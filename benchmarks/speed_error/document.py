@@ -14,7 +14,7 @@ from ..tables import Cell, Table, processor, versions
 from .figures import write_plots
 from .pictures import write_comparison
 from .plan import MAIN_SCENES, THRESHOLD_SHARES
-from .results import Result, plain
+from .results import Outcome, Result, plain
 from .tables import (
     bias_table,
     cost_table,
@@ -31,34 +31,25 @@ READING = "reading.md"
 """Written by hand beside the report, with the date of the figures that it reads."""
 
 
-def write_document(
-    out: Path,
-    results: Sequence[Result],
-    poses: dict[str, dict[str, Any]],
-    folders: dict[str, Path],
-    facts: dict[str, Any],
-) -> None:
+def write_document(out: Path, outcome: Outcome, facts: dict[str, Any]) -> None:
     """Write ``README.md``, the plots and the pictures into a folder.
 
     Parameters
     ----------
     out : Path
         Must exist.
-    results : sequence of Result
-    poses : dict
-        By scene; see :mod:`.poses`.
-    folders : dict
-        Ground-truth folders by scene.
+    outcome : Outcome
     facts : dict
         ``command``, ``date``, ``minutes``, ``reused``, ``photos``, ``runs`` (folder of the runs).
     """
+    results, poses = outcome.results, outcome.poses
     write_plots(results, out / PLOTS)
-    pictures = _pictures(out, results, folders, facts["runs"])
+    pictures = _pictures(out, results, outcome.folders, facts["runs"])
     reading = out / READING
     tables = [
-        _scene_table(folders),
+        _scene_table(outcome.folders),
         cost_table(results),
-        surface_table(results),
+        surface_table(results, outcome.ceilings),
         image_table(results),
         stage_table(results, poses),
         pose_table(poses),
@@ -103,7 +94,7 @@ def _headline(results: Sequence[Result]) -> list[str]:
     """Return one sentence a scene, made from the figures alone."""
     lines = ["## In short", ""]
     for scene in MAIN_SCENES:
-        same = {r.run.preset: r for r in results if plain(r) and r.run.scene == scene}
+        same = {r.run.preset: r for r in plain(results, scene)}
         if "draft" not in same:
             continue
         words = []
@@ -138,7 +129,7 @@ def _pictures(
         "",
     ]
     for scene, folder in folders.items():
-        same = [r for r in results if plain(r) and r.run.scene == scene]
+        same = plain(results, scene)
         if not same:
             continue
         name = f"scene-{scene}.jpg"

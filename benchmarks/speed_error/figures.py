@@ -87,7 +87,7 @@ def _count(result: Result) -> float:
 def _presets(results: Sequence[Result], value: Value) -> list[Series]:
     series = []
     for scene in MAIN_SCENES:
-        same = [r for r in results if plain(r) and r.run.scene == scene]
+        same = plain(results, scene)
         points = [(r.wall_s, value(r)) for r in same]
         series.append(Series(scene, points, labels=tuple(r.run.preset for r in same)))
     return series

@@ -4,21 +4,15 @@
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gaussian_wrapping_addon.core.evaluation.pose_error import pose_errors
-
 from gaussian_wrapping_addon.core.dataset.load import load_scene
-from gaussian_wrapping_addon.core.errors import WorkerError
-from gaussian_wrapping_addon.core.files import read_json, write_json
+from gaussian_wrapping_addon.core.evaluation.pose_error import pose_errors
+from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.progress import Progress
-
-from .runs import LAST_LINES, ROOT, Settings
 
 
 def solve(scene: Path, folder: Path, threads: int) -> dict[str, Any]:
@@ -38,22 +32,6 @@ def solve(scene: Path, folder: Path, threads: int) -> dict[str, Any]:
         "solved": len(solved.cameras),
         "errors": errors.to_json(),
     }
-
-
-def pose_scores(name: str, scene: Path, settings: Settings) -> dict[str, Any]:
-    """Solve in a process of its own (the solver keeps memory), or read what was found before."""
-    folder = settings.folder / f"{name}-poses"
-    path = folder / "poses.json"
-    if not (settings.reuse and path.is_file()):
-        command = [
-            sys.executable, "-m", "benchmarks.speed_error.poses", str(scene), str(folder),
-            "--threads", str(settings.threads),
-        ]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-        if done.returncode != 0:
-            words = "\n".join((done.stdout + done.stderr).splitlines()[-LAST_LINES:])
-            raise WorkerError(f"Solving the cameras of {name} failed: {words}")
-    return dict(read_json(path))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

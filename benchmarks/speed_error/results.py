@@ -7,6 +7,7 @@ import dataclasses
 import math
 import statistics
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from .plan import Run, Variant
@@ -62,6 +63,19 @@ class Result:
         return math.nan if value is None else float(value) / float(self.scores["diagonal"])
 
 
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """Everything that a plan gave; all but the results by scene."""
+
+    folders: dict[str, Path]
+    """Ground truth."""
+    results: list[Result]
+    poses: dict[str, dict[str, Any]]
+    """Cameras solved from photos alone, of some scenes; see :mod:`.poses`."""
+    ceilings: dict[str, dict[str, Any]]
+    """Scores of the true surface itself."""
+
+
 def mean_and_spread(values: Sequence[float]) -> str:
     """Return ``mean ± standard deviation`` (of the sample), in words for a table."""
     if len(values) < 2:
@@ -78,6 +92,13 @@ def pick(results: Sequence[Result], keep: Callable[[Result], bool]) -> list[Resu
     return sorted((r for r in results if keep(r)), key=parameter)
 
 
-def plain(result: Result) -> bool:
+def plain(results: Sequence[Result], scene: str = "") -> list[Result]:
+    """Return the presets as they are, with seed 0, scene by scene (or of one scene)."""
+    scenes = list(dict.fromkeys(r.run.scene for r in results))
+    kept = [r for r in results if is_plain(r) and (not scene or r.run.scene == scene)]
+    return sorted(kept, key=lambda r: scenes.index(r.run.scene))
+
+
+def is_plain(result: Result) -> bool:
     """Tell whether a result is a preset as it is, with seed 0."""
     return not result.run.name and result.run.seed == 0 and result.variant is None

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import shutil
 import subprocess
@@ -55,6 +54,16 @@ def run_wrap(run: Run, scene: Path, settings: Settings) -> Path:
     ]  # fmt: skip
     _batch(arguments, folder, settings)
     return folder
+
+
+def warm_up(scene: Path, settings: Settings) -> None:
+    """Wrap a scene in a minute and forget it, so that no measured run compiles kernels."""
+    folder = settings.folder / "warm-up"
+    shutil.rmtree(folder, ignore_errors=True)
+    arguments = ("--iterations", "60", "--max-gaussians", "2000")
+    run = Run(scene.name, "draft", 0, "warm-up", arguments)
+    run_wrap(run, scene, dataclasses.replace(settings, folder=folder))
+    shutil.rmtree(folder)
 
 
 def run_variant(variant: Variant, base: Path, scene: Path, settings: Settings) -> Path:
@@ -111,24 +120,28 @@ def measured(folder: Path) -> dict[str, Any]:
     return dict(read_json(folder / "measured.json"))
 
 
-def score(folder: Path, scene: Path, settings: Settings, *, stages: bool) -> dict[str, Any]:
-    """Judge a run's mesh against the ground truth, in a process of its own, or read the scores.
+def judged_by(module: str, arguments: list[str], path: Path, settings: Settings) -> dict[str, Any]:
+    """Run a module of this package in a process of its own, and read the JSON that it writes.
 
     Parameters
     ----------
-    stages : bool
-        Also judge what lies before the mesh: Gaussians, depth, vacancy.
+    module : str
+        Name in this package.
+    arguments : list of str
+        Its command line, without the threads.
+    path : Path
+        The file that it writes; kept from before where the settings allow it.
+
+    Raises
+    ------
+    WorkerError
+        With the last lines of its output.
     """
-    path = folder / "scores.json"
     if not (settings.reuse and path.is_file()):
-        module = "benchmarks.speed_error.score"
-        job = folder if stages else folder.parent
-        command = [
-            sys.executable, "-m", module, str(folder), str(scene), str(job / "out"),
-            "--threads", str(settings.threads), *(["--stages"] if stages else []),
-        ]  # fmt: skip
+        name = f"{__package__}.{module}"
+        command = [sys.executable, "-m", name, *arguments, "--threads", str(settings.threads)]
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
         if done.returncode != 0:
             words = "\n".join((done.stdout + done.stderr).splitlines()[-LAST_LINES:])
-            raise WorkerError(f"Scoring {folder.name} failed: {words}")
-    return dict(json.loads(path.read_text(encoding="utf-8")))
+            raise WorkerError(f"{module} {' '.join(arguments)} failed: {words}")
+    return dict(read_json(path))

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Judge one run against the ground truth: ``python -m benchmarks.speed_error.score RUN SCENE JOB``.
+"""Judge one run against the ground truth.
+
+``python -m benchmarks.speed_error.score SCENE OUT.json [--mesh FOLDER --job FOLDER [--stages]]``;
+without a mesh, the true surface itself is judged, which shows what each protocol can reach.
 
 Everything is judged in world coordinates with the known poses: no alignment. The test views of the
 scene were never given to the job.
@@ -20,6 +23,7 @@ from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.evaluation.command import read_cameras
 from gaussian_wrapping_addon.core.evaluation.field_errors import depth_errors, vacancy_errors
 from gaussian_wrapping_addon.core.evaluation.lpips import lpips_if_ready
 from gaussian_wrapping_addon.core.evaluation.mesh_rendering import render_views
@@ -43,20 +47,38 @@ VACANCY_SAMPLES = 4000
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write ``scores.json`` into the run's folder."""
+    """Write the scores."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path)
     parser.add_argument("scene", type=Path)
-    parser.add_argument("job", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--mesh", type=Path, help="folder with mesh.npz and albedo.png")
+    parser.add_argument("--job", type=Path, help="folder of the job that made it")
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--stages", action="store_true", help="also what lies before the mesh")
     options = parser.parse_args(arguments)
     begun_s = time.monotonic()
-    scores = judge(
-        options.run / "mesh", options.scene, options.job, options.threads, options.stages
-    )
+    if options.mesh is None:
+        scores = judge_truth(options.scene, options.threads)
+    else:
+        scores = judge(options.mesh, options.scene, options.job, options.threads, options.stages)
     scores["seconds_scoring"] = time.monotonic() - begun_s
-    write_json(options.run / "scores.json", scores)
+    write_json(options.out, scores)
+
+
+def judge_truth(scene_folder: Path, threads: int) -> dict[str, Any]:
+    """Return the surface scores of the true surface itself."""
+    truth = read_truth(scene_folder)
+    diagonal = _diagonal(scene_folder)
+    thresholds = [share * diagonal for share in THRESHOLD_SHARES]
+    cameras = read_cameras(scene_folder)
+    surfaces = score_protocols(
+        truth.vertices, truth.faces, truth, cameras, thresholds, count=SURFACE_SAMPLES, seed=0,
+        threads=threads,
+    )  # fmt: skip
+    return {
+        "diagonal": diagonal,
+        "surface": {name: score.to_json() for name, score in surfaces.items()},
+    }
 
 
 def judge(mesh: Path, scene_folder: Path, job: Path, threads: int, stages: bool) -> dict[str, Any]:
@@ -75,7 +97,7 @@ def judge(mesh: Path, scene_folder: Path, job: Path, threads: int, stages: bool)
     """
     scene = load_saved_scene(stage_folder(job, "cameras"))
     truth = read_truth(scene_folder)
-    diagonal = float(read_json(scene_folder / "scene.json")["diagonal"])
+    diagonal = _diagonal(scene_folder)
     thresholds = [share * diagonal for share in THRESHOLD_SHARES]
     textured = read_textured(mesh)
     world = scene.world_from_scene
@@ -159,6 +181,10 @@ def judge_stages(
         "depth": depth,
         "vacancy": vacancy,
     }
+
+
+def _diagonal(scene_folder: Path) -> float:
+    return float(read_json(scene_folder / "scene.json")["diagonal"])
 
 
 def _finite(value: float) -> float | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..tables import Cell, Table
 from .plan import MAIN_SCENES, THRESHOLD_SHARES
-from .results import Result, mean_and_spread, pick, plain
+from .results import Result, is_plain, mean_and_spread, pick, plain
 
 SHARES = tuple(f"{100 * share:g} %" for share in THRESHOLD_SHARES)
 MIDDLE = 1
@@ -19,7 +19,7 @@ MIDDLE = 1
 def cost_table(results: Sequence[Result]) -> Table:
     """Return time, memory and size of every preset."""
     rows: list[tuple[Cell, ...]] = []
-    for r in filter(plain, results):
+    for r in plain(results):
         stages = [r.seconds(name) for name in ("cameras", "train", "mesh", "texture")]
         rows.append(
             (
@@ -39,26 +39,23 @@ def cost_table(results: Sequence[Result]) -> Table:
     return Table("What it costs", header, rows, (note,))
 
 
-def surface_table(results: Sequence[Result]) -> Table:
-    """Return the errors of the mesh of every preset."""
+def surface_table(results: Sequence[Result], ceilings: dict[str, dict[str, Any]]) -> Table:
+    """Return the errors of the mesh of every preset, and what the true surface itself gets."""
     rows: list[tuple[Cell, ...]] = []
-    for r in filter(plain, results):
-        rows.append(
+    for scene in dict.fromkeys(r.run.scene for r in results):
+        if scene in ceilings:
+            rows.append((scene, "true surface", *_surface_cells(ceilings[scene]), ""))
+        rows += [
             (
-                r.run.scene, r.run.preset,
-                *(f"{r.f1('uniform', i):.3f}" for i in range(len(SHARES))),
-                *(f"{r.f1('scan', i):.3f}" for i in range(len(SHARES))),
-                f"{r.surface('uniform', 'precision')[MIDDLE]:.3f}",
-                f"{_first(r.surface('uniform', 'visible_recall')):.3f}",
-                f"{100 * r.distance_share('chamfer_mean'):.3f}",
-                f"{r.surface('uniform', 'normal_consistency'):.3f}",
+                scene, r.run.preset, *_surface_cells(r.scores),
                 "yes" if r.region["statistics"]["closed"] else "NO",
             )
-        )  # fmt: skip
+            for r in plain(results, scene)
+        ]  # fmt: skip
     header = (
         "scene", "preset", *(f"F1 {s}" for s in SHARES), *(f"scan F1 {s}" for s in SHARES),
-        f"precision {SHARES[MIDDLE]}", f"visible recall {SHARES[MIDDLE]}", "Chamfer %",
-        "normals", "closed",
+        f"precision {SHARES[MIDDLE]}", f"visible recall {SHARES[MIDDLE]}",
+        f"thin recall {SHARES[MIDDLE]}", "Chamfer %", "normals", "closed",
     )  # fmt: skip
     notes = (
         (
@@ -67,8 +64,26 @@ def surface_table(results: Sequence[Result]) -> Table:
             "hidden sides included. Scan: only what the cameras see of either."
         ),
         "Normals: mean |cosine| between normals of counterparts, both directions.",
+        (
+            "The rows of the true surface show what a protocol can reach: a scan's points stand as "
+            "far apart as the pixels of its cameras."
+        ),
     )
     return Table("How exact the mesh is", header, rows, notes)
+
+
+def _surface_cells(scores: dict[str, Any]) -> tuple[str, ...]:
+    uniform, scan = scores["surface"]["uniform"], scores["surface"]["scan"]
+    thin, chamfer = uniform["thin_recall"], uniform["chamfer_mean"]
+    return (
+        *(f"{value:.3f}" for value in uniform["f1"]),
+        *(f"{value:.3f}" for value in scan["f1"]),
+        f"{uniform['precision'][MIDDLE]:.3f}",
+        f"{_first(uniform['visible_recall']):.3f}",
+        "" if thin is None else f"{thin[MIDDLE]:.3f}",
+        "no mesh" if chamfer is None else f"{100 * chamfer / scores['diagonal']:.3f}",
+        f"{uniform['normal_consistency']:.3f}",
+    )
 
 
 def _first(shares: Sequence[float] | None) -> float:
@@ -78,7 +93,7 @@ def _first(shares: Sequence[float] | None) -> float:
 def image_table(results: Sequence[Result]) -> Table:
     """Return the errors of images: Gaussians and textured mesh at the test views."""
     rows: list[tuple[Cell, ...]] = []
-    for r in filter(plain, results):
+    for r in plain(results):
         figures, texture = r.scores["gaussians"], r.scores["texture"]
         whole = figures["object_psnr"]
         rows.append(
@@ -109,7 +124,7 @@ def image_table(results: Sequence[Result]) -> Table:
 def stage_table(results: Sequence[Result], poses: dict[str, dict[str, Any]]) -> Table:
     """Return the error after each stage, so that one sees where it comes from."""
     rows: list[tuple[Cell, ...]] = []
-    for r in filter(plain, results):
+    for r in plain(results):
         depth, vacancy = r.scores["depth"], r.scores["vacancy"]
         pose = poses.get(r.run.scene)
         turned = None if pose is None else f"{pose['errors']['rotation_degrees_median']:.3f}"
@@ -121,7 +136,6 @@ def stage_table(results: Sequence[Result], poses: dict[str, dict[str, Any]]) -> 
                 f"{vacancy['within'][MIDDLE]:.3f}",
                 f"{100 * r.distance_share('accuracy_median'):.3f}",
                 f"{r.surface('uniform', 'recall')[MIDDLE]:.3f}",
-                _thin(r),
                 f"{r.scores['gaussians']['psnr'] - r.scores['texture']['psnr']:.2f}",
             )
         )  # fmt: skip
@@ -129,8 +143,7 @@ def stage_table(results: Sequence[Result], poses: dict[str, dict[str, Any]]) -> 
         "scene", "preset", "solved poses, median deg", "depth median %",
         f"depth in {SHARES[MIDDLE]}",
         "vacancy offset %", "offset size %", f"in {SHARES[MIDDLE]}", "mesh median %",
-        f"mesh recall {SHARES[MIDDLE]}", f"thin recall {SHARES[MIDDLE]}",
-        "Gaussians less texture dB",
+        f"mesh recall {SHARES[MIDDLE]}", "Gaussians less texture dB",
     )  # fmt: skip
     notes = (
         (
@@ -149,11 +162,6 @@ def stage_table(results: Sequence[Result], poses: dict[str, dict[str, Any]]) -> 
 
 def _percent(share: float | None) -> str:
     return "none found" if share is None else f"{100 * share:.3f}"
-
-
-def _thin(result: Result) -> str | None:
-    shares = result.surface("uniform", "thin_recall")
-    return None if shares is None else f"{shares[MIDDLE]:.3f}"
 
 
 def pose_table(poses: dict[str, dict[str, Any]]) -> Table:
@@ -268,7 +276,7 @@ def varied(results: Sequence[Result], name: str, scenes: tuple[str, ...]) -> lis
         r
         for r in results
         if r.run.scene in names & set(scenes)
-        and (_name(r) == name or (plain(r) and r.run.preset == "draft"))
+        and (_name(r) == name or (is_plain(r) and r.run.preset == "draft"))
     ]
     return sorted(chosen, key=lambda r: (scenes.index(r.run.scene), _place(r, name)))
 

@@ -14,7 +14,7 @@ import pytest
 from benchmarks.speed_error import document
 from benchmarks.speed_error.figures import write_plots
 from benchmarks.speed_error.plan import MAIN_SCENES, Plan, Run, full_plan, quick_plan
-from benchmarks.speed_error.results import Result, mean_and_spread, plain
+from benchmarks.speed_error.results import Outcome, Result, mean_and_spread, plain
 from benchmarks.speed_error.tables import (
     bias_table,
     cost_table,
@@ -105,8 +105,8 @@ def test_the_full_plan_covers_what_the_report_promises() -> None:
 @pytest.mark.parametrize("plan", PLANS, ids=["full", "quick"])
 def test_tables_hold_one_row_for_what_they_compare(plan: Plan) -> None:
     found = results(plan)
-    plains = [r for r in found if plain(r)]
-    for table in (cost_table(found), surface_table(found), image_table(found)):
+    plains = plain(found)
+    for table in (cost_table(found), surface_table(found, {}), image_table(found)):
         assert [row[:2] for row in table.rows] == [(r.run.scene, r.run.preset) for r in plains]
         check(table)
     stages = stage_table(found, POSES)
@@ -114,7 +114,13 @@ def test_tables_hold_one_row_for_what_they_compare(plan: Plan) -> None:
     assert next(row[2] for row in stages.rows if row[0] == "spot") == "0.031"
     assert {row[2] for row in stages.rows if row[0] != "spot"} == {None}
     assert "none found" in {row[5] for row in stages.rows}
-    assert next(row[10] for row in stages.rows if row[0] == "wheel") is not None
+    true = {"spot": found[0].scores}
+    surfaces = surface_table(found, true)
+    check(surfaces)
+    assert surfaces.rows[0][:3] == ("spot", "true surface", surfaces.rows[1][2])
+    thin = surfaces.header.index("thin recall 0.5 %")
+    assert {bool(row[thin]) for row in surfaces.rows if row[0] == "wheel"} == {True}
+    assert {bool(row[thin]) for row in surfaces.rows if row[0] != "wheel"} == {False}
     check(pose_table(POSES))
     (spot, *_) = seed_table(found).rows
     assert spot[:2] == ("spot", 3)
@@ -136,10 +142,10 @@ def check(table: Table) -> None:
 
 
 def test_an_open_mesh_is_shown_as_such() -> None:
-    rows = {row[-1] for row in surface_table(results(quick_plan())).rows}
+    rows = {row[-1] for row in surface_table(results(quick_plan()), {}).rows}
     assert rows == {"yes"} or rows == {"yes", "NO"}
     broken = result(Run("spot", "draft"), None, 3)
-    assert surface_table([broken]).rows[0][-1] == "NO"
+    assert surface_table([broken], {}).rows[0][-1] == "NO"
 
 
 def test_spread_is_that_of_a_sample() -> None:
@@ -173,7 +179,7 @@ def test_the_document_names_machine_seed_and_roles(
         "command": "the command", "date": "2026-01-02", "minutes": 12.0, "reused": False,
         "photos": plan.photos, "runs": tmp_path,
     }  # fmt: skip
-    document.write_document(tmp_path, results(plan), POSES, folders, facts)
+    document.write_document(tmp_path, Outcome(folders, results(plan), POSES, {}), facts)
     text = (tmp_path / "README.md").read_text(encoding="utf-8")
     for words in ("the command", "2026-01-02", "2 threads", "Seed 0", "Sober words.", "| test "):
         assert words in text

@@ -95,7 +95,7 @@ bpy.ops.gwrap.import_result(directory=str(write_result(Path({str(tmp_path)!r}) /
 for panel in panels.CLASSES:
     draw(panel)
 gaussian_wrapping_addon.unregister()
-heavy = {{"torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "embreex", "PIL"}}
+heavy = {{"torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl", "PIL"}}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 """
     done = subprocess.run(
