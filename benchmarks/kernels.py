@@ -21,7 +21,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
 
-from gaussian_wrapping_addon.core.evaluation.plot import Panel, Series, write_svg
+from gaussian_wrapping_addon.core.evaluation.report.plot import Panel, Series, write_svg
 from gaussian_wrapping_addon.core.parallel import default_threads
 
 from .error_tables import (

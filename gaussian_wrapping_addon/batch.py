@@ -323,7 +323,7 @@ def _finish(result: Path, job: JobFile, options: Namespace) -> int:
         from .ops.scene_objects import export_usd
 
         export_usd(result)
-    from .core.evaluation.report import headline
+    from .core.evaluation.report.report import headline
     from .core.files import read_json
 
     _logger.info("results: %s", result)

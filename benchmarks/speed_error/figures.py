@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gaussian_wrapping_addon.core.evaluation.plot import Panel, Series, write_svg
+from gaussian_wrapping_addon.core.evaluation.report.plot import Panel, Series, write_svg
 
 from .plan import MAIN_SCENES
 from .results import Result, plain

@@ -24,12 +24,15 @@ from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.evaluation.command import read_cameras
-from gaussian_wrapping_addon.core.evaluation.field_errors import depth_errors, vacancy_errors
-from gaussian_wrapping_addon.core.evaluation.lpips import lpips_if_ready
-from gaussian_wrapping_addon.core.evaluation.mesh_rendering import render_views
-from gaussian_wrapping_addon.core.evaluation.surface_scores import score_protocols
-from gaussian_wrapping_addon.core.evaluation.truth import Truth, read_truth
-from gaussian_wrapping_addon.core.evaluation.view_metrics import score_images
+from gaussian_wrapping_addon.core.evaluation.surface.field_errors import (
+    depth_errors,
+    vacancy_errors,
+)
+from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
+from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth, read_truth
+from gaussian_wrapping_addon.core.evaluation.views.lpips import lpips_if_ready
+from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
+from gaussian_wrapping_addon.core.evaluation.views.view_metrics import score_images
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians

@@ -12,7 +12,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from ..core.evaluation.report_text import (
+from ..core.evaluation.report.text import (
     NOT_MEASURED,
     bytes_text,
     duration,
@@ -23,7 +23,7 @@ from ..core.evaluation.report_text import (
     percent,
     plural,
 )
-from ..core.evaluation.report_warnings import collect_warnings
+from ..core.evaluation.report.warnings import collect_warnings
 
 MAX_WARNINGS = 50
 MAX_TEXT = 400

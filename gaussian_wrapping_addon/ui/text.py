@@ -6,7 +6,7 @@ from __future__ import annotations
 import textwrap
 from typing import Any
 
-from ..core.evaluation.report_text import duration
+from ..core.evaluation.report.text import duration
 
 # Width of an average character of Blender's interface font at scale 1, pixels.
 _CHARACTER_PX = 6.6

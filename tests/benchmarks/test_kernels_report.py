@@ -15,7 +15,7 @@ from benchmarks.kernel_speed import measure_workload
 from benchmarks.kernels import PARTS, main, panels, speed_sections
 from benchmarks.tables import Table
 from benchmarks.timing import measure
-from gaussian_wrapping_addon.core.evaluation.plot import write_svg
+from gaussian_wrapping_addon.core.evaluation.report.plot import write_svg
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from gaussian_wrapping_addon.ops.scene_objects import import_result
 from gaussian_wrapping_addon.ui.report_panel import _MAX_WARNINGS, GWRAP_PT_report
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.synthetic_result import png_bytes, write_result
-from tests.core.evaluation.report_examples import REGION, full_region, full_summary
+from tests.core.evaluation.report.report_examples import REGION, full_region, full_summary
 
 pytestmark = pytest.mark.usefixtures("addon")
 

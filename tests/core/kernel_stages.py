@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numba.core.dispatcher import Dispatcher
 
-from gaussian_wrapping_addon.core.evaluation.preview import write_preview
+from gaussian_wrapping_addon.core.evaluation.views.preview import write_preview
 from gaussian_wrapping_addon.core.field.isosurface_projection import project_to_isosurface
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..dataset.similarity import Similarity
 from ..errors import DatasetError
-from .surface_samples import SurfaceSamples, thin_out
+from .surface.samples import SurfaceSamples, thin_out
 
 COLLINEAR_SHARE = 1e-6
 """Second over first extent below which points count as collinear: the rotation about their line

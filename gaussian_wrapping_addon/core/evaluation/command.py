@@ -17,15 +17,15 @@ from ..errors import DatasetError, ParseError, UsageError
 from ..files import read_json
 from ..progress import Progress
 from .alignment import IcpResult, icp
-from .dtu_chamfer import DENSITY_MM, MAX_DISTANCE_MM, PATCH_MM
-from .dtu_layout import align_to_scan, is_dtu_folder, read_dtu, score_dtu
-from .mesh_input import is_cloud, read_cloud, read_mesh
+from .layouts.dtu import align_to_scan, is_dtu_folder, read_dtu, score_dtu
+from .layouts.mesh_input import is_cloud, read_cloud, read_mesh
+from .layouts.tanks import SAMPLES as TANKS_SAMPLES
+from .layouts.tanks import align_to_log, is_tanks_folder, read_tanks, score_tanks
 from .pose_error import pose_errors
-from .surface_samples import SurfaceSamples, sample_uniformly
-from .surface_scores import PROTOCOLS, score_protocols
-from .tanks_layout import SAMPLES as TANKS_SAMPLES
-from .tanks_layout import align_to_log, is_tanks_folder, read_tanks, score_tanks
-from .truth import TRUTH_FILE, Truth, read_truth
+from .surface.dtu_chamfer import DENSITY_MM, MAX_DISTANCE_MM, PATCH_MM
+from .surface.samples import SurfaceSamples, sample_uniformly
+from .surface.scores import PROTOCOLS, score_protocols
+from .surface.truth import TRUTH_FILE, Truth, read_truth
 
 LAYOUTS = ("auto", "scene", "mesh", "tanks", "dtu")
 ALIGNMENTS = ("none", "cameras", "icp")

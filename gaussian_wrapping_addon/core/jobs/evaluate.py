@@ -156,7 +156,7 @@ def _end_with(parent: int) -> None:
 def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return the report and its table."""
     from ..evaluation.command import EvaluationRequest, evaluate_mesh, read_cameras, table
-    from ..evaluation.mesh_input import read_mesh
+    from ..evaluation.layouts.mesh_input import read_mesh
     from ..parallel import default_threads
     from ..progress import Progress, ProgressEvent
     from .machine import describe_machine, peak_memory_bytes

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ..dataset.similarity import Similarity
-from ..evaluation.report import write_report
-from ..evaluation.report_markdown import CURVE, PICTURES
-from ..evaluation.report_text import finite
+from ..evaluation.report.markdown import CURVE, PICTURES
+from ..evaluation.report.report import write_report
+from ..evaluation.report.text import finite
 from ..files import read_json, resolve_inside, write_json
 from ..progress import Progress
 from .job_file import JobFile
@@ -94,7 +94,7 @@ def _region_figures(trained: Stage, meshed: Stage, textured: Stage) -> dict[str,
 def _in_world_units(
     meshed: Stage, figures: dict[str, Any], world_from_scene: Similarity
 ) -> dict[str, Any]:
-    from ..evaluation.mesh_size import sizes_in_world
+    from ..evaluation.report.mesh_size import sizes_in_world
     from ..meshing.mesh_file import load_mesh
 
     mesh = load_mesh(meshed.folder / "mesh.npz")
@@ -104,7 +104,7 @@ def _in_world_units(
 
 def _training_pictures(trained: Stage, folder: Path) -> None:
     """Bring the pictures of the training there; those of an earlier training go."""
-    from ..evaluation.report_pictures import write_learning_curve
+    from ..evaluation.report.pictures import write_learning_curve
 
     # Only these files: a region may have the name of this folder.
     folder.mkdir(exist_ok=True)

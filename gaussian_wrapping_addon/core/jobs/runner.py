@@ -177,7 +177,7 @@ def _run_training(
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         from ..dataset.photos import PhotoStore
         from ..dataset.scene_file import load_saved_scene
-        from ..evaluation.report_pictures import write_held_out
+        from ..evaluation.report.pictures import write_held_out
         from ..gaussians.gaussian_file import save_gaussians
         from ..training.trainer import held_out_views, train
 
@@ -281,8 +281,8 @@ def _run_texture(
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         from ..dataset.photos import PhotoStore
         from ..dataset.scene_file import load_saved_scene
-        from ..evaluation.photo_comparison import compare_with_photos
-        from ..evaluation.preview import write_preview
+        from ..evaluation.views.photo_comparison import compare_with_photos
+        from ..evaluation.views.preview import write_preview
         from ..limits import MAX_IMAGE_SIDE_PX
         from ..meshing.mesh_file import load_mesh
         from ..texture.export import write_textured

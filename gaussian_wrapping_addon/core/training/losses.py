@@ -9,7 +9,7 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import UsageError
-from ..evaluation.view_metrics import compare, has_windows
+from ..evaluation.views.view_metrics import compare, has_windows
 from ..parallel import default_threads, even_bounds, run_chunks
 from ..render.array_store import ArrayStore
 from ..render.types import ImageGradients

@@ -18,7 +18,7 @@ from .. import tolerances
 from ..dataset.camera import Camera
 from ..dataset.scene import Scene
 from ..errors import Cancelled, DatasetError, WrapError
-from ..evaluation.view_metrics import score_images
+from ..evaluation.views.view_metrics import score_images
 from ..gaussians.initialisation import initial_gaussians
 from ..gaussians.mip_filter import mip_filter
 from ..gaussians.model import OrientedGaussians

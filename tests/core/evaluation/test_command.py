@@ -25,12 +25,16 @@ from gaussian_wrapping_addon.core.evaluation.command import (
     find_layout,
     table,
 )
-from gaussian_wrapping_addon.core.evaluation.mesh_input import is_cloud, read_cloud, read_mesh
-from gaussian_wrapping_addon.core.evaluation.surface_samples import sample_uniformly
+from gaussian_wrapping_addon.core.evaluation.layouts.mesh_input import (
+    is_cloud,
+    read_cloud,
+    read_mesh,
+)
+from gaussian_wrapping_addon.core.evaluation.surface.samples import sample_uniformly
 from gaussian_wrapping_addon.core.jobs.evaluate import job_cameras, job_mesh
 from gaussian_wrapping_addon.core.meshing.region import Region, write_region
 from gaussian_wrapping_addon.core.progress import Progress
-from tests.core.evaluation.layouts import (
+from tests.core.evaluation.layouts.written_layouts import (
     JOB_FROM_TRUTH,
     bumpy_sphere,
     ring_of_cameras,

@@ -18,7 +18,7 @@ from gaussian_wrapping_addon.core.training.losses import (
     normal_losses,
     normals_from_depth,
 )
-from tests.core.evaluation.test_view_metrics import naive_ssim
+from tests.core.evaluation.views.test_view_metrics import naive_ssim
 from tests.core.render.scenes import look_at
 
 WIDTH, HEIGHT = 14, 12

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.evaluation import ssim_kernels
+from gaussian_wrapping_addon.core.evaluation.views import ssim_kernels
 from gaussian_wrapping_addon.core.training import adam_kernels, loss_kernels
 from gaussian_wrapping_addon.core.training.losses import color_loss, normal_losses
 from gaussian_wrapping_addon.core.training.optimizer import Adam

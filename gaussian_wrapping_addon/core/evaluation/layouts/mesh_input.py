@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Meshes and point clouds that a user wants judged, or judged against, from common files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...dataset.point_file import read_point_ply
+from ...errors import ParseError, WorkerError
+
+MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
+_HEADER_BYTES = 64 * 1024
+_AGAIN = "Export the file again."
+
+
+def is_cloud(path: Path) -> bool:
+    """Tell whether a PLY file announces no faces; other formats are taken for meshes."""
+    return path.suffix.lower() == ".ply" and not _announced(path, "face")
+
+
+def _announced(path: Path, element: str) -> int:
+    """Return how many of an element a PLY's header announces; 0 where it names none."""
+    try:
+        with path.open("rb") as stream:
+            header = stream.read(_HEADER_BYTES).split(b"end_header", 1)[0]
+    except OSError as error:
+        raise ParseError(path, "whole file", f"cannot be read: {error.strerror}.", _AGAIN) from None
+    found = re.search(rb"^element\s+" + element.encode() + rb"\s+(\d{1,18})\s*$", header, re.M)
+    return int(found.group(1)) if found else 0
+
+
+def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read a triangle mesh through trimesh, in the coordinates that the file holds.
+
+    Of a GLB the transforms of its nodes are applied; its axes stay as they are (Y up).
+
+    Returns
+    -------
+    vertices : (v, 3) float64
+    faces : (f, 3) int64
+
+    Raises
+    ------
+    ParseError
+        Not a mesh file, cut off, without faces, with values that are not finite, or with faces
+        that name missing vertices.
+    WorkerError
+        The worker's Python lacks trimesh.
+    """
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise ParseError(
+            path, "file name", "not a known mesh format.", f"Use one of {', '.join(MESH_SUFFIXES)}."
+        )
+    if not path.is_file():
+        raise ParseError(path, "whole file", "the file does not exist.", "Check the path.")
+    try:
+        import trimesh
+    except ImportError:
+        raise WorkerError(
+            "The worker's Python lacks trimesh, which reads meshes.",
+            "pip install -r requirements-worker.txt there.",
+        ) from None
+    options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+    try:
+        loaded: Any = trimesh.load(path, process=False, force="mesh", **options)
+        vertices = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
+        faces = np.asarray(loaded.faces, np.int64).reshape(-1, 3)
+    except Exception as error:  # a broken file can make a foreign reader raise anything
+        raise ParseError(
+            path, "whole file", f"cannot be read as a mesh ({error}); it may be cut off.", _AGAIN
+        ) from None
+    if len(faces) == 0:
+        raise ParseError(path, "faces", "there are none, or the file is cut off.", _AGAIN)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        bad = int(np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(1))[0])
+        raise ParseError(path, f"face {bad}", "names a vertex that does not exist.", _AGAIN)
+    _require_finite(path, vertices)
+    return vertices, faces
+
+
+def _require_finite(path: Path, points: np.ndarray) -> None:
+    bad = np.flatnonzero(~np.isfinite(points).all(1))
+    if len(bad):
+        raise ParseError(
+            path, f"vertex {int(bad[0])}", f"is not finite (as are {len(bad)} in all).", _AGAIN
+        )
+
+
+def read_cloud(path: Path) -> np.ndarray:
+    """Read the points of a PLY, (n, 3) float64.
+
+    Raises
+    ------
+    ParseError
+        Not a PLY, cut off, empty, or with points that are not finite.
+    """
+    announced = _announced(path, "vertex")
+    points, _ = read_point_ply(path)
+    if announced == 0:
+        raise ParseError(path, "header", "the cloud is empty.", _AGAIN)
+    if len(points) < announced:
+        raise ParseError(
+            path, "vertices", f"{announced - len(points)} of {announced} are not finite.", _AGAIN
+        )
+    return points

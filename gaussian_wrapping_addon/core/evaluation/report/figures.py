@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The table of all figures of a report, each with its unit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from .text import escaped, measured, number
+
+# Lists of records, shown as tables or pictures of their own.
+_SHOWN_ELSEWHERE = {"history", "pictures", "warnings", "packages", "stages", "notes"}
+
+_UNITS = {
+    "psnr": "dB",
+    "held_out_psnr": "dB",
+    "ssim": "1 is equal",
+    "held_out_ssim": "1 is equal",
+    "lpips": "0 is equal",
+    "held_out_lpips": "0 is equal",
+    "seconds_training": "s",
+    "wall_seconds": "s",
+    "mesh_seconds": "s",
+    "volume": "cubic scene units",
+    "area": "square scene units",
+    "candidate_area": "square scene units",
+    "mean_edge": "scene units",
+    "edge_length": "world units",
+    "edge_length_scene": "scene units",
+    "edge_length_world": "world units, 0 is automatic",
+    "texels_per_unit": "texels per world unit",
+    "texel_size": "world units",
+    "views_per_seen_texel": "photos",
+    "utilisation": "of 1",
+    "coverage": "of 1",
+    "covered": "of 1",
+    "exposure_spread": "of 1, standard deviation",
+    "seed": "number",
+    "version": "number",
+    "sh_degree": "degree",
+    "euler": "number",
+    "genus": "number",
+}
+_WORLD_UNITS = {
+    "area": "square world units",
+    "size": "world units",
+    "diagonal": "world units",
+    "edge_mean": "world units",
+    "edge_median": "world units",
+}
+_ENDINGS = (
+    ("_unix_s", "s since 1970"),
+    ("_bytes", "bytes"),
+    ("_px", "px"),
+    ("_share", "of 1"),
+    ("_from", "of 1 (of all iterations)"),
+    ("_until", "of 1 (of all iterations)"),
+    ("_s", "s"),
+)
+_STARTS = (("level_error_", "of vacancy"), ("lambda_", "weight"))
+
+
+def figure_rows(report: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return name, value and unit of every figure of a report, escaped for Markdown."""
+    rows = []
+    for path, value in _leaves(report, ()):
+        name = ", ".join(step.replace("_", " ") for step in path)
+        unit = unit_of(path) if measured(value) is not None else ""
+        rows.append((escaped(name), _text(value), unit))
+    return rows
+
+
+def unit_of(path: tuple[str, ...]) -> str:
+    """Return the unit of a figure by its name; what is no quantity is counted."""
+    key = path[-1]
+    if key.isdigit():  # an entry of a list
+        path, key = path[:-1], path[-2]
+    if "seconds" in path:
+        return "s"
+    if "peak_memory_bytes" in path:
+        return "bytes"
+    if "world" in path and key in _WORLD_UNITS:
+        return _WORLD_UNITS[key]
+    if key in _UNITS:
+        return _UNITS[key]
+    for ending, unit in _ENDINGS:
+        if key.endswith(ending):
+            return unit
+    for start, unit in _STARTS:
+        if key.startswith(start):
+            return unit
+    return "count"
+
+
+def _leaves(values: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    if isinstance(values, dict):
+        for key, value in values.items():
+            if key not in _SHOWN_ELSEWHERE:
+                yield from _leaves(value, (*path, str(key)))
+    elif isinstance(values, list) and any(isinstance(v, (dict, float)) for v in values):
+        for index, value in enumerate(values):
+            yield from _leaves(value, (*path, str(index)))
+    else:
+        yield path, values
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, (int, float)) or value is None:
+        return number(value)
+    if isinstance(value, list):
+        return escaped(", ".join(map(str, value))) or "none"
+    return escaped(value) or "none"

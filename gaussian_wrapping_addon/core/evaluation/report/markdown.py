@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``report.md``: what a job made, for who ordered it; first plain words, then figures."""
+
+from __future__ import annotations
+
+import math
+import time
+import urllib.parse
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from ...files import resolve_inside
+from .figures import figure_rows
+from .region import Picture, region_lines, region_summary
+from .text import (
+    NOT_MEASURED,
+    bar,
+    bytes_text,
+    duration,
+    escaped,
+    items,
+    measured,
+    number,
+    part,
+    percent,
+    plural,
+    table,
+    words,
+)
+from .warnings import FEW_HELD_OUT, collect_warnings, warning_lines
+
+PICTURES = "report"
+"""Folder of the training's pictures in the result folder."""
+CURVE = "learning-curve.svg"
+
+_STAGES = {
+    "cameras": "photos and cameras",
+    "train": "training the Gaussians",
+    "mesh": "mesh of region",
+    "texture": "texture of region",
+}
+_MEMORY = {
+    "worker": "main process",
+    "largest_helper": "largest helper process (camera solving, unwrapping)",
+}
+_FACTS = {
+    "kind": ("Input", ""),
+    "photos": ("Photos offered", "photos"),
+    "photos_placed": ("Photos that could be placed", "photos"),
+    "photos_undistorted": ("Photos straightened (lens distortion)", "photos"),
+    "photos_with_focal_length": ("Photos that name their focal length", "photos"),
+    "photo_sizes": ("Photo size", "pixels"),
+    "mean_reprojection_error_px": ("Mean reprojection error of the sparse points", "px"),
+    "start_points": ("Start points", ""),
+    "up_from": ("Up direction taken from", ""),
+    "world_frame": ("World frame", ""),
+    "camera_models": ("Lens model", ""),
+    "also_present": ("Also found", ""),
+}
+
+
+def report_markdown(report: dict[str, Any], result: Path) -> str:
+    """Return the text of ``report.md``.
+
+    Parameters
+    ----------
+    report : dict
+        Content of ``report.json``; of any version, whatever it lacks is said to be not measured.
+    result : Path
+        The result folder: a picture is linked only where its file lies there.
+    """
+    picture = _pictures_of(result)
+    lines = [
+        f"# Report: {words(report.get('source'), 'job')}",
+        "",
+        *picture("preview.png", "Left: part of a photo. Right: the textured mesh."),
+        *_summary(report),
+        "",
+        "## Time and memory",
+        "",
+        *_time(report),
+        "",
+        "## Photos and cameras",
+        "",
+        *_cameras(part(report, "cameras")),
+        "",
+        "## Training",
+        "",
+        *_training(part(report, "training"), picture),
+    ]
+    for name, region in part(report, "regions").items():
+        lines += ["", f"## Region {escaped(name)}", "", *region_lines(name, region, picture)]
+    lines += ["", "## Warnings", "", *warning_lines(report)]
+    lines += ["", "## Machine, versions, seed", "", *_machine(report)]
+    lines += [
+        "",
+        "<details>",
+        "<summary>All figures</summary>",
+        "",
+        *table(("figure", "value", "unit"), figure_rows(report), "lrl"),
+        "",
+        "</details>",
+    ]
+    return "\n".join(_without_gaps(lines)) + "\n"
+
+
+def _without_gaps(lines: list[str]) -> list[str]:
+    """Drop empty lines that follow an empty line."""
+    return [t for i, t in enumerate(lines) if t or i == 0 or lines[i - 1]]
+
+
+def _pictures_of(result: Path) -> Picture:
+    def picture(path: str, caption: str) -> list[str]:
+        file = resolve_inside(result, path)
+        if file is None or not file.is_file():
+            return []
+        link = urllib.parse.quote(PurePosixPath(path).as_posix())
+        return [f"![{escaped(caption)}]({link})", "", f"*{escaped(caption)}*", ""]
+
+    return picture
+
+
+def _summary(report: dict[str, Any]) -> list[str]:
+    cameras, training = part(report, "cameras"), part(report, "training")
+    preset = part(report, "settings").get("preset")
+    made = f"Photos used: {number(cameras.get('views'))}. "
+    made += f"Gaussians trained on them: {number(training.get('gaussians'))}"
+    if preset:
+        made += f" (preset {escaped(preset)})"
+    lines = ["## Summary", "", f"- **What was made.** {made}."]
+    lines[-1] += "".join(" " + region_summary(n, r) for n, r in part(report, "regions").items())
+    lines.append(f"- **How long.** {_how_long(report)}")
+    lines.append(f"- **How exact.** {_how_exact(training)}{_mesh_exact(report)}")
+    lines.append(f"- **How well seen.** {_how_seen(report)}")
+    warnings = collect_warnings(report)
+    if warnings:
+        lines.append(f"- **Be careful about** ({plural(len(warnings), 'warning')}):")
+        lines += [f"    - {escaped(w.text)}" for w in warnings]
+    else:
+        lines.append("- **Be careful about.** No stage had a warning.")
+    return lines
+
+
+def _how_long(report: dict[str, Any]) -> str:
+    stages = [(s, measured(s.get("seconds"))) for s in map(part, items(report.get("stages")))]
+    known = [(s, seconds) for s, seconds in stages if seconds is not None]
+    total = sum(seconds for _, seconds in known)
+    text = f"Time of this run: {duration(report.get('wall_seconds'))}."
+    reused = [_stage_name(s) for s, _ in stages if s.get("reused") is True]
+    if reused:
+        text = f"{text[:-1]}; taken over from an earlier run: {', '.join(reused)}."
+    if known and total > 0:
+        longest, seconds = max(known, key=lambda pair: pair[1])
+        text += (
+            f" All stages together: {duration(total)}, the longest was {_stage_name(longest)} "
+            f"({percent(seconds / total, 0)})."
+        )
+    return text
+
+
+def _how_exact(training: dict[str, Any]) -> str:
+    held_out = items(training.get("held_out"))
+    psnr = measured(training.get("held_out_psnr"))
+    if not held_out or psnr is None:
+        why = "No photo was held out: how" if training.get("held_out") == [] else "How"
+        return f"{why} exact new views are was {NOT_MEASURED}."
+    text = (
+        f"{plural(len(held_out), 'photo')} never trained on "
+        f"{'is' if len(held_out) == 1 else 'are'} reproduced by the Gaussians with a PSNR of "
+        f"{psnr:.1f} dB; that is a typical error of "
+        f"{percent(10.0 ** (-psnr / 20.0))} of full brightness."
+    )
+    if len(held_out) < FEW_HELD_OUT:
+        text += " These are too few to trust."
+    return text
+
+
+def _mesh_exact(report: dict[str, Any]) -> str:
+    text = ""
+    for name, region in part(report, "regions").items():
+        rendering = part(region, "mesh_rendering")
+        psnr = measured(rendering.get("psnr"))
+        if psnr is None:
+            text += f" For the textured mesh of {escaped(name)} this was {NOT_MEASURED}."
+        else:
+            views = plural(len(items(rendering.get("views"))), "photo")
+            note = rendering.get("note")
+            if isinstance(note, str) and note.strip():
+                views += f"; {escaped(note.strip().rstrip('.'))}"
+            text += f" The textured mesh of {escaped(name)}: {psnr:.1f} dB ({views})."
+    return text
+
+
+def _how_seen(report: dict[str, Any]) -> str:
+    parts = []
+    for name, region in part(report, "regions").items():
+        texture = part(region, "texture")
+        coverage = percent(texture.get("coverage"))
+        views = measured(texture.get("views_per_seen_texel"))
+        behind = f", each seen texel by {views:.1f} photos on average" if views else ""
+        if coverage == NOT_MEASURED:
+            parts.append(f"{escaped(name)}: {NOT_MEASURED}.")
+        else:
+            parts.append(f"{escaped(name)}: photos saw {coverage} of the texture{behind}.")
+    return " ".join(parts) or f"Coverage was {NOT_MEASURED}."
+
+
+def _stage_name(stage: dict[str, Any]) -> str:
+    kind, _, region = str(stage.get("name") or "unknown").partition("-")
+    return f"{_STAGES.get(kind, escaped(kind))} {escaped(region)}".strip()
+
+
+def _time(report: dict[str, Any]) -> list[str]:
+    stages = [part(stage) for stage in items(report.get("stages"))]
+    total = sum(measured(s.get("seconds")) or 0.0 for s in stages)
+    rows = []
+    for stage in stages:
+        seconds = measured(stage.get("seconds"))
+        share = seconds / total if seconds is not None and total > 0 else None
+        rows.append(
+            (
+                _stage_name(stage) + (" (earlier run)" if stage.get("reused") is True else ""),
+                NOT_MEASURED if seconds is None else f"{seconds:,.1f} s",
+                percent(share),
+                "" if share is None else bar(share),
+            )
+        )
+    rows.append(("**all stages**", f"{total:,.1f} s" if total else NOT_MEASURED, "", ""))
+    wall = number(report.get("wall_seconds"), "s", digits=1)
+    rows.append(("**this run, until the report**", wall, "", ""))
+    lines = table(("stage", "time", "share", ""), rows, "lrrl")
+    memory = part(report, "peak_memory_bytes")
+    lines += ["", "Largest memory in use in this run:", ""]
+    for key, process in _MEMORY.items():
+        value = memory.get(key)
+        text = "none ran" if key != "worker" and value == 0 else bytes_text(value)
+        lines.append(f"- {process}: {text}")
+    return lines
+
+
+def _cameras(cameras: dict[str, Any]) -> list[str]:
+    facts = part(cameras, "facts")
+    rows = [
+        ("Photos used", number(cameras.get("views"), "photos")),
+        ("Sparse points", number(cameras.get("points"), "points")),
+    ]
+    if "mean_reprojection_error_px" not in facts:
+        rows.append((_FACTS["mean_reprojection_error_px"][0], NOT_MEASURED))
+    for key, (name, unit) in _FACTS.items():
+        if key not in facts:
+            continue
+        value = facts[key]
+        if measured(value) is not None:
+            text = number(value, unit)
+        else:
+            listed = ", ".join(str(v) for v in value if v) if isinstance(value, list) else value
+            text = f"{words(listed)} {unit}".strip()
+        rows.append((name, text))
+    lines = table(("photos and cameras", "figure"), rows, "lr")
+    if facts.get("kind") == "photos":
+        lines += [
+            "",
+            (
+                "The cameras were found from the photos alone, which cannot tell the size of "
+                "things: one world unit is an arbitrary length. To measure in metres, scale the "
+                "mesh by a known length."
+            ),
+        ]
+    else:
+        lines += ["", "One world unit is the unit of the camera poses that were given."]
+    return lines
+
+
+def _training(training: dict[str, Any], picture: Picture) -> list[str]:
+    held_out = [part(figure) for figure in items(training.get("held_out"))]
+    iterations = number(training.get("iterations"), "iterations")
+    lines = [
+        f"{number(training.get('gaussians'), 'Gaussians')} after {iterations}.",
+        "",
+        *picture(f"{PICTURES}/{CURVE}", "How training went."),
+    ]
+    if not held_out:
+        why = "No photo was held out: " if training.get("held_out") == [] else ""
+        return [*lines, f"{why}PSNR and SSIM of new views were {NOT_MEASURED}."]
+    lines += [
+        (
+            "Photos held out were never trained on; they tell how well the Gaussians know views "
+            "that they have not seen. PSNR: every 6 dB more is half the error."
+        ),
+        "",
+    ]
+    perceptual = any(measured(figure.get("lpips")) is not None for figure in held_out)
+    rows = [_held_out_row(words(f.get("name")), f, perceptual) for f in held_out]
+    mean = {key: training.get(f"held_out_{key}") for key in ("psnr", "ssim", "lpips")}
+    rows.append(_held_out_row("**mean**", mean, perceptual))
+    header = ["photo held out", "PSNR", "typical error", "SSIM (1 is equal)"]
+    lines += table(header + ["LPIPS (0 is equal)"] * perceptual, rows, "lrrr" + "r" * perceptual)
+    if not perceptual:
+        lines += ["", f"LPIPS (likeness as people see it) was {NOT_MEASURED}."]
+    shown: list[str] = []
+    for entry in map(part, items(training.get("pictures"))):
+        psnr = number(entry.get("psnr"), "dB", digits=1)
+        caption = f"{entry.get('name') or 'photo'}, {psnr}"
+        shown += picture(f"{PICTURES}/{entry.get('file')}", caption)
+    if not shown:
+        return [*lines, "", "There are no pictures of the photos held out."]
+    lines += [
+        "",
+        (
+            "Left the photo, in the middle what the Gaussians show from the same place, right the "
+            "error: black is none, violet about 6 %, red 12 %, orange 19 %, and white a quarter "
+            "of full brightness or more. The worst photo comes first."
+        ),
+        "",
+    ]
+    return lines + shown
+
+
+def _held_out_row(name: str, figure: dict[str, Any], perceptual: bool) -> list[str]:
+    psnr = measured(figure.get("psnr"))
+    error = NOT_MEASURED if psnr is None else percent(math.pow(10.0, -psnr / 20.0))
+    row = [name, number(psnr, "dB", digits=2), error, number(figure.get("ssim"), digits=4)]
+    return [*row, number(figure.get("lpips"), digits=4)] if perceptual else row
+
+
+def _machine(report: dict[str, Any]) -> list[str]:
+    machine, settings = part(report, "machine"), part(report, "settings")
+    started = measured(report.get("started_unix_s"))
+    date = "unknown"
+    if started is not None:
+        date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(started))
+    packages = part(machine, "packages")
+    versions = ", ".join(f"{escaped(k)} {words(v)}" for k, v in packages.items())
+    threads = f"{number(machine.get('threads'), 'threads')} used"
+    system, python = words(machine.get("system")), words(machine.get("python"))
+    preset, seed = words(settings.get("preset")), words(settings.get("seed"))
+    processor, cores = words(machine.get("processor")), number(machine.get("cores"), "cores")
+    return [
+        f"- Started: {date}",
+        f"- Processor: {processor}, {cores}, {threads}",
+        f"- Memory of the machine: {bytes_text(machine.get('memory_bytes'))}",
+        f"- System: {system}, Python {python}",
+        f"- Packages: {versions or 'unknown'}",
+        f"- Preset: {preset}; seed: {seed}",
+    ]

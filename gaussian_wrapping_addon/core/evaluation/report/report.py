@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The report of a job: ``report.json`` for programs, ``report.md`` for people, a headline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ...files import write_bytes, write_json
+from .markdown import report_markdown
+from .region import closedness
+from .text import duration, finite, items, measured, number, part, percent, plural
+from .warnings import collect_warnings
+
+
+def write_report(result: Path, summary: dict[str, Any], regions: dict[str, Any]) -> None:
+    """Write both files into the result folder; the pictures must lie there already.
+
+    Parameters
+    ----------
+    result : Path
+        The result folder.
+    summary : dict
+        What was measured of the whole job: machine, stages, cameras, training.
+    regions : dict
+        For each region: mesh statistics, residuals, size in world units, texture coverage,
+        renderings of the mesh, seconds.
+    """
+    report = finite({"version": 1, **summary, "regions": regions})
+    report["warnings"] = [warning.to_json() for warning in collect_warnings(report)]
+    write_json(result / "report.json", report)
+    write_bytes(result / "report.md", report_markdown(report, result).encode())
+
+
+def headline(report: dict[str, Any]) -> list[str]:
+    """Return the few figures of a report that a person wants first, one line each."""
+    training = part(report, "training")
+    gaussians = number(training.get("gaussians"), "Gaussians")
+    lines = [f"time: {duration(report.get('wall_seconds'))}, {gaussians}"]
+    psnr, held_out = measured(training.get("held_out_psnr")), items(training.get("held_out"))
+    if psnr is not None and held_out:
+        count = plural(len(held_out), "photo")
+        lines.append(f"held-out photos: PSNR {psnr:.2f} dB ({count})")
+    else:
+        lines.append("held-out photos: not measured")
+    for name, region in part(report, "regions").items():
+        statistics = part(region, "statistics")
+        line = f"region {name}: {number(statistics.get('faces'), 'faces')}, "
+        line += f"{closedness(statistics)}, "
+        line += f"{percent(part(region, 'texture').get('coverage'))} of the texture seen by photos"
+        rendered = measured(part(region, "mesh_rendering").get("psnr"))
+        if rendered is not None:
+            line += f", textured mesh PSNR {rendered:.2f} dB"
+        lines.append(line)
+    warnings = collect_warnings(report)
+    lines += [f"warning ({warning.stage}): {warning.text}" for warning in warnings]
+    return lines

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a person must know of a job before using its result, each with a next step."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from .text import escaped, items, measured, number, part, percent, plural
+
+FEW_HELD_OUT = 3
+"""The mean over fewer photos says little about the next photo."""
+
+LOW_COVERAGE = 0.5
+"""Below half, most of the texture is continued from neighbours and not photographed."""
+
+GAP_DB = 20.0 * math.log10(2.0)
+"""Photos never seen in training with more than twice the error of those seen."""
+
+HALF_WAY = 0.25
+"""``|v - 0.5|`` at which a vertex is nearer to "empty" or "solid" than to the surface."""
+
+REPROJECTION_PX = 2.0
+"""Half of the 4 px at which structure from motion throws a point away."""
+
+# Parts of messages of the stages, and what to do about them.
+_STEPS = (
+    ("could not be placed", "Take more photos with more overlap there, or remove blurred ones."),
+    ("cannot be read", "Save these photos again as JPEG or PNG."),
+    ("start points", "Photos with more texture help, or a COLMAP model with its points."),
+    ("points3D", "Export the COLMAP model together with its points."),
+    ("held out for measuring", "Take more photos, from all around."),
+    ("numbers were not finite", "If the figures below are poor, train again with another seed."),
+    ("stand far away", "Check the poses of these cameras."),
+    ("stand on one line", "Take photos from other heights and directions too."),
+    ("models:", "Take photos that connect the parts, so that one model holds them all."),
+    ("left out", "Check whether these are needed; if so, export the input again."),
+    ("ply_file_path", "Put the file where transforms.json says it is."),
+)
+
+
+@dataclass(frozen=True)
+class ReportWarning:
+    """One warning of one stage."""
+
+    stage: str
+    """``cameras``, ``training``, ``mesh NAME`` or ``texture NAME``."""
+    text: str
+    next_step: str = ""
+    """What the person can do; empty where nothing is known to help."""
+
+    def to_json(self) -> dict[str, str]:
+        """Return plain JSON values."""
+        return asdict(self)
+
+
+def collect_warnings(report: dict[str, Any]) -> list[ReportWarning]:
+    """Return the warnings of every stage, in the order of the stages.
+
+    Parameters
+    ----------
+    report : dict
+        Content of ``report.json``; of any version, whatever it lacks.
+    """
+    found = _said("cameras", part(report, "cameras").get("warnings"))
+    found += _judge_cameras(part(report, "cameras", "facts"))
+    found += _said("training", part(report, "training").get("warnings"))
+    found += _judge_training(part(report, "training"))
+    for name, region in part(report, "regions").items():
+        provenance, texture = part(region, "provenance"), part(region, "texture")
+        found += _said(f"mesh {name}", provenance.get("warnings"))
+        found += _said(f"mesh {name}", provenance.get("notes"))
+        found += _judge_mesh(f"mesh {name}", part(region, "statistics"), provenance)
+        found += _said(f"texture {name}", texture.get("warnings"))
+        found += _said(f"texture {name}", part(region).get("warnings"))
+        found += _judge_texture(f"texture {name}", texture)
+    return list(dict.fromkeys(found))
+
+
+def warning_lines(report: dict[str, Any]) -> list[str]:
+    """Return the section "Warnings" as Markdown list entries."""
+    lines = []
+    for warning in collect_warnings(report):
+        step = f" *Next step:* {escaped(warning.next_step)}" if warning.next_step else ""
+        lines.append(f"- **{escaped(warning.stage)}**: {escaped(warning.text)}{step}")
+    return lines or ["None of the stages had anything to warn about."]
+
+
+def _said(stage: str, texts: Any) -> list[ReportWarning]:
+    return [ReportWarning(stage, t, _next_step(t)) for t in items(texts) if isinstance(t, str)]
+
+
+def _next_step(text: str) -> str:
+    for mark, step in _STEPS:
+        if re.search(re.escape(mark), text):
+            return step
+    return ""
+
+
+def _judge_cameras(facts: dict[str, Any]) -> list[ReportWarning]:
+    error_px = measured(facts.get("mean_reprojection_error_px"))
+    if error_px is None or error_px <= REPROJECTION_PX:
+        return []
+    text = (
+        f"The cameras miss their points by {number(error_px, 'px', digits=2)} on average; "
+        f"above {REPROJECTION_PX:g} px details blur."
+    )
+    return [ReportWarning("cameras", text, "Photograph with one lens, without zooming or motion.")]
+
+
+def _judge_training(training: dict[str, Any]) -> list[ReportWarning]:
+    if not isinstance(training.get("held_out"), list):
+        return []
+    count = len(training["held_out"])
+    if count == 0:
+        text = "No photo was held out: how exact new views are was not measured."
+        return [ReportWarning("training", text, "Take more photos, or allow held-out photos.")]
+    found = []
+    if count < FEW_HELD_OUT:
+        text = f"Only {plural(count, 'photo')} held out: too few to trust the mean."
+        found.append(ReportWarning("training", text, "Take more photos from all around."))
+    history = items(training.get("history"))
+    reached = measured(part(history[-1]).get("psnr")) if history else None
+    new = measured(training.get("held_out_psnr"))
+    if reached is not None and new is not None and reached - new > GAP_DB:
+        text = (
+            f"Photos never trained on come out with more than twice the error of trained ones "
+            f"({new:.1f} dB against {reached:.1f} dB)."
+        )
+        step = "Take more photos between the present viewpoints; check for motion and exposure."
+        found.append(ReportWarning("training", text, step))
+    return found
+
+
+def _judge_mesh(
+    stage: str, statistics: dict[str, Any], provenance: dict[str, Any]
+) -> list[ReportWarning]:
+    found = []
+    if statistics.get("closed") is False:
+        edges = plural(statistics.get("boundary_edges"), "open edge")
+        text = f"The mesh is not closed ({edges}); volumes and 3D prints need a closed one."
+        found.append(ReportWarning(stage, text, "Report the job; fill the holes in Blender."))
+    wide = measured(provenance.get("level_error_p99"))
+    if wide is not None and wide > HALF_WAY:
+        text = f"At one vertex in a hundred, |v - 0.5| is above {wide:.2f}: not on the surface."
+        found.append(ReportWarning(stage, text, "Mesh with more points or a smaller region."))
+    left = measured(provenance.get("degenerate_faces_left"))
+    if left:
+        text = f"{plural(int(left), 'face')} without area could not be removed."
+        found.append(ReportWarning(stage, text, "Blender: Mesh > Clean Up > Degenerate Dissolve."))
+    return found
+
+
+def _judge_texture(stage: str, texture: dict[str, Any]) -> list[ReportWarning]:
+    found = []
+    coverage = measured(texture.get("coverage"))
+    if coverage == 0.0:
+        text = "No photo sees the mesh: its texture is plain grey."
+        found.append(ReportWarning(stage, text, "Check the region and the cameras."))
+    elif coverage is not None and coverage < LOW_COVERAGE:
+        text = (
+            f"Only {percent(coverage)} of the texture was seen by photos: most of it was filled in "
+            "from its surroundings."
+        )
+        step = "Make the region tighter, or photograph the sides that are missing."
+        found.append(ReportWarning(stage, text, step))
+    reason = texture.get("unwrap_fallback_reason")
+    if isinstance(reason, str) and reason:
+        text = f"The mesh was unwrapped in the simpler way: {reason}"
+        found.append(ReportWarning(stage, text, "Seams are more; a smaller mesh may unwrap."))
+    lost = measured(texture.get("faces_without_texel"))
+    if lost:
+        text = f"{plural(int(lost), 'face')} smaller than a texel have no colour of their own."
+        found.append(ReportWarning(stage, text, "Choose a larger texture or a coarser mesh."))
+    overlaps = measured(texture.get("texels_overlapping"))
+    if overlaps:
+        text = f"{plural(int(overlaps), 'texel')} belong to two faces at once."
+        found.append(ReportWarning(stage, text, "Choose a larger texture."))
+    return found

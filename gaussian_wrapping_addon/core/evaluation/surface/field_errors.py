@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How far depth and vacancy of trained Gaussians are from a true surface, before any meshing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...dataset.camera import Camera
+from ...errors import UsageError
+from ...field.vacancy import VacancyField
+from ...gaussians.model import OrientedGaussians
+from ...parallel import default_threads
+from ...render.render import render
+from ...render.types import RenderOptions
+from ...texture.depth_buffer import depth_buffer
+
+PROBE_REACH = 2.0
+"""Vacancy is probed along each normal this many largest thresholds to both sides."""
+PROBES_PER_SIDE = 40
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Isosurface depth against the true surface's depth, over the pixels that show it."""
+
+    pixels: int
+    """Pixels whose ray meets the true surface."""
+    found: float
+    """Share of them where the Gaussians have a depth at all."""
+    median: float
+    """Median absolute difference along the ray where found, in the unit of the scene."""
+    percentile_95: float
+    within: tuple[float, ...]
+    """Share of all these pixels that have a depth within each threshold."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class VacancyErrors:
+    """Where vacancy crosses 0.5 along the true surface's normals."""
+
+    samples: int
+    found: float
+    """Share of samples with a crossing (outside empty, inside not) within the probed reach."""
+    median_offset: float
+    """Median signed offset of the nearest crossing, positive outside, in the unit of the scene."""
+    median: float
+    """Median absolute offset."""
+    within: tuple[float, ...]
+    """Share of all samples whose crossing is within each threshold."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return dataclasses.asdict(self)
+
+
+def depth_errors(
+    gaussians: OrientedGaussians,
+    cameras: Sequence[Camera],
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    thresholds: Sequence[float],
+    *,
+    threads: int = 0,
+) -> DepthErrors:
+    """Compare the 0.5-isosurface depth (method.md 2.4) with the first hit of each pixel's ray.
+
+    Parameters
+    ----------
+    gaussians : OrientedGaussians
+        Scene frame.
+    cameras : sequence of Camera
+        In the same frame; every pixel of each is compared.
+    vertices, faces : (v, 3) float64, (f, 3) int
+        The true surface in the same frame. Nothing else may stand before it.
+    thresholds : sequence of float
+        Distances along the ray, unit of the frame.
+
+    Raises
+    ------
+    UsageError
+        If no pixel shows the surface.
+    """
+    threads = threads or default_threads()
+    errors, missing = [], 0
+    for camera in cameras:
+        true = depth_buffer(
+            vertices, np.ascontiguousarray(faces, np.int32), camera, threads=threads
+        )
+        shows = np.isfinite(true.depth)  # (h, w)
+        depth = render(gaussians, camera, RenderOptions(threads=threads)).depth.numpy()  # (h, w)
+        stretch = np.linalg.norm(camera.rays(), axis=2)  # (h, w) ray length of one unit of z
+        found = shows & (depth > 0)
+        missing += int(np.count_nonzero(shows & ~found))
+        errors.append((np.abs(depth.astype(np.float64) - true.depth) * stretch)[found])
+    error = np.concatenate(errors) if errors else np.zeros(0)
+    total = len(error) + missing
+    if total == 0:
+        raise UsageError("No pixel shows the true surface.", "Check its frame.")
+    return DepthErrors(
+        total,
+        len(error) / total,
+        float(np.median(error)) if len(error) else float("inf"),
+        float(np.percentile(error, 95)) if len(error) else float("inf"),
+        tuple(float(np.count_nonzero(error <= limit)) / total for limit in thresholds),
+    )
+
+
+def vacancy_errors(
+    field: VacancyField,
+    points: np.ndarray,
+    normals: np.ndarray,
+    thresholds: Sequence[float],
+) -> VacancyErrors:
+    """Probe vacancy along the normals of true surface samples and find where it crosses 0.5.
+
+    Probes stand ``PROBE_REACH`` times the largest threshold to both sides, evenly; a crossing lies
+    between an emptier probe and the occupied one below it, by linear interpolation. The one nearest
+    to the sample counts, so that a thin part's other side is not mistaken for this one unless it
+    is nearer.
+
+    Parameters
+    ----------
+    field : VacancyField
+    points, normals : (n, 3) float64
+        Samples and unit normals (towards the empty side) of the true surface, frame of the field.
+    thresholds : sequence of float
+        Unit of the frame.
+
+    Raises
+    ------
+    UsageError
+        If there is no sample.
+    """
+    count = len(points)
+    if count == 0:
+        raise UsageError("There is no sample of the true surface.", "Check the crop volume.")
+    reach = PROBE_REACH * max(thresholds)
+    offsets = np.linspace(reach, -reach, 2 * PROBES_PER_SIDE + 1)  # from outside to inside
+    probes = points[:, None] + offsets[None, :, None] * normals[:, None]  # (n, k, 3)
+    vacancy = field.vacancy(probes.reshape(-1, 3)).vacancy.reshape(count, -1).astype(np.float64)
+    outer, inner = vacancy[:, :-1], vacancy[:, 1:]  # (n, k - 1)
+    crosses = (outer > 0.5) & (inner <= 0.5)
+    share = np.where(crosses, (outer - 0.5) / np.where(crosses, outer - inner, 1.0), 0.0)
+    place = offsets[:-1] + share * (offsets[1:] - offsets[:-1])  # (n, k - 1)
+    distance = np.where(crosses, np.abs(place), np.inf)
+    nearest = distance.argmin(1)
+    rows = np.arange(count)
+    least = distance[rows, nearest]
+    found = np.isfinite(least)
+    signed = place[rows, nearest][found]
+    return VacancyErrors(
+        count,
+        float(found.mean()),
+        float(np.median(signed)) if len(signed) else float("inf"),
+        float(np.median(np.abs(signed))) if len(signed) else float("inf"),
+        tuple(float((least <= limit).mean()) for limit in thresholds),
+    )

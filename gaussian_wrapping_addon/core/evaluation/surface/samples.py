@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Points with normals that stand for a surface when it is judged: three ways to choose them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...dataset.camera import Camera
+from ...dataset.similarity import Similarity
+from ...errors import MeshingError, UsageError
+from ...texture.depth_buffer import depth_buffer
+
+DEGENERATE_SHARE = 1e-12
+"""A face whose doubled area is below this share of its longest edge squared has no direction."""
+
+SCAN_NEAR_SHARE = 1e-7
+"""Near plane of a virtual scan, as a share of the extent of mesh and cameras: the protocol has
+none, but a point in the camera's own plane has no pixel."""
+
+PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])
+"""Steps of the plane's additive sequence with the smallest discrepancy known: 1 / g and 1 / g^2
+with g^3 = g + 1."""
+
+
+@dataclass(frozen=True)
+class SurfaceSamples:
+    """Points on a surface, in the frame of the mesh they come from."""
+
+    points: np.ndarray
+    """(n, 3) float64."""
+    normals: np.ndarray
+    """(n, 3) float64, unit, or 0 where unknown; as the surface is oriented."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def kept(self, mask: np.ndarray) -> SurfaceSamples:
+        """Return those that a (n,) bool mask or an index array chooses."""
+        return SurfaceSamples(self.points[mask], self.normals[mask])
+
+    @classmethod
+    def none(cls) -> SurfaceSamples:
+        """Return zero samples: what an empty mesh has."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit normals (f, 3) and areas (f,) of faces, both 0 for degenerate ones."""
+    corners = vertices[faces]  # (f, 3, 3)
+    edges = np.roll(corners, -1, axis=1) - corners  # (f, 3, 3), b - a, c - b, a - c
+    cross = np.cross(edges[:, 0], -edges[:, 2])  # (f, 3)
+    doubled = np.linalg.norm(cross, axis=1)
+    longest = (edges**2).sum(2).max(1) if len(faces) else np.zeros(0)
+    sound = doubled > DEGENERATE_SHARE * longest
+    normals = np.where(sound[:, None], cross / np.where(sound, doubled, 1.0)[:, None], 0.0)
+    return normals, np.where(sound, doubled / 2, 0.0)
+
+
+def sample_uniformly(
+    vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int
+) -> SurfaceSamples:
+    """Spread points evenly over the area of a mesh (method.md 9.1, "uniform sampling").
+
+    One point is drawn from each of ``count`` equal parts of the area, counted along the list of
+    faces; where many fall on one face, they follow a low-discrepancy sequence over it. The number
+    on any part of the surface therefore depends on its area and not on its tessellation.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+    faces : (f, 3) int
+    count : int
+        Number of samples, exactly.
+    seed : int
+        The same seed gives bitwise the same samples.
+
+    Returns
+    -------
+    SurfaceSamples
+        With the normals of the faces. Degenerate faces get none.
+
+    Raises
+    ------
+    MeshingError
+        No face has an area, or a vertex that is used is not finite.
+    UsageError
+        ``count`` is less than one, or faces name vertices that do not exist.
+    """
+    if count < 1:
+        raise UsageError(f"{count} samples were asked for.", "Ask for at least one.")
+    vertices, faces = _checked(vertices, faces)
+    local, origin = _centred(vertices, faces)
+    normals, areas = face_normals(local, faces)
+    sound = np.flatnonzero(areas > 0)
+    if len(sound) == 0:
+        raise MeshingError(
+            "The mesh has no area to sample.", "Check that the reconstruction is not empty."
+        )
+    rng = np.random.default_rng(seed)
+    total = np.cumsum(areas[sound])
+    where = (np.arange(count) + rng.random(count)) * (total[-1] / count)  # (n,)
+    slot = np.minimum(np.searchsorted(total, where, side="right"), len(sound) - 1)
+    weights = np.modf(rng.random(2) + np.arange(1, count + 1)[:, None] * PLASTIC)[0]  # (n, 2)
+    weights = np.where(weights.sum(1, keepdims=True) > 1.0, 1.0 - weights, weights)
+    face = sound[slot]
+    a, b, c = (local[faces[face, k]] for k in range(3))
+    points = a + weights[:, :1] * (b - a) + weights[:, 1:] * (c - a)  # (n, 3)
+    return SurfaceSamples(points + origin, normals[face])
+
+
+def sample_legacy(vertices: np.ndarray, faces: np.ndarray) -> SurfaceSamples:
+    """Return all vertices that faces use and all face centres (method.md 9.1, "legacy").
+
+    The number on a part of the surface depends on its tessellation: the bias that the other ways
+    avoid. Vertices have no normal here, centres that of their face.
+
+    Raises
+    ------
+    MeshingError
+        There is no face, or a vertex that is used is not finite.
+    """
+    vertices, faces = _checked(vertices, faces)
+    local, origin = _centred(vertices, faces)
+    used = np.unique(faces)
+    normals, _ = face_normals(local, faces)
+    centres = local[faces].mean(1)
+    return SurfaceSamples(
+        np.concatenate([vertices[used], centres + origin]),
+        np.concatenate([np.zeros((len(used), 3)), normals]),
+    )
+
+
+def scan_virtually(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: Sequence[Camera],
+    *,
+    threads: int = 1,
+    step_px: float = 1.0,
+) -> SurfaceSamples:
+    """Collect what cameras see of a mesh: first hits of all pixels (method.md 9.1, "scanning").
+
+    No near plane, no culling of back faces: a side that shows hides what is behind it. Points lie
+    on their faces to float64 precision, also at world coordinates of millions. Normals are those
+    of the faces as the mesh orients them: they are not turned towards the camera, so that a face
+    seen from its inner side is counted as wrongly oriented.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+    faces : (f, 3) int
+    cameras : sequence of Camera
+        In the frame of the mesh.
+    threads : int
+        Threads to use; the result does not depend on it.
+    step_px : float
+        Distance between rays, in pixels of the cameras: 2 gives a quarter of the points.
+
+    Returns
+    -------
+    SurfaceSamples
+        Camera after camera, row after row; empty if no camera sees the mesh.
+
+    Raises
+    ------
+    MeshingError
+        There is no face, or a vertex that is used is not finite.
+    UsageError
+        ``step_px`` is less than one.
+    """
+    if not step_px >= 1.0:
+        raise UsageError(f"A scan with a step of {step_px} pixels.", "Give at least 1.")
+    vertices, faces = _checked(vertices, faces)
+    local, origin = _centred(vertices, faces)
+    faces = np.ascontiguousarray(faces, np.int32)
+    normals, _ = face_normals(local, faces)
+    points, directions = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    to_local = Similarity(translation=-origin)
+    used = np.unique(faces)
+    for camera in cameras:
+        moved = camera.moved(to_local).resized(
+            max(1, round(camera.width / step_px)), max(1, round(camera.height / step_px))
+        )
+        seen = moved.to_camera(local)
+        near = SCAN_NEAR_SHARE * float(np.abs(seen[used]).max())
+        buffer = depth_buffer(local, faces, moved, threads=threads, near=near)
+        hit = buffer.face >= 0  # (h, w)
+        face = buffer.face[hit]
+        weights = _weights_on_faces(seen[faces[face]], moved.rays()[hit])
+        points.append(np.einsum("nc,ncx->nx", weights, local[faces[face]]) + origin)
+        directions.append(normals[face])
+    return SurfaceSamples(np.concatenate(points), np.concatenate(directions))
+
+
+def _weights_on_faces(corners: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Barycentric weights (n, 3) where rays (n, 3) from the origin meet triangles (n, 3, 3).
+
+    Clamped to the triangle: a ray that grazes a face stays on it, whatever rounding does.
+    """
+    volumes = np.stack(
+        [
+            (rays * np.cross(corners[:, (k + 1) % 3], corners[:, (k + 2) % 3])).sum(1)
+            for k in range(3)
+        ],
+        1,
+    )  # (n, 3), of one sign where the ray meets the face
+    sign = np.sign(volumes.sum(1, keepdims=True))
+    weights = np.maximum(volumes * sign, 0.0)
+    total = weights.sum(1, keepdims=True)
+    return np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1.0 / 3.0)
+
+
+def thin_out(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
+    """Replace the samples in each cell of a grid by their mean, as point-cloud tools do.
+
+    The grid begins half a cell before the smallest coordinates. Mean normals are made unit again;
+    they are 0 where those of a cell cancel.
+
+    Parameters
+    ----------
+    voxel : float
+        Side of a cell, > 0, in the samples' frame.
+
+    Returns
+    -------
+    SurfaceSamples
+        In order of the cells (x, then y, then z).
+
+    Raises
+    ------
+    UsageError
+        ``voxel`` is not a positive number, or so small that cells cannot be numbered.
+    """
+    group, members = _cells(samples.points, voxel)
+    if len(samples) == 0:
+        return samples
+    low = samples.points.min(0)
+    normals = _means(samples.normals, group, members)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    known = length > 1e-9  # shorter means are those of normals that cancel, up to rounding
+    normals = np.where(known, normals / np.where(known, length, 1.0), 0.0)
+    return SurfaceSamples(_means(samples.points - low, group, members) + low, normals)
+
+
+def choose_per_cell(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
+    """Keep in each cell of a grid the sample nearest to the mean of those there.
+
+    As even as :func:`thin_out`, whose means leave a curved surface: these samples stay on it.
+    Same grid, order and errors; ties go to the earlier sample.
+    """
+    group, members = _cells(samples.points, voxel)
+    if len(samples) == 0:
+        return samples
+    local = samples.points - samples.points.min(0)
+    away = ((local - _means(local, group, members)[group]) ** 2).sum(1)  # (n,)
+    order = np.lexsort((away, group))  # stable: equal ones stay in order
+    return samples.kept(order[np.cumsum(members) - members])
+
+
+def _cells(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Number of the occupied cell of each point (n,), and how many points each has (c,)."""
+    if not (np.isfinite(voxel) and voxel > 0):
+        raise UsageError(f"A cell of {voxel} cannot be used to thin out.", "Give a length > 0.")
+    if len(points) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    local = points - points.min(0)
+    cells = np.floor(local / voxel + 0.5)  # (n, 3)
+    size = cells.max(0) + 1
+    if not np.prod(size) < 2.0**62:
+        raise UsageError(
+            f"Cells of {voxel} are too small for samples that extend over {local.max():.6g}.",
+            "Give a larger one.",
+        )
+    whole, sides = cells.astype(np.int64), size.astype(np.int64)
+    key = (whole[:, 0] * sides[1] + whole[:, 1]) * sides[2] + whole[:, 2]
+    _, group, members = np.unique(key, return_inverse=True, return_counts=True)
+    return group, members
+
+
+def _means(values: np.ndarray, group: np.ndarray, members: np.ndarray) -> np.ndarray:
+    """Mean of the rows (n, 3) of each group, (c, 3)."""
+    sums = [np.bincount(group, values[:, k], len(members)) for k in range(3)]
+    return np.stack(sums, 1) / members[:, None]
+
+
+def _checked(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise UsageError(
+            f"A mesh has arrays of shapes {vertices.shape} and {faces.shape}.",
+            "Give vertices (v, 3) and faces (f, 3).",
+        )
+    if len(faces) == 0:
+        raise MeshingError("The mesh has no faces.", "Check that the reconstruction is not empty.")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise UsageError(
+            f"The mesh's faces name vertices outside of 0 to {len(vertices) - 1}.",
+            "Write the mesh again.",
+        )
+    if not np.isfinite(vertices[np.unique(faces)]).all():
+        raise MeshingError(
+            "The mesh has a vertex that is not finite.", "Remove it, or make the mesh again."
+        )
+    return vertices, faces
+
+
+def _centred(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices relative to the middle of the used ones' bounds, and that middle (3,)."""
+    used = vertices[np.unique(faces)]
+    origin = (used.min(0) + used.max(0)) / 2
+    return vertices - origin, origin

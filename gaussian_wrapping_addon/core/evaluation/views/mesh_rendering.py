@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Mesh-based rendering: how close the textured mesh, seen from a camera, comes to a photo.
+
+Unlike the measure of the same name in the papers (method.md 9.3), no colour field is trained on the
+mesh: what is judged is the mesh with the texture that a person gets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...dataset.camera import Camera
+from ...errors import UsageError
+from ...parallel import default_threads
+from ...texture.textured_mesh import TexturedMesh
+from .lpips import Lpips, lpips_ready
+from .textured_rendering import TexturedRenderer
+from .view_metrics import ViewScores, has_windows, score_images
+
+OnView = Callable[[str, np.ndarray, np.ndarray], None]
+
+
+@dataclass(frozen=True)
+class MeshView:
+    """Figures of one photo."""
+
+    name: str
+    """Of the camera."""
+    scores: ViewScores
+    covered: float
+    """Share of the pixels that could count (of the mask, or of the whole photo where there is none)
+    that the mesh covers wholly."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values; ``lpips`` only where it was measured."""
+        return {"name": self.name, **self.scores.to_json(), "covered": self.covered}
+
+
+@dataclass(frozen=True)
+class MeshRenderingScore:
+    """Figures of all photos; means are over the photos, each counting once."""
+
+    views: tuple[MeshView, ...]
+    pixels: str
+    """``"mask"``: the pixels of given masks; ``"covered"``: those that the mesh covers wholly."""
+    left_out: int
+    """Photos in which no pixel counts, or none that a window of SSIM can be centred on."""
+    lpips_note: str = ""
+    """Why LPIPS is absent."""
+
+    @property
+    def psnr(self) -> float | None:
+        """Mean PSNR, dB; ``None`` without any view."""
+        return _mean([view.scores.psnr for view in self.views])
+
+    @property
+    def ssim(self) -> float | None:
+        """Mean SSIM; ``None`` without any view."""
+        return _mean([view.scores.ssim for view in self.views])
+
+    @property
+    def lpips(self) -> float | None:
+        """Mean LPIPS of the views where it was measured; ``None`` without any."""
+        return _mean([v.scores.lpips for v in self.views if v.scores.lpips is not None])
+
+    @property
+    def covered(self) -> float | None:
+        """Mean covered share; ``None`` without any view."""
+        return _mean([view.covered for view in self.views])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values; what was not measured is absent, and nothing is infinite."""
+        means = {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips, "covered": self.covered}
+        values: dict[str, Any] = {
+            "views": [view.to_json() for view in self.views],
+            **{name: value for name, value in means.items() if value is not None},
+            "pixels": self.pixels,
+            "left_out": self.left_out,
+        }
+        if self.lpips_note:
+            values["lpips_note"] = self.lpips_note
+        return values
+
+
+def render_views(
+    textured: TexturedMesh,
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    *,
+    masks: Sequence[np.ndarray] | None = None,
+    counted: Sequence[np.ndarray | None] | None = None,
+    lpips: Lpips | None = None,
+    threads: int = 0,
+    on_view: OnView | None = None,
+) -> MeshRenderingScore:
+    """Render the mesh from each camera and compare with the camera's photo.
+
+    PSNR, SSIM and LPIPS are those of :func:`~.view_metrics.score_images` over the pixels that
+    count. The rendering is antialiased by ``SUPERSAMPLING`` squared rays a pixel, unlit, both sides
+    of the surface shown.
+
+    Parameters
+    ----------
+    textured : TexturedMesh
+        Scene frame.
+    cameras : sequence of Camera
+        In the mesh's frame (``Camera.moved`` brings others there), each of the size of its photo.
+    images : sequence of (h, w, 3) uint8, or floats whose white is 1
+        The photos.
+    masks : sequence of (h, w) bool, optional
+        Pixels that count, such as true silhouettes. Where the mesh leaves one uncovered, the
+        background colour stands there and counts: a hole is an error. Without masks, the pixels
+        that the mesh covers wholly count: holes and missing parts cost nothing, and whatever stands
+        in front of the mesh in the photo is an error.
+    counted : sequence of ((h, w) bool or None), optional
+        Pixels of each photo that may count at all, such as a photo's own mask.
+    lpips : Lpips, optional
+    threads : int
+        0 uses every core; the result does not depend on it (LPIPS excepted, in its last digits).
+    on_view : callable, optional
+        Called with name, photo and rendering of each view that counts.
+
+    Raises
+    ------
+    UsageError
+        If a photo or mask has another size than its camera, or the numbers of them differ.
+    """
+    threads = threads or default_threads()
+    renderer = TexturedRenderer(textured, threads=threads)
+    views: list[MeshView] = []
+    left_out = 0
+    for camera, photo, mask, may_count in zip(
+        cameras,
+        _one_each(images, cameras, "photos"),
+        _one_each(masks, cameras, "masks"),
+        _one_each(counted, cameras, "masks"),
+        strict=True,
+    ):
+        _check_sizes(camera, photo, mask, may_count)
+        view = renderer.render(camera)
+        candidates = np.ones(view.covered.shape, np.bool_)
+        for part in (mask, may_count):
+            if part is not None:
+                candidates &= part
+        judged = candidates & view.covered if mask is None else candidates
+        if not has_windows(judged.shape, judged):
+            left_out += 1
+            continue
+        scores = score_images(view.image, photo, judged, lpips=lpips, threads=threads)
+        share = np.count_nonzero(view.covered & candidates) / np.count_nonzero(candidates)
+        views.append(MeshView(camera.name, scores, share))
+        if on_view is not None:
+            on_view(camera.name, photo, view.image)
+    pixels = "covered" if masks is None else "mask"
+    return MeshRenderingScore(tuple(views), pixels, left_out, _note(lpips, views))
+
+
+def _one_each(given: Sequence[Any] | None, cameras: Sequence[Camera], what: str) -> Sequence[Any]:
+    if given is None:
+        return [None] * len(cameras)
+    if len(given) != len(cameras):
+        raise UsageError(
+            f"{len(given)} {what} for {len(cameras)} cameras.", f"Give {what}, one for each camera."
+        )
+    return given
+
+
+def _check_sizes(camera: Camera, *pictures: np.ndarray | None) -> None:
+    for picture in pictures:
+        if picture is not None and picture.shape[:2] != (camera.height, camera.width):
+            raise UsageError(
+                f"{camera.name}: a picture of {picture.shape[:2]} pixels (height, width) for a "
+                f"camera of {(camera.height, camera.width)}.",
+                "Resize the camera or the picture.",
+            )
+
+
+def _note(lpips: Lpips | None, views: list[MeshView]) -> str:
+    if lpips is None:
+        ready, reason = lpips_ready()
+        return "LPIPS was not asked for." if ready else reason
+    if views and all(view.scores.lpips is None for view in views):
+        return "The pictures are too small for LPIPS."
+    return ""
+
+
+def _mean(values: list[float]) -> float | None:
+    return sum(values) / len(values) if values else None

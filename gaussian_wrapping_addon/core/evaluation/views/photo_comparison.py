@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A job's textured mesh beside some of the job's own photos: figures and pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...dataset.scene import Scene
+from ...texture.bake import Photos
+from ...texture.textured_mesh import TexturedMesh
+from .lpips import lpips_if_ready
+from .mesh_rendering import render_views
+from .side_by_side import write_side_by_side
+
+MAX_PHOTOS = 8
+LONG_SIDE_PX = 800
+MAX_PICTURES = 3
+PICTURE_WIDTH_PX = 1200
+NOTE = "the texture was baked from all photos, these included"
+
+
+def compare_with_photos(
+    textured: TexturedMesh,
+    scene: Scene,
+    photos: Photos,
+    held_out: Collection[str],
+    folder: Path,
+    *,
+    threads: int = 0,
+) -> dict[str, Any]:
+    """Measure mesh-based rendering over covered pixels, and write some of the comparisons.
+
+    Parameters
+    ----------
+    textured : TexturedMesh
+        Scene frame.
+    scene : Scene
+        Whose views the photos are.
+    photos : PhotoStore
+    held_out : collection of str
+        Names of photos that no Gaussian was trained on. Up to :data:`MAX_PHOTOS` are taken evenly
+        from these, or from all photos where there are none.
+    folder : Path
+        Gets ``comparison-1.jpg`` and so on: photo left, rendering right.
+    threads : int
+        0 uses every core.
+
+    Returns
+    -------
+    dict
+        What :meth:`~.mesh_rendering.MeshRenderingScore.to_json` returns, with ``pictures`` (file
+        names), ``held_out`` (whether the photos were held out of training) and ``note``. A view
+        that is pictured names its ``picture``.
+
+    Raises
+    ------
+    ResourceError
+        A picture cannot be written.
+    """
+    names = [view.camera.name for view in scene.views]
+    wanted = [index for index, name in enumerate(names) if name in held_out]
+    chosen = _evenly(wanted or list(range(len(names))), MAX_PHOTOS)
+    cameras, images, counted = [], [], []
+    for index in chosen:
+        full = photos.camera(index, 1)
+        # Whole blocks of pixels are averaged, as the renderer averages whole blocks of rays.
+        divisor = math.ceil(max(full.width, full.height) / LONG_SIDE_PX)
+        divisor = min(divisor, full.width, full.height)
+        cameras.append(photos.camera(index, divisor))
+        images.append(photos.photo(index, divisor))
+        counted.append(photos.mask(index, divisor))
+    shown: list[tuple[np.ndarray, np.ndarray]] = []
+    lpips, reason = lpips_if_ready()
+    score = render_views(
+        textured, cameras, images, counted=counted, lpips=lpips, threads=threads,
+        on_view=lambda name, photo, image: shown.append((photo, image)),
+    )  # fmt: skip
+    values = score.to_json()
+    if reason:
+        values["lpips_note"] = reason
+    values["pictures"] = []
+    for number, index in enumerate(_evenly(list(range(len(shown))), MAX_PICTURES), start=1):
+        name = f"comparison-{number}.jpg"
+        write_side_by_side(folder / name, *shown[index], max_width_px=PICTURE_WIDTH_PX)
+        values["views"][index]["picture"] = name
+        values["pictures"].append(name)
+    return {**values, "held_out": bool(wanted), "note": NOTE}
+
+
+def _evenly(items: list[int], count: int) -> list[int]:
+    """Return ``count`` of the items (or all), from the first to the last."""
+    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[place] for place in places.tolist()]

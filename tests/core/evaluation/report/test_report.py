@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The report tells all that was measured and warned of, and never what was not measured."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import re
+import urllib.parse
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gaussian_wrapping_addon.core.evaluation.report.figures import figure_rows
+from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
+from gaussian_wrapping_addon.core.evaluation.report.report import headline, write_report
+from gaussian_wrapping_addon.core.evaluation.report.text import (
+    NOT_MEASURED,
+    bar,
+    duration,
+    escaped,
+    finite,
+    number,
+    percent,
+    table,
+)
+from gaussian_wrapping_addon.core.evaluation.report.warnings import (
+    FEW_HELD_OUT,
+    collect_warnings,
+)
+from tests.core.evaluation.report.report_examples import (
+    PICTURES,
+    REGION,
+    full_region,
+    full_summary,
+    write_pictures,
+)
+
+LINK = re.compile(r"!\[[^\n]*?\]\(([^)\s]+)\)")
+WRONG_NUMBER = re.compile(r"\b(nan|inf|infinity|none)\b", re.IGNORECASE)
+
+
+def write(
+    folder: Path, summary: dict[str, Any] | None = None, regions: dict[str, Any] | None = None
+) -> tuple[dict[str, Any], str]:
+    """Write a report; return what both files hold."""
+    summary = full_summary() if summary is None else summary
+    write_report(folder, summary, {REGION: full_region()} if regions is None else regions)
+
+    def refuse(name: str) -> Any:
+        raise AssertionError(name)
+
+    values = json.loads((folder / "report.json").read_text(), parse_constant=refuse)
+    return values, (folder / "report.md").read_text(encoding="utf-8")
+
+
+def section(text: str, heading: str) -> str:
+    """Return the lines below a heading, up to the next of its rank."""
+    rank = heading.split(" ")[0]
+    begin = text.index(f"\n{heading}\n")
+    end = text.find(f"\n{rank} ", begin + len(heading))
+    return text[begin : end if end >= 0 else len(text)]
+
+
+def row(text: str, name: str) -> str:
+    """Return the figure beside a name in a table of two columns."""
+    (found,) = re.findall(rf"^\| {re.escape(name)} \| (.*) \|$", text, re.MULTILINE)
+    return found
+
+
+def cells(line: str) -> list[str]:
+    """Split a table row at the bars that are not escaped."""
+    return re.split(r"(?<!\\)\|", line)[1:-1]
+
+
+def tables(text: str) -> list[list[str]]:
+    found: list[list[str]] = [[]]
+    for line in text.splitlines():
+        if line.startswith("|"):
+            found[-1].append(line)
+        elif found[-1]:
+            found.append([])
+    return [t for t in found if t]
+
+
+def leaves(values: Any, path: tuple = ()) -> list[tuple]:
+    if isinstance(values, dict):
+        return [p for k, v in values.items() for p in leaves(v, (*path, k))]
+    if isinstance(values, list):
+        return [p for k, v in enumerate(values) for p in leaves(v, (*path, k))]
+    return [path]
+
+
+def test_every_warning_is_listed_with_stage_and_next_step(tmp_path: Path) -> None:
+    report, text = write(tmp_path)
+    warnings = section(text, "## Warnings")
+    entries = [line for line in warnings.splitlines() if line.startswith("- ")]
+    expected = [
+        ("cameras", "2 of 16 photos could not be placed"),
+        ("cameras", "miss their points by 3.50 px"),
+        ("training", "numbers were not finite"),
+        ("training", "Only 2 photos held out: too few to trust"),
+        ("training", "more than twice the error"),
+        (f"mesh {REGION}", "The edge length was raised to 0.02."),
+        (f"mesh {REGION}", "not closed (4 open edges)"),
+        (f"mesh {REGION}", "above 0.31"),
+        (f"mesh {REGION}", "3 faces without area"),
+        (f"texture {REGION}", "most of it was filled in"),
+        (f"texture {REGION}", "the unwrapper crashed"),
+        (f"texture {REGION}", "5 faces smaller than a texel"),
+        (f"texture {REGION}", "2 texels belong to two faces"),
+    ]
+    assert len(entries) == len(expected)
+    for entry, (stage, words) in zip(entries, expected, strict=True):
+        assert entry.startswith(f"- **{escaped(stage)}**: ")
+        assert escaped(words) in entry
+        assert ("*Next step:*" in entry) == ("edge length was raised" not in entry)
+    assert [w["stage"] for w in report["warnings"]] == [stage for stage, _ in expected]
+    summary = section(text, "## Summary")
+    assert all(escaped(w["text"]) in summary for w in report["warnings"])
+    for warning, line in zip(report["warnings"], headline(report)[3:], strict=True):
+        assert line == f"warning ({warning['stage']}): {warning['text']}"
+
+
+def good() -> dict[str, Any]:
+    """A report without anything to warn about."""
+    report = {**full_summary(), "regions": {REGION: full_region()}}
+    report["cameras"]["warnings"] = report["training"]["warnings"] = []
+    report["cameras"]["facts"]["mean_reprojection_error_px"] = 0.5
+    photo = {"name": "x.jpg", "psnr": 29.0, "ssim": 0.9}
+    report["training"].update(held_out=[photo] * FEW_HELD_OUT, held_out_psnr=29.0)
+    region = report["regions"][REGION]
+    region["statistics"].update(closed=True, boundary_edges=0)
+    region["provenance"].update(notes=[], degenerate_faces_left=0, level_error_p99=0.01)
+    region["texture"].update(
+        coverage=0.9, unwrap_fallback_reason="", faces_without_texel=0, texels_overlapping=0
+    )
+    return report
+
+
+def test_nothing_is_judged_where_nothing_is_wrong(tmp_path: Path) -> None:
+    assert collect_warnings(good()) == []
+    assert "had anything to warn about" in section(report_markdown(good(), tmp_path), "## Warnings")
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (("cameras", "facts", "mean_reprojection_error_px"), 2.01, "miss their points"),
+        (("training", "held_out_psnr"), 23.9, "twice the error"),
+        (("training", "held_out"), [], "No photo was held out"),
+        (("regions", REGION, "texture", "coverage"), 0.499, "filled in"),
+        (("regions", REGION, "texture", "coverage"), 0.0, "plain grey"),
+        (("regions", REGION, "provenance", "level_error_p99"), 0.251, "not on the surface"),
+    ],
+)
+def test_each_judgement_stands_alone(path: tuple[str, ...], value: Any, words: str) -> None:
+    report = good()
+    place = report
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    (warning,) = collect_warnings(report)
+    assert words in warning.text
+    assert warning.next_step
+
+
+def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
+    _, text = write(tmp_path)
+    summary = section(text, "## Summary")
+    for words in (
+        "Photos used: 14. Gaussians trained on them: 12,235 (preset draft).",
+        "196 faces, not closed",
+        "3 min 22 s",  # 201.5 s
+        "PSNR of 23.0 dB",
+        "typical error of 7.1 % of full brightness",  # 10 ** (-23 / 20)
+        "photos saw 25.0 % of the texture",
+        "20.0 dB (2 photos; the texture was baked from all photos, these included)",
+        "too few to trust",
+    ):
+        assert words in summary, words
+    stages = section(text, "## Time and memory")
+    assert "| training the Gaussians | 140.0 s | 70.0 % |" in stages
+    assert "| photos and cameras (earlier run) | 20.0 s | 10.0 % |" in stages
+    assert "main process: 3.00 GiB" in stages
+    assert "512 MiB" in stages
+    training = section(text, "## Training")
+    assert cells(training[training.index("| **mean**") :].splitlines()[0]) == [
+        " **mean** ", " 23.00 dB ", " 7.1 % ", " 0.6000 ",
+    ]  # fmt: skip
+    assert "| p\\|q.jpg | 20.00 dB | 10.0 % | 0.5000 |" in training
+    region = section(text, f"## Region {escaped(REGION)}")
+    for name, figure in (
+        ("Faces", "196 faces"),
+        ("Vertices", "100 vertices"),
+        ("Closed", "not closed, 4 open edges"),
+        ("Size (x, y, z)", "1 x 2 x 3.5 world units"),
+        ("Edge length, mean", "0.04 world units"),
+        ("Edge length, median", "0.03 world units"),
+        ("Residual, median", "0.002 of vacancy"),
+        ("Residual, 99 % of vertices below", "0.31 of vacancy"),
+        ("Residual, largest", "0.45 of vacancy"),
+        ("Size", "512 x 512 texels, chosen from the photos"),
+        ("Texel density", "8.8 texels per world unit"),
+        ("Coverage: seen by photos", "25.0 %"),
+    ):
+        assert row(region, name) == figure
+    assert "| p\\|q.jpg | 18.50 dB | 0.4500 | 75.0 % |" in region
+    assert "| **mean** | 20.00 dB | 0.5000 |  |" in region
+    assert "The texture was baked from all photos, these included." in region
+    assert f"LPIPS was {NOT_MEASURED}: its weights are not here." in region
+    machine = section(text, "## Machine, versions, seed")
+    for words in ("Some CPU", "numpy 1.26.4", "numba 0.68.1", "seed: 7", "2026-11-21"):
+        assert words in machine
+
+
+def test_pictures_are_linked_exactly_where_they_are(tmp_path: Path) -> None:
+    _, text = write(tmp_path)
+    assert LINK.findall(text) == []
+    assert "no pictures of the photos held out" in text
+    write_pictures(tmp_path)
+    _, text = write(tmp_path)
+    links = [urllib.parse.unquote(link) for link in LINK.findall(text)]
+    assert sorted(links) == sorted(PICTURES)
+    assert r"*p\|q.jpg, 18.5 dB. Left the photo, right the textured mesh.*" in text
+    summary = full_summary()
+    summary["training"]["pictures"] = [{"file": "../../secret.jpg", "name": "x", "psnr": 1.0}]
+    (tmp_path.parent / "secret.jpg").write_bytes(b"x")
+    _, text = write(tmp_path, summary)
+    assert "secret" not in section(text, "## Training")
+
+
+@pytest.mark.parametrize("perceptual", [False, True])
+def test_tables_are_well_formed(tmp_path: Path, perceptual: bool) -> None:
+    summary, region = full_summary(), full_region()
+    if perceptual:
+        summary["training"]["held_out"][0]["lpips"] = 0.25
+        region["mesh_rendering"]["views"][1]["lpips"] = 0.35
+    _, text = write(tmp_path, summary, {REGION: region})
+    found = tables(text)
+    assert len(found) == 7
+    for lines in found:
+        widths = {len(cells(line)) for line in lines}
+        assert len(widths) == 1, lines
+        assert all(set(c.strip()) <= {"-", ":"} and "---" in c for c in cells(lines[1]))
+        assert len(lines) > 2
+    assert ("LPIPS (0 is equal)" in text) == perceptual
+    # Markup of outside names is shown, not obeyed.
+    assert text.splitlines()[0] == r"# Report: a\|b &lt;i&gt;\*photos\*&lt;/i&gt;"
+
+
+def test_every_number_of_the_table_has_a_unit() -> None:
+    report = {"version": 1, **full_summary(), "regions": {REGION: full_region()}}
+    rows = figure_rows(report)
+    units = {name: unit for name, value, unit in rows}
+    assert all(unit for _, value, unit in rows if re.fullmatch(r"[\d,]+(\.\d+)?(e[+-]\d+)?", value))
+    for words, unit in (
+        ("training, held out psnr", "dB"),
+        ("peak memory bytes, worker", "bytes"),
+        ("stem 1, statistics, area", "square scene units"),
+        ("stem 1, world, area", "square world units"),
+        ("stem 1, world, size, 0", "world units"),
+        ("stem 1, seconds, mesh", "s"),
+        ("stem 1, provenance, level error p99", "of vacancy"),
+        ("stem 1, statistics, faces", "count"),
+        ("texture, gutter px", "px"),
+        ("started unix s", "s since 1970"),
+    ):
+        (found,) = [u for name, u in units.items() if name.endswith(words)]
+        assert found == unit, words
+
+
+@pytest.mark.parametrize("value", [None, math.nan, "x"])
+def test_one_bad_figure_never_breaks_a_report(tmp_path: Path, value: Any) -> None:
+    """Whatever single value is missing or not finite, the report is written and stays sober."""
+    whole = {**full_summary(), "regions": {REGION: full_region()}}
+    for path in leaves(whole):
+        report = copy.deepcopy(whole)
+        place: Any = report
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = value
+        if path[:2] == ("training", "pictures"):
+            continue
+        values = finite(report)
+        text = report_markdown(values, tmp_path)
+        body = text[: text.index("<details>")].replace("none ran", "").replace("black is none", "")
+        assert WRONG_NUMBER.search(body) is None, path
+        assert headline(values)
+        json.dumps([w.to_json() for w in collect_warnings(values)], allow_nan=False)
+        for lines in tables(text):
+            assert len({len(cells(line)) for line in lines}) == 1
+
+
+def test_files_hold_no_number_that_is_not_finite(tmp_path: Path) -> None:
+    summary, region = full_summary(), full_region()
+    summary["training"]["held_out_psnr"] = math.nan
+    region["world"]["edge_mean"] = math.inf
+    values, text = write(tmp_path, summary, {REGION: region})
+    assert values["training"]["held_out_psnr"] is None
+    assert row(text, "Edge length, mean") == NOT_MEASURED
+
+
+@pytest.mark.parametrize("report", [{}, {"regions": {"a": {}}}, {"training": 3, "stages": {}}])
+def test_what_an_old_report_lacks_is_not_measured(tmp_path: Path, report: dict[str, Any]) -> None:
+    text = report_markdown(report, tmp_path)
+    assert re.search(r"(?<![\d.,])0(\.0+)? (%|dB|faces|Gaussians|s)\b", text) is None
+    assert "not measured" in section(text, "## Training")
+    assert all("not measured" in line for line in headline(report))
+    if report.get("regions"):
+        region = section(text, "## Region a")
+        for name in ("Faces", "Residual, median", "Size (x, y, z)", "Texel density", "Size"):
+            assert row(region, name) == NOT_MEASURED
+        assert "reproduces photos was not measured" in region
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (number(0.00012345, "dB"), "1.234e-04 dB"),
+        (number(1234567), "1,234,567"),
+        (number(12345.6), "12,346"),
+        (number(2.0), "2"),
+        (number(True), NOT_MEASURED),
+        (number(math.nan, "s"), NOT_MEASURED),
+        (number(10**400), NOT_MEASURED),
+        (percent(0.99999), "99.9 %"),
+        (percent(1.0), "100.0 %"),
+        (percent(0.00001), "less than 0.1 %"),
+        (percent(0), "0.0 %"),
+        (percent(None), NOT_MEASURED),
+        (duration(math.inf), NOT_MEASURED),
+        (duration(3661), "1 h 01 min"),
+        (escaped("a\nb | `c`"), r"a b \| \`c\`"),
+    ],
+)
+def test_words(text: str, expected: str) -> None:
+    assert text == expected
+
+
+def test_bars_and_tables() -> None:
+    assert bar(0.0).count("█") == 0
+    assert bar(1e-6).count("█") == 1
+    assert bar(0.5).count("█") == bar(0.5).count("░")
+    assert set(bar(1.0)) == {"█"}
+    with pytest.raises(ValueError, match="cells"):
+        table(("a", "b"), [("1",)], "lr")

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Depth and vacancy errors against surfaces that are known in closed form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from gaussian_wrapping_addon.core import tolerances
+from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.evaluation.surface.field_errors import (
+    depth_errors,
+    vacancy_errors,
+)
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from tests.core.field.field_scenes import camera_at, unit_sphere
+
+ALPHA, SIGMA = 0.9, 0.4
+RADIUS = SIGMA * math.sqrt(2.0 * math.log(2.0 * ALPHA))
+"""One round Gaussian's isosurface is a sphere of this radius from everywhere (method.md 14.1)."""
+THRESHOLDS = (0.005, 0.02)
+
+
+def ball() -> OrientedGaussians:
+    return OrientedGaussians(
+        means=torch.zeros(1, 3),
+        log_scales=torch.full((1, 3), math.log(SIGMA)),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        opacity_logits=torch.tensor([math.log(ALPHA / (1.0 - ALPHA))]),
+        sh=torch.zeros(1, 1, 3),
+        orientation=torch.zeros(1, 4),
+        filter_3d=torch.zeros(1),
+    )
+
+
+def sphere(radius: float) -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(5, radius)
+
+
+def cameras() -> list:
+    return [camera_at(3.0 * direction) for direction in unit_sphere(6)]
+
+
+def test_the_right_surface_has_no_error() -> None:
+    mesh = sphere(RADIUS)
+    depth = depth_errors(ball(), cameras(), mesh.vertices, mesh.faces, THRESHOLDS)
+    assert depth.pixels > 10_000
+    # Depth needs T <= 0.45 behind the ray's peak, which rays near the silhouette do not reach: the
+    # discs q_min < 2 ln(alpha / 0.55) and q_min < 2 ln(2 alpha) differ by this ratio of areas.
+    valid = math.log(ALPHA / (1.0 - tolerances.DEPTH_VALID_TRANSMITTANCE)) / math.log(2 * ALPHA)
+    assert depth.found == pytest.approx(valid, abs=0.01)
+    assert depth.median < 2e-4  # the facets lie up to 3e-4 of the radius below the sphere
+    assert depth.within[1] == depth.found
+    field = VacancyField(ball().arrays(), cameras())
+    points = unit_sphere(500)
+    vacancy = vacancy_errors(field, RADIUS * points, points, THRESHOLDS)
+    assert vacancy.found == 1.0
+    assert vacancy.median < 1e-4
+    assert vacancy.within == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("offset", [0.01, -0.01])
+def test_a_known_offset_is_measured_with_its_sign(offset: float) -> None:
+    """Judged against a sphere that is ``offset`` smaller, the isosurface lies outside by it."""
+    mesh = sphere(RADIUS - offset)
+    depth = depth_errors(ball(), cameras(), mesh.vertices, mesh.faces, THRESHOLDS)
+    assert depth.median > 0.0099  # along slanted rays the gap is longer than along the normal
+    assert depth.within[0] == 0.0
+    assert depth.within[1] > 0.5
+    field = VacancyField(ball().arrays(), cameras())
+    points = unit_sphere(500)
+    vacancy = vacancy_errors(field, (RADIUS - offset) * points, points, THRESHOLDS)
+    assert vacancy.median_offset == pytest.approx(offset, abs=1e-4)
+    assert vacancy.within == (0.0, 1.0)
+
+
+def test_what_is_missing_is_counted_as_missing() -> None:
+    far = sphere(RADIUS)
+    far.apply_translation([0.0, 0.0, 2.0 * RADIUS])
+    depth = depth_errors(ball(), cameras()[2:4], far.vertices, far.faces, THRESHOLDS)
+    assert depth.found < 0.9
+    field = VacancyField(ball().arrays(), cameras())
+    points = unit_sphere(100)
+    vacancy = vacancy_errors(field, 3.0 * RADIUS * points, points, THRESHOLDS)
+    assert vacancy.found == 0.0
+    assert vacancy.within == (0.0, 0.0)
+
+
+def test_nothing_to_compare_is_refused() -> None:
+    mesh = sphere(RADIUS)
+    behind = np.add(mesh.vertices, [0.0, 0.0, 1e4])
+    with pytest.raises(UsageError, match="No pixel"):
+        depth_errors(ball(), cameras()[:1], behind, mesh.faces, THRESHOLDS)
+    with pytest.raises(UsageError, match="no sample"):
+        vacancy_errors(
+            VacancyField(ball().arrays(), cameras()), np.zeros((0, 3)), np.zeros((0, 3)), THRESHOLDS
+        )
