@@ -54,7 +54,7 @@ def main(given: list[str] | None = None) -> int:
                     width=options.width,
                     height=options.height,
                     test_views=options.test_views,
-                )  # fmt: skip
+                )
             )
             print(f"{name}: {time.perf_counter() - begin_s:.1f} s, {folders[-1]}", flush=True)
         if options.sheet:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from gaussian_wrapping_addon.core.meshing.region import Region
 from . import furniture
 from .geometry import Part, read_obj, scaled_to
 from .rendering import Light, union_of
-from .surroundings import room_shell, studio
+from .surroundings import ceiling_lamps, room_shell, studio
 from .viewpoints import around_thing, inside_room
 
 MESHES = Path(__file__).parents[1] / "meshes"
@@ -27,7 +27,10 @@ THING_DIAGONAL = 2.0
 THIN_SHARE = 0.015
 """Walls thinner than this share of the crop's diagonal count as thin."""
 
-_STUDIO_LIGHT = Light(sky=0.55, sun=1.3)
+STUDIO_FLOOR, STUDIO_HEIGHT = -1.45, 4.2
+"""Of the room around single things, whose middle is at 0."""
+
+_STUDIO_LIGHT = Light(sun=1.15)
 _Y_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """Turns a mesh whose y axis points up so that z does."""
 
@@ -41,7 +44,7 @@ class SceneKind:
     """"test": reported, nothing may be tuned on it; "development"."""
     description: str
     seed: int
-    samples: int = 8
+    samples: int = 5
     distance: float = 2.35
     """Of the cameras from the middle of a single thing."""
     derived_from: str = ""
@@ -68,11 +71,11 @@ KINDS = {
     kind.name: kind
     for kind in (
         SceneKind("spot", "development", "A painted cow, matte, in a studio room.", 101),
-        SceneKind("wheel", "test", "A wheel with 28 thin crossing spokes, matte.", 102, distance=2.3),
+        SceneKind("wheel", "test", "A wheel with 28 thin crossing spokes, matte.", 102, 5, 2.3),
         SceneKind("cup", "test", "A thin-walled cup with a handle, matte ceramic.", 103),
         SceneKind("fence", "development", "A panel of crossing wires, matte.", 104, distance=2.15),
         SceneKind("room", "test", "A furnished room seen from inside.", 105),
-        SceneKind("glossy", "test", "A glazed gourd that reflects its room.", 106, 10, 2.2),
+        SceneKind("glossy", "test", "A glazed gourd that reflects its room.", 106, 6, 2.2),
         SceneKind(
             "spot_exposure", "development", "spot; exposure and white balance change from photo to"
             " photo.", 107, derived_from="spot", exposure=True,
@@ -124,20 +127,18 @@ def _thing_content(kind: SceneKind, photos: int, tests: int, size: tuple[int, in
     random = np.random.default_rng(kind.seed)
     thing = _thing(kind.name)
     low, high = thing.vertices.min(0), thing.vertices.max(0)
-    light = _STUDIO_LIGHT
+    parts = [thing, *studio(3.6, STUDIO_FLOOR, STUDIO_HEIGHT)]
     if kind.name == "glossy":
-        light = replace(
-            light, sun=0.6, lamps=(((1.6, -1.2, 2.6), 70.0, 0.9), ((-2.0, 1.5, 2.4), 45.0, 0.5))
-        )
+        parts += ceiling_lamps(STUDIO_FLOOR + STUDIO_HEIGHT)
     around: Callable[[int, str], list[Camera]] = lambda count, prefix: around_thing(  # noqa: E731
         count, *size, kind.distance, random, prefix
     )
     return SceneContent(
-        (thing, *studio(3.6, -1.45, 4.2)),
+        tuple(parts),
         (thing.vertices, thing.faces),
         _grown("region", low, high, 0.05 * THING_DIAGONAL),
         _grown("crop", low, high, 0.03 * THING_DIAGONAL),
-        light,
+        _STUDIO_LIGHT,
         tuple(around(photos, "photo")),
         tuple(around(tests, "test")),
     )
@@ -166,7 +167,7 @@ def _room_content(kind: SceneKind, photos: int, tests: int, size: tuple[int, int
         union_of([furniture.wall_solid(), *things]),
         _grown("region", low, high, furniture.WALL_THICKNESS),
         _grown("crop", low, high, 0.35 * furniture.WALL_THICKNESS),
-        Light(sky=0.62, sun=0.9, sun_direction=(0.5, 0.35, -0.8)),
+        Light(sun=1.0, direction=(0.5, 0.35, -0.8)),
         tuple(cameras),
         tuple(test_cameras),
     )

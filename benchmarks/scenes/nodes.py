@@ -9,13 +9,23 @@ from typing import Any
 Color = tuple[float, float, float]
 """Linear red, green, blue, 0 to 1."""
 
+SKY_UP = (0.24, -0.30, 0.92)
+"""Where the sky is brightest, about unit."""
+
+SKY_BELOW, SKY_ABOVE = 0.30, 0.46
+"""Radiance that a white surface returns of the sky's light, facing away from and towards it."""
+
+EVEN_LIGHT = 0.62
+"""Radiance that a white surface returns of light from everywhere."""
+
 
 class Nodes:
     """The node tree of one material; every pattern method returns an output socket."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, *, unlit: bool = False) -> None:
         import bpy
 
+        self.unlit = unlit
         self.material = bpy.data.materials.new(name)
         with warnings.catch_warnings():
             # Needed up to Blender 4.x; announced to go in 6.0.
@@ -23,7 +33,10 @@ class Nodes:
             self.material.use_nodes = True
         self.tree = self.material.node_tree
         self.tree.nodes.clear()
-        self.position = self.tree.nodes.new("ShaderNodeNewGeometry").outputs["Position"]
+        surface = self.tree.nodes.new("ShaderNodeNewGeometry")
+        self.position, self.normal = surface.outputs["Position"], surface.outputs["Normal"]
+        # The sky's share is emission, which must not be taken for lamps.
+        self.material.cycles.emission_sampling = "NONE"
 
     def feed(self, socket: Any, value: Any) -> None:
         """Link an output socket, or set a constant; colours are three numbers."""
@@ -119,21 +132,51 @@ class Nodes:
 
     def finish_matte(self, color: Any) -> Any:
         """Make it a material that looks the same from everywhere."""
+        if self.unlit:
+            return self._finish(self.add("ShaderNodeEmission", {"Color": color}))
         shader = self.add("ShaderNodeBsdfDiffuse", {"Color": color})
-        return self._finish(shader)
+        return self._finish(self._with_sky(shader, color))
+
+    def finish_even(self, color: Any) -> Any:
+        """Make it matte in light that comes evenly from everywhere: no shadows, no noise."""
+        values = {"Color": color, "Strength": EVEN_LIGHT}
+        return self._finish(self.add("ShaderNodeEmission", values))
 
     def finish_glossy(self, color: Any, roughness: float, coat: float) -> Any:
         """Make it a glazed material with a clear coat."""
         values = {
-            "Base Color": color, "Roughness": roughness, "Coat Weight": coat,
+            "Base Color": color,
+            "Specular IOR Level": 0.0,  # only the coat reflects: a broad second lobe is grain
+            "Roughness": roughness,
+            "Coat Weight": coat,
             "Coat Roughness": 0.04,
-        }  # fmt: skip
-        return self._finish(self.add("ShaderNodeBsdfPrincipled", values))
+        }
+        shader = self.add("ShaderNodeBsdfPrincipled", values)
+        return self._finish(self._with_sky(shader, color))
 
-    def finish_mask(self, value: float) -> Any:
-        """Make it shine evenly: for masks that tell where a thing is seen."""
-        shader = self.add("ShaderNodeEmission", {"Color": (value, value, value)})
+    def finish_light(self, strength: float) -> Any:
+        """Make it shine evenly, 1 is white in the photo."""
+        shader = self.add("ShaderNodeEmission", {"Strength": strength})
         return self._finish(shader)
+
+    def _with_sky(self, shader: Any, color: Any) -> Any:
+        """Add the light of an even sky, brighter from above, that nothing hides.
+
+        As emission it has no sampling noise: photos stay clean at few samples a pixel.
+        """
+        node = self.tree.nodes.new("ShaderNodeVectorMath")
+        node.operation = "DOT_PRODUCT"
+        self.feed(node.inputs[0], self.normal)
+        self.feed(node.inputs[1], SKY_UP)
+        upward = self.math("MULTIPLY_ADD", node.outputs["Value"], 0.5)
+        upward.node.inputs[2].default_value = 0.5  # 0 from below to 1 from above
+        strength = self.math("MULTIPLY_ADD", upward, SKY_ABOVE - SKY_BELOW)
+        strength.node.inputs[2].default_value = SKY_BELOW
+        glow = self.add("ShaderNodeEmission", {"Color": color, "Strength": strength})
+        both = self.tree.nodes.new("ShaderNodeAddShader")
+        self.tree.links.new(shader.outputs[0], both.inputs[0])
+        self.tree.links.new(glow.outputs[0], both.inputs[1])
+        return both
 
     def _finish(self, shader: Any) -> Any:
         output = self.tree.nodes.new("ShaderNodeOutputMaterial")

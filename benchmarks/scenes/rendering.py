@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +20,16 @@ import numpy as np
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ResourceError
 
+from .baking import bake_walls
 from .geometry import SHARP_DEGREES, Part
-from .materials import make_mask_material, make_material
+from .materials import make_mask_material, make_material, make_picture_material
 
 SENSOR_MM = 36.0
 FILTER_WIDTH_PX = 1.2
 """Width of the pixel filter: a little softer than a box, as lenses are."""
+
+SUN_DEGREES = 14.0
+"""Size of the sun: it makes soft shadows."""
 
 _BLENDER_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 """Blender's cameras look along -z with y up, ours along +z with y down."""
@@ -31,16 +37,12 @@ _BLENDER_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class Light:
-    """Light of a scene: an even sky, a soft sun, and lamps."""
+    """A soft sun; the sky's even light is part of the materials (``nodes.py``)."""
 
-    sky: float
-    """Radiance of the sky, which shines through everything that is ``surrounding``."""
     sun: float
-    """Irradiance of the sun."""
-    sun_direction: tuple[float, float, float] = (-0.4, 0.5, -0.9)
+    """Irradiance; a white matte surface that faces it returns this / pi."""
+    direction: tuple[float, float, float] = (-0.4, 0.5, -0.9)
     """From the sun to the scene."""
-    lamps: tuple[tuple[tuple[float, float, float], float, float], ...] = ()
-    """Position, power in watts and edge length of square lamps that shine downwards."""
 
 
 def require_bpy() -> Any:
@@ -77,34 +79,19 @@ def _mesh_object(part: Part, material: Any) -> Any:
     bpy.context.scene.collection.objects.link(item)
     if part.surrounding:
         item.visible_shadow = False
-        item.visible_diffuse = False
+        item.visible_diffuse = False  # so that scattered rays do not find its lamps by chance
     return item
 
 
 def _add_light(light: Light) -> None:
     import bpy
-
-    world = bpy.data.worlds.new("sky")
-    bpy.context.scene.world = world
-    if world.node_tree is None:
-        world.use_nodes = True
-    world.node_tree.nodes["Background"].inputs["Color"].default_value = (1.0, 0.98, 0.95, 1.0)
-    world.node_tree.nodes["Background"].inputs["Strength"].default_value = light.sky
     from mathutils import Vector
 
-    if light.sun > 0.0:
-        sun = bpy.data.lights.new("sun", "SUN")
-        sun.energy, sun.angle = light.sun, math.radians(25.0)
-        item = bpy.data.objects.new("sun", sun)
-        item.rotation_euler = Vector(light.sun_direction).to_track_quat("-Z", "Y").to_euler()
-        bpy.context.scene.collection.objects.link(item)
-    for position, power, size in light.lamps:
-        lamp = bpy.data.lights.new("lamp", "AREA")
-        lamp.energy, lamp.size = power, size
-        item = bpy.data.objects.new("lamp", lamp)
-        item.location = position
-        item.visible_camera = False
-        bpy.context.scene.collection.objects.link(item)
+    sun = bpy.data.lights.new("sun", "SUN")
+    sun.energy, sun.angle = light.sun, math.radians(SUN_DEGREES)
+    item = bpy.data.objects.new("sun", sun)
+    item.rotation_euler = Vector(light.direction).to_track_quat("-Z", "Y").to_euler()
+    bpy.context.scene.collection.objects.link(item)
 
 
 def _configure(width: int, height: int, samples: int, glossy_bounces: int, threads: int) -> Any:
@@ -169,7 +156,9 @@ def render_photos(
     paths: Sequence[Path],
     light: Light,
     *,
-    samples: int = 8,
+    samples: int = 5,
+    wall_density: float = 140.0,
+    wall_shadows: bool = False,
     glossy_bounces: int = 0,
     threads: int = 0,
     mask_of: Callable[[Part], bool] | None = None,
@@ -181,6 +170,12 @@ def render_photos(
     ----------
     samples : int
         Rays a pixel; the seed is fixed.
+    wall_density : float
+        Pixels per unit of length of the pictures that walls are hung with.
+    wall_shadows : bool
+        Whether the sun reaches the walls and floor; else they are lit evenly, which is quicker.
+    glossy_bounces : int
+        0 for matte scenes, 1 where things reflect their room.
     mask_of : function or None
         Instead of photos, write masks that are white where a part of these is seen.
     done : function or None
@@ -198,6 +193,14 @@ def render_photos(
         masks = {seen: make_mask_material(seen) for seen in (False, True)}
         scene.view_settings.view_transform = "Raw"
     materials: dict[str, Any] = {}
+    if mask_of is None:
+        folder = Path(tempfile.mkdtemp(prefix="walls-"))
+        parts, pictures = bake_walls(parts, folder, wall_density, scene)
+        materials = {
+            name: make_picture_material(path, shadows=wall_shadows)
+            for name, path in pictures.items()
+        }
+        _configure(cameras[0].width, cameras[0].height, samples, glossy_bounces, threads)
     for part in parts:
         if mask_of is not None:
             material = masks[bool(mask_of(part))]
@@ -216,6 +219,8 @@ def render_photos(
         bpy.ops.render.render(write_still=True)
         if done is not None:
             done(index + 1)
+    if mask_of is None:
+        shutil.rmtree(folder)
 
 
 def union_of(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:

@@ -93,3 +93,18 @@ def studio(half_width: float, floor_z: float, height: float) -> list[Part]:
             "north": ("wallpaper_xz", "poster_d"),
         },
     )
+
+
+def ceiling_lamps(ceiling_z: float) -> list[Part]:
+    """Return bright panels just below a ceiling: what shiny things reflect."""
+    places = {"lamp 0": (1.3, -1.0, 1.1, 0.5), "lamp 1": (-1.7, 1.4, 0.6, 0.6)}
+    return [
+        _sheet(
+            name,
+            np.array([x, y, ceiling_z - 0.03]),
+            np.array([0.0, width, 0.0]),
+            np.array([depth, 0.0, 0.0]),
+            "lamp_panel",
+        )
+        for name, (x, y, width, depth) in places.items()
+    ]
