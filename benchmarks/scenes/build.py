@@ -68,7 +68,7 @@ def build_scene(kind: SceneKind, size: BuildSize, folder: Path, base: Path | Non
             content.parts, cameras, paths, content.light, samples=kind.samples,
             glossy_bounces=glossy,
             wall_shadows=kind.name == "room",
-            wall_density=220.0 if kind.name == "room" else 140.0,
+            wall_density=(220.0 if kind.name == "room" else 140.0) * size.width / 640,
         )  # fmt: skip
         facts["bpy"] = require_bpy().app.version_string
     else:

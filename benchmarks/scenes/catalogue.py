@@ -167,7 +167,7 @@ def _room_content(kind: SceneKind, photos: int, tests: int, size: tuple[int, int
         union_of([furniture.wall_solid(), *things]),
         _grown("region", low, high, furniture.WALL_THICKNESS),
         _grown("crop", low, high, 0.35 * furniture.WALL_THICKNESS),
-        Light(sun=1.0, direction=(0.5, 0.35, -0.8)),
+        Light(sun=1.7, direction=(0.5, 0.35, -0.8)),
         tuple(cameras),
         tuple(test_cameras),
     )

@@ -172,7 +172,7 @@ _BUILDERS: dict[str, Callable[[Nodes], Any]] = {
     "poster_b": _poster(3.3, (0.1, 0.3, 0.5), (0.7, 0.72, 0.6), 2.0),
     "poster_c": _poster(2.6, (0.15, 0.4, 0.2), (0.7, 0.6, 0.3), 8.0),
     "poster_d": _poster(4.0, (0.5, 0.1, 0.3), (0.6, 0.7, 0.75), 3.0),
-    "lamp_panel": lambda n: n.finish_light(5.0),
+    "lamp_panel": lambda n: n.finish_light(18.0),
     "oak": _wood((0.24, 0.13, 0.06), (0.45, 0.30, 0.17)),
     "walnut": _wood((0.09, 0.045, 0.025), (0.20, 0.11, 0.06)),
     "dark_metal": _plain((0.08, 0.08, 0.085), (0.12, 0.11, 0.11), 12.0),

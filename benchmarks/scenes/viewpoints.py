@@ -82,7 +82,7 @@ def inside_room(
         center = np.array([np.cos(angle) * half[0] * reach, np.sin(angle) * half[1] * reach, 0.0])
         center += [middle[0], middle[1], random.uniform(1.15, 1.75)]
         pan = np.radians((0.0, 48.0, -48.0)[k % 3] + random.uniform(-8, 8))
-        pitch = np.radians((-14.0, -30.0, 4.0, -6.0, 22.0)[k % 5] + random.uniform(-4, 4))
+        pitch = np.radians((-15.0, -32.0, -4.0, -22.0, 14.0)[k % 5] + random.uniform(-4, 4))
         # Across the room as the walls stand: the direction to the opposite point of the ellipse.
         yaw = np.arctan2(np.sin(angle) * half[1], np.cos(angle) * half[0]) + np.pi + pan
         direction = [np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)]
