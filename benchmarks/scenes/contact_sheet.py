@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 _CELL = (320, 240)
 _CAPTION_PX = 16
-_SHARES = (0.14, 0.62)
+_SHARES = (0.26, 0.34)
 """Which two of a scene's photos are shown: these shares of the way through them."""
 
 
