@@ -21,7 +21,7 @@ from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.job_file import read_job
 from gaussian_wrapping_addon.ops import job_actions, job_timer, known_jobs, tags
-from gaussian_wrapping_addon.ui import panels
+from gaussian_wrapping_addon.ui import panels, report_panel
 from tests.blender.fake_layout import draw
 from tests.blender.synthetic_result import BOX_SCENE, WORLD_FROM_SCENE
 
@@ -110,8 +110,8 @@ def test_wrap_scene_runs_and_imports(photos: Path, worker: object) -> None:
     assert kinds == ["camera"] * 4 + ["frame", "mesh", "region"]
     assert not job_timer.poll_jobs(), "the timer must stop when idle"
     assert job_timer.tick() is None
-    layout = draw(panels.GWRAP_PT_result)
-    for text in ("27.2 dB", "4,321", "12, closed", "87.5 %", "1 min 23 s"):
+    layout = draw(report_panel.GWRAP_PT_report)
+    for text in ("27.2 dB", "4,321", "Faces\n12\n", "Closed\nYes\n", "87.5 %", "1 min 23 s"):
         assert text in layout.texts
     assert list(photos.iterdir()) == [], "nothing may be written into the photo folder"
 

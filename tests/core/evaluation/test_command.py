@@ -224,6 +224,8 @@ def test_an_interrupt_ends_it_and_its_child(tmp_path: Path) -> None:
             "--samples", "30000000", "--out", str(out),
         ],
         stdout=subprocess.PIPE,
+        # Where the tests run in a shell's background, interrupts arrive ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert process.stdout is not None
     assert b"%]" in process.stdout.readline()  # the child has begun
