@@ -60,7 +60,7 @@ def warm_up(scene: Path, settings: Settings) -> None:
     """Wrap a scene in a minute and forget it, so that no measured run compiles kernels."""
     folder = settings.folder / "warm-up"
     shutil.rmtree(folder, ignore_errors=True)
-    arguments = ("--iterations", "60", "--max-gaussians", "2000")
+    arguments = ("--iterations", "400", "--max-gaussians", "8000")
     run = Run(scene.name, "draft", 0, "warm-up", arguments)
     run_wrap(run, scene, dataclasses.replace(settings, folder=folder))
     shutil.rmtree(folder)
