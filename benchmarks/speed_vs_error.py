@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.core.parallel import default_threads
 from .scenes import ensure_scene
 from .speed_error.document import write_document
 from .speed_error.plan import Plan, Run, full_plan, quick_plan
-from .speed_error.results import Outcome, Result
+from .speed_error.results import Outcome, Result, is_plain
 from .speed_error.runs import ROOT, Settings, judged_by, measured, run_variant, run_wrap, warm_up
 
 _logger = logging.getLogger("benchmarks")
@@ -76,7 +76,7 @@ def carry_out(plan: Plan, settings: Settings, only: Sequence[str] | None = None)
     for number, run in enumerate(runs):
         results += carry_out_run(run, folders[run.scene], settings)
         _log(f"{number + 1}/{len(runs)} {run.identity}", results[-1 - len(run.variants)])
-    poses, ceilings = {}, {}
+    poses, ceilings, kernels = {}, {}, {}
     for name, scene in folders.items():
         path = settings.folder / f"{name}-truth.json"
         ceilings[name] = judged_by("score", [str(scene), str(path)], path, settings)
@@ -85,7 +85,13 @@ def carry_out(plan: Plan, settings: Settings, only: Sequence[str] | None = None)
             arguments = [str(scene), str(path.parent)]
             poses[name] = judged_by("poses", arguments, path, settings)
             _logger.info("poses of %s: %.0f s", name, poses[name]["seconds"])
-    return Outcome(folders, results, poses, ceilings)
+    for run in runs:
+        if run.scene in plan.pose_scenes and run.preset == "draft" and is_plain(run):
+            folder = settings.folder / run.identity
+            path = folder / "vacancy-kernel.json"
+            arguments = [str(folders[run.scene]), str(folder / "out"), str(path)]
+            kernels[run.scene] = judged_by("vacancy_kernel", arguments, path, settings)
+    return Outcome(folders, results, poses, ceilings, kernels)
 
 
 def carry_out_run(run: Run, scene: Path, settings: Settings) -> list[Result]:

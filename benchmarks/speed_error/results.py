@@ -74,6 +74,8 @@ class Outcome:
     """Cameras solved from photos alone, of some scenes; see :mod:`.poses`."""
     ceilings: dict[str, dict[str, Any]]
     """Scores of the true surface itself."""
+    kernels: dict[str, dict[str, Any]]
+    """The vacancy kernel against its definition; see :mod:`.vacancy_kernel`."""
 
 
 def mean_and_spread(values: Sequence[float]) -> str:
@@ -95,10 +97,14 @@ def pick(results: Sequence[Result], keep: Callable[[Result], bool]) -> list[Resu
 def plain(results: Sequence[Result], scene: str = "") -> list[Result]:
     """Return the presets as they are, with seed 0, scene by scene (or of one scene)."""
     scenes = list(dict.fromkeys(r.run.scene for r in results))
-    kept = [r for r in results if is_plain(r) and (not scene or r.run.scene == scene)]
+    kept = [
+        r
+        for r in results
+        if is_plain(r.run) and r.variant is None and (not scene or r.run.scene == scene)
+    ]
     return sorted(kept, key=lambda r: scenes.index(r.run.scene))
 
 
-def is_plain(result: Result) -> bool:
-    """Tell whether a result is a preset as it is, with seed 0."""
-    return not result.run.name and result.run.seed == 0 and result.variant is None
+def is_plain(run: Run) -> bool:
+    """Tell whether a run is a preset as it is, with seed 0."""
+    return not run.name and run.seed == 0

@@ -19,6 +19,7 @@ from benchmarks.speed_error.tables import (
     bias_table,
     cost_table,
     image_table,
+    kernel_table,
     pose_table,
     seed_table,
     stage_table,
@@ -41,6 +42,12 @@ POSES = {
         },
     }
 }
+KERNELS = {
+    "spot": {
+        "gaussians": 40_000, "cameras": 40, "kernel_us": 2.0, "definition_us": 50_000.0,
+        "error_median": 1e-4, "error_max": 1e-2, "same_side": 0.98, "definition_points": 60,
+    }
+}  # fmt: skip
 
 
 def result(run: Run, variant: Any, number: int) -> Result:
@@ -122,6 +129,7 @@ def test_tables_hold_one_row_for_what_they_compare(plan: Plan) -> None:
     assert {bool(row[thin]) for row in surfaces.rows if row[0] == "wheel"} == {True}
     assert {bool(row[thin]) for row in surfaces.rows if row[0] != "wheel"} == {False}
     check(pose_table(POSES))
+    check(kernel_table(KERNELS))
     (spot, *_) = seed_table(found).rows
     assert spot[:2] == ("spot", 3)
     bias = bias_table(found)
@@ -179,7 +187,7 @@ def test_the_document_names_machine_seed_and_roles(
         "command": "the command", "date": "2026-01-02", "minutes": 12.0, "reused": False,
         "photos": plan.photos, "runs": tmp_path,
     }  # fmt: skip
-    document.write_document(tmp_path, Outcome(folders, results(plan), POSES, {}), facts)
+    document.write_document(tmp_path, Outcome(folders, results(plan), POSES, {}, KERNELS), facts)
     text = (tmp_path / "README.md").read_text(encoding="utf-8")
     for words in ("the command", "2026-01-02", "2 threads", "Seed 0", "Sober words.", "| test "):
         assert words in text
