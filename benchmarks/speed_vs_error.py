@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import datetime
 import logging
+import math
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,25 +41,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--scenes", nargs="+", help="only runs of these scenes")
     options = parser.parse_args(arguments)
+    plan = quick_plan() if options.quick else full_plan()
+    known = {run.scene for run in plan.runs}
+    if unknown := set(options.scenes or ()) - known:
+        parser.error(f"unknown scenes {sorted(unknown)}; there are {', '.join(sorted(known))}")
+    if options.scenes and not options.out:
+        parser.error("--scenes makes a part of the report: name its folder with --out")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     logging.getLogger("PIL").setLevel(logging.WARNING)
     kind = "quick" if options.quick else "full"
     settings = Settings(CACHE / kind, options.threads or default_threads(), options.reuse)
     out = options.out or (CACHE / "quick-report" if options.quick else ROOT / "docs/benchmarks")
     out.mkdir(parents=True, exist_ok=True)
-    plan = quick_plan() if options.quick else full_plan()
     begun_s = time.monotonic()
     outcome = carry_out(plan, settings, options.scenes)
+    words = sys.argv[1:] if arguments is None else list(arguments)
     facts = {
-        "command": f"python -m benchmarks.speed_vs_error{' --quick' if options.quick else ''}",
+        "command": " ".join(["python -m benchmarks.speed_vs_error", *words]),
         "date": datetime.date.today().isoformat(),
-        "minutes": (time.monotonic() - begun_s) / 60.0,
-        "reused": options.reuse,
         "photos": plan.photos,
         "runs": settings.folder,
     }
     write_document(out, outcome, facts)
-    _logger.info("report: %s", out / "README.md")
+    _logger.info("report after %.0f minutes: %s", (time.monotonic() - begun_s) / 60, out)
 
 
 def carry_out(plan: Plan, settings: Settings, only: Sequence[str] | None = None) -> Outcome:
@@ -118,7 +124,7 @@ def _log(name: str, result: Result) -> None:
         name,
         result.wall_s,
         " ".join(f"{value:.3f}" for value in result.surface("uniform", "f1")),
-        result.scores["texture"]["psnr"],
+        math.nan if result.texture_psnr is None else result.texture_psnr,
     )
 
 

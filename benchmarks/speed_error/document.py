@@ -13,18 +13,24 @@ from gaussian_wrapping_addon.core.files import read_json, write_bytes
 from ..tables import Cell, Table, processor, versions
 from .figures import write_plots
 from .pictures import write_comparison
-from .plan import MAIN_SCENES, THRESHOLD_SHARES
+from .plan import MAIN_SCENES
 from .results import Outcome, Result, plain
 from .tables import (
-    bias_table,
+    AT,
     cost_table,
     image_table,
     kernel_table,
     pose_table,
-    seed_table,
     stage_table,
     surface_table,
-    varied_tables,
+    thin_recall,
+)
+from .varied_tables import (
+    gaussian_table,
+    image_size_table,
+    mesh_table,
+    seed_table,
+    texture_table,
 )
 
 PLOTS = "speed-vs-error.svg"
@@ -41,40 +47,35 @@ def write_document(out: Path, outcome: Outcome, facts: dict[str, Any]) -> None:
         Must exist.
     outcome : Outcome
     facts : dict
-        ``command``, ``date``, ``minutes``, ``reused``, ``photos``, ``runs`` (folder of the runs).
+        ``command``, ``date``, ``photos`` (:class:`.plan.Photos`), ``runs`` (folder of the runs).
     """
-    results, poses = outcome.results, outcome.poses
-    write_plots(results, out / PLOTS)
+    results = outcome.results
+    photos = facts["photos"]
+    side_px = max(photos.width, photos.height)
+    write_plots(results, side_px, out / PLOTS)
     pictures = _pictures(out, results, outcome.folders, facts["runs"])
-    reading = out / READING
     tables = [
         _scene_table(outcome.folders),
         cost_table(results),
         surface_table(results, outcome.ceilings),
         image_table(results),
-        stage_table(results, poses),
-        pose_table(poses),
+        stage_table(results, outcome.poses),
+        pose_table(outcome.poses),
         kernel_table(outcome.kernels),
         seed_table(results),
-        bias_table(results),
-        *varied_tables(results),
+        mesh_table(results),
+        gaussian_table(results),
+        image_size_table(results, side_px),
+        texture_table(results),
     ]
-    photos, threads = facts["photos"], results[0].report["machine"]["threads"]
-    minutes = math.fsum(r.wall_s + r.scores["seconds_scoring"] for r in results)
-    minutes = (minutes + math.fsum(p["seconds"] for p in poses.values())) / 60.0
     lines = [
         "# Speed against error",
         "",
-        *(
-            f"`{facts['command']}`, {facts['date']}. {processor()}, {threads} threads;",
-            f"{versions()}. {photos.count} photos of {photos.width} x {photos.height} pixels and",
-            f"8 test views a scene. Seed 0, where no other is named. {len(results)} meshes; runs",
-            f"and scores took {minutes:.0f} minutes{_reuse_note(facts)}.",
-        ),
+        *_origin(outcome, facts),
         "",
         f"![Plots]({PLOTS})",
         "",
-        *([reading.read_text(encoding="utf-8").strip(), ""] if reading.is_file() else []),
+        *_reading(out / READING, facts["date"]),
         *_headline(results),
         *pictures,
         _words("protocol"),
@@ -86,34 +87,59 @@ def write_document(out: Path, outcome: Outcome, facts: dict[str, Any]) -> None:
     write_bytes(out / "README.md", ("\n".join(lines).rstrip() + "\n").encode())
 
 
-def _reuse_note(facts: dict[str, Any]) -> str:
-    if facts["reused"]:
-        return ", in several sittings with the same code"
-    return f", all in all {facts['minutes']:.0f}"
+def _origin(outcome: Outcome, facts: dict[str, Any]) -> list[str]:
+    """Return where the figures come from: command, machine, versions, code, time."""
+    results, photos = outcome.results, facts["photos"]
+    codes = sorted({r.measured.get("code", "not recorded") for r in results})
+    loads = [r.measured.get("load_before") for r in results]
+    seconds = [*(r.wall_s + r.scores["seconds_scoring"] for r in results)]
+    seconds += [p["seconds"] for p in outcome.poses.values()]
+    known = [load for load in loads if load is not None]
+    load = f"{max(known):.1f}" if len(known) == len(loads) else "not recorded for all runs"
+    machine = f"{processor()}, {results[0].report['machine']['threads']} threads; {versions()}"
+    return [
+        f"`{facts['command']}`, {facts['date']}. {machine}.",
+        f"Code: {', '.join(codes)}. {len(results)} meshes; runs and scores took",
+        f"{math.fsum(seconds) / 60:.0f} minutes; largest load average before a run: {load}.",
+        "",
+        f"{photos.count} photos of {photos.width} x {photos.height} pixels and 8 test views a",
+        "scene. That is smaller than Draft, Standard and Fine would use (up to 480, 640 and 1024",
+        "pixels), so that all runs fit into the time: here the presets differ by iterations,",
+        "Gaussians and harmonics only. Seed 0, where no other is named.",
+    ]
+
+
+def _reading(path: Path, date: str) -> list[str]:
+    """Return the hand-written reading; its first line is the date of the figures that it reads."""
+    if not path.is_file():
+        return []
+    written, _, text = path.read_text(encoding="utf-8").partition("\n")
+    stale = (
+        [] if written.strip() == date else [f"*Written for the figures of {written.strip()}.*", ""]
+    )
+    heading, _, rest = text.strip().partition("\n")
+    return [heading, "", *stale, rest.strip(), ""]
 
 
 def _headline(results: Sequence[Result]) -> list[str]:
     """Return one sentence a scene, made from the figures alone."""
-    lines = ["## In short", ""]
+    lines = [
+        "## In short",
+        "",
+        f"F1 at {AT} of the diagonal, whole surface; in brackets what cameras see.",
+        "",
+    ]
     for scene in MAIN_SCENES:
-        same = {r.run.preset: r for r in plain(results, scene)}
-        if "draft" not in same:
-            continue
-        words = []
-        for preset, r in same.items():
-            words.append(
-                f"{preset} {r.f1('uniform', 1):.2f} ({r.f1('scan', 1):.2f} of what is seen) in "
-                f"{r.wall_s:.0f} s"
-            )
-        thin = same["draft"].surface("uniform", "thin_recall")
-        last = list(same.values())[-1]
-        extra = ""
-        if thin is not None:
-            best = last.surface("uniform", "thin_recall")
-            extra = f"; thin parts found: {thin[1]:.2f} to {best[1]:.2f}"
-        lines.append(
-            f"- **{scene}**: F1 at {100 * THRESHOLD_SHARES[1]:g} %: {', '.join(words)}{extra}."
-        )
+        same = plain(results, scene)
+        words = [
+            f"{r.run.preset} {r.f1('uniform', 1):.2f} ({r.f1('scan', 1):.2f}) in {r.wall_s:.0f} s"
+            for r in same
+        ]
+        thin = [thin_recall(r.scores["surface"]["uniform"]) for r in same]
+        found = [f"{value:.2f}" for value in thin if value is not None]
+        extra = f"; thin parts found: {', '.join(found)}" if found else ""
+        if words:
+            lines.append(f"- **{scene}**: {', '.join(words)}{extra}.")
     return [*lines, ""]
 
 
@@ -125,8 +151,9 @@ def _pictures(
         "",
         *(
             "Above: a test photo and the textured meshes. Below: the true surface, and the",
-            "meshes coloured by the distance of each face to it: blue within 0.25 % of the",
-            "diagonal, green within 0.5 %, yellow within 1 %, red beyond.",
+            "meshes coloured by the distance of each face's centre to it: blue within 0.25 %",
+            "of the diagonal, green within 0.5 %, yellow within 1 %, red beyond; grey lies",
+            "outside of the crop volume and is not judged.",
         ),
         "",
     ]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -10,13 +11,18 @@ from gaussian_wrapping_addon.core.evaluation.report.plot import Panel, Series, w
 
 from .plan import MAIN_SCENES
 from .results import Result, plain
-from .tables import MIDDLE, SHARES, varied
+from .tables import MIDDLE, SHARES
+from .varied_tables import varied
 
 Value = Callable[[Result], float]
 
 
-def write_plots(results: Sequence[Result], path: Path) -> None:
-    """Write all panels into one SVG."""
+def write_plots(results: Sequence[Result], long_side_px: int, path: Path) -> None:
+    """Write all panels into one SVG; the photos' own long side bounds that of training images."""
+
+    def image_side(result: Result) -> float:
+        return min(result.report["settings"]["training"]["max_image_px"], long_side_px)
+
     texels = [
         _varied(results, "texture", lambda r: r.scores["texture_side_px"] ** 2, _texture_psnr)
     ]
@@ -52,24 +58,31 @@ def write_plots(results: Sequence[Result], path: Path) -> None:
             [
                 _varied(
                     results, "points", lambda r: r.scores["vertices"],
-                    lambda r: 100 * r.distance_share("chamfer_mean"), scene,
+                    lambda r: _percent(r.share("chamfer_mean")), scene,
                 )
                 for scene in ("spot", "wheel")
             ],
         ),
         Panel("Texels against images", "texels", "textured mesh, PSNR dB", texels, y_log=False),
         Panel(
-            "Gaussians against images and surface",
+            "Gaussians against images",
             "Gaussians",
-            "PSNR dB of Gaussians; 30 x F1",
-            [
-                _varied(results, "gaussians", _count, lambda r: r.scores["gaussians"]["psnr"]),
-                _varied(
-                    results, "gaussians", _count, lambda r: 30 * r.f1("uniform", MIDDLE),
-                    label=f"spot, 30 x F1 {SHARES[MIDDLE]}",
-                ),
-            ],
-            legend_low=True,
+            "Gaussians at test views, PSNR dB",
+            [_varied(results, "gaussians", _count, lambda r: r.scores["gaussians"]["psnr"])],
+            y_log=False,
+        ),
+        Panel(
+            "Gaussians against surface",
+            "Gaussians",
+            f"F1 at {SHARES[MIDDLE]}",
+            [_varied(results, "gaussians", _count, lambda r: r.f1("uniform", MIDDLE))],
+            y_log=False,
+        ),
+        Panel(
+            "Training images against surface",
+            "long side, px",
+            f"F1 at {SHARES[MIDDLE]}",
+            [_varied(results, "image", image_side, lambda r: r.f1("uniform", MIDDLE))],
             y_log=False,
         ),
     ]  # fmt: skip
@@ -77,7 +90,11 @@ def write_plots(results: Sequence[Result], path: Path) -> None:
 
 
 def _texture_psnr(result: Result) -> float:
-    return float(result.scores["texture"]["psnr"])
+    return math.nan if result.texture_psnr is None else result.texture_psnr
+
+
+def _percent(share: float | None) -> float:
+    return math.nan if share is None else 100 * share
 
 
 def _count(result: Result) -> float:
@@ -94,7 +111,7 @@ def _presets(results: Sequence[Result], value: Value) -> list[Series]:
 
 
 def _varied(
-    results: Sequence[Result], name: str, x: Value, y: Value, scene: str = "spot", label: str = ""
+    results: Sequence[Result], name: str, x: Value, y: Value, scene: str = "spot"
 ) -> Series:
     same = varied(results, name, (scene,))
-    return Series(label or scene, [(float(x(r)), float(y(r))) for r in same])
+    return Series(scene, [(float(x(r)), float(y(r))) for r in same])

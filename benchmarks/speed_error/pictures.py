@@ -28,6 +28,8 @@ VIEW = 1
 SUPERSAMPLING = 2
 ERROR_COLORS = ((70, 120, 200), (110, 190, 110), (240, 200, 60), (200, 50, 40))
 """Nearer than each threshold of the report, and farther than all."""
+NOT_JUDGED = (150, 150, 150)
+"""Faces outside of the crop volume."""
 LIGHT = np.array([-0.4, -0.5, -0.77])
 """Direction of light in camera coordinates, towards the scene."""
 QUALITY = 85
@@ -63,6 +65,8 @@ def write_comparison(scene: Path, runs: Sequence[tuple[str, Path]], path: Path) 
         centres = frame.points(mesh.vertices[mesh.faces].mean(1))
         distance = distances_to_mesh(centres, truth.vertices, truth.faces)[0] / diagonal
         colors = np.array(ERROR_COLORS, float)[np.searchsorted(THRESHOLD_SHARES, distance)]
+        if truth.crop is not None:
+            colors[~truth.crop.inside(centres)] = NOT_JUDGED
         bottom.append((f"{label}: error", shade(mesh.vertices, mesh.faces, colors, camera, size)))
     rows = [
         np.concatenate([_labelled(image, text) for text, image in row], 1) for row in (top, bottom)

@@ -57,10 +57,16 @@ class Result:
         """Return the F1 score at a threshold."""
         return float(self.surface(protocol, "f1")[index])
 
-    def distance_share(self, name: str) -> float:
-        """Return a distance of the uniform protocol as a share of the diagonal; NaN if unknown."""
+    @property
+    def texture_psnr(self) -> float | None:
+        """PSNR of the textured mesh at the test views, dB; ``None`` if none shows the surface."""
+        value = self.scores["texture"].get("psnr")
+        return None if value is None else float(value)
+
+    def share(self, name: str) -> float | None:
+        """Return a distance of the uniform protocol, as a share of the diagonal, if any."""
         value = self.surface("uniform", name)
-        return math.nan if value is None else float(value) / float(self.scores["diagonal"])
+        return None if value is None else float(value) / float(self.scores["diagonal"])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
+import os
 import shutil
 import subprocess
 import sys
@@ -88,6 +90,7 @@ def _batch(arguments: list[str], folder: Path, settings: Settings, out: Path | N
         sys.executable, str(BATCH), *arguments, "--export", "ply", "--no-blend",
         "--threads", str(settings.threads),
     ]  # fmt: skip
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
     begun_s = time.monotonic()
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     wall_s = time.monotonic() - begun_s
@@ -101,9 +104,26 @@ def _batch(arguments: list[str], folder: Path, settings: Settings, out: Path | N
     values = {
         "command": ["batch.py", *_without_paths(arguments)],
         "wall_s": wall_s,
+        "load_before": load,
+        "code": code_state(),
         "report": report,
     }
     write_json(folder / "measured.json", {**values, "region": name})
+
+
+def code_state() -> str:
+    """Return the commit of the package, and whether its files differ from it."""
+    git = ["git", "-C", str(ROOT)]
+    commit = subprocess.run(
+        [*git, "rev-parse", "--short=10", "HEAD"], capture_output=True, text=True, check=False
+    )
+    if commit.returncode != 0:
+        return "unknown commit"
+    changed = subprocess.run(
+        [*git, "status", "--porcelain", "--", "gaussian_wrapping_addon"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    return commit.stdout.strip() + (" with changes" if changed.stdout.strip() else "")
 
 
 def _region_names(out: Path) -> list[str]:
