@@ -161,7 +161,7 @@ def judge_stages(
         gaussians, [c for c, _ in views], inverse.points(truth.vertices), truth.faces, limits,
         threads=threads,
     ).to_json()  # fmt: skip
-    seen = np.flatnonzero(truth.seen >= 2 if truth.seen is not None else True)
+    seen = np.flatnonzero(truth.visible())
     chosen = np.random.default_rng(0).choice(seen, min(VACANCY_SAMPLES, len(seen)), replace=False)
     field = VacancyField(gaussians.arrays(), scene.cameras, threads=threads)
     vacancy = vacancy_errors(
