@@ -131,7 +131,7 @@ def preset(name: str, **overrides: Any) -> JobSettings:
         ),
         "standard": TrainingSettings(),
         "fine": TrainingSettings(
-            iterations=7000, max_gaussians=200_000, max_image_px=1024, sh_degree=3, wrap_rounds=5
+            iterations=4000, max_gaussians=120_000, max_image_px=1024, sh_degree=3, wrap_rounds=4
         ),
     }[name]
     return JobSettings(preset=name, training=training, **overrides)
