@@ -12,6 +12,7 @@ from pathlib import Path
 
 from .errors import WrapError
 from .helper_process import emit
+from .peak_memory import own_peak_bytes
 
 _PARENT_POLL_S = 1.0
 
@@ -30,6 +31,8 @@ def main(arguments: list[str]) -> int:
     except WrapError as error:
         emit(error=error.message, hint=error.hint)
         return error.exit_code
+    finally:
+        emit(peak_bytes=own_peak_bytes())
     return 0
 
 

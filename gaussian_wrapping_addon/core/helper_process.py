@@ -4,7 +4,8 @@
 A helper is a module with ``main(arguments) -> int``; it is given a folder, reads ``task.json`` and
 arrays there, writes its results there, and reports on stdout, one JSON object a line:
 ``{"fraction": 0.5, "message": "..."}``. A typed failure is ``{"error": "...", "hint": "..."}``
-followed by exit code 3.
+followed by exit code 3. The last line of every helper that ends in order is
+``{"peak_bytes": ...}``, its largest memory.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import IO, Any
 
 from . import limits
 from .errors import DatasetError, ResourceError, WorkerError
+from .peak_memory import note_helper
 from .progress import Progress
 
 _logger = logging.getLogger(__name__)
@@ -127,6 +129,8 @@ def run_helper(
                 _logger.debug("%s: %s", module, line.rstrip())
             elif "error" in values:
                 failure = values
+            elif "peak_bytes" in values:
+                note_helper(int(values["peak_bytes"]))
             else:
                 progress.update(float(values.get("fraction", 0.0)), str(values.get("message", "")))
     finally:

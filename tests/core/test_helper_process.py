@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core import helper_entry, helper_process
+from gaussian_wrapping_addon.core import helper_entry, helper_process, peak_memory
 from gaussian_wrapping_addon.core.errors import (
     Cancelled,
     DatasetError,
@@ -24,6 +25,7 @@ HELPERS = {
     "raises": "raise RuntimeError('unexpected words')",
     "noise": "sys.stdout.write('not json\\n[1]\\n'); (folder / 'out').write_text('1')",
     "sleeps": "time.sleep(60)",
+    "large": "held = b'x' * (150 * 2**20)",
     "greedy": "bytearray(4 * 2**30)",
 }
 
@@ -50,7 +52,6 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         script.write_text(body)
 
         def command(module: str, *arguments: str, python: str | None = None) -> list[str]:
-            import sys
 
             return [sys.executable, str(script), *arguments]
 
@@ -107,6 +108,22 @@ def test_cancelling_ends_the_helper_within_two_seconds(run) -> None:
 def test_the_memory_limit_holds(run) -> None:
     with pytest.raises(WorkerError, match="MemoryError"):
         run("greedy", memory_bytes=2 * 2**30)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="others report the parent's too")
+def test_the_peak_is_the_helpers_own_and_the_largest_is_kept(
+    run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(peak_memory, "_largest_helper_bytes", 0)
+    assert peak_memory.largest_helper_bytes() == 0
+    parents_bytes = b"x" * (600 * 2**20)
+    run("good")
+    small_bytes = peak_memory.largest_helper_bytes()
+    run("large")
+    large_bytes = peak_memory.largest_helper_bytes()
+    assert small_bytes + 140 * 2**20 < large_bytes < len(parents_bytes)
+    run("good")
+    assert peak_memory.largest_helper_bytes() == large_bytes
 
 
 def test_entry_module_has_the_signature_that_worker_main_calls() -> None:

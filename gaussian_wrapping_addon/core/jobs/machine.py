@@ -6,9 +6,10 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
-import sys
 from pathlib import Path
 from typing import Any
+
+from ..peak_memory import largest_helper_bytes, own_peak_bytes
 
 PACKAGES = (
     "numpy", "torch", "numba", "scipy", "pycolmap", "xatlas", "shull", "pillow", "trimesh",
@@ -53,13 +54,9 @@ def _memory_bytes() -> int:
 
 
 def peak_memory_bytes() -> dict[str, int]:
-    """Return the largest resident size so far of this process and of its largest helper."""
-    if sys.platform == "win32":
-        return {}
-    import resource
+    """Return the largest resident size so far of this process and of its largest helper.
 
-    unit = 1 if sys.platform == "darwin" else 1024
-    return {
-        "worker": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit,
-        "largest_helper": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * unit,
-    }
+    Empty where the system does not tell; see :mod:`~..peak_memory`.
+    """
+    own_bytes = own_peak_bytes()
+    return {"worker": own_bytes, "largest_helper": largest_helper_bytes()} if own_bytes else {}
