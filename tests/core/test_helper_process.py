@@ -52,7 +52,6 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         script.write_text(body)
 
         def command(module: str, *arguments: str, python: str | None = None) -> list[str]:
-
             return [sys.executable, str(script), *arguments]
 
         monkeypatch.setattr(helper_process, "child_command", command)

@@ -192,6 +192,7 @@ def _statistics(
     face_seen = np.zeros(len(areas), np.bool_)
     face_seen[points.face[seen]] = True
     used, texels_seen = len(points), int(seen.sum())
+    judged_area = float(areas[with_texel].sum())
     return {
         "size_px": size_px,
         "size_automatic": settings.size_px == 0,
@@ -207,7 +208,9 @@ def _statistics(
         "texels_overlapping": raster.overlaps,
         "coverage": texels_seen / max(used, 1),
         "faces_seen_share": float(face_seen.sum()) / max(int(with_texel.sum()), 1),
-        "area_seen_share": float(areas[face_seen].sum() / areas.sum()),
+        # Of the faces that have a texel: whether a photo saw the others is not known.
+        "area_seen_share": float(areas[face_seen].sum()) / judged_area if judged_area else 0.0,
+        "area_without_texel_share": float(areas[~with_texel].sum() / areas.sum()),
         "faces_without_texel": int((~with_texel).sum()),
         "views_per_seen_texel": float(baked.views[seen].mean()) if texels_seen else 0.0,
         "views_rejected_share": baked.rejected_share,

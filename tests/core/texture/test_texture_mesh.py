@@ -14,14 +14,16 @@ from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError, UsageEr
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.atlas_raster import AtlasRaster, raster_atlas
+from gaussian_wrapping_addon.core.texture.bake import Baked
 from gaussian_wrapping_addon.core.texture.exposure import solve_gains
 from gaussian_wrapping_addon.core.texture.face_graph import face_graph
 from gaussian_wrapping_addon.core.texture.fill import surface_positions
 from gaussian_wrapping_addon.core.texture.photo_samples import SurfaceArrays, SurfacePoints
-from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
+from gaussian_wrapping_addon.core.texture.texture_mesh import _statistics, texture_mesh
 from gaussian_wrapping_addon.core.texture.texture_size import automatic_size
 from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
+from gaussian_wrapping_addon.core.texture.unwrap import Unwrap
 from tests.core.texture.texture_scenes import (
     FakePhotos,
     box,
@@ -160,6 +162,23 @@ def test_faces_that_no_photo_sees_are_filled_and_counted(tmp_path: Path) -> None
     assert abs(counts["texels_filled"] / counts["texels_used"] - below.mean()) < 0.05
     assert abs(counts["area_seen_share"] - 5 / 6) < 0.03
     assert counts["coverage"] < 0.86
+
+
+@pytest.mark.parametrize("areas", [(3.0, 1.0, 4.0), (0.0, 0.0, 4.0)])
+def test_faces_smaller_than_a_texel_are_neither_seen_nor_unseen(areas: tuple) -> None:
+    """Of three faces one is seen, one is not, and one has no texel to tell by."""
+    points = SurfacePoints(np.array([0, 0, 1]), np.zeros((3, 2), np.float32))
+    views = np.array([2, 0, 0], np.uint8)
+    baked = Baked(np.zeros((3, 3), np.uint8), views, views > 0, 1, 0.0, False, 0.0)
+    unwrapped = Unwrap(np.zeros((3, 3, 2), np.float32), np.zeros(3, np.int32), "box", 2.0)
+    nothing = np.zeros(0)
+    raster = AtlasRaster(nothing, nothing, nothing, 0, nothing)
+    counts = _statistics(
+        SIZE_PX, TextureSettings(SIZE_PX, 4), unwrapped, raster, points, baked, np.array(areas)
+    )
+    assert counts["area_seen_share"] == (0.75 if areas[0] else 0.0)
+    assert counts["area_without_texel_share"] == areas[2] / sum(areas)
+    assert counts["faces_without_texel"] == 1
 
 
 def test_the_whole_image_is_filled_and_gutters_repeat_their_chart(ball: TexturedMesh) -> None:

@@ -146,6 +146,10 @@ def _texture(region: dict[str, Any]) -> list[str]:
         ("Coverage: seen by photos", percent(texture.get("coverage"))),
         ("Surface area seen", percent(texture.get("area_seen_share"))),
         (
+            "Area of faces smaller than a texel",
+            percent(texture.get("area_without_texel_share")),
+        ),
+        (
             "Photos behind each seen texel",
             number(texture.get("views_per_seen_texel"), "photos", digits=1),
         ),

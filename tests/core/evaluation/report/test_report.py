@@ -205,6 +205,8 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         ("Size", "512 x 512 texels, chosen from the photos"),
         ("Texel density", "8.8 texels per world unit"),
         ("Coverage: seen by photos", "25.0 %"),
+        ("Surface area seen", "30.0 %"),
+        ("Area of faces smaller than a texel", "0.2 %"),
     ):
         assert row(region, name) == figure
     assert "| p\\|q.jpg | 18.50 dB | 0.4500 | 75.0 % |" in region
