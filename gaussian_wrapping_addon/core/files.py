@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import uuid
 from pathlib import Path, PurePosixPath
@@ -31,6 +32,20 @@ def write_bytes(path: Path, data: bytes) -> None:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def finite(values: Any) -> Any:
+    """Return JSON values with ``None`` for every number that is not finite: JSON has none.
+
+    Tuples become lists and keys text, as JSON would read them back.
+    """
+    if isinstance(values, dict):
+        return {str(key): finite(value) for key, value in values.items()}
+    if isinstance(values, (list, tuple)):
+        return [finite(value) for value in values]
+    if isinstance(values, float) and not math.isfinite(values):
+        return None
+    return values
 
 
 def read_json(path: Path) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..dataset.similarity import Similarity
 from ..errors import DatasetError
-from .surface.samples import SurfaceSamples, thin_out
+from .surface.samples import thin_points
 
 COLLINEAR_SHARE = 1e-6
 """Second over first extent below which points count as collinear: the rotation about their line
@@ -379,9 +379,9 @@ def refine_as_tanks(
         if voxels:
             # Voxels are of the target's frame, so that both sets are equally dense.
             moving = transform.inverse().points(
-                _thinned(transform.points(moving), voxels * threshold)
+                thin_points(transform.points(moving), voxels * threshold)
             )
-            aim = _thinned(aim, voxels * threshold)
+            aim = thin_points(aim, voxels * threshold)
         else:
             moving, aim = _every_kth(moving), _every_kth(aim)
         stages.append(
@@ -398,10 +398,6 @@ def refine_as_tanks(
         )
         transform = stages[-1].transform
     return TanksRefinement(transform, tuple(stages))
-
-
-def _thinned(points: np.ndarray, voxel: float) -> np.ndarray:
-    return thin_out(SurfaceSamples(points, np.zeros_like(points)), voxel).points
 
 
 def _every_kth(points: np.ndarray) -> np.ndarray:

@@ -374,7 +374,7 @@ def _dtu(
         transform = found.transform
         alignment |= {"source": truth.camera_source, **found.to_json()}
     progress.update(0.2, "measuring distances")
-    score = score_dtu(vertices, faces, truth, transform, seed=request.seed)
+    score = score_dtu(vertices, faces, truth, transform, seed=request.seed, threads=request.threads)
     return {
         "scan": truth.scan,
         "density_mm": DENSITY_MM,

@@ -11,8 +11,7 @@ from typing import Any
 from ..dataset.similarity import Similarity
 from ..evaluation.report.markdown import CURVE, PICTURES
 from ..evaluation.report.report import write_report
-from ..evaluation.report.text import finite
-from ..files import read_json, resolve_inside, write_json
+from ..files import finite, read_json, resolve_inside, write_json
 from ..progress import Progress
 from .job_file import JobFile
 from .job_folder import JobFolder

@@ -301,6 +301,7 @@ def score_dtu(
     truth_from_job: Similarity,
     *,
     seed: int = 0,
+    threads: int = 1,
 ) -> DtuScore:
     """Align a mesh, cover it with points, and compare (see :func:`~.dtu_chamfer.dtu_chamfer`).
 
@@ -317,4 +318,4 @@ def score_dtu(
         corners.min(1) <= truth.mask.high + PATCH_MM
     )
     points = resample_mesh(placed, faces[near.all(1)], DENSITY_MM)
-    return dtu_chamfer(points, truth.cloud, truth.mask, truth.plane, seed=seed)
+    return dtu_chamfer(points, truth.cloud, truth.mask, truth.plane, seed=seed, threads=threads)

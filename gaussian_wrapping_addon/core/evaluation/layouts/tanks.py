@@ -23,11 +23,10 @@ from ...errors import DatasetError, ParseError, UsageError
 from ...progress import Progress
 from ..alignment import RansacResult, refine_as_tanks, umeyama_ransac
 from ..surface.samples import (
-    SurfaceSamples,
     sample_legacy,
     sample_uniformly,
     scan_virtually,
-    thin_out,
+    thin_points,
 )
 from ..surface.scores import score_clouds
 from .mesh_input import read_cloud
@@ -365,7 +364,9 @@ def score_tanks(
                 points = sample_uniformly(vertices, near, samples, seed=seed + 1).points
         placed = transform.points(points)
         placed = placed[scene.crop.inside(placed)]
-        score = score_clouds(placed, truth, scene.threshold, voxel=scene.threshold / 2)
+        score = score_clouds(
+            placed, truth, scene.threshold, voxel=scene.threshold / 2, threads=threads
+        )
         results[protocol] = {
             "score": score.to_json(),
             "points_in_crop": len(placed),
@@ -410,14 +411,10 @@ def _scan(
         progress.check()
         seen = start.points(scan_virtually(vertices, faces, [camera], threads=threads).points)
         near = ((seen >= low - margin) & (seen <= high + margin)).all(1)
-        kept.append(_thinned(seen[near], voxel))
+        kept.append(thin_points(seen[near], voxel))
         count += len(kept[-1])
         if count > SCAN_KEPT_POINTS:
-            kept = [_thinned(np.concatenate(kept), voxel)]
+            kept = [thin_points(np.concatenate(kept), voxel)]
             # What is left is as thin as it gets: the next thinning waits for as much again.
             count = 0
-    return back.points(_thinned(np.concatenate(kept), voxel))
-
-
-def _thinned(points: np.ndarray, voxel: float) -> np.ndarray:
-    return thin_out(SurfaceSamples(points, np.zeros_like(points)), voxel).points
+    return back.points(thin_points(np.concatenate(kept), voxel))

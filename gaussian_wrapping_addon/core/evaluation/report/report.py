@@ -6,10 +6,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ...files import write_bytes, write_json
+from ...files import finite, write_bytes, write_json
 from .markdown import report_markdown
 from .region import closedness
-from .text import duration, finite, items, measured, number, part, percent, plural
+from .text import duration, items, measured, number, part, percent, plural
 from .warnings import collect_warnings
 
 

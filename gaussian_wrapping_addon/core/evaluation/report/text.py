@@ -38,17 +38,6 @@ def measured(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def finite(values: Any) -> Any:
-    """Return JSON values with ``None`` for every number that is not finite."""
-    if isinstance(values, dict):
-        return {str(key): finite(value) for key, value in values.items()}
-    if isinstance(values, (list, tuple)):
-        return [finite(value) for value in values]
-    if isinstance(values, float) and not math.isfinite(values):
-        return None
-    return values
-
-
 def number(value: Any, unit: str = "", *, digits: int | None = None) -> str:
     """Return a number with its unit, or :data:`NOT_MEASURED`.
 

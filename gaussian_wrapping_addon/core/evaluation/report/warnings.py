@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -94,7 +93,7 @@ def _said(stage: str, texts: Any) -> list[ReportWarning]:
 
 def _next_step(text: str) -> str:
     for mark, step in _STEPS:
-        if re.search(re.escape(mark), text):
+        if mark in text:
             return step
     return ""
 

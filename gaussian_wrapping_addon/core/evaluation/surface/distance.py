@@ -18,7 +18,8 @@ def distances_to_mesh(
     points : (n, 3) float64
     vertices : (v, 3) float64
     faces : (f, 3) int
-        Degenerate faces count as the segment or point that they are.
+        Degenerate faces count as the segment or point that they are. libigl takes as many threads
+        as it finds cores.
 
     Returns
     -------
@@ -46,13 +47,17 @@ def distances_to_mesh(
     return np.linalg.norm(local - closest, axis=1), face, closest + origin
 
 
-def distances_to_cloud(points: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def distances_to_cloud(
+    points: np.ndarray, cloud: np.ndarray, *, threads: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
     """Measure from each point to the nearest point of a cloud.
 
     Parameters
     ----------
     points : (n, 3) float64
     cloud : (m, 3) float64
+    threads : int
+        Of the search; the result does not depend on it.
 
     Returns
     -------
@@ -65,5 +70,5 @@ def distances_to_cloud(points: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarra
     if len(cloud) == 0 or len(points) == 0:
         return np.full(len(points), np.inf), np.full(len(points), -1)
     tree = cKDTree(np.asarray(cloud, np.float64))
-    distances, index = tree.query(points, workers=-1)
+    distances, index = tree.query(points, workers=threads)
     return distances, index

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from ...errors import MeshingError, ResourceError, UsageError
+from ...files import finite
 from ...limits import MAX_POINTS
 from ...meshing.sampling import thin
 from .distance import distances_to_cloud
-from .scores import finite_json
 
 DENSITY_MM = 0.2
 """Predicted points are no denser than this, and a resampled mesh has no wider gaps."""
@@ -98,7 +98,7 @@ class DtuScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return finite_json(dataclasses.asdict(self))
+        return dict(finite(dataclasses.asdict(self)))
 
 
 def dtu_chamfer(
@@ -111,6 +111,7 @@ def dtu_chamfer(
     patch: float = PATCH_MM,
     max_distance: float = MAX_DISTANCE_MM,
     seed: int = 0,
+    threads: int = 1,
 ) -> DtuScore:
     """Compare points with a scan as the data set's paper describes (Jensen et al., CVPR 2014).
 
@@ -135,6 +136,8 @@ def dtu_chamfer(
         In the truth's unit (mm); ``density`` 0 keeps all points.
     seed : int
         Order of step 2.
+    threads : int
+        Of the search; the result does not depend on it.
 
     Raises
     ------
@@ -155,9 +158,10 @@ def dtu_chamfer(
         raise UsageError("No true point is above the ground plane.", "Check the plane's sign.")
     points = thin_by_distance(points[mask.within(points, patch)], density, seed=seed)
     accuracy = _mean_below(
-        distances_to_cloud(points[mask.observed(points)], truth_points)[0], max_distance
+        distances_to_cloud(points[mask.observed(points)], truth_points, threads=threads)[0],
+        max_distance,
     )
-    completeness = _mean_below(distances_to_cloud(above, points)[0], max_distance)
+    completeness = _mean_below(distances_to_cloud(above, points, threads=threads)[0], max_distance)
     return DtuScore(
         accuracy[0], completeness[0], (accuracy[0] + completeness[0]) / 2,
         accuracy[1], completeness[1], accuracy[2], completeness[2],

@@ -245,6 +245,11 @@ def thin_out(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
     return SurfaceSamples(_means(samples.points - low, group, members) + low, normals)
 
 
+def thin_points(points: np.ndarray, voxel: float) -> np.ndarray:
+    """Thin out (n, 3) points that have no normals; see :func:`thin_out`."""
+    return thin_out(SurfaceSamples(points, np.zeros_like(points)), voxel).points
+
+
 def choose_per_cell(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
     """Keep in each cell of a grid the sample nearest to the mean of those there.
 

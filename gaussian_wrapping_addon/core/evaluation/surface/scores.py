@@ -13,6 +13,8 @@ import numpy as np
 
 from ...dataset.camera import Camera
 from ...errors import UsageError
+from ...files import finite
+from ...parallel import default_threads
 from .distance import distances_to_cloud, distances_to_mesh
 from .samples import (
     SurfaceSamples,
@@ -21,11 +23,14 @@ from .samples import (
     sample_legacy,
     sample_uniformly,
     scan_virtually,
-    thin_out,
+    thin_points,
 )
 from .truth import MIN_CAMERAS, Truth
 
 PROTOCOLS = ("uniform", "scan", "legacy")
+
+MIN_THIN_SHARE = 0.01
+"""Recall of thin parts says nothing where fewer of the true samples than these are thin."""
 
 SCAN_RAYS = 4_000_000
 """Rays of a virtual scan unless a step is given: some 400 MB of points at most."""
@@ -34,14 +39,6 @@ Shares = tuple[float, ...]
 """One number in [0, 1] for each threshold."""
 
 _Mesh = tuple[np.ndarray, np.ndarray]
-
-
-def finite_json(values: dict[str, Any]) -> dict[str, Any]:
-    """Replace infinite numbers by ``None``: JSON has none."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in values.items()
-    }
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,7 @@ class SurfaceScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return finite_json(dataclasses.asdict(self))
+        return dict(finite(dataclasses.asdict(self)))
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,7 @@ class CloudScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return finite_json(dataclasses.asdict(self))
+        return dict(finite(dataclasses.asdict(self)))
 
 
 def score_surface(
@@ -108,6 +105,7 @@ def score_surface(
     *,
     reached: SurfaceSamples | None = None,
     min_cameras: int = MIN_CAMERAS,
+    threads: int = 1,
 ) -> SurfaceScore:
     """Compare samples of a surface with the truth.
 
@@ -139,6 +137,8 @@ def score_surface(
         A denser set out of which ``predicted`` was chosen to be even.
     min_cameras : int
         Not used where ``truth.seen`` is boolean.
+    threads : int
+        Of the search in clouds; the result does not depend on it.
 
     Raises
     ------
@@ -154,10 +154,10 @@ def score_surface(
         inside = truth.crop.inside(predicted.points)
     true, shown = truth.samples.kept(judged), predicted.kept(inside)
 
-    accuracy, there = _nearest(shown, truth.mesh, truth.samples)
+    accuracy, there = _nearest(shown, truth.mesh, truth.samples, threads)
     if len(shown):
         cloud = predicted if reached is None else reached
-        completeness, back = _nearest(true, predicted_mesh, cloud)
+        completeness, back = _nearest(true, predicted_mesh, cloud, threads)
     else:
         completeness, back = np.full(len(true), np.inf), np.zeros((len(true), 3))
     visible = truth.visible(min_cameras)[judged]
@@ -233,7 +233,8 @@ def score_protocols(
     count, seed
         See :func:`~.surface_samples.sample_uniformly`.
     threads : int
-        Threads to use; the result does not depend on it.
+        Threads to use, 0 for every core; the result does not depend on it. The distances to meshes
+        take every core whatever is said here (see :func:`~.distance.distances_to_mesh`).
     protocols : sequence of str
         Out of :data:`PROTOCOLS`.
     step_px : float, optional
@@ -254,6 +255,7 @@ def score_protocols(
         A vertex is not finite.
     """
     limits = _checked(thresholds)
+    threads = threads or default_threads()
     result: dict[str, SurfaceScore] = {}
     for protocol in protocols:
         judged, mesh, reached = truth, None, None
@@ -280,7 +282,7 @@ def score_protocols(
         # An area that lies on nothing but degenerate faces is as empty as no faces.
         result[protocol] = score_surface(
             predicted, mesh if len(predicted) else None, judged, limits,
-            reached=reached, min_cameras=min_cameras,
+            reached=reached, min_cameras=min_cameras, threads=threads,
         )  # fmt: skip
     return result
 
@@ -291,6 +293,7 @@ def score_clouds(
     threshold: float,
     *,
     voxel: float | None,
+    threads: int = 1,
 ) -> CloudScore:
     """Compare clouds as Tanks and Temples does (method.md 9.1), after alignment and crop.
 
@@ -304,6 +307,8 @@ def score_clouds(
     voxel : float or None
         Both clouds are thinned out to one mean per cell of this side first; the protocol takes
         half of the threshold. ``None``: they are compared as they are.
+    threads : int
+        Of the search; the result does not depend on it.
 
     Raises
     ------
@@ -317,13 +322,13 @@ def score_clouds(
         if not np.isfinite(points).all():
             raise UsageError(f"The {name} cloud has a point that is not finite.", "Remove it.")
         if voxel is not None:
-            points = thin_out(SurfaceSamples(points, np.zeros_like(points)), voxel).points
+            points = thin_points(points, voxel)
         clouds.append(points)
     predicted, truth = clouds
     if len(truth) == 0:
         raise UsageError("The true cloud is empty.", "Check the crop and the alignment.")
-    accuracy, _ = distances_to_cloud(predicted, truth)
-    completeness, _ = distances_to_cloud(truth, predicted)
+    accuracy, _ = distances_to_cloud(predicted, truth, threads=threads)
+    completeness, _ = distances_to_cloud(truth, predicted, threads=threads)
     precision, recall = _shares(accuracy, (limit,))[0], _shares(completeness, (limit,))[0]
     return CloudScore(
         limit, precision, recall, _f1(precision, recall), _mean(accuracy), _mean(completeness),
@@ -345,7 +350,7 @@ def _uniform(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> 
 
 
 def _nearest(
-    samples: SurfaceSamples, mesh: _Mesh | None, cloud: SurfaceSamples
+    samples: SurfaceSamples, mesh: _Mesh | None, cloud: SurfaceSamples, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distances (n,) to a mesh, or to a cloud without one, and normals (n, 3) of what is there."""
     if mesh is not None:
@@ -358,7 +363,7 @@ def _nearest(
         flat = (corners - corners[:, :1]).reshape(-1, 3)
         normals, _ = face_normals(flat, np.arange(len(flat)).reshape(-1, 3))
         return distances, normals
-    distances, index = distances_to_cloud(samples.points, cloud.points)
+    distances, index = distances_to_cloud(samples.points, cloud.points, threads=threads)
     if len(cloud) == 0:
         return distances, np.zeros((len(samples), 3))
     return distances, cloud.normals[index]

@@ -21,7 +21,6 @@ from gaussian_wrapping_addon.core.evaluation.report.text import (
     bar,
     duration,
     escaped,
-    finite,
     number,
     percent,
     table,
@@ -30,6 +29,7 @@ from gaussian_wrapping_addon.core.evaluation.report.warnings import (
     FEW_HELD_OUT,
     collect_warnings,
 )
+from gaussian_wrapping_addon.core.files import finite
 from tests.core.evaluation.report.report_examples import (
     PICTURES,
     REGION,

@@ -9,8 +9,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from gaussian_wrapping_addon.core.errors import MeshingError, UsageError
+from gaussian_wrapping_addon.core.evaluation.surface import distance as surface_distance
 from gaussian_wrapping_addon.core.evaluation.surface import scores as surface_scores
 from gaussian_wrapping_addon.core.evaluation.surface.samples import (
     SurfaceSamples,
@@ -27,6 +29,7 @@ from gaussian_wrapping_addon.core.evaluation.surface.scores import (
 )
 from gaussian_wrapping_addon.core.evaluation.surface.truth import RegionCrop, Truth
 from gaussian_wrapping_addon.core.meshing.region import Region
+from gaussian_wrapping_addon.core.parallel import default_threads
 from tests.core.evaluation.surface.surface_scenes import (
     Mesh,
     ball,
@@ -353,6 +356,29 @@ def test_scores_are_the_same_in_every_frame() -> None:
     assert here == score_protocols(
         *guess, truth_of(mesh, 5000), cameras, [0.02, 0.05], count=5000, threads=3
     )
+
+
+def test_clouds_are_searched_by_the_threads_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    class Tree(cKDTree):
+        def query(self, points: np.ndarray, workers: int = 1) -> tuple:
+            asked.append(workers)
+            return super().query(points, workers=workers)
+
+    monkeypatch.setattr(surface_distance, "cKDTree", Tree)
+    mesh = ball(2)
+    truth = without_mesh(truth_of(mesh, 500))
+    for protocols in (("legacy",), ("uniform", "scan")):
+        asked.clear()
+        score_protocols(*mesh, truth, CAMERAS[:2], [0.1], count=500, threads=3, protocols=protocols)
+        assert set(asked) == {3}
+    asked.clear()
+    score_clouds(mesh[0], mesh[0], 0.1, voxel=None, threads=2)
+    assert asked == [2, 2]
+    asked.clear()
+    score_protocols(*mesh, truth, [], [0.1], count=500, threads=0, protocols=["legacy"])
+    assert set(asked) == {default_threads()}
 
 
 def test_what_cannot_be_scored_is_refused() -> None:
