@@ -19,6 +19,15 @@ class HeldOutFigure:
     psnr: float
     """dB, at the finest training size."""
     ssim: float
+    lpips: float | None = None
+    """``None`` where it was not measured."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values; ``lpips`` only where it was measured."""
+        values = dataclasses.asdict(self)
+        if self.lpips is None:
+            del values["lpips"]
+        return values
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,8 @@ class TrainingResult:
     held_out: tuple[HeldOutFigure, ...]
     seconds: float
     warnings: tuple[str, ...]
+    lpips_note: str = ""
+    """Why the held-out photos have no LPIPS."""
 
     @property
     def held_out_psnr(self) -> float:
@@ -43,19 +54,28 @@ class TrainingResult:
         """Mean over the held-out photos; NaN without any."""
         return _mean([figure.ssim for figure in self.held_out])
 
+    @property
+    def held_out_lpips(self) -> float:
+        """Mean over the held-out photos where it was measured; NaN without any."""
+        return _mean([figure.lpips for figure in self.held_out if figure.lpips is not None])
+
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values for the report; the Gaussians are only counted."""
         values: dict[str, Any] = {
             "gaussians": len(self.gaussians),
             "iterations": self.iterations,
             "seconds_training": round(self.seconds, 3),
-            "held_out": [dataclasses.asdict(figure) for figure in self.held_out],
+            "held_out": [figure.to_json() for figure in self.held_out],
             "history": [dict(entry) for entry in self.history],
             "warnings": list(self.warnings),
         }
         if self.held_out:
             values["held_out_psnr"] = self.held_out_psnr
             values["held_out_ssim"] = self.held_out_ssim
+            if not math.isnan(self.held_out_lpips):
+                values["held_out_lpips"] = self.held_out_lpips
+            elif self.lpips_note:
+                values["lpips_note"] = self.lpips_note
         return values
 
 

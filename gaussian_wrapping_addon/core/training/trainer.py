@@ -18,6 +18,7 @@ from .. import tolerances
 from ..dataset.camera import Camera
 from ..dataset.scene import Scene
 from ..errors import Cancelled, DatasetError, WrapError
+from ..evaluation.views.lpips import lpips_if_ready
 from ..evaluation.views.view_metrics import score_images
 from ..gaussians.initialisation import initial_gaussians
 from ..gaussians.mip_filter import mip_filter
@@ -53,6 +54,8 @@ SNAPSHOT_EVERY = 100
 REPORT_EVERY = 10
 AVERAGE_SHARE = 0.05
 """Weight of the newest iteration in the figures of the progress message."""
+
+TOO_SMALL = "The photos are too small for LPIPS."
 
 RESTART_RATE = 0.5
 """Learning rates are multiplied by this after a restart."""
@@ -209,7 +212,7 @@ class _Trainer:
             save_checkpoint(self.folder, state, key)
             raise
         gaussians = state.adam.gaussians().detached()
-        held_out = self._measure(gaussians, progress)
+        held_out, lpips_note = self._measure(gaussians, progress)
         return TrainingResult(
             gaussians,
             total,
@@ -217,6 +220,7 @@ class _Trainer:
             tuple(held_out),
             spent_s + time.monotonic() - begun_s,
             tuple(self.warnings),
+            lpips_note,
         )
 
     def _start(self) -> TrainingState:
@@ -377,8 +381,12 @@ class _Trainer:
             **figures,
         )
 
-    def _measure(self, gaussians: OrientedGaussians, progress: Progress) -> list[HeldOutFigure]:
+    def _measure(
+        self, gaussians: OrientedGaussians, progress: Progress
+    ) -> tuple[list[HeldOutFigure], str]:
+        """Return the figures of the held-out photos, and why they have no LPIPS."""
         figures = []
+        lpips, reason = lpips_if_ready() if self.held_out else (None, "")
         options = RenderOptions(depth=False, threads=self.threads)
         raw = RawArrays.from_gaussians(gaussians)
         for view in self.held_out:
@@ -388,7 +396,9 @@ class _Trainer:
                 continue
             image = self.renderer.render(raw, self.photos.camera(view, 1), options).color
             photo = self.photos.photo(view, 1)
-            scores = score_images(image, photo, mask, threads=self.threads)
+            scores = score_images(image, photo, mask, lpips=lpips, threads=self.threads)
             name = self.scene.views[view].camera.name
-            figures.append(HeldOutFigure(name, scores.psnr, scores.ssim))
-        return figures
+            figures.append(HeldOutFigure(name, scores.psnr, scores.ssim, scores.lpips))
+        if not figures or any(figure.lpips is not None for figure in figures):
+            return figures, ""
+        return figures, reason or TOO_SMALL

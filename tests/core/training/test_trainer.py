@@ -16,8 +16,9 @@ from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import trainer
+from gaussian_wrapping_addon.core.training.result import TrainingResult
 from gaussian_wrapping_addon.core.training.trainer import held_out_views, train
-from tests.core.training.small_scene import PhotosInMemory, sphere_scene
+from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
 
 SETTINGS = TrainingSettings(
     iterations=40, max_gaussians=400, max_image_px=32, sh_degree=1, densify_every=5,
@@ -68,6 +69,44 @@ def test_training_learns_the_photos_it_never_saw(tmp_path: Path) -> None:
     outward = (normals * means).sum(1)[strong & opaque] > 0
     assert outward.size > 30
     assert outward.mean() > 0.75
+
+
+class _LikenessOfSize:
+    """Stands for LPIPS."""
+
+    def __init__(self, min_side_px: int) -> None:
+        self.min_side_px = min_side_px
+
+    def fits(self, shape: tuple[int, ...]) -> bool:
+        return min(shape[:2]) >= self.min_side_px
+
+    def distance(self, image: np.ndarray, photo: np.ndarray) -> float:
+        assert image.shape == photo.shape == (24, 24, 3)
+        return 0.25
+
+
+@pytest.mark.parametrize(
+    ("found", "value", "note"),
+    [
+        ((_LikenessOfSize(24), ""), 0.25, ""),
+        ((_LikenessOfSize(25), ""), None, trainer.TOO_SMALL),
+        ((None, "The weights are not here."), None, "The weights are not here."),
+    ],
+)
+def test_held_out_photos_get_a_likeness_or_the_reason_why_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: tuple, value: float | None, note: str
+) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    monkeypatch.setattr(trainer, "lpips_if_ready", lambda: found)
+    run = trainer._Trainer(scene, photos, SETTINGS, tmp_path, 0, 1)
+    figures, said = run._measure(sphere_gaussians(), Progress())
+    values = TrainingResult(sphere_gaussians(), 1, (), tuple(figures), 1.0, (), said).to_json()
+    assert len(values["held_out"]) == 2
+    assert said == values.get("lpips_note", "") == note
+    for entry in values["held_out"]:
+        assert set(entry) == {"name", "psnr", "ssim"} | ({"lpips"} if value else set())
+        assert entry.get("lpips") == value
+    assert values.get("held_out_lpips") == value
 
 
 def test_killed_and_resumed_is_bit_for_bit_the_same(tmp_path: Path) -> None:
