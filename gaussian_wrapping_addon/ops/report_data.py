@@ -69,8 +69,8 @@ def figures_of_report(report: Any) -> dict[str, Any]:
     dict
         ``seconds``, ``gaussians``, ``psnr`` (held-out photos, dB), ``psnr_count``,
         ``memory_bytes``, ``stages`` (pairs of name and seconds), ``warnings`` (texts), and
-        ``regions``: for each name ``faces``, ``vertices``, ``closed``, ``residual`` (99 % of
-        ``|v - 0.5|`` are below), ``coverage`` and ``mesh_psnr`` (dB).
+        ``regions``: for each name ``faces``, ``vertices``, ``closed``, ``coverage`` and
+        ``mesh_psnr`` (dB).
     """
     if not isinstance(report, dict) or not report:
         return {}
@@ -101,11 +101,10 @@ def figures_of_report(report: Any) -> dict[str, Any]:
 
 
 def _region(region: Any) -> dict[str, Any]:
-    statistics, provenance = part(region, "statistics"), part(region, "provenance")
+    statistics = part(region, "statistics")
     figures = _measured(
         faces=statistics.get("faces"),
         vertices=statistics.get("vertices"),
-        residual=provenance.get("level_error_p99"),
         coverage=part(region, "texture").get("coverage"),
         mesh_psnr=part(region, "mesh_rendering").get("psnr"),
     )
@@ -167,7 +166,6 @@ def _region_rows(region: dict[str, Any]) -> tuple[Row, ...]:
     return (
         ("Faces", number(region.get("faces"))),
         ("Closed", ("Yes" if closed else "No") if isinstance(closed, bool) else NOT_MEASURED),
-        ("Residual, 99 % below", number(region.get("residual"), "vacancy")),
         ("Texture Seen", percent(region.get("coverage"))),
         ("Textured Mesh PSNR", number(region.get("mesh_psnr"), "dB", digits=1)),
     )

@@ -252,7 +252,10 @@ def _run_meshing(
             edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
         )  # fmt: skip
         if not np.isfinite(mesh.vertices).all():
-            raise MeshingError("The mesh has vertices that are not finite.", "Report the job.")
+            raise MeshingError(
+                "The mesh has vertices that are not finite.",
+                "Send the job folder's log.txt with a bug report.",
+            )
         save_mesh(stage_folder / "mesh.npz", mesh)
         write_region(stage_folder / "region.json", region.transformed(scene.world_from_scene))
         progress.update(0.97, "measuring the mesh")

@@ -134,7 +134,7 @@ def main(arguments: list[str]) -> int:
         _logger.exception("unexpected failure")
         code, state = EXIT_OTHER, "FAILED"
         error = f"Unexpected {type(failure).__name__}: {failure}"
-        hint = "See log.txt in the job folder and report it."
+        hint = "Send the job folder's log.txt with a bug report."
     else:
         code, state, error, hint = EXIT_DONE, "DONE", "", ""
     reporter.end()

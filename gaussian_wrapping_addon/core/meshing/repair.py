@@ -17,6 +17,8 @@ parts do not touch and programs that merge equal points do not join them again."
 
 MAX_PASSES = 20
 
+_DEFECT = "Send the job folder's log.txt with a bug report."
+
 
 @dataclass(frozen=True)
 class Repaired:
@@ -77,7 +79,10 @@ def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> Repaired:
         split_edges += len(pairs)
         faces = new_faces
     else:
-        raise MeshingError("The surface could not be made manifold.", "Report the job.")
+        raise MeshingError(
+            "The surface could not be made manifold.",
+            _DEFECT,
+        )
     moved = _apart(vertices, new_faces, origin)
     return Repaired(moved, new_faces, origin, len(moved) - before - split_edges, split_edges)
 
@@ -98,7 +103,7 @@ def _partners(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     sizes = np.diff(starts)
     forwards = np.add.reduceat(forward[order].astype(np.int64), starts[:-1])
     if (2 * forwards != sizes).any():
-        raise MeshingError("The surface is not closed.", "Report the job.")
+        raise MeshingError("The surface is not closed.", _DEFECT)
     partner = np.empty(len(order), np.int64)
     plain = starts[:-1][sizes == 2]
     partner[order[plain]], partner[order[plain + 1]] = order[plain + 1], order[plain]

@@ -112,7 +112,7 @@ def texture_mesh(
 
 def check_mesh(mesh: SurfaceMesh) -> None:
     """Refuse what cannot be unwrapped or written (conventions.md D.5, 46 and 49)."""
-    hint = "Mesh the region again, or report the job."
+    hint = "Mesh the region again, or send the job folder's log.txt with a bug report."
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if len(faces) == 0 or len(vertices) == 0:
         raise MeshingError("The mesh has no faces.", "Choose a region that holds a surface.")

@@ -18,6 +18,7 @@ import trimesh
 from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.evaluation.report.figures import figure_rows
 from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder
 from tests.synthetic import BALL_RADIUS, BallScene, write_ball_scene
 
@@ -107,6 +108,8 @@ def test_result_files_are_there_and_agree(wrapped: tuple[BallScene, Path, str]) 
     for name in ("mesh.ply", "mesh.glb", "mesh.obj", "albedo.png", "mesh.npz", "region.json"):
         assert (result / "ball" / name).stat().st_size > 0, name
     report = json.loads((result / "report.json").read_text())
+    number = re.compile(r"[\d,]+(\.\d+)?(e[+-]\d+)?")
+    assert [row for row in figure_rows(report) if number.fullmatch(row[1]) and not row[2]] == []
     figures = report["regions"]["ball"]
     assert figures["statistics"]["closed"] is True
     assert report["training"]["held_out_psnr"] > 22.0

@@ -57,6 +57,23 @@ _ENDINGS = (
     ("_until", "of 1 (of all iterations)"),
     ("_s", "s"),
 )
+_COUNTS = frozenset(
+    (
+        "boundary_edges", "candidates", "cap_points", "charts", "components", "cores",
+        "degenerate_faces", "degenerate_faces_left", "densify_every", "dropped_candidates",
+        "faces", "faces_without_texel", "frames", "gaussians", "gaussians_in_region",
+        "holdout_every", "images_in_model", "inconsistent_edges", "interior_samples",
+        "iterations", "jump_points", "left_out", "max_gaussians", "nonmanifold_edges",
+        "nonmanifold_vertices", "photos", "photos_placed", "photos_undistorted", "photos_used",
+        "photos_with_focal_length", "pivots", "points", "points_in_model",
+        "projection_evaluations", "relabelled_tetrahedra", "removed_cavities",
+        "removed_solids", "split_edges", "split_vertices", "surface_points", "tetrahedra",
+        "texels_filled", "texels_overlapping", "texels_seen", "texels_seen_at_outlines_only",
+        "texels_used", "threads", "undecided_tetrahedra", "unused_vertices", "vertices",
+        "vertices_at_end_of_sight", "vertices_moved_apart", "vertices_on_region_boundary",
+        "vertices_on_surface", "views", "wrap_rounds",
+    )
+)  # fmt: skip
 _STARTS = (("level_error_", "of vacancy"), ("lambda_", "weight"))
 
 
@@ -71,7 +88,7 @@ def figure_rows(report: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def unit_of(path: tuple[str, ...]) -> str:
-    """Return the unit of a figure by its name; what is no quantity is counted."""
+    """Return the unit of a figure by its name; empty where the name is not known."""
     key = path[-1]
     if key.isdigit():  # an entry of a list
         path, key = path[:-1], path[-2]
@@ -89,7 +106,7 @@ def unit_of(path: tuple[str, ...]) -> str:
     for start, unit in _STARTS:
         if key.startswith(start):
             return unit
-    return "count"
+    return "count" if key in _COUNTS else ""
 
 
 def _leaves(values: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:

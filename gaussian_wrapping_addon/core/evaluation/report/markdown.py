@@ -11,7 +11,7 @@ from typing import Any
 
 from ...files import resolve_inside
 from .figures import figure_rows
-from .region import Picture, region_lines, region_summary
+from .region import Picture, note_lines, region_lines, region_summary
 from .text import (
     NOT_MEASURED,
     bar,
@@ -181,13 +181,17 @@ def _mesh_exact(report: dict[str, Any]) -> str:
         rendering = part(region, "mesh_rendering")
         psnr = measured(rendering.get("psnr"))
         if psnr is None:
-            text += f" For the textured mesh of {escaped(name)} this was {NOT_MEASURED}."
+            text += f' For the textured mesh of "{escaped(name)}" this was {NOT_MEASURED}.'
         else:
             views = plural(len(items(rendering.get("views"))), "photo")
+            if rendering.get("pixels") == "covered":
+                # The Gaussians above are judged by whole photos: the two are not to be compared.
+                covered = percent(rendering.get("covered"))
+                views += f", counted where the mesh is: {covered} of the photo"
             note = rendering.get("note")
             if isinstance(note, str) and note.strip():
                 views += f"; {escaped(note.strip().rstrip('.'))}"
-            text += f" The textured mesh of {escaped(name)}: {psnr:.1f} dB ({views})."
+            text += f' The textured mesh of "{escaped(name)}": {psnr:.1f} dB ({views}).'
     return text
 
 
@@ -207,7 +211,8 @@ def _how_seen(report: dict[str, Any]) -> str:
 
 def _stage_name(stage: dict[str, Any]) -> str:
     kind, _, region = str(stage.get("name") or "unknown").partition("-")
-    return f"{_STAGES.get(kind, escaped(kind))} {escaped(region)}".strip()
+    title = _STAGES.get(kind, escaped(kind))
+    return f'{title} "{escaped(region)}"' if region else title
 
 
 def _time(report: dict[str, Any]) -> list[str]:
@@ -296,7 +301,8 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
     header = ["photo held out", "PSNR", "typical error", "SSIM (1 is equal)"]
     lines += table(header + ["LPIPS (0 is equal)"] * perceptual, rows, "lrrr" + "r" * perceptual)
     if not perceptual:
-        lines += ["", f"LPIPS (likeness as people see it) was {NOT_MEASURED}."]
+        unknown = ["", f"LPIPS (likeness as people see it) was {NOT_MEASURED}."]
+        lines += note_lines({"lpips_note": training.get("lpips_note")}) or unknown
     shown: list[str] = []
     for entry in map(part, items(training.get("pictures"))):
         psnr = number(entry.get("psnr"), "dB", digits=1)

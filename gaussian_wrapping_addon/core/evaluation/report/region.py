@@ -164,7 +164,7 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
     views = [part(view) for view in items(rendering.get("views"))]
     if measured(rendering.get("psnr")) is None and not views:
         lines = [f"How well the textured mesh reproduces photos was {NOT_MEASURED}."]
-        return lines + _notes(rendering)
+        return lines + note_lines(rendering)
     perceptual = any(measured(view.get("lpips")) is not None for view in views)
     where = {
         "mask": "Counted are the pixels inside of the photos' masks.",
@@ -183,7 +183,7 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
     left_out = measured(rendering.get("left_out"))
     if left_out:
         lines += ["", f"{plural(int(left_out), 'photo')} could not be judged: no pixel counts."]
-    return lines + _notes(rendering)
+    return lines + note_lines(rendering)
 
 
 def _view_row(name: str, view: dict[str, Any], perceptual: bool) -> list[str]:
@@ -197,10 +197,11 @@ def _view_row(name: str, view: dict[str, Any], perceptual: bool) -> list[str]:
     return [*row, number(view.get("lpips"), digits=4)] if perceptual else row
 
 
-def _notes(rendering: dict[str, Any]) -> list[str]:
+def note_lines(figures: dict[str, Any]) -> list[str]:
+    """Return what a measurement says of itself: ``note``, and ``lpips_note``, why LPIPS lacks."""
     lines = []
     for key in ("note", "lpips_note"):
-        text = rendering.get(key)
+        text = figures.get(key)
         if not isinstance(text, str) or not text.strip():
             continue
         text = text.strip().rstrip(".")

@@ -140,10 +140,11 @@ def _judge_mesh(
     if statistics.get("closed") is False:
         edges = plural(statistics.get("boundary_edges"), "open edge")
         text = f"The mesh is not closed ({edges}); volumes and 3D prints need a closed one."
-        found.append(ReportWarning(stage, text, "Report the job; fill the holes in Blender."))
+        step = "Fill the holes in Blender; send the job folder's log.txt with a bug report."
+        found.append(ReportWarning(stage, text, step))
     wide = measured(provenance.get("level_error_p99"))
     if wide is not None and wide > HALF_WAY:
-        text = f"At one vertex in a hundred, |v - 0.5| is above {wide:.2f}: not on the surface."
+        text = "At one vertex in a hundred the mesh is not on the surface the photos describe."
         found.append(ReportWarning(stage, text, "Mesh with more points or a smaller region."))
     left = measured(provenance.get("degenerate_faces_left"))
     if left:

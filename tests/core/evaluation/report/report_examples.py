@@ -69,6 +69,7 @@ def full_summary() -> dict[str, Any]:
             ],
             "held_out_psnr": 23.0,
             "held_out_ssim": 0.6,
+            "lpips_note": "LPIPS is not measured: AlexNet's weights are not here.",
             "history": [
                 {"iteration": 100.0, "loss": 0.2, "psnr": 25.0, "gaussians": 9000.0},
                 {"iteration": 200.0, "loss": 0.15, "psnr": 28.0, "gaussians": 10000.0},
@@ -145,6 +146,7 @@ def full_region() -> dict[str, Any]:
             ],
             "psnr": 20.0,
             "ssim": 0.5,
+            "covered": 0.625,
             "pixels": "covered",
             "held_out": True,
             "note": "the texture was baked from all photos, these included",

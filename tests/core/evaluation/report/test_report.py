@@ -30,6 +30,7 @@ from gaussian_wrapping_addon.core.evaluation.report.warnings import (
     collect_warnings,
 )
 from gaussian_wrapping_addon.core.files import finite
+from gaussian_wrapping_addon.core.settings import JobSettings, to_json
 from tests.core.evaluation.report.report_examples import (
     PICTURES,
     REGION,
@@ -105,7 +106,7 @@ def test_every_warning_is_listed_with_stage_and_next_step(tmp_path: Path) -> Non
         ("training", "more than twice the error"),
         (f"mesh {REGION}", "The edge length was raised to 0.02."),
         (f"mesh {REGION}", "not closed (4 open edges)"),
-        (f"mesh {REGION}", "above 0.31"),
+        (f"mesh {REGION}", "one vertex in a hundred the mesh is not on the surface"),
         (f"mesh {REGION}", "3 faces without area"),
         (f"texture {REGION}", "most of it was filled in"),
         (f"texture {REGION}", "the unwrapper crashed"),
@@ -177,13 +178,15 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         "PSNR of 23.0 dB",
         "typical error of 7.1 % of full brightness",  # 10 ** (-23 / 20)
         "photos saw 25.0 % of the texture",
-        "20.0 dB (2 photos; the texture was baked from all photos, these included)",
+        f'The textured mesh of "{escaped(REGION)}": 20.0 dB (2 photos, counted where the mesh is',
+        ": 62.5 % of the photo; the texture was baked from all photos, these included)",
         "too few to trust",
     ):
         assert words in summary, words
     stages = section(text, "## Time and memory")
     assert "| training the Gaussians | 140.0 s | 70.0 % |" in stages
     assert "| photos and cameras (earlier run) | 20.0 s | 10.0 % |" in stages
+    assert f'| mesh of region "{escaped(REGION)}" | 30.0 s | 15.0 % |' in stages
     assert "main process: 3.00 GiB" in stages
     assert "512 MiB" in stages
     training = section(text, "## Training")
@@ -191,6 +194,7 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         " **mean** ", " 23.00 dB ", " 7.1 % ", " 0.6000 ",
     ]  # fmt: skip
     assert "| p\\|q.jpg | 20.00 dB | 10.0 % | 0.5000 |" in training
+    assert "LPIPS is not measured: AlexNet's weights are not here." in training
     region = section(text, f"## Region {escaped(REGION)}")
     for name, figure in (
         ("Faces", "196 faces"),
@@ -210,7 +214,7 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
     ):
         assert row(region, name) == figure
     assert "| p\\|q.jpg | 18.50 dB | 0.4500 | 75.0 % |" in region
-    assert "| **mean** | 20.00 dB | 0.5000 |  |" in region
+    assert "| **mean** | 20.00 dB | 0.5000 | 62.5 % |" in region
     assert "The texture was baked from all photos, these included." in region
     assert f"LPIPS was {NOT_MEASURED}: its weights are not here." in region
     machine = section(text, "## Machine, versions, seed")
@@ -255,6 +259,7 @@ def test_tables_are_well_formed(tmp_path: Path, perceptual: bool) -> None:
 
 def test_every_number_of_the_table_has_a_unit() -> None:
     report = {"version": 1, **full_summary(), "regions": {REGION: full_region()}}
+    report["settings"] = to_json(JobSettings())
     rows = figure_rows(report)
     units = {name: unit for name, value, unit in rows}
     assert all(unit for _, value, unit in rows if re.fullmatch(r"[\d,]+(\.\d+)?(e[+-]\d+)?", value))
@@ -272,6 +277,24 @@ def test_every_number_of_the_table_has_a_unit() -> None:
     ):
         (found,) = [u for name, u in units.items() if name.endswith(words)]
         assert found == unit, words
+    report["training"]["brightness"] = 3.5
+    unknown = [row for row in figure_rows(report) if row not in rows]
+    assert unknown == [("training, brightness", "3.5", "")]
+
+
+def test_perceptual_figures_of_held_out_photos(tmp_path: Path) -> None:
+    summary = full_summary()
+    summary["training"].pop("lpips_note")
+    _, text = write(tmp_path, summary)
+    assert "LPIPS (likeness as people see it) was not measured." in section(text, "## Training")
+    for figure, value in zip(summary["training"]["held_out"], (0.25, 0.35), strict=True):
+        figure["lpips"] = value
+    summary["training"]["held_out_lpips"] = 0.3
+    _, text = write(tmp_path, summary)
+    training = section(text, "## Training")
+    assert "| p\\|q.jpg | 20.00 dB | 10.0 % | 0.5000 | 0.2500 |" in training
+    assert "| **mean** | 23.00 dB | 7.1 % | 0.6000 | 0.3000 |" in training
+    assert NOT_MEASURED not in training
 
 
 @pytest.mark.parametrize("value", [None, math.nan, "x"])
