@@ -91,10 +91,22 @@ def _log_to(path: Path) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
+def parent_to_watch(caller: str) -> int:
+    """Return the process with which to stop, 0 for none.
+
+    The caller's own id only tells whether there is one: where Python is started through a launcher
+    (``python.exe`` of a virtual environment on Windows), that launcher is the parent.
+    """
+    return os.getppid() if int(caller) else 0
+
+
 def main(arguments: list[str]) -> int:
-    """Run the job of ``arguments = [folder, parent pid or 0]``; return the exit code."""
+    """Run the job of ``arguments = [folder, caller's pid or 0]``; return the exit code.
+
+    With 0 the worker goes on when its parent ends.
+    """
     folder = JobFolder(Path(arguments[0]))
-    parent = int(arguments[1]) if len(arguments) > 1 else 0
+    parent = parent_to_watch(arguments[1] if len(arguments) > 1 else "0")
     _log_to(folder.log_path)
     reporter = _Reporter(
         folder,

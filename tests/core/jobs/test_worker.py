@@ -16,8 +16,9 @@ from gaussian_wrapping_addon.core.errors import ParseError, UsageError
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.helper_process import child_command
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job
-from gaussian_wrapping_addon.core.jobs.job_folder import process_start_ticks
+from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, write_job
+from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, process_start_ticks
+from gaussian_wrapping_addon.core.jobs.worker import parent_to_watch
 from gaussian_wrapping_addon.core.settings import JobSettings
 
 BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"
@@ -79,6 +80,34 @@ def test_a_worker_that_may_not_lock_leaves_the_owner_alone(tmp_path: Path) -> No
         assert folder.status_path.read_bytes() == before
         assert read_json(folder.lock_path) == lock
         owner.kill()
+
+
+def test_the_parent_that_is_watched_may_be_a_launcher() -> None:
+    assert parent_to_watch("0") == 0
+    assert parent_to_watch(str(os.getppid() + 1)) == os.getppid()
+
+
+def test_a_worker_behind_a_launcher_is_not_stopped(tmp_path: Path) -> None:
+    """In a virtual environment on Windows, the worker's parent is not its caller."""
+    (tmp_path / "photos").mkdir()
+    target = JobFolder(tmp_path / "out")
+    target.create()
+    write_job(target.job_path, make_job("wrap", tmp_path / "photos", JobSettings()))
+    script = (
+        "import sys, time\n"
+        f"sys.path[:0] = {sys.path!r}\n"
+        "from gaussian_wrapping_addon.core.errors import Cancelled\n"
+        "from gaussian_wrapping_addon.core.jobs import runner, worker\n"
+        "def run_job(folder, job, event, cancelled):\n"
+        "    time.sleep(0.5)\n"
+        "    if cancelled():\n"
+        "        raise Cancelled()\n"
+        "runner.run_job, worker.PARENT_POLL_S = run_job, 0.05\n"
+        "sys.exit(worker.main(sys.argv[1:]))\n"
+    )
+    caller = str(os.getppid())  # not the worker's parent, which is this process
+    done = subprocess.run([sys.executable, "-c", script, str(target.root), caller], check=False)
+    assert (done.returncode, target.read_status().state) == (0, "DONE")
 
 
 def test_results_inside_the_photo_folder_are_refused(tmp_path: Path) -> None:
