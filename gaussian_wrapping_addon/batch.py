@@ -12,7 +12,7 @@ import logging
 import math
 import sys
 import time
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -107,10 +107,17 @@ def _parser() -> ArgumentParser:
 
 
 def _add_evaluate(parser: ArgumentParser) -> None:
-    parser.add_argument("mesh", type=Path, metavar="MESH_OR_JOB")
-    parser.add_argument("--truth", type=Path, required=True, metavar="PATH")
     parser.add_argument(
-        "--layout", choices=("auto", "scene", "mesh", "tanks", "dtu"), default="auto"
+        "mesh", type=Path, metavar="MESH_OR_JOB", help="PLY, OBJ, GLB, STL or OFF; or a job folder"
+    )
+    parser.add_argument(
+        "--truth", type=Path, required=True, metavar="PATH", help="mesh, cloud, scene or data set"
+    )
+    parser.add_argument(
+        "--layout",
+        choices=("auto", "scene", "mesh", "tanks", "dtu"),
+        default="auto",
+        help="of the truth; auto tells it by the files there",
     )
     parser.add_argument("--scan", type=int, help="number of the DTU scan")
     parser.add_argument("--region", help="of the job, where it has several")
@@ -119,19 +126,27 @@ def _add_evaluate(parser: ArgumentParser) -> None:
         "--thresholds", type=_floats, help="shares of the truth's diagonal, comma separated"
     )
     parser.add_argument("--distances", type=_floats, help="lengths instead, comma separated")
-    parser.add_argument("--align", choices=("none", "cameras", "icp"))
+    parser.add_argument(
+        "--align",
+        choices=("none", "cameras", "icp"),
+        help="how the mesh is placed on the truth first: as it is, by cameras of equal names, by "
+        "nearest points (default: none; tanks icp, dtu cameras)",
+    )
     parser.add_argument("--protocols", help="comma separated, of uniform,scan,legacy")
-    parser.add_argument("--samples", type=int)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--samples", type=int, help="points drawn on the mesh (uniform protocol)")
+    parser.add_argument("--seed", type=int, default=0, help="of these points")
     parser.add_argument("--threads", type=int, default=0, help="0 uses every core")
-    parser.add_argument("--out", type=Path, metavar="FILE.json")
+    parser.add_argument("--out", type=Path, metavar="FILE.json", help="all figures, for programs")
     parser.set_defaults(run=_evaluate)
 
 
 def _floats(text: str) -> list[float]:
-    values = [float(word) for word in text.split(",") if word]
+    try:
+        values = [float(word) for word in text.split(",") if word]
+    except ValueError:
+        values = [math.nan]
     if not all(math.isfinite(value) for value in values):
-        raise ValueError(text)
+        raise ArgumentTypeError(f"{text!r}: give numbers separated by commas")
     return values
 
 

@@ -24,7 +24,7 @@ from .layouts.tanks import align_to_log, is_tanks_folder, read_tanks, score_tank
 from .pose_error import pose_errors
 from .surface.dtu_chamfer import DENSITY_MM, MAX_DISTANCE_MM, PATCH_MM
 from .surface.samples import SurfaceSamples, sample_uniformly
-from .surface.scores import PROTOCOLS, score_protocols
+from .surface.scores import MIN_THIN_SHARE, PROTOCOLS, score_protocols
 from .surface.truth import TRUTH_FILE, Truth, read_truth
 
 LAYOUTS = ("auto", "scene", "mesh", "tanks", "dtu")
@@ -32,6 +32,9 @@ ALIGNMENTS = ("none", "cameras", "icp")
 SHARES = (0.0025, 0.005, 0.01)
 """Thresholds as shares of the truth's diagonal, where none are given."""
 SAMPLES = 200_000
+ELSEWHERE_SHARE = 0.01
+"""Cameras further than this share of their spread from the true ones stand in another frame, where
+an alignment brings them nearer: the largest of :data:`SHARES`."""
 ICP_REACH = (0.05, 0.01)
 """Largest distance of pairs in the two stages of ``--align icp``, shares of the diagonal."""
 
@@ -65,6 +68,8 @@ class EvaluationRequest:
         ):
             if value is not None and value not in known:
                 raise UsageError(f"{name} {value} is not known.", f"Use {', '.join(known)}.")
+        if self.protocols is not None and not self.protocols:
+            raise UsageError("--protocols names none.", f"Use {', '.join(PROTOCOLS)}.")
         for protocol in self.protocols or ():
             if protocol not in PROTOCOLS:
                 raise UsageError(
@@ -200,7 +205,7 @@ def _surface(
     align = request.align or "none"
     transform = Similarity()
     alignment: dict[str, Any] = {"method": align}
-    poses = None
+    poses, pose_note = None, ""
     if align == "cameras" or (align == "icp" and cameras and true_cameras):
         if layout == "mesh":
             raise UsageError(
@@ -216,7 +221,11 @@ def _surface(
             {"fitness": s.fitness, "rmse": s.rmse, "iterations": s.iterations} for s in stages
         ]
     if poses is None and cameras and true_cameras:
-        poses = pose_errors(cameras, true_cameras)
+        # Nobody asked for these: where they cannot be told, the scores still can.
+        try:
+            poses = pose_errors(cameras, true_cameras)
+        except DatasetError as error:
+            pose_note = str(error)
     viewers = true_cameras or [camera.moved(transform) for camera in cameras]
     protocols = _protocols(request, viewers)
     shares = request.shares or (None if request.distances else SHARES)
@@ -235,6 +244,7 @@ def _surface(
         "truth_samples": len(truth.samples),
         "alignment": {**alignment, "transform": transform.to_json()},
         "pose_errors": None if poses is None else poses.to_json(),
+        "pose_note": pose_note,
         "scan_cameras": len(viewers) if "scan" in protocols else 0,
         "scores": {name: score.to_json() for name, score in scores.items()},
     }
@@ -387,7 +397,7 @@ def _dtu(
 
 
 def table(result: dict[str, Any]) -> list[str]:
-    """Return the scores as lines for a terminal."""
+    """Return the scores as lines for a terminal; recall of thin parts where there are such."""
     align = result["alignment"]["method"]
     lines = [f"layout {result['layout']}, alignment {align}, seed {result['seed']}"]
     if result["layout"] == "dtu":
@@ -410,18 +420,33 @@ def table(result: dict[str, Any]) -> list[str]:
         for protocol, entry in result["scores"].items():
             lines.append(
                 f"{protocol:9s} Chamfer mean {_figure(entry['chamfer_mean'])}, "
-                f"median {_figure(entry['chamfer_median'])}, "
+                f"median {_figure(entry['chamfer_median'])} (in the truth's units), "
                 f"normal consistency {entry['normal_consistency']:.4f}"
             )
-            if entry["thin_recall"] is not None:
+            thin = entry["thin_count"] >= MIN_THIN_SHARE * entry["truth_count"]
+            if thin and entry["thin_recall"] is not None:
                 shares = " ".join(f"{share:.4f}" for share in entry["thin_recall"])
                 lines.append(f"{protocol:9s} recall of thin parts {shares}")
+    return lines + _pose_lines(result, align)
+
+
+def _pose_lines(result: dict[str, Any], align: str) -> list[str]:
+    """Return what is known of the cameras; a warning where the mesh may stand elsewhere too."""
     poses = result.get("pose_errors")
-    if poses:
+    if not poses:
+        note = result.get("pose_note")
+        return [f"poses     not compared: {note}"] if note else []
+    given, aligned = poses["given_share_median"], poses["center_share_median"]
+    text = (
+        f"poses     centres {100 * aligned:.3g} % of the spread, "
+        f"rotations {poses['rotation_degrees_median']:.3g} degrees (medians of "
+        f"{poses['cameras']}, after their own best alignment)"
+    )
+    lines = [text]
+    if align == "none" and given > max(ELSEWHERE_SHARE, 2.0 * aligned):
         lines.append(
-            f"poses     centres {100 * poses['center_share_median']:.3g} % of the spread, "
-            f"rotations {poses['rotation_degrees_median']:.3g} degrees (medians of "
-            f"{poses['cameras']})"
+            f"poses     the cameras lie elsewhere (scale {poses['transform']['scale']:.4g}, shift "
+            f"{given * poses['spread']:.4g} in the truth's units): try --align cameras"
         )
     return lines
 

@@ -23,6 +23,8 @@ class PoseErrors:
     center_shares: np.ndarray
     """(n,) distance of the aligned centre from the true one, over the true cameras' spread: the
     root mean square distance of their centres from their mean."""
+    given_shares: np.ndarray
+    """(n,) the same distance as the cameras were given, before any alignment."""
     rotation_degrees: np.ndarray
     """(n,) angle between the aligned and the true orientation."""
     spread: float
@@ -40,6 +42,7 @@ class PoseErrors:
             "spread": self.spread,
             "center_share_median": float(np.median(self.center_shares)),
             "center_share_max": float(self.center_shares.max()),
+            "given_share_median": float(np.median(self.given_shares)),
             "rotation_degrees_median": float(np.median(self.rotation_degrees)),
             "rotation_degrees_max": float(self.rotation_degrees.max()),
             "transform": self.transform.to_json(),
@@ -74,13 +77,16 @@ def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> Po
     transform = umeyama(centers, true_centers, with_scale=True)
     spread = float(np.sqrt(((true_centers - true_centers.mean(0)) ** 2).sum(1).mean()))
     distances = np.linalg.norm(transform.points(centers) - true_centers, axis=1)
+    given = np.linalg.norm(centers - true_centers, axis=1)
     moved = np.array([solved[name].rotation @ transform.rotation.T for name in names])
     apart = moved - np.array([true[name].rotation for name in names])  # (n, 3, 3)
     # ||A - B||_F = 2 sqrt(2) sin(angle / 2): exact for tiny angles, where the trace is not.
     sines = np.linalg.norm(apart, axis=(1, 2)) / np.sqrt(8.0)
     angles = np.degrees(2.0 * np.arcsin(np.minimum(sines, 1.0)))
     missing = tuple(name for name in true if name not in solved)
-    return PoseErrors(tuple(names), distances / spread, angles, spread, transform, missing)
+    return PoseErrors(
+        tuple(names), distances / spread, given / spread, angles, spread, transform, missing
+    )
 
 
 def _by_name(cameras: Sequence[Camera], kind: str) -> dict[str, Camera]:

@@ -61,7 +61,7 @@ def run_in_worker(request: dict[str, Any], *, python: str) -> int:
     WorkerError
         It does not start, or ends without a word.
     """
-    text = json.dumps({**request, "parent": os.getpid()}, allow_nan=False)
+    text = json.dumps(request, allow_nan=False)
     with tempfile.TemporaryFile() as words:
         try:
             process = subprocess.Popen(
@@ -118,9 +118,10 @@ def _show(raw: bytes) -> bool:
 
 def main(arguments: list[str]) -> int:
     """Evaluate ``arguments = [request as JSON]`` in this process; return the exit code."""
+    # Not the caller's own id: where Python is started through a launcher, that is the parent.
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     try:
         request = json.loads(arguments[0])
-        threading.Thread(target=_end_with, args=(int(request["parent"]),), daemon=True).start()
         report, lines = _evaluate(request)
         if request["out"]:
             out = Path(request["out"])

@@ -20,6 +20,7 @@ from gaussian_wrapping_addon import batch
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.evaluation.command import (
+    ELSEWHERE_SHARE,
     EvaluationRequest,
     evaluate_mesh,
     find_layout,
@@ -31,6 +32,7 @@ from gaussian_wrapping_addon.core.evaluation.layouts.mesh_input import (
     read_mesh,
 )
 from gaussian_wrapping_addon.core.evaluation.surface.samples import sample_uniformly
+from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.evaluate import job_cameras, job_mesh
 from gaussian_wrapping_addon.core.meshing.region import Region, write_region
 from gaussian_wrapping_addon.core.progress import Progress
@@ -136,6 +138,96 @@ def test_clouds_are_judged_against_as_well(tmp_path: Path) -> None:
     assert list(bare["scores"]["uniform"]["f1"]) == [1.0]
 
 
+def test_cameras_in_another_frame_are_told_unless_aligned(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    options = {"protocols": ("uniform",), "samples": 2_000}
+    moved = JOB_FROM_TRUTH.points(MESH[0]), MESH[1]
+    cameras = [camera.moved(JOB_FROM_TRUTH) for camera in CAMERAS]
+    result = evaluate(moved, scene, cameras, **options)
+    assert result["scores"]["uniform"]["f1"][-1] < 0.1
+    assert result["pose_errors"]["center_share_median"] < 1e-9
+    assert result["pose_errors"]["given_share_median"] > 1.0
+    (line,) = [line for line in table(result) if "lie elsewhere" in line]
+    assert f"scale {1 / JOB_FROM_TRUTH.scale:.4g}" in line
+    apart = [JOB_FROM_TRUTH.points(c.center[None])[0] - c.center for c in CAMERAS]
+    shift = float(np.median(np.linalg.norm(apart, axis=1)))
+    assert f"shift {shift:.4g} in the truth's units" in line
+    assert "--align cameras" in line
+    for result in (
+        evaluate(moved, scene, cameras, align="cameras", **options),
+        evaluate(MESH, scene, CAMERAS, **options),
+    ):
+        lines = table(result)
+        assert not any("elsewhere" in line for line in lines)
+        assert any("after their own best alignment" in line for line in lines)
+        assert any("Chamfer" in line and "in the truth's units" in line for line in lines)
+
+
+def test_noise_of_the_cameras_is_not_taken_for_another_frame(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    rng = np.random.default_rng(3)
+    cameras = [c.moved(Similarity(1.0, np.eye(3), rng.normal(0.0, 0.2, 3))) for c in CAMERAS]
+    result = evaluate(MESH, scene, cameras, protocols=("uniform",), samples=2_000)
+    assert result["pose_errors"]["given_share_median"] > ELSEWHERE_SHARE
+    assert not any("elsewhere" in line for line in table(result))
+
+
+def test_poses_that_nobody_asked_for_never_end_it(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    strangers = ring_of_cameras([f"other-{i}.png" for i in range(8)], 4.0, np.zeros(3))
+    options = {"protocols": ("uniform",), "samples": 2_000}
+    result = evaluate(MESH, scene, strangers, **options)
+    assert result["scores"]["uniform"]["f1"] == [1.0, 1.0, 1.0]
+    assert result["pose_errors"] is None
+    assert "0 of 8 true cameras" in result["pose_note"]
+    assert table(result)[-1] == f"poses     not compared: {result['pose_note']}"
+    for align in ("cameras", "icp"):
+        with pytest.raises(DatasetError, match="0 of 8 true cameras"):
+            evaluate(MESH, scene, strangers, align=align, **options)
+
+
+def test_thin_parts_are_told_where_there_are_such(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    result = evaluate(MESH, scene, protocols=("uniform",), samples=2_000)
+    entry = result["scores"]["uniform"]
+    entry["thin_recall"] = [0.1, 0.2, 0.3]
+    for count, told in ((199, False), (200, True)):
+        entry["thin_count"] = count
+        assert entry["truth_count"] == 20_000
+        assert any("0.1000 0.2000 0.3000" in line for line in table(result)) == told
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a shell script")
+def test_a_launcher_between_caller_and_child_does_not_end_it(tmp_path: Path) -> None:
+    """In a virtual environment on Windows, the child's parent is not its caller."""
+    mesh = write_ply(tmp_path / "mesh.ply", MESH)
+    launcher = tmp_path / "python"
+    launcher.write_text(f'#!/bin/sh\n"{sys.executable}" "$@"\nexit $?\n')
+    launcher.chmod(0o755)
+    out = tmp_path / "scores.json"
+    options = batch._parser().parse_args(
+        ["evaluate", str(mesh), "--truth", str(mesh), "--samples", "1000", "--out", str(out)]
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(PYTHON_VARIABLE, str(launcher))
+        assert options.run(options) == 0
+    assert json.loads(out.read_text())["scores"]["uniform"]["f1"][0] == 1.0
+
+
+def test_options_explain_themselves() -> None:
+    commands = next(a for a in batch._parser()._actions if isinstance(a.choices, dict))
+    for action in commands.choices["evaluate"]._actions:
+        assert action.help, action.dest
+    for text in ("a", "1,b", "nan", "1,inf"):
+        with pytest.raises(UsageError, match="give numbers separated by commas"):
+            batch._parser().parse_args(["evaluate", "m", "--truth", "t", "--thresholds", text])
+
+
+def test_no_protocol_is_refused(tmp_path: Path) -> None:
+    mesh = write_ply(tmp_path / "mesh.ply", MESH)
+    assert batch.main(["evaluate", str(mesh), "--truth", str(mesh), "--protocols", ","]) == 2
+
+
 def test_what_contradicts_itself_is_refused(tmp_path: Path) -> None:
     truth = write_ply(tmp_path / "truth.ply", MESH)
     for options, words in (
@@ -144,6 +236,7 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path) -> None:
         ({"distances": (-1.0,)}, "no positive numbers"),
         ({"protocols": ("scan",)}, "needs cameras"),
         ({"protocols": ("best",)}, "not known"),
+        ({"protocols": ()}, "names none"),
         ({"samples": 0}, "too few"),
     ):
         with pytest.raises(UsageError, match=words):
