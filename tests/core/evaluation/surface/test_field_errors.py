@@ -11,6 +11,7 @@ import torch
 import trimesh
 
 from gaussian_wrapping_addon.core import tolerances
+from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.evaluation.surface.field_errors import (
     depth_errors,
@@ -19,6 +20,7 @@ from gaussian_wrapping_addon.core.evaluation.surface.field_errors import (
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from tests.core.field.field_scenes import camera_at, unit_sphere
+from tests.poses import look_at_pose
 
 ALPHA, SIGMA = 0.9, 0.4
 RADIUS = SIGMA * math.sqrt(2.0 * math.log(2.0 * ALPHA))
@@ -69,7 +71,7 @@ def test_a_known_offset_is_measured_with_its_sign(offset: float) -> None:
     """Judged against a sphere that is ``offset`` smaller, the isosurface lies outside by it."""
     mesh = sphere(RADIUS - offset)
     depth = depth_errors(ball(), cameras(), mesh.vertices, mesh.faces, THRESHOLDS)
-    assert depth.median > 0.0099  # along slanted rays the gap is longer than along the normal
+    assert 0.0099 < depth.median < 0.015  # along slanted rays the gap is longer than the normal
     assert depth.within[0] == 0.0
     assert depth.within[1] > 0.5
     field = VacancyField(ball().arrays(), cameras())
@@ -77,6 +79,30 @@ def test_a_known_offset_is_measured_with_its_sign(offset: float) -> None:
     vacancy = vacancy_errors(field, (RADIUS - offset) * points, points, THRESHOLDS)
     assert vacancy.median_offset == pytest.approx(offset, abs=1e-4)
     assert vacancy.within == (0.0, 1.0)
+
+
+def test_depth_is_compared_along_the_ray_far_off_the_axis() -> None:
+    """Hits of two spheres in closed form, where a unit of z is 1.1 to 1.5 units of the ray."""
+    eye, offset = np.array([0.2, -3.0, 0.3]), 0.01
+    camera = Camera("wide", 420, 300, 260.0, 265.0, 203.0, 148.0, look_at_pose(eye, (2.2, 0, 0.9)))
+    x, y = np.meshgrid(np.arange(420) + 0.5, np.arange(300) + 0.5)
+    rays = np.stack([(x - 203.0) / 260.0, (y - 148.0) / 265.0, np.ones_like(x)], -1)
+    stretch = np.linalg.norm(rays, axis=-1)
+    along = (rays / stretch[..., None]) @ camera.cam_from_world[:, 3]  # to the nearest approach
+    missed_sq = eye @ eye - along**2  # (h, w) squared distance of the ray from the middle
+    shown = missed_sq < (RADIUS - offset) ** 2
+    # See above: the ray's peak has to leave T <= 0.45 behind it.
+    limit = SIGMA**2 * 2.0 * math.log(ALPHA / (1.0 - tolerances.DEPTH_VALID_TRANSMITTANCE))
+    valid = missed_sq < limit
+    assert 1.1 < stretch[valid].min() < 1.3 < stretch[valid].max() < 1.5
+    reach = [np.sqrt(radius**2 - missed_sq[valid]) for radius in (RADIUS, RADIUS - offset)]
+    gaps = reach[0] - reach[1]  # along the ray, from the outer sphere to the inner one
+    mesh = trimesh.creation.icosphere(6, RADIUS - offset)
+    depth = depth_errors(ball(), [camera], mesh.vertices, mesh.faces, (float(np.median(gaps)),))
+    assert depth.pixels == pytest.approx(shown.sum(), rel=2e-3)
+    assert depth.found == pytest.approx(valid.sum() / shown.sum(), abs=3e-3)
+    assert depth.median == pytest.approx(np.median(gaps), rel=5e-3)
+    assert depth.percentile_95 == pytest.approx(np.percentile(gaps, 95), rel=2e-2)
 
 
 def test_what_is_missing_is_counted_as_missing() -> None:
