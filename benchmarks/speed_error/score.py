@@ -34,7 +34,7 @@ from gaussian_wrapping_addon.core.evaluation.views.lpips import lpips_if_ready
 from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
 from gaussian_wrapping_addon.core.evaluation.views.view_metrics import score_images
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
-from gaussian_wrapping_addon.core.files import read_json, write_json
+from gaussian_wrapping_addon.core.files import finite, read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
@@ -173,7 +173,7 @@ def judge_stages(
         (vacancy, ("median", "median_offset")),
     ):
         for name in names:
-            values[name] = _finite(values[name] * shares)
+            values[name] = finite(values[name] * shares)
     return {
         "gaussians": {
             "count": len(gaussians),
@@ -188,10 +188,6 @@ def judge_stages(
 
 def _diagonal(scene_folder: Path) -> float:
     return float(read_json(scene_folder / "scene.json")["diagonal"])
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def true_mask(vertices: np.ndarray, faces: np.ndarray, camera: Camera, threads: int) -> np.ndarray:

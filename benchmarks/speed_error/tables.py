@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from gaussian_wrapping_addon.core.evaluation.surface.scores import MIN_THIN_SHARE
+
 from ..tables import Cell, Table
 from .plan import THRESHOLD_SHARES
 from .results import Result, plain
@@ -17,8 +19,6 @@ SHARES = tuple(f"{100 * share:g} %" for share in THRESHOLD_SHARES)
 MIDDLE = 1
 """The threshold that is shown where there is room for one: 0.5 %."""
 AT = SHARES[MIDDLE]
-MIN_THIN_SHARE = 0.01
-"""Recall of thin parts is shown where at least this share of the true samples is thin."""
 
 Row = dict[str, Cell]
 

@@ -110,9 +110,8 @@ def test_the_true_mesh_has_the_best_scores(run: tuple[Path, Path]) -> None:
     assert scores["surface"]["scan"]["precision"] == [1.0, 1.0, 1.0]
     # A grey ball against the patterned one: far from right, not absurd.
     assert 8.0 < scores["texture"]["psnr"] < 25.0
-    assert [view["covered"] for view in scores["texture"]["views"]] == pytest.approx(
-        [1, 1], abs=0.05
-    )
+    covered = [view["covered"] for view in scores["texture"]["views"]]
+    assert covered == pytest.approx([1.0, 1.0], abs=0.1)  # outlines are covered in part
 
 
 def test_stages_are_judged_in_shares_of_the_diagonal(run: tuple[Path, Path]) -> None:

@@ -172,7 +172,7 @@ def _judge_texture(stage: str, texture: dict[str, Any]) -> list[ReportWarning]:
         found.append(ReportWarning(stage, text, "Seams are more; a smaller mesh may unwrap."))
     lost = measured(texture.get("faces_without_texel"))
     if lost:
-        text = f"{plural(int(lost), 'face')} smaller than a texel have no colour of their own."
+        text = f"{plural(int(lost), 'face')} smaller than a texel: without a colour of their own."
         found.append(ReportWarning(stage, text, "Choose a larger texture or a coarser mesh."))
     overlaps = measured(texture.get("texels_overlapping"))
     if overlaps:
