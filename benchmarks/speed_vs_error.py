@@ -33,7 +33,9 @@ CACHE = ROOT / ".cache" / "speed_vs_error"
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="Draft alone, fewer and smaller photos")
+    parser.add_argument(
+        "--quick", action="store_true", help="Draft alone, fewer and smaller photos"
+    )
     parser.add_argument("--out", type=Path, help="folder of the report")
     parser.add_argument("--threads", type=int, default=0, help="0 uses every core")
     parser.add_argument(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,12 +17,17 @@ from gaussian_wrapping_addon.core.progress import Progress
 
 
 def solve(scene: Path, folder: Path, threads: int) -> dict[str, Any]:
-    """Solve the cameras of ``scene/images`` and return their errors and the seconds it took."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Solve the cameras of a scene's photos and return their errors and the seconds it took.
+
+    The photos are copied first: beside their model they would be read with it.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "exact").mkdir(parents=True)
+    shutil.copytree(scene / "images", folder / "photos")
     begun_s = time.monotonic()
-    solved = load_scene(scene / "images", folder, Progress(), seed=0, threads=threads)
+    solved = load_scene(folder / "photos", folder, Progress(), seed=0, threads=threads)
     seconds = time.monotonic() - begun_s
-    exact = load_scene(scene, folder, Progress(), seed=0, threads=threads)
+    exact = load_scene(scene, folder / "exact", Progress(), seed=0, threads=threads)
     errors = pose_errors(
         [camera.moved(solved.world_from_scene) for camera in solved.cameras],
         [camera.moved(exact.world_from_scene) for camera in exact.cameras],
