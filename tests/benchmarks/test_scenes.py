@@ -7,6 +7,7 @@ import functools
 import importlib.util
 import json
 import operator
+import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -44,9 +45,16 @@ _render_masks = functools.partial(
 
 
 def _apart(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Run in a fresh process: Blender's state is global, and other tests use it too."""
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()
+    """Run in a fresh process: Blender's state is global, and other tests use it too.
+
+    A process that has imported bpy has its scripts on the path, and hands the path on: there another
+    ``bpy`` lies, which works inside of Blender only.
+    """
+    own = [entry for entry in sys.path if "bpy" not in Path(entry).parts]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "path", own)
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            return pool.submit(function, *arguments).result()
 
 
 @pytest.fixture(scope="module")
