@@ -47,8 +47,8 @@ _render_masks = functools.partial(
 def _apart(function: Callable[..., Any], *arguments: Any) -> Any:
     """Run in a fresh process: Blender's state is global, and other tests use it too.
 
-    A process that has imported bpy has its scripts on the path, and hands the path on: there another
-    ``bpy`` lies, which works inside of Blender only.
+    A process that has imported bpy has its scripts on the path, and hands the path on: another
+    ``bpy`` lies there, which works inside of Blender only.
     """
     own = [entry for entry in sys.path if "bpy" not in Path(entry).parts]
     with pytest.MonkeyPatch.context() as patch:
