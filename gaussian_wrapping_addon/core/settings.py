@@ -12,7 +12,23 @@ from typing import Any
 from .errors import UsageError
 
 PRESETS = ("draft", "standard", "fine")
+DECISIONS = ("auto", "on", "off")
+"""Of what a scene may need: ``"auto"`` lets the photos decide (design.md 6)."""
+
+MASK_MODES = ("ignore", "background")
+CORRELATIONS = ("signed", "squared")
 EXPORT_FORMATS = ("glb", "obj", "ply", "usd")
+
+
+_CHOICES = {
+    "harmonics": DECISIONS,
+    "exposure": DECISIONS,
+    "multi_view": DECISIONS,
+    "wrapping": DECISIONS,
+    "growth": DECISIONS,
+    "mask_mode": MASK_MODES,
+    "correlation": CORRELATIONS,
+}
 
 
 @dataclass(frozen=True)
@@ -24,13 +40,36 @@ class TrainingSettings:
     max_image_px: int = 640
     """Long side of the finest training image, pixels."""
     sh_degree: int = 2
+    """Highest degree of the harmonics; how much of it is used, ``harmonics`` decides."""
     holdout_every: int = 8
     """Every n-th photo (sorted by name) is kept for measuring only; 0 keeps none."""
     lambda_dssim: float = 0.2
     lambda_depth_normal: float = 0.05
     lambda_normal: float = 0.03
+    lambda_photometric: float = 0.6
+    lambda_geometric: float = 0.02
+    correlation: str = "signed"
+    """Of two patches: ``"signed"``, or ``"squared"``, where a negative is as good (method.md 3.4)."""
+    multi_view_pixels: int = 4000
+    """Pixels of an iteration that the multi-view terms look at."""
+    multi_view_every: int = 1
+    """They are asked in every n-th iteration, with n times the weight."""
+    harmonics: str = "auto"
+    """``"auto"``: only degrees that lower the error of held-out photos; ``"on"``: all of them;
+    ``"off"``: degree 0."""
+    exposure: str = "auto"
+    """Gain and offset per photo."""
+    multi_view: str = "auto"
+    """The multi-view terms."""
+    wrapping: str = "auto"
+    """Orientation, its loss, and clones of opposite orientation."""
+    growth: str = "auto"
+    """``"auto"``: the number of Gaussians stops growing where it gains little; ``"on"``: only the
+    cap stops it; ``"off"``: none are added."""
+    mask_mode: str = "ignore"
+    """What masks leave out: ``"ignore"``: anything may stand there; ``"background"``: nothing."""
     depth_from: float = 7 / 30
-    """Depth-normal loss starts here (method.md 3)."""
+    """Depth-normal loss and multi-view terms start here (method.md 3)."""
     densify_from: float = 0.5 / 30
     densify_until: float = 0.5
     densify_every: int = 100
@@ -74,6 +113,8 @@ class JobSettings:
     regions: tuple[str, ...] = ("auto",)
     """``"auto"``, ``"all"``, or the path of a region file (method.md 7.3)."""
     export: tuple[str, ...] = ("glb",)
+    start_splat: str = ""
+    """PLY of Gaussians that training starts from; empty starts from the sparse points."""
     training: TrainingSettings = field(default_factory=TrainingSettings)
     meshing: MeshingSettings = field(default_factory=MeshingSettings)
     texture: TextureSettings = field(default_factory=TextureSettings)
@@ -102,6 +143,20 @@ class JobSettings:
                 "from 32 to 16384",
             ),
             ("training.sh_degree", 0 <= self.training.sh_degree <= 3, "from 0 to 3"),
+            *(
+                (f"training.{name}", getattr(self.training, name) in choices, _one_of(choices))
+                for name, choices in _CHOICES.items()
+            ),
+            (
+                "training.multi_view_pixels",
+                1 <= self.training.multi_view_pixels <= 10**6,
+                "from 1 to 1000000",
+            ),
+            (
+                "training.multi_view_every",
+                1 <= self.training.multi_view_every <= 1000,
+                "from 1 to 1000",
+            ),
             (
                 "meshing.edge_length",
                 math.isfinite(self.meshing.edge_length) and self.meshing.edge_length >= 0,
@@ -119,6 +174,10 @@ class JobSettings:
             if not good:
                 raise UsageError(f"Setting {name} is out of range.", f"Give {wanted}.")
         return self
+
+
+def _one_of(choices: tuple[str, ...]) -> str:
+    return f"one of {', '.join(choices)}"
 
 
 def preset(name: str, **overrides: Any) -> JobSettings:
