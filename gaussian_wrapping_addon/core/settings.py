@@ -20,6 +20,9 @@ CORRELATIONS = ("signed", "squared")
 EXPORT_FORMATS = ("glb", "obj", "ply", "usd")
 
 
+RESULT_FREE = ("checkpoint_every_s", "preview_every_s")
+"""Training settings that the result does not depend on."""
+
 _CHOICES = {
     "harmonics": DECISIONS,
     "exposure": DECISIONS,
@@ -36,6 +39,8 @@ class TrainingSettings:
     """How the Gaussians are trained. Iteration milestones are fractions of ``iterations``."""
 
     iterations: int = 3000
+    extra_iterations: int = 0
+    """More iterations after the plan's end, at its last learning rates ("train more")."""
     max_gaussians: int = 80_000
     max_image_px: int = 640
     """Long side of the finest training image, pixels."""
@@ -49,7 +54,7 @@ class TrainingSettings:
     lambda_photometric: float = 0.6
     lambda_geometric: float = 0.02
     correlation: str = "signed"
-    """Of two patches: ``"signed"``, or ``"squared"``, where a negative is as good (method.md 3.4)."""
+    """Of two patches: ``"signed"``, or ``"squared"``, where -1 is as good as 1 (method.md 3.4)."""
     multi_view_pixels: int = 4000
     """Pixels of an iteration that the multi-view terms look at."""
     multi_view_every: int = 1
@@ -79,6 +84,8 @@ class TrainingSettings:
     wrap_until: float = 26 / 30
     wrap_share: float = 0.05
     checkpoint_every_s: float = 60.0
+    preview_every_s: float = 20.0
+    """Between two preview pictures of a running training; 0 writes none."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +139,11 @@ class JobSettings:
                 f"among {', '.join(EXPORT_FORMATS)}",
             ),
             ("training.iterations", 1 <= self.training.iterations <= 10**6, "from 1 to 1000000"),
+            (
+                "training.extra_iterations",
+                0 <= self.training.extra_iterations <= 10**6,
+                "from 0 to 1000000",
+            ),
             (
                 "training.max_gaussians",
                 100 <= self.training.max_gaussians <= 20_000_000,

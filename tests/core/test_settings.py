@@ -12,6 +12,7 @@ from gaussian_wrapping_addon.core.settings import (
     PRESETS,
     JobSettings,
     MeshingSettings,
+    TrainingSettings,
     from_json,
     preset,
     to_json,
@@ -49,6 +50,16 @@ def test_values_out_of_range_are_named(change: dict) -> None:
         replace(JobSettings(), **change).validated()
 
 
-def test_every_training_setting_is_a_plain_number() -> None:
+def test_every_training_setting_is_a_plain_number_or_a_word() -> None:
     training = preset("draft").training
-    assert all(isinstance(getattr(training, f.name), (int, float)) for f in fields(training))
+    assert all(isinstance(getattr(training, f.name), (int, float, str)) for f in fields(training))
+
+
+@pytest.mark.parametrize("name", ["harmonics", "exposure", "multi_view", "wrapping", "growth"])
+def test_what_a_scene_may_need_is_auto_on_or_off(name: str) -> None:
+    for word in ("auto", "on", "off"):
+        settings = replace(preset("draft"), training=replace(TrainingSettings(), **{name: word}))
+        assert settings.validated() is settings
+    wrong = replace(preset("draft"), training=replace(TrainingSettings(), **{name: "maybe"}))
+    with pytest.raises(UsageError, match=f"training.{name}"):
+        wrong.validated()

@@ -16,7 +16,7 @@ from ..errors import MeshingError, UsageError
 from ..files import write_json
 from ..parallel import default_threads
 from ..progress import Progress, ProgressEvent
-from ..settings import to_json
+from ..settings import RESULT_FREE, to_json
 from .job_file import AUTOMATIC_REGIONS, JobFile
 from .job_folder import JobFolder
 from .machine import describe_machine, peak_memory_bytes
@@ -170,8 +170,7 @@ def _run_training(
     folder: JobFolder, job: JobFile, cameras: Stage, overall: _Overall, threads: int
 ) -> Stage:
     training = job.settings.training
-    described = to_json(training)
-    described.pop("checkpoint_every_s")
+    described = {k: v for k, v in to_json(training).items() if k not in RESULT_FREE}
     key = stage_key(STAGE_VERSIONS["train"], cameras.key, described, job.settings.seed)
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:

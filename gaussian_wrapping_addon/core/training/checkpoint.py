@@ -16,7 +16,7 @@ import numpy as np
 from ..dataset.scene import Scene
 from ..errors import ParseError, UsageError
 from ..files import read_json, write_bytes, write_json
-from ..settings import TrainingSettings, to_json
+from ..settings import RESULT_FREE, TrainingSettings, to_json
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
@@ -31,8 +31,8 @@ _AGAIN = "Delete the folder and train again."
 
 def fingerprint(scene: Scene, settings: TrainingSettings, seed: int) -> str:
     """Hash what a training's result depends on: settings, seed, cameras, photo names, points."""
-    described = to_json(settings)
-    described.pop("checkpoint_every_s")
+    described = {k: v for k, v in to_json(settings).items() if k not in RESULT_FREE}
+    described.pop("extra_iterations")  # a longer run starts as the shorter one does
     digest = hashlib.sha256()
     digest.update(repr((VERSION, sorted(described.items()), seed)).encode())
     for view in scene.views:
