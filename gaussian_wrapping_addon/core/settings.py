@@ -78,6 +78,9 @@ class TrainingSettings:
     densify_from: float = 0.5 / 30
     densify_until: float = 0.5
     densify_every: int = 100
+    prune_share: float = 0.02
+    """Gaussians that together contribute less than this share of all blending weights are removed
+    every now and then; 0 removes none."""
     orient_from: float = 20 / 30
     wrap_rounds: int = 3
     wrap_from: float = 22 / 30

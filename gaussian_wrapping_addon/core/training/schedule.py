@@ -50,6 +50,10 @@ SMALLEST_SIDE_PX = 96
 DEGREE_SHARE = 1.0 / 6.0
 """The harmonics' degree rises by one whenever this share of the iterations has passed."""
 
+PRUNE_AT = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
+"""Shares of the iterations at which Gaussians of little contribution are removed: while the number
+grows, so that others take their room, and twice after that, where an iteration costs most."""
+
 RESET_EVERY = 3000
 """Iterations between opacity resets (method.md 4.1); a run too short for recovery has none."""
 
@@ -116,6 +120,10 @@ class Schedule:
         """Tell whether Gaussians are added and removed after this iteration's step."""
         begin, end = self._at(self.settings.densify_from), self._at(self.settings.densify_until)
         return begin < iteration <= end and iteration % self.settings.densify_every == 0
+
+    def prunes(self, iteration: int) -> bool:
+        """Tell whether Gaussians of little contribution go after this iteration's step."""
+        return self.settings.prune_share > 0.0 and iteration in {self._at(x) for x in PRUNE_AT}
 
     def growth_limit(self) -> int:
         """Return the number of Gaussians that density control may reach.

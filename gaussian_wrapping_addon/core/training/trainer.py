@@ -31,6 +31,7 @@ from ..render.types import ImageGradients, RenderOptions
 from ..render.view_renderer import ViewRenderer
 from ..settings import TrainingSettings
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
+from .contribution import contributions, least_contributors, prune_contributors
 from .density_control import densify_and_prune, reset_opacity
 from .losses import color_loss, normal_losses
 from .result import HeldOutFigure, TrainingResult
@@ -330,6 +331,16 @@ class _Trainer:
         changed = False
         if schedule.densifies(iteration):
             densify_and_prune(adam, state.statistics, schedule.growth_limit(), state.random)
+            changed = True
+        if schedule.prunes(iteration):
+            found = contributions(
+                adam.gaussians().detached(),
+                self._round_views(ROUND_DIVISOR),
+                self.renderer,
+                threads=self.threads,
+            )
+            gone = prune_contributors(adam, least_contributors(found, self.settings.prune_share))
+            _logger.info("iteration %d: %d Gaussians removed", iteration, gone)
             changed = True
         if schedule.wraps(iteration) and schedule.is_oriented(iteration):
             errors = normal_errors(
