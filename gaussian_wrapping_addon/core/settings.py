@@ -44,6 +44,8 @@ class TrainingSettings:
     max_gaussians: int = 80_000
     max_image_px: int = 640
     """Long side of the finest training image, pixels."""
+    pixels_per_iteration: int = 80_000
+    """An iteration looks at a window of the photo with about so many pixels at most."""
     sh_degree: int = 2
     """Highest degree of the harmonics; how much of it is used, ``harmonics`` decides."""
     holdout_every: int = 8
@@ -78,6 +80,8 @@ class TrainingSettings:
     densify_from: float = 0.5 / 30
     densify_until: float = 0.5
     densify_every: int = 100
+    overlap_price: float = 0.0
+    """Price, in the unit of the loss, of one more Gaussian over every pixel."""
     prune_share: float = 0.02
     """Gaussians that together contribute less than this share of all blending weights are removed
     every now and then; 0 removes none."""

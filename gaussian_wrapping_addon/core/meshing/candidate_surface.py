@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import MeshingError
+from ..field.sightings import Sightings, bracket_pairs
 from ..gaussians.model import GaussianArrays
 from ..progress import Progress
 from .convex_region import Region
@@ -48,13 +49,16 @@ def candidate_surface(
     tolerance: float,
     seed: int,
     progress: Progress,
+    sightings: Sightings | None = None,
 ) -> CandidateSurface:
-    """Extract the isosurface on the Delaunay edges of two pivots per Gaussian.
+    """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and sighting.
 
     Parameters
     ----------
     tolerance : float
         Length of the bracket on crossing edges; 0 takes :data:`BRACKET_SHARE`.
+    sightings : Sightings, optional
+        Of the cameras in the region: parts about as thin as a pixel are found by these alone.
 
     Raises
     ------
@@ -70,6 +74,8 @@ def candidate_surface(
     pivots = two_pivots(arrays, chosen)
     pivots = pivots[region.distance(pivots) <= 0.5 * region.diagonal]
     pivots = np.concatenate([pivots, _probes(region, margin, seed)])
+    if sightings is not None:
+        pivots = np.concatenate([pivots, *bracket_pairs(sightings, is_empty)])
     points = np.concatenate([pivots, far_points(pivots, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
     progress.update(0.3, f"evaluating {len(pivots)} pivots")

@@ -57,14 +57,32 @@ class Floaters:
     """Area of all removed parts, of the total."""
 
 
-def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> Floaters:
-    """Remove closed parts whose area is below ``min_share`` of the largest part's.
+LONG_FACTOR = 3.0
+"""A part this many times longer than its share of the area allows is no floater: a piece of wire
+has little area and may be all that is left of it."""
 
-    Small cavities go as well, which fills them. A cavity whose solid goes is small itself.
+
+def extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: int) -> np.ndarray:
+    """Return the diagonal of the bounding box of each part, (count,)."""
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    corners = vertices[faces]  # (f, 3, 3)
+    np.minimum.at(low, part, corners.min(1))
+    np.maximum.at(high, part, corners.max(1))
+    return np.asarray(np.linalg.norm(np.maximum(high - low, 0.0), axis=1))
+
+
+def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> Floaters:
+    """Remove closed parts that are small: in area and in length.
+
+    The area is below ``min_share`` of the largest part's, and the length below
+    :data:`LONG_FACTOR` times that share of the longest part's. Small cavities go as well, which
+    fills them. A cavity whose solid goes is small itself.
     """
     count, part = face_components(len(vertices), faces)
     volume, area = volumes_and_areas(vertices, faces, part, count)
+    length = extents(vertices, faces, part, count)
     keep = area >= min_share * area.max(initial=0.0)
+    keep |= length >= LONG_FACTOR * min_share * length.max(initial=0.0)
     removed = float(area[~keep].sum() / max(area.sum(), 1e-300))
     return Floaters(
         faces[keep[part]],

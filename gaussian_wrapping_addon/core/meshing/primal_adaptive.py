@@ -12,6 +12,7 @@ import numpy as np
 from .. import tolerances
 from ..dataset.camera import Camera
 from ..errors import MeshingError
+from ..field.sightings import Sightings
 from ..gaussians.model import GaussianArrays
 from ..progress import Progress
 from ..settings import MeshingSettings
@@ -50,6 +51,7 @@ def mesh_region(
     seed: int,
     threads: int,
     edge_length_scene: float = 0.0,
+    sightings: Sightings | None = None,
 ) -> SurfaceMesh:
     """Mesh the surface ``vacancy = 0.5`` inside a region; the boundary closes the solid.
 
@@ -74,6 +76,8 @@ def mesh_region(
         The same seed gives the same mesh, for any number of threads.
     edge_length_scene : float
         Target edge length in scene units; 0 leaves it to ``settings.points``.
+    sightings : Sightings, optional
+        Where the cameras see the isosurface in the region (:func:`~..field.sightings`).
 
     Returns
     -------
@@ -93,8 +97,9 @@ def mesh_region(
     request = checked_request(edge_length_scene, settings.points, region)
     rng = np.random.default_rng(seed)
     surface = candidate_surface(
-        arrays, region, vacancy.is_empty, 0.5 * request.edge_length, seed, progress.span(0.0, 0.3)
-    )
+        arrays, region, vacancy.is_empty, 0.5 * request.edge_length, seed, progress.span(0.0, 0.3),
+        sightings,
+    )  # fmt: skip
     sampler = SurfaceSampler(vacancy, vectors, region, surface, threads)
     cloud = sampler.sample(request, rng, progress.span(0.3, 0.6))
     vertices, faces, kind, figures = _connect(cloud, vacancy, region, settings, seed, rng, progress)
@@ -104,6 +109,7 @@ def mesh_region(
         "edge_length_scene": EDGE_PER_RADIUS * cloud.radius,
         "gaussians_in_region": surface.gaussians,
         "pivots": surface.pivots,
+        "sightings": 0 if sightings is None else len(sightings),
         "candidate_area": sampler.area,
         "notes": list(request.notes),
         "seed": seed,

@@ -43,9 +43,18 @@ class DensityStatistics:
             np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.int32)
         )
 
-    def add(self, statistics: RenderStatistics, width: int, height: int) -> None:
-        """Add one view after its backward pass; ``width`` and ``height`` of its image."""
-        half_image = 0.5 * max(width, height)
+    def add(self, statistics: RenderStatistics, width: int, height: int, part: float = 1.0) -> None:
+        """Add one view after its backward pass.
+
+        Parameters
+        ----------
+        width, height : int
+            Of its image, pixels.
+        part : float
+            Share of the image that was rendered: a loss that is a mean over fewer pixels has
+            larger gradients.
+        """
+        half_image = 0.5 * max(width, height) * part
         # 0 for the unseen: all are added, which is faster than picking the seen.
         weight = np.multiply(statistics.visible, half_image, dtype=np.float32)
         self.gradient += weight * statistics.grad_px

@@ -50,6 +50,9 @@ SMALLEST_SIDE_PX = 96
 DEGREE_SHARE = 1.0 / 6.0
 """The harmonics' degree rises by one whenever this share of the iterations has passed."""
 
+FIRST_BUDGET = 5000
+"""The budget of Gaussians is never smaller than this."""
+
 PRUNE_AT = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 """Shares of the iterations at which Gaussians of little contribution are removed: while the number
 grows, so that others take their room, and twice after that, where an iteration costs most."""
@@ -126,12 +129,23 @@ class Schedule:
         return self.settings.prune_share > 0.0 and iteration in {self._at(x) for x in PRUNE_AT}
 
     def growth_limit(self) -> int:
-        """Return the number of Gaussians that density control may reach.
+        """Return the number of Gaussians that density control may reach in the end.
 
         The wrapping rounds keep their part of ``max_gaussians``.
         """
         growth = (1.0 + self.settings.wrap_share) ** self.settings.wrap_rounds
         return max(1, math.floor(self.settings.max_gaussians / growth))
+
+    def budget(self, iteration: int) -> int:
+        """Return the number of Gaussians that density control may reach after this iteration.
+
+        It grows evenly while the images do: a coarse image cannot tell where many are needed, and
+        those that it asks for cost time in all iterations to come (DashGaussian schedules both
+        together; Taming 3DGS grows along a planned budget).
+        """
+        share = min(1.0, self._share(iteration) / max(self.settings.densify_until, 1e-9))
+        limit = self.growth_limit()
+        return min(limit, max(FIRST_BUDGET, math.floor(share * limit)))
 
     def resets_opacity(self, iteration: int) -> bool:
         """Tell whether opacities are reset after this iteration's step."""

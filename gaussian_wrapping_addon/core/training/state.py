@@ -34,6 +34,7 @@ class TrainingState:
     error_average: float = 0.0
     """Moving average of the mean squared colour error, for the progress message."""
     loss_average: float = 0.0
+    overlap_average: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
     """Time spent until the last checkpoint."""

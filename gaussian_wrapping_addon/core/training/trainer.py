@@ -34,9 +34,11 @@ from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from .contribution import contributions, least_contributors, prune_contributors
 from .density_control import densify_and_prune, reset_opacity
 from .losses import color_loss, normal_losses
+from .overlap_price import add_overlap_price
 from .result import HeldOutFigure, TrainingResult
 from .schedule import Schedule
 from .state import TrainingState
+from .windows import windows
 from .wrapping import WrapView, normal_errors, start_orientation, wrap
 
 _logger = logging.getLogger(__name__)
@@ -275,7 +277,12 @@ class _Trainer:
             start_orientation(adam, self._round_views(VOTE_DIVISOR), threads=self.threads)
         view = state.next_view(self.views)
         divisor = schedule.divisor(iteration)
-        camera, mask = self.photos.camera(view, divisor), self.photos.mask(view, divisor)
+        whole, mask = self.photos.camera(view, divisor), self.photos.mask(view, divisor)
+        choices = windows(whole.width, whole.height, settings.pixels_per_iteration)
+        window = choices[int(state.random.integers(len(choices)))]
+        camera = window.camera(whole)
+        if mask is not None:
+            mask = window.of(mask)
         gathers = schedule.gathers_statistics(iteration)
         uses_depth = schedule.uses_depth(iteration)
         degree = schedule.sh_degree(iteration)
@@ -285,7 +292,7 @@ class _Trainer:
         image = self.renderer.render(RawArrays.from_gaussians(adam.gaussians()), camera, options)
         value, by_color, figures = color_loss(
             image.color,
-            self.photos.photo(view, divisor),
+            window.of(self.photos.photo(view, divisor)),
             mask,
             lambda_dssim=settings.lambda_dssim,
             threads=self.threads,
@@ -313,7 +320,16 @@ class _Trainer:
         seen = image.backward(gradients)
         if gathers:
             assert image.statistics is not None
-            state.statistics.add(image.statistics, camera.width, camera.height)
+            part = camera.width * camera.height / (whole.width * whole.height)
+            state.statistics.add(image.statistics, whole.width, whole.height, part)
+        if settings.overlap_price > 0.0:
+            state.overlap_average = add_overlap_price(
+                seen,
+                adam.array("log_scales"),
+                image.screen.boxes,
+                (camera.width, camera.height),
+                settings.overlap_price,
+            )
         rates = schedule.rates(iteration, state.rate_factor)
         adam.step_rows(seen, rates, sh_degree=degree, threads=self.threads)
         state.iteration = iteration + 1
@@ -330,7 +346,7 @@ class _Trainer:
             return
         changed = False
         if schedule.densifies(iteration):
-            densify_and_prune(adam, state.statistics, schedule.growth_limit(), state.random)
+            densify_and_prune(adam, state.statistics, schedule.budget(iteration), state.random)
             changed = True
         if schedule.prunes(iteration):
             found = contributions(
@@ -388,7 +404,7 @@ class _Trainer:
         progress.update(
             state.iteration / total,
             f"iteration {state.iteration}/{total} · loss {state.loss_average:.4f} · "
-            f"PSNR {quality:.1f} dB · {count} Gaussians",
+            f"PSNR {quality:.1f} dB · {count} Gaussians · ov {state.overlap_average:.0f}",
             **figures,
         )
 

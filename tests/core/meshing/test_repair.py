@@ -168,3 +168,12 @@ def test_statistics_of_broken_meshes() -> None:
     twisted = mesh_statistics(as_mesh(vertices, turned))
     assert (twisted.inconsistent_edges, twisted.closed) == (3, False)
     assert mesh_statistics(as_mesh(vertices, faces)).to_json()["genus"] == 0
+
+
+def test_a_piece_of_wire_is_no_floater() -> None:
+    block = [(x, y, z) for x in range(10) for y in range(10) for z in range(10)]
+    wire = [(x, 20, 0) for x in range(4)]
+    vertices, faces = cubes(*block, *wire, (30, 0, 0))
+    result = without_floaters(vertices, faces, 0.05)  # areas 600, 18, 6; lengths 17.3, 4.2, 1.7
+    assert (result.kept, result.removed_solids) == (2, 1)
+    assert result.removed_area_share == pytest.approx(6 / 624)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Windows of a photo: an iteration looks at a part of a large image, all parts in turn."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..dataset.camera import Camera
+
+OVERLAP_PX = 16
+"""Windows overlap by this much: SSIM leaves out five pixels along the border of each."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of pixels."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def camera(self, camera: Camera) -> Camera:
+        """Return the camera that sees this part of the image."""
+        if (self.left, self.top, self.width, self.height) == (0, 0, camera.width, camera.height):
+            return camera
+        return dataclasses.replace(
+            camera,
+            width=self.width,
+            height=self.height,
+            cx=camera.cx - self.left,
+            cy=camera.cy - self.top,
+        )
+
+    def of(self, image: np.ndarray) -> np.ndarray:
+        """Return this part of an (h, w, ...) image, C-contiguous."""
+        part = image[self.top : self.top + self.height, self.left : self.left + self.width]
+        return np.ascontiguousarray(part)
+
+
+def windows(width: int, height: int, most_pixels: int) -> list[Window]:
+    """Split an image into equal windows of about ``most_pixels`` at most, row by row.
+
+    With many pixels an iteration measures nearly the same gradient as with a part of them, and
+    steps in between are worth more than exactness; so time goes into iterations.
+    """
+    count = max(1, math.ceil(math.sqrt(width * height / most_pixels)))
+    columns = min(count, max(1, width // (2 * OVERLAP_PX)))
+    rows = min(count, max(1, height // (2 * OVERLAP_PX)))
+    wide, high = _side(width, columns), _side(height, rows)
+    lefts = np.linspace(0, width - wide, columns).round().astype(int).tolist()
+    tops = np.linspace(0, height - high, rows).round().astype(int).tolist()
+    return [Window(left, top, wide, high) for top in tops for left in lefts]
+
+
+def _side(length: int, parts: int) -> int:
+    return length if parts == 1 else math.ceil((length + (parts - 1) * OVERLAP_PX) / parts)
