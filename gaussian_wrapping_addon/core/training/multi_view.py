@@ -172,8 +172,11 @@ def multi_view_losses(
     by_depth = store.zeros("multi-view by depth", image.depth.shape, np.float32)
     by_normal = store.zeros("multi-view by normal", image.geometric_normal.shape, np.float32)
     on_images = ImageGradients(depth=by_depth, geometric_normal=by_normal)
+    given = np.isfinite(image.depth.reshape(-1)[pixels])  # (m,)
+    given &= np.isfinite(image.geometric_normal.reshape(-1, 3)[pixels]).all(1)
     if not np.isfinite(places[:, 0]).any():
-        return MultiViewLoss(0.0, on_images, None, MultiViewFigures(0, 0, len(pixels), 0, 0, 0))
+        nothing = MultiViewFigures(0.0, 0.0, len(pixels), 0, 0, int((~given).sum()))
+        return MultiViewLoss(0.0, on_images, None, nothing)
     view = query_view(gaussians, other_camera, options)
     answer = solve_depths(view, places)
     noise, by_found, by_places = pair.back(places, answer.values)
@@ -201,7 +204,7 @@ def multi_view_losses(
         other, on_places, broken = _other_gradients(gaussians, view, answer, share * by_found)
         on_places = share[:, None] * by_places + on_places
         pixel_depth = pixel_depth + (on_places * moves).sum(1)
-    sound = np.isfinite(pixel_depth) & np.isfinite(pixel_normal).all(1)
+    sound = given & np.isfinite(pixel_depth) & np.isfinite(pixel_normal).all(1)
     rows = pixels[sound]
     by_depth.reshape(-1)[rows] = pixel_depth[sound]
     by_normal.reshape(-1, 3)[rows] = pixel_normal[sound]

@@ -68,7 +68,7 @@ def choose_pixels(
     (m,) int32
         ``row * width + column``, m <= count.
     """
-    height, width = grey.shape
+    height = len(grey)
     jitter = random.random(count)
     steepness = (
         np.empty(grey.shape, np.float32)
@@ -83,7 +83,7 @@ def choose_pixels(
 
     run_chunks(run, even_bounds(height, threads, 2), threads)
     steep, usable = sums.sum(0).tolist()
-    if usable == 0 or not math.isfinite(steep):
+    if usable == 0:
         return np.zeros(0, np.int32)
     even = steep / usable if steep > 0.0 else 1.0
     chosen = np.empty(count, np.int32)
@@ -91,7 +91,7 @@ def choose_pixels(
     return chosen[:found]
 
 
-@kernel(fast=True)
+@kernel(fast=False, fused=True)
 def _grey_rows(begin: int, end: int, photo: np.ndarray, scale: float, grey: np.ndarray) -> None:
     red, green = np.float32(RED * scale), np.float32(GREEN * scale)
     blue = np.float32(BLUE * scale)
@@ -127,7 +127,10 @@ def _steepness_rows(
                 continue
             across = grey[i, j + 1] - grey[i, j - 1]
             down = grey[i + 1, j] - grey[i - 1, j]
-            steepness[i, j] = np.sqrt(across * across + down * down)
+            length = np.sqrt(across * across + down * down)
+            if not length < math.inf:
+                continue
+            steepness[i, j] = length
             total += steepness[i, j]
             usable += 1
         sums[i, 0] = total
