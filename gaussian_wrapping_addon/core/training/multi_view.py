@@ -159,8 +159,8 @@ def multi_view_losses(
     """
     threads = threads or default_threads()
     store = ArrayStore() if store is None else store
-    _check_sizes(camera, image.depth, photo, mask)
-    _check_sizes(other_camera, other_photo, other_photo, other_mask)
+    _check_sizes(camera, image=image.depth, photo=photo, mask=mask)
+    _check_sizes(other_camera, photo=other_photo, mask=other_mask)
     options = RenderOptions(sh_degree=0, threads=threads)
     grey = grey_image(photo, "multi-view grey", threads=threads, store=store)
     pixels = choose_pixels(
@@ -327,11 +327,9 @@ def _pack(camera: Camera) -> np.ndarray:
     return np.array(values, np.float64)
 
 
-def _check_sizes(
-    camera: Camera, image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None
-) -> None:
+def _check_sizes(camera: Camera, **arrays: np.ndarray | None) -> None:
     wanted = (camera.height, camera.width)
-    for name, array in (("image", image), ("photo", photo), ("mask", mask)):
+    for name, array in arrays.items():
         if array is not None and array.shape[:2] != wanted:
             height, width = array.shape[:2]
             raise UsageError(
