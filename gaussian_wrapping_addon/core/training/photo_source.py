@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the parts of training ask of the photos, on disk or in memory."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from ..dataset.camera import Camera
+
+
+class Photos(Protocol):
+    """The side of :class:`~..dataset.photos.PhotoStore` that training looks at."""
+
+    def camera(self, index: int, divisor: int = 1) -> Camera:
+        """Return the camera of a level."""
+
+    def photo(self, index: int, divisor: int = 1) -> np.ndarray:
+        """Return (h, w, 3) uint8."""
+
+    def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
+        """Return (h, w) bool or ``None``."""
