@@ -11,7 +11,7 @@ luminance and contrast terms then ask of the same Gaussians a different brightne
 which is the contradiction that the exposure is there to remove.
 
 The Gaussians keep the mean exposure of the training photos: the means over these of all log gains
-and of all offsets are held at 0, without which colours and exposures could drift against each
+and of all offsets (at middle grey) are held at 0, without which colours and exposures could drift against each
 other.
 """
 
@@ -30,6 +30,11 @@ from .exposure_kernels import apply_rows, backward_rows
 SRGB_PEDESTAL = 0.055
 """Constant of the sRGB curve: display values plus this are a power of the light."""
 
+PIVOT = 0.5
+"""Display value about which gains act: an offset then moves the mean of a usual image and a gain
+its contrast, and Adam, which scales every value alone, need not creep along the valley between
+them. Middle grey is also what the pinned means leave in place."""
+
 REFERENCE_RATE = 1e-3
 """Learning rate of method.md 1.4."""
 
@@ -44,7 +49,7 @@ they leave at the end is an error of colour."""
 
 MAX_LOG_GAIN = 1.5
 """Log gains are kept within this; more is no exposure but a photo that shows nothing."""
-MAX_OFFSET = 0.5
+MAX_OFFSET = 1.0
 
 BETAS = (0.9, 0.99)
 """Of Adam. A photo has its turn only some dozens of times in a short run; its gradient, a mean over
@@ -90,13 +95,13 @@ class Exposure:
         self, count: int, trained: Sequence[int], log_gains: np.ndarray | None = None
     ) -> None:
         self.trained = np.unique(np.asarray(trained, np.int64))
-        if len(self.trained) and not (0 <= self.trained[0] and self.trained[-1] < count):
+        if len(self.trained) and (self.trained[0] < 0 or self.trained[-1] >= count):
             raise UsageError(
                 f"Exposures of {count} views cannot hold view {int(self.trained[-1])}.",
                 "Number the views of the scene from 0.",
             )
         self.values = np.zeros((count, 6), np.float32)
-        """Log gains of red, green, blue, then offsets; display values."""
+        """Log gains of red, green, blue, then offsets at :data:`PIVOT`; display values."""
         self.first = np.zeros((count, 6), np.float32)
         self.second = np.zeros((count, 6), np.float32)
         self.steps = np.zeros(count, np.int64)
@@ -111,7 +116,7 @@ class Exposure:
                 )
             start = np.where(np.isfinite(start), start, 0.0)[self.trained]
             self.values[self.trained, :3] = start
-            self.values[self.trained, 3:] = SRGB_PEDESTAL * np.expm1(start)
+            self.values[self.trained, 3:] = (SRGB_PEDESTAL + PIVOT) * np.expm1(start)
         self.pin()
 
     def corrected(
@@ -188,7 +193,8 @@ class Exposure:
         threads = threads or default_threads()
         run_chunks(run, even_bounds(len(color), threads, 1), threads)
         self.gradient[:] = sums.sum(axis=0)
-        self.gradient[:3] *= gains  # d exp(a) / d a
+        # d/da of exp(a) (color - PIVOT alpha)
+        self.gradient[:3] = gains * (self.gradient[:3] - PIVOT * self.gradient[3:])
         return by_color, None if alpha is None else by_alpha
 
     def step(self, view: int, rate: float) -> None:
@@ -218,9 +224,10 @@ class Exposure:
         self.values[self.trained] = kept - kept.mean(axis=0)
 
     def factors(self, view: int, dtype: np.dtype | type = np.float64) -> tuple[np.ndarray, ...]:
-        """Return the gains (3,) and the offsets (3,) of a photo."""
+        """Return ``exp(a)`` (3,) and the offset at black ``b`` (3,) of a photo."""
         value = self.values[view].astype(np.float64)
-        return np.exp(value[:3]).astype(dtype), value[3:].astype(dtype)
+        gains = np.exp(value[:3])
+        return gains.astype(dtype), (value[3:] + PIVOT * (1.0 - gains)).astype(dtype)
 
     def spread(self) -> float:
         """Return the standard deviation of the trained photos' log gains over all channels."""
@@ -242,7 +249,9 @@ class Exposure:
         """
         count = len(arrays["values"])
         trained = arrays["trained"]
-        if trained.ndim != 1 or (len(trained) and not (0 <= trained.min() <= trained.max() < count)):
+        if trained.ndim != 1 or (
+            len(trained) and not (0 <= trained.min() <= trained.max() < count)
+        ):
             raise ValueError("the trained views of the exposures are none of the scene's")
         made = cls(count, trained)
         for name in ("values", "first", "second", "steps"):
