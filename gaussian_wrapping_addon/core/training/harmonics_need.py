@@ -276,9 +276,7 @@ class _Trial:
         options = RenderOptions(depth=False, threads=self.threads, statistics=True)
         sums = np.zeros((len(self.fitted), count, 3), np.float32)  # blended residuals, in pixels
         weights = np.zeros((len(self.fitted), count), np.float32)
-        for row, (view, (target, counts)) in enumerate(
-            zip(self.fitted, self.targets, strict=True)
-        ):
+        for row, (view, (target, counts)) in enumerate(zip(self.fitted, self.targets, strict=True)):
             image = self.renderer.render(self._with(sh), view.camera, options)
             assert image.statistics is not None
             residual = (target - image.color) * counts[..., None]

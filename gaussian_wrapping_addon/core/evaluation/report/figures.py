@@ -9,7 +9,7 @@ from typing import Any
 from .text import escaped, measured, number
 
 # Lists of records, shown as tables or pictures of their own.
-_SHOWN_ELSEWHERE = {"history", "pictures", "warnings", "packages", "stages", "notes"}
+_SHOWN_ELSEWHERE = {"decisions", "history", "pictures", "warnings", "packages", "stages", "notes"}
 
 _UNITS = {
     "psnr": "dB",

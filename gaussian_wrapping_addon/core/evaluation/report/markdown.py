@@ -11,6 +11,7 @@ from typing import Any
 
 from ...files import resolve_inside
 from .figures import figure_rows
+from .needs import needs_lines
 from .region import Picture, note_lines, region_lines, region_summary
 from .text import (
     NOT_MEASURED,
@@ -87,6 +88,8 @@ def report_markdown(report: dict[str, Any], result: Path) -> str:
         "## Training",
         "",
         *_training(part(report, "training"), picture),
+        "",
+        *needs_lines(part(report, "training")),
     ]
     for name, region in part(report, "regions").items():
         lines += ["", f"## Region {escaped(name)}", "", *region_lines(name, region, picture)]

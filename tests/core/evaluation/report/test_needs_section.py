@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The report lists each decision with its evidence and how to override it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
+from gaussian_wrapping_addon.core.evaluation.report.needs import needs_lines
+from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.training.needs import Needs, decide
+from tests.core.evaluation.report.report_examples import full_summary
+
+NAMES = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "image_size")
+
+
+def training() -> dict[str, Any]:
+    needs = Needs()
+    for name in NAMES:
+        needs = needs.with_decision(decide(name, "auto", True, f"Seen in {name} a|b."))
+    needs = needs.with_decision(decide("exposure", "off", True, "Photos differ by 20 %."))
+    return {"decisions": needs.to_json()}
+
+
+def test_every_decision_is_listed_with_its_evidence_and_setting() -> None:
+    text = "\n".join(needs_lines(training()))
+    for name in NAMES:
+        if name != "exposure":
+            assert f"Seen in {name.replace('_', chr(92) + '_')} a\\|b." in text
+        setting = "max_image_px" if name == "image_size" else name
+        assert f"setting `{setting}`" in text
+        assert setting in TrainingSettings.__dataclass_fields__
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    assert len(rows) == 2 + len(NAMES)
+    assert text.count("*To decide otherwise:*") == len(NAMES)
+
+
+def test_what_a_person_decided_is_told_apart() -> None:
+    text = "\n".join(needs_lines(training()))
+    assert "| off | you (off) |" in text
+    assert text.count("| the photos |") == len(NAMES) - 1
+    assert "You decided this. What the photos say: Photos differ by 20 %." in text
+    assert text.count('"auto" leaves it to the photos') == 1
+
+
+def test_the_section_stands_between_training_and_regions() -> None:
+    summary = full_summary()
+    summary["training"] |= training()
+    text = report_markdown(summary, Path("nowhere"))
+    order = [text.index(f"\n## {title}") for title in ("Training", "What this scene", "Warnings")]
+    assert order == sorted(order)
+    assert "What this scene needed" not in report_markdown(full_summary(), Path("nowhere"))
+
+
+@pytest.mark.parametrize("decisions", [None, 3, "x", [], [None, 3, {}, {"chosen": "on"}]])
+def test_nothing_is_written_where_nothing_was_decided(decisions: Any) -> None:
+    assert needs_lines({"decisions": decisions}) == []
+
+
+def test_an_unknown_decision_is_shown_as_it_is() -> None:
+    text = "\n".join(needs_lines({"decisions": [{"name": "new_one", "chosen": "x`y"}]}))
+    assert "new\\_one" in text
+    assert "x\\`y" in text
+    assert "No evidence was recorded" in text
