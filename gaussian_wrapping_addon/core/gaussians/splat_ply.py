@@ -11,32 +11,26 @@ from __future__ import annotations
 import json
 import logging
 import math
-import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from .. import limits
 from ..dataset.similarity import Similarity
 from ..errors import ParseError
 from ..files import write_bytes
+from ..ply_table import read_ply_header, read_vertices
 from .model import OrientedGaussians
 
 _logger = logging.getLogger(__name__)
 
-MAX_HEADER_BYTES = 64 * 1024
 MAX_LOG_SCALE = 40.0
 """Scales beyond e^40 cannot be meant; such Gaussians are dropped."""
 
 _FRAME_COMMENT = "world_from_scene"
 _HINT = "Write the file again with this program."
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2",
-    "ushort": "<u2", "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4",
-    "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -53,7 +47,7 @@ class SplatFile:
 def write_splat_ply(path: Path, gaussians: OrientedGaussians, world_from_scene: Similarity) -> None:
     """Write the native file: raw parameters, scene frame, the frame in a header comment."""
     arrays = {name: t.detach().cpu().numpy() for name, t in gaussians.tensors()}
-    names = [*_standard_names(arrays["sh"].shape[1]), "filter_3D"]
+    names = [*standard_names(arrays["sh"].shape[1]), "filter_3D"]
     names += [f"gaussian_features_{i}" for i in range(4)]
     columns = [*_standard_columns(arrays), arrays["filter_3d"][:, None], arrays["orientation"]]
     frame = json.dumps(world_from_scene.to_json(), separators=(",", ":"))
@@ -68,10 +62,11 @@ def write_viewer_ply(path: Path, gaussians: OrientedGaussians) -> None:
     logit = log_opacity - torch.log(-torch.expm1(log_opacity.clamp_max(-1e-12)))
     baked = wide.replaced(log_scales=torch.log(wide.scales()), opacity_logits=logit)
     arrays = {name: t.numpy() for name, t in baked.tensors()}
-    _write(path, _standard_names(arrays["sh"].shape[1]), _standard_columns(arrays), [])
+    _write(path, standard_names(arrays["sh"].shape[1]), _standard_columns(arrays), [])
 
 
-def _standard_names(coefficients: int) -> list[str]:
+def standard_names(coefficients: int) -> list[str]:
+    """Return the properties of the original code's files, in its order."""
     rest = 3 * (coefficients - 1)
     return [
         *("x", "y", "z", "nx", "ny", "nz"),
@@ -119,78 +114,33 @@ def read_splat_ply(path: Path) -> SplatFile:
         Not such a file; names the line or property. Nothing is allocated before the file's size
         is known to hold what the header promises.
     """
-    size_bytes = path.stat().st_size
-    with path.open("rb") as stream:
-        head = stream.read(MAX_HEADER_BYTES)
-        count, properties, comments, begin = _parse_header(path, head)
-        kind = np.dtype([(name, _TYPES[t]) for name, t in properties])
-        need_bytes = begin + count * kind.itemsize
-        if size_bytes < need_bytes:
-            raise ParseError(
-                path, f"byte {size_bytes}", f"cut off: the header promises {need_bytes} bytes.",
-                _HINT,
-            )  # fmt: skip
-        stream.seek(begin)
-        table = np.frombuffer(stream.read(count * kind.itemsize), kind)
-    return _gaussians_of(path, table, comments)
-
-
-def _parse_header(path: Path, head: bytes) -> tuple[int, list[tuple[str, str]], list[str], int]:
-    """Return count, (name, type) of the properties, comments, and where the body begins."""
-    if not re.match(rb"ply\r?\n", head):
-        raise ParseError(path, "byte 0", "not a PLY file.", _HINT)
-    end = re.search(rb"\nend_header\r?\n", head)
-    if end is None:
-        raise ParseError(path, "header", f"does not end within {MAX_HEADER_BYTES} bytes.", _HINT)
-    count = -1
-    properties: list[tuple[str, str]] = []
-    comments = []
-    for number, raw in enumerate(head[: end.start()].splitlines()[1:], start=2):
-        words = raw.decode("ascii", "replace").split()
-        place = f"line {number}"
-        if not words or words[0] == "obj_info":
-            continue
-        if words[0] == "comment":
-            comments.append(" ".join(words[1:]))
-        elif words[0] == "format":
-            if words[1:2] != ["binary_little_endian"]:
-                raise ParseError(
-                    path, place, f"format {' '.join(words[1:])} is not read.",
-                    "Save it as binary little endian.",
-                )  # fmt: skip
-        elif words[0] == "element":
-            if count >= 0 or words[1:2] != ["vertex"]:
-                raise ParseError(
-                    path, place, "only one element, named vertex, is expected.",
-                    "This looks like a mesh or a compressed splat file; give a native splat file.",
-                )  # fmt: skip
-            if len(words) != 3 or not re.fullmatch(r"\d{1,18}", words[2]):
-                raise ParseError(path, place, "no count of vertices.", _HINT)
-            count = int(words[2])
-        elif words[0] == "property":
-            if len(words) != 3 or words[1] not in _TYPES or count < 0:
-                raise ParseError(path, place, f"property {' '.join(words[1:])!r}.", _HINT)
-            if words[2] in (name for name, _ in properties):
-                raise ParseError(path, place, f"property {words[2]} comes twice.", _HINT)
-            properties.append((words[2], words[1]))
-        else:
-            raise ParseError(path, place, f"unknown header line {words[0]!r}.", _HINT)
-    if not 0 <= count <= limits.MAX_GAUSSIANS:
+    header = read_ply_header(path, _HINT)
+    if header.encoding != "<":
         raise ParseError(
-            path, "header", f"{count} vertices; at most {limits.MAX_GAUSSIANS} are read.", _HINT
+            path, "header", "not binary little endian.", "Save it as binary little endian."
         )
-    if not properties:
-        raise ParseError(path, "header", "no properties.", _HINT)
-    return count, properties, comments, end.end()
+    if [element.name for element in header.elements] != ["vertex"]:
+        raise ParseError(
+            path, "header", "only one element, named vertex, is expected.",
+            "This looks like a mesh or a compressed splat file; give a native splat file.",
+        )  # fmt: skip
+    return _gaussians_of(path, read_vertices(path, header, _HINT), header.comments)
 
 
-def _gaussians_of(path: Path, table: np.ndarray, comments: list[str]) -> SplatFile:
+def harmonics_of(constant: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Return (n, k, 3) coefficients of (n, 3) f_dc and (n, 3 (k - 1)) f_rest, channel by channel."""
+    count = len(constant)
+    higher = rest.reshape(count, 3, rest.shape[1] // 3)
+    return np.concatenate([constant[:, None], higher.transpose(0, 2, 1)], axis=1)
+
+
+def _gaussians_of(path: Path, table: np.ndarray, comments: Sequence[str]) -> SplatFile:
     names = set(table.dtype.names or ())
     rest = sum(1 for name in names if name.startswith("f_rest_"))
     degree = math.isqrt(rest // 3 + 1) - 1
     if rest != 3 * ((degree + 1) ** 2 - 1) or degree > 3:
         raise ParseError(path, "header", f"{rest} f_rest properties fit no degree 0 to 3.", _HINT)
-    wanted = [n for n in _standard_names((degree + 1) ** 2) if n not in ("nx", "ny", "nz")]
+    wanted = [n for n in standard_names((degree + 1) ** 2) if n not in ("nx", "ny", "nz")]
     wanted += ["filter_3D", *(f"gaussian_features_{i}" for i in range(4))]
     for name in wanted:
         if name not in names:
@@ -210,10 +160,8 @@ def _gaussians_of(path: Path, table: np.ndarray, comments: list[str]) -> SplatFi
     if not good.any():
         raise ParseError(path, "body", "no Gaussian has sensible values.", _HINT)
     values, quats, log_scales = values[good], quats[good], log_scales[good]
-    count = len(values)
     first = at["f_dc_0"]
-    higher = values[:, first + 3 : first + 3 + rest].reshape(count, 3, rest // 3)
-    sh = np.concatenate([values[:, None, first : first + 3], higher.transpose(0, 2, 1)], axis=1)
+    sh = harmonics_of(values[:, first : first + 3], values[:, first + 3 : first + 3 + rest])
     orientation = values[:, at["gaussian_features_0"] : at["gaussian_features_0"] + 4]
     arrays = {
         "means": values[:, 0:3], "log_scales": log_scales, "quats": quats,
@@ -224,7 +172,7 @@ def _gaussians_of(path: Path, table: np.ndarray, comments: list[str]) -> SplatFi
     return SplatFile(OrientedGaussians(**tensors), _frame_in(path, comments), dropped)
 
 
-def _frame_in(path: Path, comments: list[str]) -> Similarity | None:
+def _frame_in(path: Path, comments: Sequence[str]) -> Similarity | None:
     for comment in comments:
         key, _, text = comment.partition(" ")
         if key != _FRAME_COMMENT:
