@@ -15,7 +15,9 @@ from ..limits import MIN_IMAGES
 from .normalisation import find_scene_frame
 from .photo_finder import PhotoIndex, find_mask, list_photos, photo_root
 from .photo_header import read_photo_header
-from .source_kind import SourceKind, read_poses, source_kind
+from .source_kind import SPLAT, SourceKind, read_poses, source_kind
+from .splat_header import read_splat_header
+from .splat_source import WITH_PHOTOS, WITHOUT_PHOTOS
 
 Severity = Literal["error", "warning", "fact"]
 
@@ -42,9 +44,12 @@ def check_input(source: Path) -> list[Finding]:
     """
     findings: list[Finding] = []
     try:
-        kind = source_kind(Path(source).resolve())
+        source = Path(source).resolve()
+        kind = source_kind(source)
         findings.append(Finding("fact", f"The input is of kind: {kind.kind}."))
-        if kind.kind == "photos":
+        if kind.kind == SPLAT:
+            _check_splat(source, findings)
+        elif kind.kind == "photos":
             _check_photos(kind, findings)
         else:
             _check_poses(kind, findings)
@@ -53,6 +58,17 @@ def check_input(source: Path) -> list[Finding]:
     except OSError as error:
         findings.append(Finding("error", f"{source} cannot be read: {error.strerror}."))
     return findings
+
+
+def _check_splat(path: Path, findings: list[Finding]) -> None:
+    header = read_splat_header(path)
+    if header.count == 0:
+        raise DatasetError(f"{path.name} holds no Gaussians.", "Export the splat again.")
+    kind = "surfels" if header.axes == 2 else "Gaussians"
+    findings.append(
+        Finding("fact", f"{header.count} {kind} with harmonics of degree {header.degree}.")
+    )
+    findings.append(Finding("warning", WITHOUT_PHOTOS, WITH_PHOTOS))
 
 
 def _check_photos(kind: SourceKind, findings: list[Finding]) -> None:

@@ -10,11 +10,17 @@ from ..errors import DatasetError
 from .colmap_reader import find_models, read_colmap
 from .photo_finder import PHOTO_FOLDERS, list_photos, mask_roots_of, photo_root
 from .source_model import SourceModel
+from .splat_header import is_splat_path
 from .transforms_reader import find_transforms, read_transforms
 
 _WANTED = (
-    "Give a folder of photos, a folder with images/ and sparse/0 (COLMAP), or a transforms.json."
+    "Give a folder of photos, a folder with images/ and sparse/0 (COLMAP), a transforms.json, or "
+    "the PLY of a 3D Gaussian splat."
 )
+
+
+SPLAT = "splat"
+"""Kind of a 3D Gaussian splat as an input of its own, without photos."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +28,7 @@ class SourceKind:
     """What an input is."""
 
     kind: str
-    """``"COLMAP model"``, ``"transforms.json"`` or ``"photos"``."""
+    """``"COLMAP model"``, ``"transforms.json"``, ``"photos"`` or ``"splat"``."""
     folder: Path
     """Folder that names in the input are relative to."""
     transforms: Path | None
@@ -56,6 +62,8 @@ def source_kind(source: Path) -> SourceKind:
     if not source.exists():
         raise DatasetError(f"{source} does not exist.", _WANTED)
     if source.is_file():
+        if is_splat_path(source):
+            return SourceKind(SPLAT, source.parent, None)
         transforms = find_transforms(source)
         if transforms is None:
             raise DatasetError(f"{source.name} is a file, but not a transforms.json.", _WANTED)
@@ -81,6 +89,8 @@ def read_poses(kind: SourceKind) -> SourceModel:
     ------
     ParseError, DatasetError
     """
+    if kind.kind == SPLAT:
+        raise DatasetError("A splat holds no cameras.", "Give the input that it was trained on.")
     if kind.kind == "COLMAP model":
         return read_colmap(kind.folder)
     assert kind.transforms is not None

@@ -128,7 +128,7 @@ def read_splat_ply(path: Path) -> SplatFile:
 
 
 def harmonics_of(constant: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return (n, k, 3) coefficients of (n, 3) f_dc and (n, 3 (k - 1)) f_rest, channel by channel."""
+    """Return (n, k, 3) of (n, 3) f_dc and (n, 3 (k - 1)) f_rest, which is channel by channel."""
     count = len(constant)
     higher = rest.reshape(count, 3, rest.shape[1] // 3)
     return np.concatenate([constant[:, None], higher.transpose(0, 2, 1)], axis=1)

@@ -146,6 +146,7 @@ def run_job(
 def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: int) -> Stage:
     from ..dataset.load import load_scene
     from ..dataset.scene_file import save_scene
+    from .splat_scene import is_splat, make_splat_scene
 
     source = Path(job.source)
     key = stage_key(
@@ -153,7 +154,12 @@ def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: in
     )
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
-        scene = load_scene(source, stage_folder, progress, seed=job.settings.seed, threads=threads)
+        if is_splat(source):
+            scene = make_splat_scene(source, stage_folder, progress, threads=threads)
+        else:
+            scene = load_scene(
+                source, stage_folder, progress, seed=job.settings.seed, threads=threads
+            )
         save_scene(scene, stage_folder)
         return {
             "views": len(scene.views),

@@ -50,6 +50,9 @@ def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
 
     Photos are not read: size and time tell a change, as in other build systems.
     """
+    if source.is_file() and source.suffix.lower() == ".ply":
+        state = source.stat()
+        return [(source.name, state.st_size, state.st_mtime_ns)]
     root = source if source.is_dir() else source.parent
     found = []
     for folder, subfolders, names in os.walk(root):

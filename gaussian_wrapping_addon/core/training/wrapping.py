@@ -17,9 +17,7 @@ from ..render.render import render
 from ..render.types import RenderOptions
 from .losses import normals_from_depth
 from .optimizer import Adam
-
-FIRST_SIGN = 0.5
-"""Size of the sign parameter after the cameras' vote (method.md 1.3)."""
+from .orientation import voted_orientation
 
 SHIFT = 0.1
 """Original and clone move apart by this many standard deviations along the normal, each."""
@@ -47,22 +45,8 @@ def start_orientation(adam: Adam, views: Iterable[WrapView], *, threads: int = 0
     Each view votes with the Gaussian's blending weight for the side that it sees; the sign
     parameter becomes +-0.5, or stays 0 where no view sees the Gaussian (method.md 1.3).
     """
-    gaussians = adam.gaussians().detached()
-    shortest = torch.argmin(gaussians.log_scales, dim=1)  # (n,)
-    axes = gaussians.rotations()  # (n, 3, 3)
-    direction = axes[torch.arange(len(gaussians)), :, shortest].numpy()  # (n, 3)
-    means = gaussians.means.numpy()
-    votes = np.zeros(len(gaussians))
-    options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
-    for view in views:
-        with torch.no_grad():
-            statistics = render(gaussians, view.camera, options).statistics
-        assert statistics is not None
-        toward = view.camera.center - means  # (n, 3)
-        votes += statistics.weight_sum * np.sign((toward * direction).sum(1))
-    orientation = adam.array("orientation")
-    orientation[:, :3] = direction
-    orientation[:, 3] = FIRST_SIGN * np.sign(votes)
+    cameras = (view.camera for view in views)
+    adam.array("orientation")[:] = voted_orientation(adam.gaussians(), cameras, threads=threads)
     adam.reset_moments("orientation")
 
 

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Splats of other programs: any 3D Gaussian splatting PLY as oriented Gaussians.
+
+Formats: conventions.md C.6 (Inria's code), gsplat and nerfstudio exports (with or without normals,
+or with plain colours), 2D Gaussian splatting (two scales), files with Mip-Splatting's
+``filter_3D``, and our own with ``gaussian_features_*``.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..dataset.splat_header import EXPECTED, SplatHeader, read_splat_header
+from ..errors import ParseError
+from ..ply_table import read_vertices
+from ..tolerances import QUATERNION_MIN_NORM
+from .initialisation import SH_C0
+from .model import OrientedGaussians
+from .splat_ply import MAX_LOG_SCALE, harmonics_of
+
+_logger = logging.getLogger(__name__)
+
+MAX_DEGREE = 3
+"""Higher degrees of the harmonics are left out: the renderer has none."""
+
+SURFEL_THICKNESS = 0.02
+"""Third axis of a surfel, which has none, over its shorter one: flat to the eye, and far from the
+discs of 1e8 : 1 that float32 cannot render."""
+
+THINNEST_AXIS = 1e-5
+"""An axis is made at least this share of the longest one."""
+
+MOST_OPAQUE_LOGIT = 30.0
+"""Opacity logits are clamped to this and its negative: sigmoid is 1 or 0 to 13 digits."""
+
+_ACTIVATED_SHARE = 0.999
+"""A file where this share of all opacities and scales could be activated values likely has them."""
+
+
+@dataclass(frozen=True)
+class ForeignSplat:
+    """A splat of any program."""
+
+    gaussians: OrientedGaussians
+    """In the frame of the file. float64 where the file has doubles, else float32; the orientation
+    is zero where the file has none."""
+    oriented: bool
+    """Whether the file has orientations."""
+    dropped: int
+    """Gaussians left out because a value was not finite or senseless."""
+    warnings: tuple[str, ...] = ()
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+def read_foreign_splat(path: Path) -> ForeignSplat:
+    """Read a 3D Gaussian splatting PLY: properties in any order and type, others beside them.
+
+    Raises
+    ------
+    ParseError
+        Not a splat, cut, or without a single sensible Gaussian; names place and next step.
+    DatasetError
+        A splat in a format that is not read.
+    """
+    header = read_splat_header(path)
+    rows = read_vertices(path, header.ply, EXPECTED)
+    wide = any(kind == "f8" for _, kind in header.ply.elements[0].properties)
+    dtype = np.float64 if wide else np.float32
+
+    def columns(*names: str) -> np.ndarray:
+        stacked = [rows[name].astype(dtype) for name in names]  # (n,) each
+        return np.stack(stacked, axis=1) if stacked else np.zeros((len(rows), 0), dtype)
+
+    names = header.names
+    features = [f"gaussian_features_{i}" for i in range(4)]
+    oriented = set(features) <= names
+    count = len(rows)
+    arrays = {
+        "means": columns("x", "y", "z"),
+        "log_scales": columns(*(f"scale_{i}" for i in range(header.axes))),
+        "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        "opacity_logits": columns("opacity")[:, 0],
+        "sh": _harmonics(header, columns),
+        "orientation": columns(*features) if oriented else np.zeros((count, 4), dtype),
+        "filter_3d": columns("filter_3D")[:, 0] if "filter_3D" in names else np.zeros(count, dtype),
+    }
+    good = _sensible(arrays)
+    dropped = count - int(good.sum())
+    if not good.any():
+        raise ParseError(
+            path, "body", f"none of the {count} Gaussians has sensible values.",
+            "Export the splat again.",
+        )  # fmt: skip
+    arrays = {name: array[good] for name, array in arrays.items()}
+    warnings = _warnings(header, arrays, dropped, count)
+    _normalise(arrays, header.axes)
+    tensors = {k: torch.from_numpy(np.ascontiguousarray(v, dtype)) for k, v in arrays.items()}
+    facts = {
+        "splat_gaussians": int(good.sum()),
+        "splat_dropped": dropped,
+        "splat_degree": header.degree,
+        "splat_surfels": header.axes == 2,
+        "splat_oriented": oriented,
+    }
+    for text in warnings:
+        _logger.warning("%s: %s", path.name, text)
+    return ForeignSplat(OrientedGaussians(**tensors), oriented, dropped, tuple(warnings), facts)
+
+
+def _harmonics(header: SplatHeader, columns: Any) -> np.ndarray:
+    """Return (n, k, 3) coefficients, at most of :data:`MAX_DEGREE`."""
+    constant = columns(*header.colors)  # (n, 3)
+    if header.colors[0] == "red":
+        kinds = dict(header.ply.elements[0].properties)
+        full = 1.0 if kinds["red"].startswith("f") else float(np.iinfo(kinds["red"]).max)
+        constant = (constant / full - 0.5) / SH_C0
+    stored = (header.degree + 1) ** 2 - 1
+    used = (min(header.degree, MAX_DEGREE) + 1) ** 2 - 1
+    # Channel by channel: the coefficients of one channel that are used come first in it.
+    rest = columns(*(f"f_rest_{c * stored + i}" for c in range(3) for i in range(used)))
+    return harmonics_of(constant, rest)
+
+
+def _sensible(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """(n,) bool: finite, a rotation, a size that can be meant."""
+    good = np.ones(len(arrays["means"]), np.bool_)
+    for array in arrays.values():
+        good &= np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+    good &= np.abs(arrays["quats"]).max(axis=1) > QUATERNION_MIN_NORM
+    good &= np.abs(arrays["log_scales"].max(axis=1)) < MAX_LOG_SCALE  # the longest axis
+    return good & (arrays["filter_3d"] >= 0)
+
+
+def _warnings(
+    header: SplatHeader, arrays: dict[str, np.ndarray], dropped: int, count: int
+) -> list[str]:
+    out = []
+    if dropped:
+        out.append(f"{dropped} of {count} Gaussians with senseless values were left out.")
+    if header.degree > MAX_DEGREE:
+        out.append(
+            f"The splat's harmonics are of degree {header.degree}; those above degree "
+            f"{MAX_DEGREE} are left out, so that highlights may look softer."
+        )
+    opacity, scales = arrays["opacity_logits"], arrays["log_scales"]
+    plain = (opacity >= 0) & (opacity <= 1) & (scales > 0).all(axis=1)
+    if plain.mean() > _ACTIVATED_SHARE and np.ptp(opacity) > 0:
+        out.append(
+            "Opacities and scales look like plain values; logits and logarithms are expected. "
+            "If the mesh looks wrong, export the splat again in Inria's convention."
+        )
+    return out
+
+
+def _normalise(arrays: dict[str, np.ndarray], axes: int) -> None:
+    """Give surfels a third axis, and bring extreme values to where float32 can render them."""
+    log_scales = arrays["log_scales"]
+    if axes == 2:
+        third = log_scales.min(axis=1, keepdims=True) + math.log(SURFEL_THICKNESS)
+        log_scales = np.concatenate([log_scales, third.astype(log_scales.dtype)], axis=1)
+    least = log_scales.max(axis=1, keepdims=True) + math.log(THINNEST_AXIS)
+    arrays["log_scales"] = np.maximum(log_scales, least.astype(log_scales.dtype))
+    limit = MOST_OPAQUE_LOGIT
+    arrays["opacity_logits"] = np.clip(arrays["opacity_logits"], -limit, limit)
+    quats = arrays["quats"]
+    largest = np.abs(quats).max(axis=1, keepdims=True)  # (n, 1)
+    extreme = (largest < 1e-6) | (largest > 1e6)  # their squares leave float32
+    arrays["quats"] = np.where(extreme, quats / largest, quats)
