@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Container
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,7 +121,7 @@ def _degree(path: Path, names: set[str]) -> int:
     )  # fmt: skip
 
 
-def _described(elements: dict[str, object], names: set[str]) -> str:
+def _described(elements: Container[str], names: set[str]) -> str:
     """Say in a word what a PLY without Gaussians is."""
     if "face" in elements:
         return "a mesh"

@@ -97,7 +97,7 @@ def cameras_around(extent: SplatExtent) -> list[Camera]:
     half = math.radians(0.5 * FIELD_OF_VIEW_DEG)
     focal_px = 0.5 * PHOTO_SIDE_PX / math.tan(half)
     far = FAR_MARGIN / math.sin(half)
-    cameras = []
+    cameras: list[Camera] = []
     for count, distance in ((FAR_VIEWS, far), (NEAR_VIEWS, NEAR_DISTANCE)):
         for direction in even_directions(count):
             eye = extent.center + distance * extent.radius * direction

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ..dataset.scene import Scene, View
-from ..dataset.source_kind import SPLAT, source_kind
+from ..dataset.source_kind import SPLAT
+from ..dataset.splat_header import is_splat_path
 from ..dataset.splat_source import (
     WITHOUT_PHOTOS,
     cameras_around,
@@ -37,7 +38,7 @@ def start_splat_of(job: JobFile) -> Path | None:
 
 def is_splat(source: Path) -> bool:
     """Tell whether an input is a splat of its own."""
-    return source.is_file() and source_kind(source).kind == SPLAT
+    return source.is_file() and is_splat_path(source)
 
 
 def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads: int = 0) -> Scene:

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Splats of other programs: every convention gives the same Gaussians, everything else a reason."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
+from gaussian_wrapping_addon.core.gaussians.foreign_splat import (
+    SURFEL_THICKNESS,
+    ForeignSplat,
+    read_foreign_splat,
+)
+from gaussian_wrapping_addon.core.gaussians.initialisation import SH_C0
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.splat_ply import write_splat_ply, write_viewer_ply
+from tests.core.gaussians.splat_files import permuted, splat_columns, write_ply
+from tests.core.render.scenes import random_gaussians
+
+COUNT = 30
+
+
+def example(degree: int = 3) -> OrientedGaussians:
+    made = random_gaussians(COUNT, 3, dtype=torch.float32, sh_degree=degree, filter_size=0.0)
+    return made.replaced(orientation=torch.zeros(COUNT, 4))
+
+
+def assert_same(found: ForeignSplat, wanted: OrientedGaussians) -> None:
+    for name, tensor in wanted.tensors():
+        assert torch.equal(getattr(found.gaussians, name).to(tensor.dtype), tensor), name
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("normals", [True, False])
+def test_inria_and_gsplat_files_are_read_exactly(
+    tmp_path: Path, degree: int, normals: bool
+) -> None:
+    wanted = example(degree)
+    path = write_ply(tmp_path / "a.ply", splat_columns(wanted, normals=normals))
+    found = read_foreign_splat(path)
+    assert_same(found, wanted)
+    assert found.gaussians.means.dtype == torch.float32
+    assert (found.dropped, found.warnings, found.oriented) == (0, (), False)
+    assert found.facts["splat_degree"] == degree
+
+
+@pytest.mark.parametrize("encoding", ["<", ">", "ascii"])
+def test_any_order_types_and_extras_change_nothing(tmp_path: Path, encoding: str) -> None:
+    wanted = example()
+    columns = splat_columns(wanted)
+    random = np.random.default_rng(5)
+    columns["segment"] = random.integers(0, 255, COUNT)
+    columns["confidence"] = random.normal(size=COUNT)
+    kinds = {"segment": "u1", **dict.fromkeys(("x", "y", "z", "confidence", "rot_2"), "f8")}
+    faces = "element camera 2\nproperty float focal\nproperty list uchar int ids"
+    path = write_ply(
+        tmp_path / "a.ply", columns, encoding=encoding, kinds=kinds, order=permuted(columns),
+        after=(faces, b"12 3 1 2 3\n" * 2),
+    )  # fmt: skip
+    assert path.read_bytes().count(b"\nproperty ") == len(columns) + 2
+    assert_same(read_foreign_splat(path), wanted)
+
+
+def test_doubles_keep_their_digits(tmp_path: Path) -> None:
+    columns = splat_columns(example())
+    columns["x"] = columns["x"].astype(np.float64) + 4.5e6
+    path = write_ply(tmp_path / "a.ply", columns, kinds=dict.fromkeys("xyz", "f8"))
+    found = read_foreign_splat(path).gaussians
+    assert found.means.dtype == torch.float64
+    assert np.array_equal(found.means[:, 0].numpy(), columns["x"])
+
+
+def test_the_viewers_file_is_read_to_the_last_bit(tmp_path: Path) -> None:
+    filtered = random_gaussians(COUNT, 1, dtype=torch.float32, sh_degree=2, filter_size=0.2)
+    path = tmp_path / "v.ply"
+    write_viewer_ply(path, filtered)
+    table = np.frombuffer(path.read_bytes().split(b"end_header\n", 1)[1], "<f4").reshape(COUNT, -1)
+    found = read_foreign_splat(path).gaussians
+    for name in ("means", "quats", "sh"):
+        assert torch.equal(getattr(found, name), getattr(filtered, name)), name
+    first = 6 + 27  # positions, normals, harmonics
+    assert np.array_equal(found.opacity_logits.numpy(), table[:, first])
+    assert np.array_equal(found.log_scales.numpy(), table[:, first + 1 : first + 4])
+    np.testing.assert_allclose(found.scales(), filtered.scales(), rtol=1e-5)
+    np.testing.assert_allclose(found.log_opacities(), filtered.log_opacities(), atol=1e-5)
+
+
+def test_our_own_file_keeps_filter_and_orientation(tmp_path: Path) -> None:
+    wanted = random_gaussians(COUNT, 1, dtype=torch.float32, sh_degree=1, filter_size=0.2)
+    write_splat_ply(tmp_path / "n.ply", wanted, Similarity())
+    found = read_foreign_splat(tmp_path / "n.ply")
+    assert_same(found, wanted)
+    assert found.oriented
+
+
+def test_degree_4_is_cut_and_said(tmp_path: Path) -> None:
+    gaussians = example(3)
+    more = torch.cat([gaussians.sh, torch.full((COUNT, 9, 3), 7.0)], dim=1)
+    path = write_ply(tmp_path / "a.ply", splat_columns(gaussians.replaced(sh=more)))
+    found = read_foreign_splat(path)
+    assert torch.equal(found.gaussians.sh, gaussians.sh)
+    assert "degree 4" in found.warnings[0]
+
+
+def test_surfels_get_a_thin_third_axis(tmp_path: Path) -> None:
+    columns = splat_columns(example(0))
+    del columns["scale_2"]
+    found = read_foreign_splat(write_ply(tmp_path / "a.ply", columns)).gaussians
+    scales = torch.exp(found.log_scales.double())
+    shorter = scales[:, :2].amin(1)
+    np.testing.assert_allclose(scales[:, 2], SURFEL_THICKNESS * shorter, rtol=1e-6)
+    assert bool((found.log_scales.argmin(1) == 2).all())
+
+
+def test_plain_colours_stand_for_the_constant_harmonic(tmp_path: Path) -> None:
+    columns = splat_columns(example(0))
+    for i, name in enumerate(("red", "green", "blue")):
+        del columns[f"f_dc_{i}"]
+        columns[name] = np.arange(COUNT) * (i + 1)
+    kinds = dict.fromkeys(("red", "green", "blue"), "u1")
+    found = read_foreign_splat(write_ply(tmp_path / "a.ply", columns, kinds=kinds)).gaussians
+    color = 0.5 + SH_C0 * found.sh[:, 0].numpy()
+    np.testing.assert_allclose(255 * color[:, 2], columns["blue"], atol=1e-4)
+
+
+def test_senseless_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
+    columns = {name: np.array(column) for name, column in splat_columns(example(1)).items()}
+    for row, (name, value) in enumerate(
+        [("x", np.nan), ("opacity", np.inf), ("scale_1", 80.0), ("f_rest_4", -np.inf)]
+    ):
+        columns[name][row] = value
+    for i in range(4):
+        columns[f"rot_{i}"][4] = 0.0
+    found = read_foreign_splat(write_ply(tmp_path / "a.ply", columns))
+    assert found.dropped == 5
+    assert torch.equal(found.gaussians.means, example(1).means[5:])
+    assert "5 of 30" in found.warnings[0]
+    columns["y"][:] = np.nan
+    with pytest.raises(ParseError):
+        read_foreign_splat(write_ply(tmp_path / "b.ply", columns))
+
+
+def test_extreme_quaternions_keep_their_rotation(tmp_path: Path) -> None:
+    wanted = example(0)
+    columns = splat_columns(wanted.replaced(quats=wanted.quats * 1e30))
+    found = read_foreign_splat(write_ply(tmp_path / "a.ply", columns)).gaussians
+    np.testing.assert_allclose(found.rotations(), wanted.rotations(), atol=1e-5)
+
+
+def test_plain_opacities_and_scales_are_pointed_out(tmp_path: Path) -> None:
+    columns = splat_columns(example(0))
+    columns["opacity"] = 1 / (1 + np.exp(-columns["opacity"]))
+    for i in range(3):
+        columns[f"scale_{i}"] = np.exp(columns[f"scale_{i}"])
+    (warning,) = read_foreign_splat(write_ply(tmp_path / "a.ply", columns)).warnings
+    assert "logits" in warning
+
+
+@pytest.mark.parametrize("name", ["x", "f_dc_1", "opacity", "scale_0", "rot_3"])
+def test_a_missing_property_is_named(tmp_path: Path, name: str) -> None:
+    columns = splat_columns(example(1))
+    del columns[name]
+    with pytest.raises(ParseError, match=rf"\b{name}\b") as caught:
+        read_foreign_splat(write_ply(tmp_path / "a.ply", columns))
+    assert "rot_0..3" in caught.value.hint
+
+
+def test_numbers_of_harmonics_that_fit_no_degree_are_refused(tmp_path: Path) -> None:
+    columns = splat_columns(example(2))
+    del columns["f_rest_23"]
+    with pytest.raises(ParseError, match="23 f_rest"):
+        read_foreign_splat(write_ply(tmp_path / "a.ply", columns))
+
+
+def test_meshes_and_clouds_are_named(tmp_path: Path) -> None:
+    points = {axis: np.arange(3.0) for axis in "xyz"}
+    with pytest.raises(ParseError, match="a point cloud"):
+        read_foreign_splat(write_ply(tmp_path / "cloud.ply", points))
+    faces = "element face 1\nproperty list uchar int vertex_indices"
+    mesh = write_ply(tmp_path / "mesh.ply", points, after=(faces, b"\3" + 12 * b"\0"))
+    with pytest.raises(ParseError, match="a mesh"):
+        read_foreign_splat(mesh)
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat", ".ksplat", ".sog"])
+def test_other_formats_are_named_with_the_next_step(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"NGSP")
+    with pytest.raises(DatasetError, match="not read") as caught:
+        read_foreign_splat(path)
+    assert "uncompressed PLY" in caught.value.hint
+
+
+def test_compressed_plys_are_named(tmp_path: Path) -> None:
+    head = "ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\n"
+    head += "element vertex 1\nproperty uint packed_position\nend_header\n"
+    path = tmp_path / "a.ply"
+    path.write_bytes(head.encode() + bytes(8))
+    with pytest.raises(ParseError, match="compressed"):
+        read_foreign_splat(path)
+
+
+@pytest.mark.parametrize("encoding", ["<", "ascii"])
+def test_files_cut_anywhere_are_refused(tmp_path: Path, encoding: str) -> None:
+    columns = {name: column[:2] for name, column in splat_columns(example(0)).items()}
+    data = write_ply(tmp_path / "a.ply", columns, encoding=encoding).read_bytes()
+    cut = tmp_path / "cut.ply"
+    # The last digits of an ASCII number can be missing without a trace.
+    last = len(data) if encoding == "<" else data.rstrip().rindex(b" ")
+    for length in range(0, last, 7):
+        cut.write_bytes(data[:length])
+        with pytest.raises(ParseError):
+            read_foreign_splat(cut)
+
+
+def test_a_count_beyond_the_file_allocates_nothing(tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "a.ply", splat_columns(example(0)))
+    data = path.read_bytes()
+    for count in (COUNT + 1, 19_999_999, 2**31 - 1, 10**17):
+        path.write_bytes(data.replace(b"vertex 30", b"vertex %d" % count))
+        with pytest.raises(ParseError):
+            read_foreign_splat(path)
+
+
+def test_flat_needles_stay_renderable(tmp_path: Path) -> None:
+    columns = splat_columns(example(0))
+    columns["scale_1"] = np.full(COUNT, -39.0)
+    found = read_foreign_splat(write_ply(tmp_path / "a.ply", columns)).gaussians
+    spread = found.log_scales.amax(1) - found.log_scales.amin(1)
+    assert float(spread.max()) <= -math.log(1e-5) + 1e-4
