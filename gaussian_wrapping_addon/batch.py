@@ -57,20 +57,15 @@ class _Parser(ArgumentParser):
 
 
 def _parser() -> ArgumentParser:
-    from .core.settings import EXPORT_FORMATS, PRESETS
+    from .batch_options import add_training_options
+    from .core.settings import EXPORT_FORMATS
 
     parser = _Parser(prog="batch.py", description="Photos in, a textured mesh out.")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
 
     wrap = commands.add_parser("wrap", help="photos, a COLMAP project or a transforms.json -> mesh")
     wrap.add_argument("input", type=Path)
-    wrap.add_argument("--preset", choices=PRESETS, default="standard")
-    wrap.add_argument("--seed", type=int, default=0)
-    wrap.add_argument("--iterations", type=int, help="training iterations instead of the preset's")
-    wrap.add_argument("--max-gaussians", type=int, help="cap instead of the preset's")
-    wrap.add_argument(
-        "--max-image-px", type=int, help="training image size instead of the preset's"
-    )
+    add_training_options(wrap)
     wrap.set_defaults(run=_wrap)
 
     mesh = commands.add_parser(
@@ -78,8 +73,16 @@ def _parser() -> ArgumentParser:
     )
     mesh.set_defaults(run=_mesh)
 
+    more = commands.add_parser("more", help="train a finished job further, and mesh it again")
+    more.add_argument("--out", type=Path, required=True, metavar="DIR")
+    more.add_argument("--iterations", type=int, required=True, metavar="N", help="to be added")
+    more.set_defaults(run=_more)
+
     resume = commands.add_parser("resume", help="continue a job that was stopped")
     resume.add_argument("out", type=Path, metavar="DIR")
+    resume.add_argument(
+        "--max-gaussians", type=int, metavar="N", help="train anew with another cap"
+    )
     resume.set_defaults(run=_resume)
 
     for command in (wrap, mesh):
@@ -92,11 +95,16 @@ def _parser() -> ArgumentParser:
         command.add_argument(
             "--export", default="glb", help=f"comma separated, of {','.join(EXPORT_FORMATS)}"
         )
-        command.add_argument("--threads", type=int, default=0, help="0 uses every core")
-    for command in (wrap, mesh, resume):
+    mesh.add_argument("--threads", type=int, default=0, help="0 uses every core")
+    for command in (wrap, mesh, more, resume):
         command.add_argument("--no-blend", action="store_true", help="needs no bpy")
 
     _add_evaluate(commands.add_parser("evaluate", help="a mesh or a job against a ground truth"))
+
+    estimate = commands.add_parser("estimate", help="time, memory and disk of a training, before")
+    estimate.add_argument("input", type=Path)
+    add_training_options(estimate)
+    estimate.set_defaults(run=_estimate)
 
     check = commands.add_parser("check", help="findings about an input, without starting anything")
     check.add_argument("input", type=Path)
@@ -151,19 +159,13 @@ def _floats(text: str) -> list[float]:
 
 
 def _wrap(options: Namespace) -> int:
+    from .batch_options import training_settings
     from .core.dataset.check import check_input
     from .core.errors import DatasetError
     from .core.jobs.client import JobClient, worker_python
     from .core.jobs.job_file import make_job
-    from .core.settings import preset
 
-    settings = preset(options.preset)
-    changes = {
-        name: value
-        for name in ("iterations", "max_gaussians", "max_image_px")
-        if (value := getattr(options, name)) is not None
-    }
-    settings = replace(settings, seed=options.seed, training=replace(settings.training, **changes))
+    settings = training_settings(options)
     job = make_job("wrap", options.input, _region_settings(settings, options))
     _require_bpy(job, options)
     for finding in check_input(options.input):
@@ -172,6 +174,30 @@ def _wrap(options: Namespace) -> int:
         if finding.severity == "warning":
             _logger.warning("warning: %s %s", finding.message, finding.hint)
     return _follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+
+
+def _more(options: Namespace) -> int:
+    from .core.jobs.client import JobClient, worker_python
+    from .core.jobs.job_file import read_job
+    from .core.jobs.job_folder import JobFolder
+    from .core.jobs.more import job_with_more
+
+    folder = JobFolder(options.out.resolve())
+    job = job_with_more(folder, read_job(folder.job_path), options.iterations)
+    _require_bpy(job, options)
+    return _follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+
+
+def _estimate(options: Namespace) -> int:
+    from .batch_options import training_settings
+    from .core.jobs.client import worker_python
+    from .core.jobs.evaluate import run_in_worker
+    from .core.jobs.job_file import make_job
+
+    job = make_job("wrap", options.input, training_settings(options))
+    return run_in_worker(
+        job.to_json(), python=worker_python(), module="jobs.estimate", what="estimate"
+    )
 
 
 def _mesh(options: Namespace) -> int:
@@ -199,7 +225,11 @@ def _resume(options: Namespace) -> int:
 
     job = read_job(JobFolder(options.out.resolve()).job_path)
     _require_bpy(job, options)
-    return _follow(JobClient.resume(options.out, python=worker_python()), job, options)
+    if options.max_gaussians is None:
+        return _follow(JobClient.resume(options.out, python=worker_python()), job, options)
+    training = replace(job.settings.training, max_gaussians=options.max_gaussians)
+    job = replace(job, settings=replace(job.settings, training=training).validated())
+    return _follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 
 
 def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:

@@ -41,6 +41,14 @@ def kernel(*, fast: bool, fused: bool = False) -> Callable[[Callable[..., Any]],
     return decorate
 
 
+def is_ready(compiled: Any) -> bool:
+    """Tell whether calling a kernel will not compile it: it was called, or lies in the cache."""
+    if compiled.signatures:
+        return True
+    cache = compiled._cache
+    return isinstance(cache, KernelCache) and not cache.is_empty()
+
+
 def part(*, fast: bool, fused: bool = False) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator for a large helper of kernels: compiled alone, then inlined into each.
 

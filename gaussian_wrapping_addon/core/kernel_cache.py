@@ -99,6 +99,14 @@ class KernelCache(caching.FunctionCache):
 
     _impl_class = _Places
 
+    def is_empty(self) -> bool:
+        """Tell whether no machine code is kept that fits the present sources."""
+        try:
+            return not self._cache_file._load_index()
+        except Exception as error:  # as in load_overload: it will be compiled anew
+            warn_without_cache(f"{type(error).__name__}: {error}")
+            return True
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return machine code that was kept, or ``None``."""
         try:

@@ -13,13 +13,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import UsageError, WorkerError
+from ..errors import ParseError, UsageError, WorkerError
 from ..helper_process import child_command, child_environment, kill_group
-from .job_file import JobFile, write_job
+from .job_file import JobFile, read_job, write_job
 from .job_folder import JobFolder, JobStatus, process_alive
+from .smaller import killed_hint
 
 PYTHON_VARIABLE = "GAUSSIAN_WRAPPING_PYTHON"
 LAST_WORDS_BYTES = 2000
+KILLED_CODES = (-9, 137)
+"""Of a process that SIGKILL ended, itself or under a shell: what the kernel does for memory."""
 
 
 def worker_python(preference: str = "") -> str:
@@ -125,9 +128,22 @@ class JobClient:
                 return self._failed(status, "The worker did not start.")
             return status
         if status.active or status.state == "LOST":
+            if code in KILLED_CODES:
+                return self._killed(status)
             reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
             return self._failed(status, f"The worker {reason}. {self.last_words()}".strip())
         return status
+
+    def _killed(self, status: JobStatus) -> JobStatus:
+        """Say what a worker dies of that could not say it itself."""
+        failed = self._failed(
+            status, "The worker was stopped by signal 9: killed, probably out of memory."
+        )
+        try:
+            training = read_job(self.folder.job_path).settings.training
+        except (UsageError, ParseError, OSError):
+            return failed
+        return replace(failed, hint=killed_hint(training))
 
     def _failed(self, status: JobStatus, error: str) -> JobStatus:
         return replace(

@@ -45,7 +45,13 @@ LAST_WORDS_BYTES = 2000
 _EXTRA_PACKAGES = ("libigl", "trimesh")
 
 
-def run_in_worker(request: dict[str, Any], *, python: str) -> int:
+def run_in_worker(
+    request: dict[str, Any],
+    *,
+    python: str,
+    module: str = "jobs.evaluate",
+    what: str = "evaluation",
+) -> int:
     """Start the child, show what it says, and return its exit code.
 
     Parameters
@@ -55,6 +61,8 @@ def run_in_worker(request: dict[str, Any], *, python: str) -> int:
         entries of :class:`~..evaluation.command.EvaluationRequest`; plain JSON values.
     python : str
         The worker's interpreter.
+    module, what : str
+        The child's module, and what errors call it: others speak the same way.
 
     Raises
     ------
@@ -65,7 +73,7 @@ def run_in_worker(request: dict[str, Any], *, python: str) -> int:
     with tempfile.TemporaryFile() as words:
         try:
             process = subprocess.Popen(
-                child_command("jobs.evaluate", text, python=python),
+                child_command(module, text, python=python),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=words,
@@ -92,7 +100,7 @@ def run_in_worker(request: dict[str, Any], *, python: str) -> int:
             last = words.read().decode(errors="replace").strip().splitlines()
             reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
             raise WorkerError(
-                f"The evaluation {reason}: {last[-1] if last else 'no output'}.",
+                f"The {what} {reason}: {last[-1] if last else 'no output'}.",
                 "See whether batch.py doctor finds something.",
             )
         return code
@@ -119,7 +127,7 @@ def _show(raw: bytes) -> bool:
 def main(arguments: list[str]) -> int:
     """Evaluate ``arguments = [request as JSON]`` in this process; return the exit code."""
     # Not the caller's own id: where Python is started through a launcher, that is the parent.
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
     try:
         request = json.loads(arguments[0])
         report, lines = _evaluate(request)
@@ -147,7 +155,7 @@ def main(arguments: list[str]) -> int:
     return EXIT_DONE
 
 
-def _end_with(parent: int) -> None:
+def end_with(parent: int) -> None:
     """End this process when the one that asked has gone: nobody waits for the answer."""
     while os.getppid() == parent:
         time.sleep(PARENT_POLL_S)

@@ -13,7 +13,7 @@ from ..files import read_json, write_json
 from ..settings import JobSettings, from_json, to_json
 
 SCHEMA_VERSION = 1
-COMMANDS = ("wrap", "mesh")
+COMMANDS = ("wrap", "mesh", "more")
 AUTOMATIC_REGIONS = ("auto", "all")
 
 
@@ -87,7 +87,15 @@ def make_job(command: str, source: Path, settings: JobSettings) -> JobFile:
         bodies[name] = read_json(path)
         _check_region(bodies[name], path)
         names.append(name)
-    return JobFile(command, str(source.resolve()), replace(settings, regions=tuple(names)), bodies)
+    start = settings.start_splat
+    if start and not Path(start).is_file():
+        raise DatasetError(f"The start splat {start} does not exist.", "Check the path.")
+    settings = replace(
+        settings,
+        regions=tuple(names),
+        start_splat=str(Path(start).resolve()) if start else "",
+    )
+    return JobFile(command, str(source.resolve()), settings, bodies)
 
 
 def _check_region(body: Any, path: Path) -> None:

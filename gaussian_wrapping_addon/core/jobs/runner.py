@@ -16,11 +16,11 @@ from ..errors import MeshingError, UsageError
 from ..files import write_json
 from ..parallel import default_threads
 from ..progress import Progress, ProgressEvent
-from ..settings import RESULT_FREE, to_json
+from ..settings import to_json
 from .job_file import AUTOMATIC_REGIONS, JobFile
 from .job_folder import JobFolder
 from .machine import describe_machine, peak_memory_bytes
-from .stages import Stage, note_interrupted, run_stage, source_fingerprint, stage_key
+from .stages import Stage, run_stage, source_fingerprint, stage_key
 
 _logger = logging.getLogger(__name__)
 
@@ -175,40 +175,12 @@ def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: in
 def _run_training(
     folder: JobFolder, job: JobFile, cameras: Stage, overall: _Overall, threads: int
 ) -> Stage:
-    training = job.settings.training
-    described = {k: v for k, v in to_json(training).items() if k not in RESULT_FREE}
-    key = stage_key(STAGE_VERSIONS["train"], cameras.key, described, job.settings.seed)
-
-    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
-        from ..dataset.photos import PhotoStore
-        from ..dataset.scene_file import load_saved_scene
-        from ..evaluation.report.pictures import write_held_out
-        from ..gaussians.gaussian_file import save_gaussians
-        from ..training.trainer import held_out_views, train
-
-        scene = load_saved_scene(cameras.folder)
-        photos = PhotoStore(scene, training.max_image_px)
-        begun_s = time.monotonic()
-        try:
-            result = train(
-                scene, photos, training, stage_folder, progress,
-                seed=job.settings.seed, threads=threads,
-            )  # fmt: skip
-        except BaseException:
-            note_interrupted(folder.stages, "train", key, time.monotonic() - begun_s)
-            raise
-        save_gaussians(stage_folder / "gaussians.npz", result.gaussians)
-        measured = {figure.name: figure.psnr for figure in result.held_out}
-        shown = [
-            (index, scene.views[index].camera.name, measured[scene.views[index].camera.name])
-            for index in held_out_views(scene, training.holdout_every)
-            if scene.views[index].camera.name in measured
-        ]
-        pictures = write_held_out(result.gaussians, photos, shown, stage_folder, threads=threads)
-        return {**result.to_json(), "pictures": pictures}
+    from .training_stage import run_training
 
     span = _Span(SHARES["cameras"], SHARES["cameras"] + SHARES["train"])
-    return run_stage(folder.stages, "train", key, overall.stage("train", span), work)
+    progress = overall.stage("train", span)
+    version = STAGE_VERSIONS["train"]
+    return run_training(folder, job, cameras, progress, version=version, threads=threads)
 
 
 def _run_meshing(

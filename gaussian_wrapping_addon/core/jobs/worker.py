@@ -17,12 +17,14 @@ from ..errors import EXIT_DONE, EXIT_OTHER, EXIT_RESOURCES, Cancelled, WrapError
 from ..progress import ProgressEvent
 from .job_file import read_job
 from .job_folder import JobFolder, JobStatus, process_start_ticks
+from .training_stage import COMPILING
 
 _logger = logging.getLogger(__name__)
 
 HEARTBEAT_S = 5.0
 STATUS_EVERY_S = 0.25
 PARENT_POLL_S = 1.0
+RESUME_HINT = "Resume continues from the last checkpoint."
 
 
 class _Reporter:
@@ -71,10 +73,20 @@ class _Reporter:
         while not self._stop.wait(PARENT_POLL_S):
             if parent and os.getppid() != parent:
                 self.stop_asked = True
-            if self.cancelled() and self.status.state == "RUNNING":
+            if self.cancelled() and self.status.message == COMPILING:
+                self._end_at_once()
+            elif self.cancelled() and self.status.state == "RUNNING":
                 self.write(state="CANCELLING")
             elif time.time() - self.status.heartbeat_s > HEARTBEAT_S:
                 self.write()
+
+    def _end_at_once(self) -> None:
+        """Leave while the main thread compiles: it asks for nothing then, and has done nothing."""
+        _logger.info("cancelled")
+        self.write(state="CANCELLED", error="", hint=RESUME_HINT, exit_code=Cancelled.exit_code)
+        self.folder.unlock()
+        logging.shutdown()
+        os._exit(Cancelled.exit_code)
 
     def end(self) -> None:
         """Stop the heartbeat."""
@@ -134,7 +146,7 @@ def main(arguments: list[str]) -> int:
     except Cancelled:
         _logger.info("cancelled")
         code = Cancelled.exit_code
-        state, error, hint = "CANCELLED", "", "Resume continues from the last checkpoint."
+        state, error, hint = "CANCELLED", "", RESUME_HINT
     except WrapError as failure:
         _logger.error("%s", failure)
         code, state, error, hint = failure.exit_code, "FAILED", failure.message, failure.hint

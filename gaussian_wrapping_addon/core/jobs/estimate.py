@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``estimate`` of the command line: what a training will take, told by the worker's Python.
+
+Speaks as :mod:`~.evaluate` does: one JSON object a line on stdout.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import EXIT_DONE, EXIT_OTHER, DatasetError, WrapError
+from ..helper_process import emit
+from .evaluate import end_with
+from .job_file import JobFile
+
+if TYPE_CHECKING:
+    from ..training.estimate import SceneFacts
+
+
+def main(arguments: list[str]) -> int:
+    """Estimate the job of ``arguments = [job file as JSON]``; return the exit code."""
+    # Not the caller's own id: where Python is started through a launcher, that is the parent.
+    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
+    try:
+        lines = _estimate(JobFile.from_json(json.loads(arguments[0])))
+    except WrapError as error:
+        emit(error=error.message, hint=error.hint)
+        return error.exit_code
+    except ImportError as error:
+        emit(
+            error=f"The worker's Python lacks a package: {error}.",
+            hint="pip install -r requirements-worker.txt there.",
+        )
+        return EXIT_OTHER
+    except OSError as error:
+        emit(error=f"{error}.", hint="Check the path and its permissions.")
+        return EXIT_OTHER
+    for line in lines:
+        emit(line=line)
+    return EXIT_DONE
+
+
+def _estimate(job: JobFile) -> list[str]:
+    from ..parallel import default_threads
+    from ..training.estimate import estimate, judge, this_machine
+    from ..training.machine_speed import machine_speed, renderer_is_compiled
+
+    facts = input_facts(Path(job.source))
+    threads = job.settings.threads or default_threads()
+    compiled = renderer_is_compiled()
+    speed = machine_speed(threads) if compiled else 1.0
+    machine = this_machine(Path.cwd(), threads, speed)
+    expected = estimate(facts, job.settings.training, machine)
+    points = f"{facts.points} sparse points" if facts.points else "camera poses still to be solved"
+    lines = [
+        f"{facts.photos} photos, long side {facts.long_side_px} px, {points}",
+        f"training ({job.settings.preset}, {threads} threads): {expected.span()}",
+        f"memory: {expected.memory_bytes / 2**30:.1f} GB · disk: "
+        f"{expected.disk_bytes / 2**30:.2f} GB · Gaussians: up to {expected.gaussians}",
+        "mesh and texture take about a tenth of it more"
+        + ("" if facts.points else "; solving the cameras takes minutes before"),
+    ]
+    if not compiled:
+        lines.append("not timed here: the first job compiles the renderer, about a minute, once")
+    return [*lines, *(f"warning: {text}" for text in judge(expected, machine))]
+
+
+def input_facts(source: Path) -> SceneFacts:
+    """Return the facts of an input, read from headers and poses alone.
+
+    Raises
+    ------
+    DatasetError
+        The input holds no photo that can be read.
+    """
+    from ..dataset.photo_file import photo_header
+    from ..dataset.photo_finder import PhotoIndex, find_mask, list_photos, photo_root
+    from ..dataset.source_kind import read_poses, source_kind
+    from ..training.estimate import SceneFacts
+
+    kind = source_kind(source.resolve())
+    points = 0
+    if kind.kind == "photos":
+        root = photo_root(kind.folder)
+        named = {p.relative_to(root).as_posix(): p for p in list_photos(root)}
+    else:
+        model = read_poses(kind)
+        points, index = len(model.points), PhotoIndex(kind.photo_roots)
+        matches = {photo.name: index.find(photo.name) for photo in model.photos}
+        named = {name: match.path for name, match in matches.items() if match is not None}
+    sizes = []
+    for path in named.values():
+        try:
+            sizes.append(photo_header(path).upright_size)
+        except DatasetError:
+            continue  # loading leaves it out, or refuses, with words
+    if not sizes:
+        raise DatasetError(
+            f"{source} holds no photo that can be read.", "See what batch.py check finds."
+        )
+    return SceneFacts(
+        len(sizes),
+        sum(width * height for width, height in sizes) / len(sizes),
+        max(max(size) for size in sizes),
+        points,
+        any(find_mask(kind.mask_roots, name) is not None for name in named),
+    )

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a person sees of a running training: a preview picture and the PSNR of held-out photos.
+
+Nothing here is part of a training's result: the renderer is another one, nothing is drawn at
+random, and the clock decides only whether to look.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from ..dataset.camera import Camera
+from ..evaluation.views.view_metrics import psnr
+from ..files import write_bytes
+from ..gaussians.model import OrientedGaussians
+from ..render.projection import RawArrays
+from ..render.types import RenderOptions
+from ..render.view_renderer import ViewRenderer
+from ..settings import TrainingSettings
+
+_logger = logging.getLogger(__name__)
+
+PREVIEW_FILE = "preview-training.png"
+PREVIEW_PX = 640
+"""Width of the whole picture: photo and render side by side."""
+
+MEASURED_VIEWS = 4
+MEASURED_PX = 240
+"""So many held-out photos are measured along the way, no longer than this: about 5 ms each."""
+
+BEST_PSNR = 100.0
+"""Equal images count as this many dB, so that a mean stays finite."""
+
+GAP_PX = 4
+
+Correction = Callable[[np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
+"""Brings a (h, w, 3) render to the exposure of a (h, w, 3) uint8 photo, seen through a mask."""
+
+
+class Photos(Protocol):
+    """What is asked of :class:`~..dataset.photos.PhotoStore`."""
+
+    def camera(self, index: int, divisor: int = 1) -> Camera:
+        """Return the camera of a level."""
+
+    def photo(self, index: int, divisor: int = 1) -> np.ndarray:
+        """Return (h, w, 3) uint8."""
+
+    def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
+        """Return (h, w) bool or ``None``."""
+
+
+def divisor_for(photos: Photos, index: int, longest_px: int) -> int:
+    """Return the smallest divisor that brings a photo's long side to at most ``longest_px``."""
+    camera = photos.camera(index, 1)
+    divisor = -(-max(camera.width, camera.height) // longest_px)
+    return max(1, min(divisor, camera.width, camera.height))
+
+
+def spread(views: Sequence[int], count: int) -> list[int]:
+    """Return at most ``count`` of the views, evenly spread."""
+    if not views:
+        return []
+    places = np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)
+    return [views[place] for place in places.tolist()]
+
+
+def measure_held_out(
+    gaussians: OrientedGaussians,
+    photos: Photos,
+    held_out: Sequence[int],
+    *,
+    threads: int,
+    renderer: ViewRenderer | None = None,
+    exposure_correction: Correction | None = None,
+    check: Callable[[], None] | None = None,
+) -> float:
+    """Return the mean PSNR of a few held-out photos at a small size.
+
+    A function of the Gaussians and photos alone: it may stand in a training's history.
+
+    Parameters
+    ----------
+    gaussians : OrientedGaussians
+        As they are trained; nothing is copied and nothing is changed.
+    photos : PhotoStore
+    held_out : sequence of int
+        Views; :data:`MEASURED_VIEWS` of them, evenly spread, are looked at.
+    threads : int
+        The result does not depend on it.
+    renderer : ViewRenderer, optional
+        Whose memory to use; not that of a view whose gradient is still to be asked.
+    exposure_correction : callable, optional
+        Applied to each render before it is measured
+        (:func:`~.exposure.corrected_for_measuring`).
+    check : callable, optional
+        Called before each view; what it raises ends the measuring.
+
+    Returns
+    -------
+    float
+        dB; NaN where there is no held-out photo, or masks leave nothing of them.
+    """
+    renderer = renderer or ViewRenderer()
+    raw = RawArrays.from_gaussians(gaussians)
+    figures = []
+    for view in spread(held_out, MEASURED_VIEWS):
+        if check is not None:
+            check()
+        divisor = divisor_for(photos, view, MEASURED_PX)
+        mask = photos.mask(view, divisor)
+        if mask is not None and not mask.any():
+            continue
+        image = _rendered(renderer, raw, photos, view, divisor, threads, exposure_correction)
+        figures.append(min(psnr(image, photos.photo(view, divisor), mask), BEST_PSNR))
+    return float(np.mean(figures)) if figures else float("nan")
+
+
+def _rendered(
+    renderer: ViewRenderer,
+    raw: RawArrays,
+    photos: Photos,
+    view: int,
+    divisor: int,
+    threads: int,
+    correction: Correction | None,
+) -> np.ndarray:
+    options = RenderOptions(depth=False, threads=threads)
+    image = renderer.render(raw, photos.camera(view, divisor), options).color
+    if correction is None:
+        return image
+    return correction(image, photos.photo(view, divisor), photos.mask(view, divisor))
+
+
+class LiveView:
+    """Looks at a training from outside, every few seconds.
+
+    Parameters
+    ----------
+    photos : PhotoStore
+        The training's own; its cache is shared.
+    held_out : sequence of int
+        Views that are never trained on. The middle one is shown; the first view of all where
+        there is none.
+    folder : Path
+        Gets :data:`PREVIEW_FILE`, replaced atomically.
+    settings : TrainingSettings
+        ``preview_every_s`` is the time between two looks; 0 never looks.
+    threads : int
+    clock : callable
+        Seconds; the first look comes ``preview_every_s`` after the start.
+    """
+
+    def __init__(
+        self,
+        photos: Photos,
+        held_out: Sequence[int],
+        folder: Path,
+        settings: TrainingSettings,
+        threads: int,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._photos, self._held_out, self._folder = photos, list(held_out), folder
+        self._every_s, self._threads, self._clock = settings.preview_every_s, threads, clock
+        self._renderer = ViewRenderer()
+        self._looked_s = clock()
+        self._shown = self._held_out[len(self._held_out) // 2] if self._held_out else 0
+
+    def look(
+        self,
+        gaussians: OrientedGaussians,
+        iteration: int,
+        exposure_correction: Correction | None = None,
+    ) -> dict[str, float] | None:
+        """Write the preview and measure, where it is time.
+
+        Returns
+        -------
+        dict or None
+            ``held_out_psnr`` (dB) and ``held_out_iteration`` for the progress' figures, empty
+            without held-out photos; ``None`` where it is not time yet.
+        """
+        if self._every_s <= 0 or self._clock() - self._looked_s < self._every_s:
+            return None
+        figures = {}
+        quality = measure_held_out(
+            gaussians,
+            self._photos,
+            self._held_out,
+            threads=self._threads,
+            renderer=self._renderer,
+            exposure_correction=exposure_correction,
+        )
+        if np.isfinite(quality):
+            figures = {"held_out_psnr": quality, "held_out_iteration": float(iteration)}
+        self._write(gaussians, exposure_correction)
+        # After the work: looks that take long on a slow machine do not follow one on the other.
+        self._looked_s = self._clock()
+        return figures
+
+    def _write(self, gaussians: OrientedGaussians, correction: Correction | None) -> None:
+        divisor = divisor_for(self._photos, self._shown, (PREVIEW_PX - GAP_PX) // 2)
+        raw = RawArrays.from_gaussians(gaussians)
+        image = _rendered(
+            self._renderer, raw, self._photos, self._shown, divisor, self._threads, correction
+        )
+        picture = side_by_side(self._photos.photo(self._shown, divisor), image)
+        try:
+            write_bytes(self._folder / PREVIEW_FILE, png(picture))
+        except OSError as error:
+            # The training does not need pictures; whether its checkpoints fit is told elsewhere.
+            self._every_s = 0.0
+            _logger.warning("no more preview pictures: %s", error)
+
+
+def side_by_side(photo: np.ndarray, rendering: np.ndarray) -> np.ndarray:
+    """Return (h, 2 w + gap, 3) uint8: the photo left, the rendering (white is 1) right."""
+    right = np.rint(255.0 * np.clip(np.nan_to_num(rendering), 0.0, 1.0)).astype(np.uint8)
+    gap = np.zeros((photo.shape[0], GAP_PX, 3), np.uint8)
+    return np.concatenate([photo, gap, right], axis=1)
+
+
+def png(picture: np.ndarray) -> bytes:
+    """Return the bytes of a PNG file of a (h, w, 3) uint8 picture."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(picture)).save(stream, format="PNG", compress_level=1)
+    return stream.getvalue()
