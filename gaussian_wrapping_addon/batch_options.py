@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options of the command line that become training settings: shared by ``wrap`` and ``estimate``."""
+"""Options of the command line that become training settings, of ``wrap`` and ``estimate``."""
 
 from __future__ import annotations
 

@@ -59,8 +59,9 @@ def _estimate(job: JobFile) -> list[str]:
     lines = [
         f"{facts.photos} photos, long side {facts.long_side_px} px, {points}",
         f"training ({job.settings.preset}, {threads} threads): {expected.span()}",
-        f"memory: {expected.memory_bytes / 2**30:.1f} GB · disk: "
-        f"{expected.disk_bytes / 2**30:.2f} GB · Gaussians: up to {expected.gaussians}",
+        f"memory: {expected.memory_bytes / 2**30:.1f} GB",
+        f"disk: {expected.disk_bytes / 2**30:.2f} GB",
+        f"Gaussians: up to {expected.gaussians}",
         "mesh and texture take about a tenth of it more"
         + ("" if facts.points else "; solving the cameras takes minutes before"),
     ]

@@ -89,8 +89,8 @@ def train_within_memory(
 
     Raises
     ------
-    MemoryError, ResourceError, RuntimeError
-        The smallest try also ran out of memory; or anything else that ``train`` raises.
+    ResourceError
+        The smallest try also ran out of memory. Whatever else ``train`` raises is passed on.
     """
     reasons = _read_steps(folder)
     for _ in reasons:
@@ -100,9 +100,15 @@ def train_within_memory(
             return Trained(train(settings), settings, tuple(reasons))
         except (MemoryError, ResourceError, RuntimeError) as error:
             # Words only: the error itself would keep the memory of the failed training.
-            smaller = one_smaller(settings) if is_out_of_memory(error) else None
-            if smaller is None or len(reasons) >= MAX_STEPS:
+            if not is_out_of_memory(error):
                 raise
+            smaller = one_smaller(settings)
+            if smaller is None or len(reasons) >= MAX_STEPS:
+                raise ResourceError(
+                    f"Memory did not suffice, even with at most {settings.max_gaussians} Gaussians "
+                    f"and photos of {settings.max_image_px} px ({_first_line(error)}).",
+                    "Close other programs, or choose a smaller preset.",
+                ) from error
             reasons.append(_reason(error, settings, smaller))
         _logger.warning("%s", reasons[-1])
         forget()
@@ -112,13 +118,16 @@ def train_within_memory(
 
 
 def _reason(error: BaseException, before: TrainingSettings, after: TrainingSettings) -> str:
-    lines = str(error).strip().splitlines()
-    said = f" ({lines[0].rstrip('.')})" if lines else ""
     return (
-        f"Memory did not suffice{said}: trained again with at most {after.max_gaussians} Gaussians "
-        f"and photos of {after.max_image_px} px, instead of {before.max_gaussians} and "
+        f"Memory did not suffice ({_first_line(error)}): trained again with at most "
+        f"{after.max_gaussians} Gaussians and photos of {after.max_image_px} px, instead of {before.max_gaussians} and "
         f"{before.max_image_px} px."
     )
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0].rstrip(".") if lines else type(error).__name__
 
 
 def _read_steps(folder: Path) -> list[str]:

@@ -298,9 +298,10 @@ def judge(expected: Estimate, machine: Machine) -> list[str]:
             "--max-gaussians; then resume.",
         )
     if machine.memory_bytes and expected.memory_bytes > MEMORY_SHARE_LEFT * machine.memory_bytes:
-        return [
+        text = (
             f"The training may need {expected.memory_bytes / 2**30:.1f} GB of memory, and "
             f"{machine.memory_bytes / 2**30:.1f} GB are free: close other programs, or give fewer "
             "--max-gaussians or a smaller --max-image-px."
-        ]
+        )
+        return [text]
     return []

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Options of the command line become the settings they name, and nothing else changes."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.batch import _parser
+from gaussian_wrapping_addon.batch_options import NEEDS, training_settings
+from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.settings import PRESETS, JobSettings, preset, to_json
+
+BATCH = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon" / "batch.py"
+
+
+def settings_of(*arguments: str) -> JobSettings:
+    return training_settings(_parser().parse_args(["wrap", "photos", "--out", "o", *arguments]))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_without_options_the_preset_stands(name: str) -> None:
+    assert settings_of("--preset", name) == preset(name)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "name", "wanted"),
+    [
+        ("--iterations", "70", "iterations", 70),
+        ("--max-gaussians", "700", "max_gaussians", 700),
+        ("--max-image-px", "96", "max_image_px", 96),
+        ("--sh-degree", "0", "sh_degree", 0),
+        ("--holdout", "0", "holdout_every", 0),
+        ("--preview-every", "2.5", "preview_every_s", 2.5),
+        ("--mask-mode", "background", "mask_mode", "background"),
+        *((f"--{n.replace('_', '-')}", "off", n, "off") for n in NEEDS),
+        *((f"--{n.replace('_', '-')}", "on", n, "on") for n in NEEDS),
+    ],
+)
+def test_an_option_changes_its_setting_alone(
+    option: str, value: str, name: str, wanted: object
+) -> None:
+    before, after = (
+        to_json(preset("draft")),
+        to_json(settings_of("--preset", "draft", option, value)),
+    )
+    assert after["training"][name] == wanted
+    assert before["training"][name] != wanted
+    before["training"][name] = wanted
+    assert after == before
+
+
+@pytest.mark.parametrize(("word", "wanted"), [("auto", "auto"), ("all", "on"), ("none", "off")])
+def test_needs_sets_all_five_and_a_single_option_wins(word: str, wanted: str) -> None:
+    training = settings_of("--needs", word).training
+    assert {getattr(training, name) for name in NEEDS} == {wanted}
+    other = "off" if wanted == "on" else "on"
+    for arguments in (
+        ("--needs", word, "--exposure", other),
+        ("--exposure", other, "--needs", word),
+    ):
+        training = settings_of(*arguments).training
+        assert training.exposure == other
+        assert {getattr(training, n) for n in NEEDS if n != "exposure"} == {wanted}
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--needs", "some"), ("--growth", "yes"), ("--sh-degree", "x")]
+)
+def test_other_words_are_refused(arguments: tuple[str, str]) -> None:
+    with pytest.raises(UsageError):
+        settings_of(*arguments)
+
+
+def test_every_need_is_a_setting() -> None:
+    names = {field.name for field in dataclasses.fields(preset("draft").training)}
+    assert set(NEEDS) <= names
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["wrap", "photos", "--out", "o", "--start-splat", "no.ply", "--no-blend"], 3, "no.ply"),
+        (["wrap", "photos", "--out", "o", "--sh-degree", "4", "--no-blend"], 2, "sh_degree"),
+        (["more", "--out", "photos", "--iterations", "10", "--no-blend"], 2, "job.json"),
+        (["more", "--out", "photos", "--no-blend"], 2, "--iterations"),
+        (["estimate", "missing"], 3, "missing"),
+        (["estimate", "photos", "--iterations", "0"], 2, "iterations"),
+        (["resume", "photos", "--max-gaussians", "2000", "--no-blend"], 2, "job.json"),
+    ],
+)
+def test_bad_command_lines_end_with_words(
+    tmp_path: Path, arguments: list[str], code: int, words: str
+) -> None:
+    (tmp_path / "photos").mkdir()
+    done = subprocess.run(
+        [sys.executable, str(BATCH), *arguments], cwd=tmp_path, capture_output=True, check=False
+    )
+    said = done.stdout.decode()
+    assert (done.returncode, words in said, done.stderr) == (code, True, b""), said
+    assert not (tmp_path / "o").exists()
