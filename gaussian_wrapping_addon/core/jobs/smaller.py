@@ -120,8 +120,8 @@ def train_within_memory(
 def _reason(error: BaseException, before: TrainingSettings, after: TrainingSettings) -> str:
     return (
         f"Memory did not suffice ({_first_line(error)}): trained again with at most "
-        f"{after.max_gaussians} Gaussians and photos of {after.max_image_px} px, instead of {before.max_gaussians} and "
-        f"{before.max_image_px} px."
+        f"{after.max_gaussians} Gaussians and photos of {after.max_image_px} px, instead of "
+        f"{before.max_gaussians} and {before.max_image_px} px."
     )
 
 

@@ -46,7 +46,8 @@ def test_a_killed_worker_is_lost_and_says_the_signal(tmp_path: Path) -> None:
     os.kill(client._process.pid, signal.SIGKILL)
     status = client.wait(60)
     assert status.state in ("LOST", "FAILED")
-    assert "signal 9" in status.error
+    assert "signal 9: killed, probably out of memory" in status.error
+    assert "--max-gaussians 48000" in status.hint  # 0.6 of the default's 80 000
 
 
 def test_a_locked_folder_is_refused(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def test_looks_only_when_due_and_writes_photo_and_render(tmp_path: Path) -> None
 
 
 def test_a_large_photo_becomes_a_picture_of_at_most_640_px(tmp_path: Path) -> None:
-    scene, photos = sphere_scene()
+    scene, _ = sphere_scene()
     views = tuple(replace(v, camera=v.camera.resized(2000, 1500)) for v in scene.views)
     large = PhotosInMemory(
         replace(scene, views=views), [np.zeros((1500, 2000, 3), np.uint8)] * len(views)

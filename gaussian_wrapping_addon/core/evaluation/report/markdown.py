@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ...files import resolve_inside
+from .estimate import estimate_lines
 from .figures import figure_rows
 from .needs import needs_lines
 from .region import Picture, note_lines, region_lines, region_summary
@@ -284,6 +285,7 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
     iterations = number(training.get("iterations"), "iterations")
     lines = [
         f"{number(training.get('gaussians'), 'Gaussians')} after {iterations}.",
+        *estimate_lines(training),
         "",
         *picture(f"{PICTURES}/{CURVE}", "How training went."),
     ]

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The report's line on what was expected of the training and what it took."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .text import bytes_text, duration, measured, part
+
+
+def estimate_lines(training: dict[str, Any]) -> list[str]:
+    """Return the comparison as Markdown lines; none where nothing was estimated."""
+    expected = part(training, "estimate")
+    low, high = measured(expected.get("seconds_low")), measured(expected.get("seconds_high"))
+    took = measured(training.get("seconds_training"))
+    if low is None or high is None or took is None:
+        return []
+    where = "within it" if low <= took <= high else ("below it" if took < low else "above it")
+    return [
+        "",
+        (
+            f"Estimated before the start: {duration(low)} to {duration(high)}, "
+            f"{bytes_text(expected.get('memory_bytes'))} of memory. It took {duration(took)}, "
+            f"{where}."
+        ),
+    ]
