@@ -29,6 +29,7 @@ _CHOICES = {
     "multi_view": DECISIONS,
     "wrapping": DECISIONS,
     "growth": DECISIONS,
+    "full_size": DECISIONS,
     "mask_mode": MASK_MODES,
     "correlation": CORRELATIONS,
 }
@@ -73,6 +74,11 @@ class TrainingSettings:
     growth: str = "auto"
     """``"auto"``: the number of Gaussians stops growing where it gains little; ``"on"``: only the
     cap stops it; ``"off"``: none are added."""
+    full_size: str = "auto"
+    """``"auto"``: photos that show nothing finer than half their size are trained on at that size;
+    ``"on"``: always at full size; ``"off"``: at half."""
+    region_weight: float = 1.0
+    """Gaussians inside the job's regions count this many times where their number is limited."""
     mask_mode: str = "ignore"
     """What masks leave out: ``"ignore"``: anything may stand there; ``"background"``: nothing."""
     depth_from: float = 7 / 30
@@ -166,6 +172,22 @@ class JobSettings:
                 (f"training.{name}", getattr(self.training, name) in choices, _one_of(choices))
                 for name, choices in _CHOICES.items()
             ),
+            (
+                "training.region_weight",
+                1.0 <= self.training.region_weight <= 1000.0,
+                "from 1 to 1000",
+            ),
+            (
+                "training.pixels_per_iteration",
+                1000 <= self.training.pixels_per_iteration <= 10**9,
+                "from 1000 to 1000000000",
+            ),
+            (
+                "training.overlap_price",
+                0.0 <= self.training.overlap_price <= 1.0,
+                "from 0 to 1",
+            ),
+            ("training.prune_share", 0.0 <= self.training.prune_share < 0.5, "from 0 to 0.5"),
             (
                 "training.multi_view_pixels",
                 1 <= self.training.multi_view_pixels <= 10**6,

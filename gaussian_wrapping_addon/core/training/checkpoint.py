@@ -21,7 +21,7 @@ from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
 
-VERSION = 1
+VERSION = 2
 KEPT = 2
 """So many checkpoints stay; the older ones are there for a broken newest."""
 

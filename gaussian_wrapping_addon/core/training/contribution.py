@@ -60,7 +60,9 @@ def contributions(
     return Contributions(share / max(1, count), largest)
 
 
-def least_contributors(found: Contributions, total_share: float) -> np.ndarray:
+def least_contributors(
+    found: Contributions, total_share: float, weights: np.ndarray | None = None
+) -> np.ndarray:
     """Return (n,) bool: the Gaussians of least contribution that together make up a share of all.
 
     Removing them changes no image by more than that share on average, however many they are; a
@@ -71,9 +73,12 @@ def least_contributors(found: Contributions, total_share: float) -> np.ndarray:
     ----------
     total_share : float
         In [0, 1): of the sum of all contributions.
+    weights : (n,), optional
+        What the contribution of each Gaussian is worth.
     """
-    order = np.argsort(found.share, kind="stable")
-    running = np.cumsum(found.share[order])
+    share = found.share if weights is None else found.share * weights
+    order = np.argsort(share, kind="stable")
+    running = np.cumsum(share[order])
     least = np.zeros(len(order), np.bool_)
     least[order[running <= total_share * running[-1]]] = True
     return least

@@ -72,7 +72,11 @@ class DensityChange:
 
 
 def densify_and_prune(
-    adam: Adam, statistics: DensityStatistics, limit: int, random: np.random.Generator
+    adam: Adam,
+    statistics: DensityStatistics,
+    limit: int,
+    random: np.random.Generator,
+    weights: np.ndarray | None = None,
 ) -> DensityChange:
     """Clone small and split large Gaussians with high gradients; remove transparent ones.
 
@@ -90,13 +94,15 @@ def densify_and_prune(
         The number of Gaussians never grows beyond this.
     random : numpy.random.Generator
         Positions of the new Gaussians are drawn from the old ones.
+    weights : (n,), optional
+        What counts in the ranking where room is short: gradients are multiplied by it there.
     """
     log_scales = adam.array("log_scales")
     opacity = 1.0 / (1.0 + np.exp(-adam.array("opacity_logits").astype(np.float64)))
     keep = opacity >= MIN_OPACITY
     if not keep.any():
         keep[np.argmax(opacity)] = True
-    chosen = _qualified(statistics, keep, limit - int(keep.sum()))
+    chosen = _qualified(statistics, keep, limit - int(keep.sum()), weights)
     small = log_scales.max(axis=1) <= np.log(CLONE_SIZE)
     cloned = np.nonzero(chosen & small)[0]
     split = np.nonzero(chosen & ~small)[0]
@@ -114,7 +120,9 @@ def densify_and_prune(
     return DensityChange(len(cloned), len(split), int((~keep).sum()))
 
 
-def _qualified(statistics: DensityStatistics, keep: np.ndarray, room: int) -> np.ndarray:
+def _qualified(
+    statistics: DensityStatistics, keep: np.ndarray, room: int, weights: np.ndarray | None
+) -> np.ndarray:
     """(n,) bool: Gaussians to double, at most ``room`` of them."""
     views = np.maximum(statistics.views, 1)
     average = statistics.gradient / views
@@ -128,7 +136,8 @@ def _qualified(statistics: DensityStatistics, keep: np.ndarray, room: int) -> np
             score = np.maximum(score, average_abs / level)
     chosen = (score >= 1.0) & keep & (statistics.views > 0)
     if chosen.sum() > room:
-        ranked = np.argsort(-np.where(chosen, score, -np.inf), kind="stable")
+        weighted = score if weights is None else score * weights
+        ranked = np.argsort(-np.where(chosen, weighted, -np.inf), kind="stable")
         chosen[:] = False
         chosen[ranked[: max(0, room)]] = True
     return chosen

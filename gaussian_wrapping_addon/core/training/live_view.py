@@ -12,11 +12,9 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
-from ..dataset.camera import Camera
 from ..evaluation.views.view_metrics import psnr
 from ..files import write_bytes
 from ..gaussians.model import OrientedGaussians
@@ -24,6 +22,7 @@ from ..render.projection import RawArrays
 from ..render.types import RenderOptions
 from ..render.view_renderer import ViewRenderer
 from ..settings import TrainingSettings
+from .photo_source import Photos
 
 _logger = logging.getLogger(__name__)
 
@@ -42,19 +41,6 @@ GAP_PX = 4
 
 Correction = Callable[[np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
 """Brings a (h, w, 3) render to the exposure of a (h, w, 3) uint8 photo, seen through a mask."""
-
-
-class Photos(Protocol):
-    """What is asked of :class:`~..dataset.photos.PhotoStore`."""
-
-    def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Return the camera of a level."""
-
-    def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return (h, w, 3) uint8."""
-
-    def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """Return (h, w) bool or ``None``."""
 
 
 def divisor_for(photos: Photos, index: int, longest_px: int) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the parts of training ask of the photos, on disk or in memory."""
+"""What training asks of the photos."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from ..dataset.camera import Camera
 
 
 class Photos(Protocol):
-    """The side of :class:`~..dataset.photos.PhotoStore` that training looks at."""
+    """Cameras, photos and masks of the scene's views at sizes divided by whole numbers.
+
+    :class:`~..dataset.photos.PhotoStore` is one.
+    """
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
         """Return the camera of a level."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from ..gaussians.model import OrientedGaussians
+from .needs import Needs
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,10 @@ class TrainingResult:
     warnings: tuple[str, ...]
     lpips_note: str = ""
     """Why the held-out photos have no LPIPS."""
+    needs: Needs = field(default_factory=Needs)
+    """What was decided for the scene."""
+    exposure_fitted: bool = False
+    """Held-out photos were measured in their own exposure, fitted crosswise on their halves."""
 
     @property
     def held_out_psnr(self) -> float:
@@ -68,6 +73,9 @@ class TrainingResult:
             "held_out": [figure.to_json() for figure in self.held_out],
             "history": [dict(entry) for entry in self.history],
             "warnings": list(self.warnings),
+            "decisions": self.needs.to_json(),
+            "held_out_exposure_fitted": self.exposure_fitted,
+            "sh_degree": self.gaussians.sh_degree,
         }
         if self.held_out:
             values["held_out_psnr"] = self.held_out_psnr

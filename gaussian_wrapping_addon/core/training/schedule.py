@@ -47,6 +47,10 @@ PYRAMID = ((4, 0.0), (2, 0.1), (1, 0.3))
 SMALLEST_SIDE_PX = 96
 """Where the long side of a level would be smaller than this, a finer one is used."""
 
+TRY_HARMONICS_AT = (0.4, 0.5, 0.6)
+"""Shares of the iterations at which photos are asked whether the next degree is worth it: not
+before shapes and plain colours explain what they can."""
+
 DEGREE_SHARE = 1.0 / 6.0
 """The harmonics' degree rises by one whenever this share of the iterations has passed."""
 
@@ -73,10 +77,18 @@ class Schedule:
     settings : TrainingSettings
     long_side_px : int
         Long side of the largest training image.
+    finest : int
+        Divisor of the finest level of the pyramid.
     """
 
     settings: TrainingSettings
     long_side_px: int
+    finest: int = 1
+
+    @property
+    def total(self) -> int:
+        """All iterations, with the extra ones after the plan's end."""
+        return self.settings.iterations + self.settings.extra_iterations
 
     def _share(self, iteration: int) -> float:
         return iteration / self.settings.iterations
@@ -91,17 +103,18 @@ class Schedule:
 
     def divisor(self, iteration: int) -> int:
         """Return the divisor of the image size."""
-        chosen = 1
+        chosen = self.finest
         for divisor, start in PYRAMID:
             if self._share(iteration) >= start:
-                chosen = divisor
-        while chosen > 1 and self.long_side_px / chosen < SMALLEST_SIDE_PX:
+                chosen = max(divisor, self.finest)
+        while chosen > self.finest and self.long_side_px / chosen < SMALLEST_SIDE_PX:
             chosen //= 2
         return chosen
 
     def sh_degree(self, iteration: int) -> int:
-        """Return the degree of the harmonics in use."""
-        return min(self.settings.sh_degree, int(self._share(iteration) / DEGREE_SHARE))
+        """Return the degree of the harmonics where no evidence is asked for."""
+        share = min(1.0, self._share(iteration))
+        return min(self.settings.sh_degree, int(share / DEGREE_SHARE))
 
     def uses_depth(self, iteration: int) -> bool:
         """Tell whether the depth-normal loss is on."""
@@ -109,11 +122,17 @@ class Schedule:
 
     def is_oriented(self, iteration: int) -> bool:
         """Tell whether the orientation is learned."""
-        return iteration >= self._at(self.settings.orient_from)
+        wanted = self.settings.wrapping != "off"
+        return wanted and iteration >= self._at(self.settings.orient_from)
 
     def starts_orientation(self, iteration: int) -> bool:
         """Tell whether this is the first iteration that learns the orientation."""
-        return iteration == self._at(self.settings.orient_from)
+        wanted = self.settings.wrapping != "off"
+        return wanted and iteration == self._at(self.settings.orient_from)
+
+    def tries_harmonics(self, iteration: int) -> bool:
+        """Tell whether the next degree is tried after this iteration's step, if that decides."""
+        return iteration in {self._at(share) for share in TRY_HARMONICS_AT}
 
     def gathers_statistics(self, iteration: int) -> bool:
         """Tell whether the renders of this iteration feed density control."""

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from ..render.render import render
 from ..render.types import RenderOptions
 from ..settings import TrainingSettings
 from .orientation import orient
+from .photo_source import Photos
 from .splat_motion import move_gaussians, with_degree
 
 _logger = logging.getLogger(__name__)
@@ -53,19 +54,6 @@ WEIGHT_VIEWS = 24
 """Views that are asked which Gaussians count, where there are too many."""
 
 _SMALL_DIVISOR = 4
-
-
-class Photos(Protocol):
-    """What is asked of :class:`~..dataset.photos.PhotoStore`."""
-
-    def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Return the camera of a level."""
-
-    def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return (h, w, 3) uint8."""
-
-    def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """Return (h, w) bool or ``None``."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,9 @@ import torch
 
 from ..gaussians.model import OrientedGaussians
 from .density_control import DensityStatistics
+from .exposure import Exposure
+from .growth_need import GrowthHistory
+from .needs import Needs
 from .optimizer import TRAINED, Adam
 
 _MOMENTS = ("first", "second")
@@ -34,7 +37,15 @@ class TrainingState:
     error_average: float = 0.0
     """Moving average of the mean squared colour error, for the progress message."""
     loss_average: float = 0.0
-    overlap_average: float = 0.0
+    degree: int = 0
+    """Of the harmonics in use."""
+    needs: Needs = field(default_factory=Needs)
+    """What was decided so far."""
+    exposure: Exposure | None = None
+    """Where exposures are modelled."""
+    visits: GrowthHistory = field(default_factory=GrowthHistory)
+    """Errors of the photos, by which growth is judged."""
+    warnings: list[str] = field(default_factory=list)
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
     """Time spent until the last checkpoint."""
@@ -66,7 +77,9 @@ class TrainingState:
         arrays["steps"] = adam.steps.copy()
         for name in _STATISTICS:
             arrays[f"statistics.{name}"] = getattr(self.statistics, name).copy()
-        return arrays
+        if self.exposure is not None:
+            arrays |= {f"exposure.{k}": v for k, v in self.exposure.to_arrays().items()}
+        return arrays | {f"visits.{k}": v for k, v in self.visits.to_arrays().items()}
 
     def to_json(self) -> dict[str, Any]:
         """Return everything else as plain JSON values."""
@@ -80,6 +93,9 @@ class TrainingState:
             "loss_average": self.loss_average,
             "history": [dict(entry) for entry in self.history],
             "seconds": self.seconds,
+            "degree": self.degree,
+            "needs": self.needs.to_json(),
+            "warnings": list(self.warnings),
         }
 
     @classmethod
@@ -121,7 +137,18 @@ class TrainingState:
         state.loss_average = float(values["loss_average"])
         state.history = [{k: float(v) for k, v in entry.items()} for entry in values["history"]]
         state.seconds = float(values["seconds"])
+        state.degree = int(values["degree"])
+        state.needs = Needs.from_json(values["needs"])
+        state.warnings = [str(text) for text in values["warnings"]]
+        exposure = _part(arrays, "exposure.")
+        state.exposure = Exposure.restore(exposure) if exposure else None
+        state.visits = GrowthHistory.restore(_part(arrays, "visits."))
         return state
+
+
+def _part(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """Return the arrays whose names begin with a prefix, without it."""
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
 def _require(like: np.ndarray, array: np.ndarray, count: int) -> np.ndarray:

@@ -7,78 +7,58 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
 
-from .. import tolerances
-from ..dataset.camera import Camera
 from ..dataset.scene import Scene
 from ..errors import Cancelled, DatasetError, WrapError
 from ..evaluation.views.lpips import lpips_if_ready
 from ..evaluation.views.view_metrics import score_images
 from ..gaussians.initialisation import initial_gaussians
-from ..gaussians.mip_filter import mip_filter
 from ..gaussians.model import OrientedGaussians
 from ..parallel import default_threads
 from ..progress import Progress
-from ..render.array_store import ArrayStore
 from ..render.projection import RawArrays
-from ..render.types import ImageGradients, RenderOptions
-from ..render.view_renderer import ViewRenderer
+from ..render.types import RenderOptions
 from ..settings import TrainingSettings
+from .background import inside_masks
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
-from .contribution import contributions, least_contributors, prune_contributors
-from .density_control import densify_and_prune, reset_opacity
-from .losses import color_loss, normal_losses
-from .overlap_price import add_overlap_price
+from .exposure import Exposure, corrected_for_measuring
+from .exposure_need import exposure_need
+from .image_need import image_need, photo_detail
+from .iteration import NotFinite, Stepper, trimmed
+from .live_view import Correction, LiveView, measure_held_out, spread
+from .needs import Decision, Needs, decide, multi_view_need
+from .neighbours import find_neighbours
+from .photo_source import Photos
 from .result import HeldOutFigure, TrainingResult
-from .schedule import Schedule
+from .rounds import Inside, Rounds
+from .schedule import SMALLEST_SIDE_PX, Schedule
+from .splat_start import start_from_splat, wrapping_settings
 from .state import TrainingState
-from .windows import windows
-from .wrapping import WrapView, normal_errors, start_orientation, wrap
 
 _logger = logging.getLogger(__name__)
 
 FEW_PHOTOS = 8
 """With fewer photos than this, only one is held out."""
 
-MAX_ROUND_VIEWS = 60
-"""Wrapping rounds and the orientation's vote look at no more views, spread evenly."""
-
-ROUND_DIVISOR = 2
-VOTE_DIVISOR = 4
 SNAPSHOT_EVERY = 100
 """Iterations between two looks at all numbers, and two states to fall back to."""
 
+MEASURE_EVERY = 500
+"""Iterations between two measurements of held-out photos for the history."""
+
 REPORT_EVERY = 10
-AVERAGE_SHARE = 0.05
-"""Weight of the newest iteration in the figures of the progress message."""
+
+DETAIL_PHOTOS = 8
+"""Photos, spread evenly, that are looked at for detail."""
 
 TOO_SMALL = "The photos are too small for LPIPS."
 
 RESTART_RATE = 0.5
 """Learning rates are multiplied by this after a restart."""
-
-
-class Photos(Protocol):
-    """What the trainer asks of :class:`~..dataset.photos.PhotoStore`."""
-
-    def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Return the camera of a level."""
-
-    def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return (h, w, 3) uint8."""
-
-    def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """Return (h, w) bool or ``None``."""
-
-
-class _NotFinite(Exception):  # noqa: N818 - caught inside this module only
-    pass
 
 
 def held_out_views(scene: Scene, every: int) -> list[int]:
@@ -105,24 +85,32 @@ def train(
     *,
     seed: int = 0,
     threads: int = 0,
+    start_splat: Path | None = None,
+    inside: Inside | None = None,
 ) -> TrainingResult:
     """Train oriented Gaussians on the photos of a scene.
 
     Resumes from the newest checkpoint in ``folder``; the result is then bit for bit that of a run
-    without interruption on the same machine.
+    without interruption on the same machine. A checkpoint stays at the end, from which more
+    iterations can go on.
 
     Parameters
     ----------
     scene : Scene
     photos : PhotoStore
-        Photos, masks and cameras of the scene's views. Masked pixels count nowhere.
+        Photos, masks and cameras of the scene's views.
     settings : TrainingSettings
     folder : Path
-        Checkpoints are written here.
+        Checkpoints and preview pictures are written here.
     progress : Progress
         Told every few iterations; asked for cancelling in every one.
     seed, threads : int
         0 threads uses every core. The result does not depend on ``threads``.
+    start_splat : Path, optional
+        PLY of Gaussians in the world frame of the photos, to start from; then the training is short
+        and adds no Gaussians (:func:`~.splat_start.wrapping_settings`).
+    inside : callable, optional
+        Tells which points (n, 3), scene frame, lie where ``settings.region_weight`` applies.
 
     Returns
     -------
@@ -133,7 +121,10 @@ def train(
     Cancelled
         After a checkpoint was written.
     DatasetError
-        There is no photo to train on, or masks leave nothing of all of them.
+        There is no photo to train on, or masks leave nothing of all of them; the splat does not
+        show what the photos show.
+    ParseError
+        The splat cannot be read.
     WrapError
         The numbers stopped being finite twice.
     """
@@ -141,7 +132,8 @@ def train(
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        return _Trainer(scene, photos, settings, folder, seed, threads).run(progress)
+        run = _Trainer(scene, photos, settings, folder, seed, threads, start_splat, inside)
+        return run.run(progress)
     finally:
         torch.set_num_threads(before)
 
@@ -157,26 +149,50 @@ class _Trainer:
         folder: Path,
         seed: int,
         threads: int,
+        start_splat: Path | None = None,
+        inside: Inside | None = None,
     ) -> None:
+        if start_splat is not None:
+            settings = wrapping_settings(settings)
         self.scene, self.photos, self.settings = scene, photos, settings
         self.folder, self.seed, self.threads = folder, seed, threads
-        self.renderer, self.store = ViewRenderer(), ArrayStore()
+        self.start_splat, self.inside = start_splat, inside
         self.held_out = held_out_views(scene, settings.holdout_every)
         kept = set(self.held_out)
         self.views = [i for i in range(len(scene.views)) if i not in kept and self._shows(i)]
         if not self.views:
             raise DatasetError("No photo is left to train on.", "Add photos or check the masks.")
         sizes = [photos.camera(i, 1) for i in self.views]
-        self.schedule = Schedule(settings, max(max(c.width, c.height) for c in sizes))
-        self.warnings: list[str] = []
-        if settings.holdout_every > 0 and len(scene.views) < FEW_PHOTOS:
-            self.warnings.append(
-                f"Only {len(scene.views)} photos: {len(self.held_out)} held out for measuring."
-            )
+        side_px = max(max(c.width, c.height) for c in sizes)
+        found = find_neighbours(sizes, points=scene.points)
+        numbers = np.array(self.views)
+        self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
+        self.image_decision, finest = self._image_size(side_px)
+        self.schedule = Schedule(settings, side_px, finest)
+        self.stepper = Stepper(photos, self.schedule, self.views, self.neighbours, threads)
+        self.seen: dict[str, float] = {}
+        self.live = LiveView(photos, self.held_out, folder, settings, threads)
 
     def _shows(self, index: int) -> bool:
         mask = self.photos.mask(index, 1)
         return mask is None or bool(mask.any())
+
+    def _image_size(self, side_px: int) -> tuple[Decision, int]:
+        """Decide whether the photos hold more than half their size would."""
+        chosen = spread(self.views, DETAIL_PHOTOS)
+        found = image_need(
+            [photo_detail(self.photos.photo(v, 1), self.photos.mask(v, 1)) for v in chosen]
+        )
+        setting = self.settings.full_size
+        full = setting == "on" or (setting == "auto" and 2 * found.useful_px > side_px)
+        full |= side_px < 2 * SMALLEST_SIDE_PX
+        decision = dataclasses.replace(
+            found.decision(),
+            name="full_size",
+            setting=setting,
+            chosen=f"{side_px if full else side_px // 2} px",
+        )
+        return decision, 1 if full else 2
 
     # -- the run ----------------------------------------------------------------------------------
 
@@ -184,52 +200,96 @@ class _Trainer:
         """Start or resume, iterate to the end, measure."""
         key = fingerprint(self.scene, self.settings, self.seed)
         progress.update(0.0, "preparing the Gaussians")
+        rounds = Rounds(self.stepper, self.held_out, self.inside, progress)
         state = load_checkpoint(self.folder, key)
         if state is None:
-            state = self._start()
+            state = self._start(rounds, progress)
         else:
             _logger.info("resuming at iteration %d", state.iteration)
         begun_s = saved_s = time.monotonic()
-        spent_s = state.seconds
+        spent_s, begun_at = state.seconds, state.iteration
         good = (state.to_arrays(), state.to_json())
-        total = self.settings.iterations
+        total, settled = self.schedule.total, True
         try:
             while state.iteration < total:
                 progress.check()
                 try:
-                    self._iterate(state)
+                    rounds.before_step(state)
+                    settled = False
+                    self.stepper.step(state)
+                    rounds.after_step(state)
+                    self._note(state, progress)
+                    settled = True
                     if state.iteration % SNAPSHOT_EVERY == 0 or state.iteration == total:
                         if not state.adam.is_finite():
-                            raise _NotFinite()
+                            raise NotFinite()
                         good = (state.to_arrays(), state.to_json())
-                except _NotFinite:
-                    state = self._fall_back(state, good)
+                except NotFinite:
+                    state, settled = self._fall_back(state, good), True
                     continue
-                state.seconds = spent_s + time.monotonic() - begun_s
+                now_s = time.monotonic()
+                state.seconds = spent_s + now_s - begun_s
                 if state.iteration % REPORT_EVERY == 0 or state.iteration == total:
-                    self._report(state, progress)
-                if time.monotonic() - saved_s >= self.settings.checkpoint_every_s:
+                    speed = (state.iteration - begun_at) / max(now_s - begun_s, 1e-9)
+                    self._report(state, progress, speed)
+                if now_s - saved_s >= self.settings.checkpoint_every_s:
                     save_checkpoint(self.folder, state, key)
                     saved_s = time.monotonic()
         except Cancelled:
+            if not settled:  # a round was left half done; what is saved must be whole
+                state = TrainingState.restore(*good)
             save_checkpoint(self.folder, state, key)
             raise
-        gaussians = state.adam.gaussians().detached()
-        held_out, lpips_note = self._measure(gaussians, progress)
+        save_checkpoint(self.folder, state, key)
+        gaussians = trimmed(state.adam.gaussians().detached(), state.degree)
+        held_out, lpips_note = self._measure(gaussians, state, progress)
         return TrainingResult(
             gaussians,
             total,
             tuple(state.history),
             tuple(held_out),
             spent_s + time.monotonic() - begun_s,
-            tuple(self.warnings),
+            tuple(state.warnings),
             lpips_note,
+            state.needs,
+            state.exposure is not None,
         )
 
-    def _start(self) -> TrainingState:
+    def _start(self, rounds: Rounds, progress: Progress) -> TrainingState:
+        warnings = []
+        if self.settings.holdout_every > 0 and len(self.scene.views) < FEW_PHOTOS:
+            warnings.append(
+                f"Only {len(self.scene.views)} photos: {len(self.held_out)} held out for measuring."
+            )
+        if self.start_splat is None:
+            gaussians = self._initial()
+        else:
+            start = start_from_splat(
+                self.start_splat, self.scene, self.photos, self.views, self.settings, progress,
+                threads=self.threads,
+            )  # fmt: skip
+            gaussians = start.gaussians
+            warnings += start.warnings
+        state = TrainingState.start(gaussians, self.seed)
+        state.warnings = warnings
+        self._decide(state)
+        rounds.filter(state)
+        return state
+
+    def _initial(self) -> OrientedGaussians:
         small = self.schedule.divisor(0)
-        gaussians = initial_gaussians(
-            self.scene,
+        scene = self.scene
+        if self.settings.mask_mode == "background" and len(scene.points):
+            kept = inside_masks(
+                scene.points,
+                [self.photos.camera(i, small) for i in self.views],
+                [self.photos.mask(i, small) for i in self.views],
+            )
+            scene = dataclasses.replace(
+                scene, points=scene.points[kept], point_colors=scene.point_colors[kept]
+            )
+        return initial_gaussians(
+            scene,
             self.views,
             lambda i: (
                 self.photos.camera(i, small),
@@ -240,9 +300,30 @@ class _Trainer:
             sh_degree=self.settings.sh_degree,
             seed=self.seed,
         )
-        state = TrainingState.start(gaussians, self.seed)
-        self._filter(state)
-        return state
+
+    def _decide(self, state: TrainingState) -> None:
+        """Take the decisions that need no training; write down those that a person took."""
+        settings = self.settings
+        needs = Needs((self.image_decision,))
+        exposure = exposure_need(self.scene, self.photos, self.views)
+        needs = needs.with_decision(
+            decide("exposure", settings.exposure, exposure.needed, exposure.evidence)
+        )
+        if needs.chose("exposure"):
+            count = len(self.scene.views)
+            state.exposure = Exposure(count, self.views, exposure.log_gains)
+        pairs = [self.neighbours[view] for view in self.views]
+        needs = needs.with_decision(multi_view_need(pairs, settings.multi_view))
+        if settings.harmonics != "auto" or settings.sh_degree == 0:
+            degree = settings.sh_degree if settings.harmonics != "off" else 0
+            evidence = "Nothing was tried: the settings decide."
+            needs = needs.with_decision(
+                Decision("harmonics", settings.harmonics, f"degree {degree}", evidence)
+            )
+        if settings.wrapping == "off":
+            evidence = "Nothing was measured: the settings decide."
+            needs = needs.with_decision(Decision("wrapping", "off", "off", evidence))
+        state.needs = needs
 
     def _fall_back(
         self, state: TrainingState, good: tuple[dict[str, np.ndarray], dict[str, object]]
@@ -260,169 +341,79 @@ class _Trainer:
         restored.rate_factor = state.rate_factor * RESTART_RATE
         restored.order = []
         restored.random = np.random.Generator(np.random.PCG64([self.seed, 3]))
-        self.warnings.append(
+        restored.warnings.append(
             f"Training went back from iteration {state.iteration} to {restored.iteration} once, "
             "because numbers were not finite."
         )
         return restored
 
-    # -- one iteration ----------------------------------------------------------------------------
-
-    def _iterate(self, state: TrainingState) -> None:
-        iteration = state.iteration
-        schedule, settings, adam = self.schedule, self.settings, state.adam
-        if iteration > 0 and schedule.divisor(iteration) != schedule.divisor(iteration - 1):
-            self._filter(state)
-        if schedule.starts_orientation(iteration):
-            start_orientation(adam, self._round_views(VOTE_DIVISOR), threads=self.threads)
-        view = state.next_view(self.views)
-        divisor = schedule.divisor(iteration)
-        whole, mask = self.photos.camera(view, divisor), self.photos.mask(view, divisor)
-        choices = windows(whole.width, whole.height, settings.pixels_per_iteration)
-        window = choices[int(state.random.integers(len(choices)))]
-        camera = window.camera(whole)
-        if mask is not None:
-            mask = window.of(mask)
-        gathers = schedule.gathers_statistics(iteration)
-        uses_depth = schedule.uses_depth(iteration)
-        degree = schedule.sh_degree(iteration)
-        options = RenderOptions(
-            depth=uses_depth, sh_degree=degree, threads=self.threads, screen_gradients=gathers
-        )
-        image = self.renderer.render(RawArrays.from_gaussians(adam.gaussians()), camera, options)
-        value, by_color, figures = color_loss(
-            image.color,
-            window.of(self.photos.photo(view, divisor)),
-            mask,
-            lambda_dssim=settings.lambda_dssim,
-            threads=self.threads,
-            store=self.store,
-        )
-        gradients = ImageGradients(color=by_color)
-        if uses_depth:
-            oriented = schedule.is_oriented(iteration)
-            normal_value, by_normals, _ = normal_losses(
-                image.depth,
-                image.geometric_normal,
-                image.normal,
-                image.alpha,
-                camera,
-                mask,
-                lambda_depth_normal=settings.lambda_depth_normal,
-                lambda_normal=settings.lambda_normal if oriented else 0.0,
-                threads=self.threads,
-                store=self.store,
-            )
-            value += normal_value
-            gradients = dataclasses.replace(by_normals, color=by_color)
-        if not math.isfinite(value):
-            raise _NotFinite()
-        seen = image.backward(gradients)
-        if gathers:
-            assert image.statistics is not None
-            part = camera.width * camera.height / (whole.width * whole.height)
-            state.statistics.add(image.statistics, whole.width, whole.height, part)
-        if settings.overlap_price > 0.0:
-            state.overlap_average = add_overlap_price(
-                seen,
-                adam.array("log_scales"),
-                image.screen.boxes,
-                (camera.width, camera.height),
-                settings.overlap_price,
-            )
-        rates = schedule.rates(iteration, state.rate_factor)
-        adam.step_rows(seen, rates, sh_degree=degree, threads=self.threads)
-        state.iteration = iteration + 1
-        share = AVERAGE_SHARE if iteration > 0 else 1.0
-        state.error_average += share * (figures.mean_squared - state.error_average)
-        state.loss_average += share * (value - state.loss_average)
-        self._after_step(state)
-
-    def _after_step(self, state: TrainingState) -> None:
-        """Change the set of Gaussians where it is due."""
-        iteration, schedule, adam = state.iteration, self.schedule, state.adam
-        if iteration >= self.settings.iterations:
-            self._filter(state)
-            return
-        changed = False
-        if schedule.densifies(iteration):
-            densify_and_prune(adam, state.statistics, schedule.budget(iteration), state.random)
-            changed = True
-        if schedule.prunes(iteration):
-            found = contributions(
-                adam.gaussians().detached(),
-                self._round_views(ROUND_DIVISOR),
-                self.renderer,
-                threads=self.threads,
-            )
-            gone = prune_contributors(adam, least_contributors(found, self.settings.prune_share))
-            _logger.info("iteration %d: %d Gaussians removed", iteration, gone)
-            changed = True
-        if schedule.wraps(iteration) and schedule.is_oriented(iteration):
-            errors = normal_errors(
-                adam.gaussians(), self._round_views(ROUND_DIVISOR), threads=self.threads
-            )
-            wrap(adam, errors, self.settings.wrap_share, self.settings.max_gaussians)
-            changed = True
-        if changed:
-            state.clear_statistics()
-        if changed or schedule.refilters(iteration):
-            self._filter(state)
-        if schedule.resets_opacity(iteration):
-            reset_opacity(adam)
-
-    def _round_views(self, divisor: int) -> Iterator[WrapView]:
-        """Yield the training views at a size, at most :data:`MAX_ROUND_VIEWS` of them."""
-        count = min(len(self.views), MAX_ROUND_VIEWS)
-        spread = np.linspace(0, len(self.views) - 1, count).round().astype(int)
-        side = self.schedule.long_side_px
-        divisor = divisor if side / divisor >= 2 * tolerances.TILE_PX else 1
-        for position in spread.tolist():
-            view = self.views[position]
-            yield WrapView(self.photos.camera(view, divisor), self.photos.mask(view, divisor))
-
-    def _filter(self, state: TrainingState) -> None:
-        """Compute the 3D filter for the cameras of the coming iteration's image size."""
-        divisor = self.schedule.divisor(min(state.iteration, self.settings.iterations - 1))
-        cameras = [self.photos.camera(i, divisor) for i in self.views]
-        filter_3d = state.adam.array("filter_3d")
-        filter_3d[:] = mip_filter(state.adam.array("means"), cameras, threads=self.threads)
-
     # -- figures ----------------------------------------------------------------------------------
 
-    def _report(self, state: TrainingState, progress: Progress) -> None:
-        total, count = self.settings.iterations, len(state.adam)
-        quality = -10.0 * math.log10(max(state.error_average, 1e-10))
-        figures = {
+    def _note(self, state: TrainingState, progress: Progress) -> None:
+        """Add to the history, at fixed iterations."""
+        last = state.iteration == self.schedule.total
+        if state.iteration % SNAPSHOT_EVERY and not last:
+            return
+        figures = self._figures(state)
+        if (state.iteration % MEASURE_EVERY == 0 or last) and self.held_out:
+            quality = measure_held_out(
+                state.adam.gaussians(), self.photos, self.held_out, threads=self.threads,
+                exposure_correction=self._correction(state), check=progress.check,
+            )  # fmt: skip
+            if math.isfinite(quality):
+                figures["held_out_psnr"] = quality
+        state.history.append(figures)
+
+    def _figures(self, state: TrainingState) -> dict[str, float]:
+        return {
             "iteration": float(state.iteration),
             "loss": state.loss_average,
-            "psnr": quality,
-            "gaussians": float(count),
+            "psnr": -10.0 * math.log10(max(state.error_average, 1e-10)),
+            "gaussians": float(len(state.adam)),
         }
-        if state.iteration % SNAPSHOT_EVERY == 0 or state.iteration == total:
-            state.history.append(figures)
+
+    def _correction(self, state: TrainingState) -> Correction | None:
+        return None if state.exposure is None else corrected_for_measuring
+
+    def _report(self, state: TrainingState, progress: Progress, speed: float) -> None:
+        total, figures = self.schedule.total, self._figures(state)
+        figures["iterations_per_s"] = speed
+        seen = self.live.look(state.adam.gaussians(), state.iteration, self._correction(state))
+        if seen is not None:
+            self.seen = seen
+        figures |= self.seen
+        held_out = ""
+        if "held_out_psnr" in self.seen:
+            held_out = f" · held-out {self.seen['held_out_psnr']:.1f} dB"
         progress.update(
             state.iteration / total,
             f"iteration {state.iteration}/{total} · loss {state.loss_average:.4f} · "
-            f"PSNR {quality:.1f} dB · {count} Gaussians · ov {state.overlap_average:.0f}",
+            f"PSNR {figures['psnr']:.1f} dB{held_out} · {len(state.adam)} Gaussians · "
+            f"{speed:.1f} it/s",
             **figures,
         )
 
     def _measure(
-        self, gaussians: OrientedGaussians, progress: Progress
+        self, gaussians: OrientedGaussians, state: TrainingState, progress: Progress
     ) -> tuple[list[HeldOutFigure], str]:
-        """Return the figures of the held-out photos, and why they have no LPIPS."""
+        """Return the figures of the held-out photos, and why they have no LPIPS.
+
+        Where exposures are modelled, that of each half of a photo is fitted on the other half: it
+        was never trained.
+        """
         figures = []
         lpips, reason = lpips_if_ready() if self.held_out else (None, "")
         options = RenderOptions(depth=False, threads=self.threads)
-        raw = RawArrays.from_gaussians(gaussians)
+        raw, correction = RawArrays.from_gaussians(gaussians), self._correction(state)
         for view in self.held_out:
             progress.update(1.0, f"measuring {self.scene.views[view].camera.name}")
             mask = self.photos.mask(view, 1)
             if mask is not None and not mask.any():
                 continue
-            image = self.renderer.render(raw, self.photos.camera(view, 1), options).color
-            photo = self.photos.photo(view, 1)
+            camera, photo = self.photos.camera(view, 1), self.photos.photo(view, 1)
+            image = self.stepper.renderer.render(raw, camera, options).color
+            if correction is not None:
+                image = correction(image, photo, mask)
             scores = score_images(image, photo, mask, lpips=lpips, threads=self.threads)
             name = self.scene.views[view].camera.name
             figures.append(HeldOutFigure(name, scores.psnr, scores.ssim, scores.lpips))

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One iteration: a window of a photo is rendered, compared, and the Gaussians that it saw step."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..dataset.camera import Camera
+from ..gaussians.model import OrientedGaussians
+from ..render.array_store import ArrayStore
+from ..render.projection import RawArrays
+from ..render.types import ImageGradients, RenderOptions, VisibleGradients
+from ..render.view_renderer import ViewPass, ViewRenderer
+from .background import background_gradient, composited, draw_background
+from .exposure import exposure_rate
+from .losses import color_loss, normal_losses
+from .multi_view import (
+    MultiViewOptions,
+    add_image_gradients,
+    merge_gradients,
+    multi_view_losses,
+)
+from .overlap_price import add_overlap_price
+from .photo_source import Photos
+from .schedule import Schedule
+from .state import TrainingState
+from .windows import Window, windows
+
+AVERAGE_SHARE = 0.05
+"""Weight of the newest iteration in the figures of the progress message."""
+
+_MOST_WINDOWS = 1 << 12
+"""More windows than this no photo has: numbers a window of a view for the history."""
+
+
+class NotFinite(Exception):  # noqa: N818 - asks for a restart, caught in trainer.py
+    """A loss stopped being a finite number."""
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What an iteration looks at."""
+
+    view: int
+    divisor: int
+    whole: Camera
+    window: Window
+    number: int
+    camera: Camera
+    photo: np.ndarray  # (h, w, 3) uint8
+    mask: np.ndarray | None  # (h, w) bool
+
+
+class Stepper:
+    """Does iterations. Holds nothing that the next one depends on: that is the state's.
+
+    Parameters
+    ----------
+    photos : PhotoStore
+    schedule : Schedule
+    views : sequence of int
+        Training views.
+    neighbours : dict of int to (k,) array
+        Of each training view, the views that the multi-view terms compare it with.
+    threads : int
+    """
+
+    def __init__(
+        self,
+        photos: Photos,
+        schedule: Schedule,
+        views: Sequence[int],
+        neighbours: dict[int, np.ndarray],
+        threads: int,
+    ) -> None:
+        self.photos, self.schedule, self.views = photos, schedule, list(views)
+        self.settings, self.threads = schedule.settings, threads
+        self.neighbours = neighbours
+        self.renderer, self.store = ViewRenderer(), ArrayStore()
+        self.multi_view = MultiViewOptions.of_settings(schedule.settings)
+
+    def step(self, state: TrainingState) -> None:
+        """Do one iteration.
+
+        Raises
+        ------
+        NotFinite
+            The loss is not a number; the state must be thrown away.
+        """
+        iteration, schedule, adam = state.iteration, self.schedule, state.adam
+        look = self._look(state)
+        gathers, uses_depth = schedule.gathers_statistics(iteration), schedule.uses_depth(iteration)
+        options = RenderOptions(
+            depth=uses_depth, sh_degree=state.degree, threads=self.threads, screen_gradients=gathers
+        )
+        gaussians = RawArrays.from_gaussians(adam.gaussians())
+        image = self.renderer.render(gaussians, look.camera, options)
+        value, gradients, mean_squared = self._compare_colors(state, look, image)
+        other: VisibleGradients | None = None
+        if uses_depth:
+            normal_value, by_normals, _ = normal_losses(
+                image.depth,
+                image.geometric_normal,
+                image.normal,
+                image.alpha,
+                look.camera,
+                look.mask,
+                lambda_depth_normal=self.settings.lambda_depth_normal,
+                lambda_normal=self.settings.lambda_normal if schedule.is_oriented(iteration) else 0,
+                threads=self.threads,
+                store=self.store,
+            )
+            value += normal_value
+            gradients = add_image_gradients(by_normals, gradients)
+            if self._compares_views(state, look):
+                shared = self._compare_views(state, look, image, gaussians)
+                value += shared[0]
+                gradients, other = add_image_gradients(gradients, shared[1]), shared[2]
+        if not math.isfinite(value):
+            raise NotFinite()
+        seen = image.backward(gradients)
+        if other is not None:
+            seen = merge_gradients(seen, other, len(adam), threads=self.threads, store=self.store)
+        if self.settings.overlap_price > 0.0:
+            size_px = (look.camera.width, look.camera.height)
+            add_overlap_price(
+                seen, adam.array("log_scales"), image.screen.boxes, size_px,
+                self.settings.overlap_price,
+            )  # fmt: skip
+        if gathers:
+            assert image.statistics is not None
+            part = look.camera.width * look.camera.height / (look.whole.width * look.whole.height)
+            state.statistics.add(image.statistics, look.whole.width, look.whole.height, part)
+        rates = schedule.rates(iteration, state.rate_factor)
+        adam.step_rows(seen, rates, sh_degree=state.degree, threads=self.threads)
+        if state.exposure is not None:
+            rate = exposure_rate(iteration, self.settings.iterations, len(self.views))
+            state.exposure.step(look.view, state.rate_factor * rate)
+        place = look.view * _MOST_WINDOWS + look.number
+        state.visits.add(iteration, place, len(adam), mean_squared, look.divisor)
+        share = AVERAGE_SHARE if iteration > 0 else 1.0
+        state.error_average += share * (mean_squared - state.error_average)
+        state.loss_average += share * (value - state.loss_average)
+        state.iteration = iteration + 1
+
+    def _look(self, state: TrainingState) -> _Look:
+        view = state.next_view(self.views)
+        divisor = self.schedule.divisor(state.iteration)
+        whole, mask = self.photos.camera(view, divisor), self.photos.mask(view, divisor)
+        choices = windows(whole.width, whole.height, self.settings.pixels_per_iteration)
+        number = int(state.random.integers(len(choices)))
+        window = choices[number]
+        return _Look(
+            view,
+            divisor,
+            whole,
+            window,
+            number,
+            window.camera(whole),
+            window.of(self.photos.photo(view, divisor)),
+            None if mask is None else window.of(mask),
+        )
+
+    def _compare_colors(
+        self, state: TrainingState, look: _Look, image: ViewPass
+    ) -> tuple[float, ImageGradients, float]:
+        """Return the colour loss, its gradients on colour and alpha, and the mean squared error."""
+        empty = self.settings.mask_mode == "background"
+        alpha = image.alpha if empty else None
+        color, exposure = image.color, state.exposure
+        if exposure is not None:
+            color = exposure.corrected(look.view, image.color, alpha, threads=self.threads)
+        photo, mask = look.photo, look.mask
+        background = draw_background(state.random) if empty else None
+        if background is not None:
+            color, photo = composited(color, image.alpha, photo, mask, background, store=self.store)
+            mask = None
+        value, by_color, figures = color_loss(
+            color,
+            photo,
+            mask,
+            lambda_dssim=self.settings.lambda_dssim,
+            threads=self.threads,
+            store=self.store,
+        )
+        by_alpha = None if background is None else background_gradient(by_color, background)
+        if exposure is not None:
+            by_color, more = exposure.backward(
+                look.view, image.color, by_color, alpha, threads=self.threads
+            )
+            if by_alpha is not None and more is not None:
+                by_alpha += more
+        return value, ImageGradients(color=by_color, alpha=by_alpha), figures.mean_squared
+
+    def _compares_views(self, state: TrainingState, look: _Look) -> bool:
+        if not state.needs.chose("multi_view") or len(self.neighbours[look.view]) == 0:
+            return False
+        return state.iteration % self.settings.multi_view_every == 0
+
+    def _compare_views(
+        self, state: TrainingState, look: _Look, image: ViewPass, gaussians: RawArrays
+    ) -> tuple[float, ImageGradients, VisibleGradients | None]:
+        choices = self.neighbours[look.view]
+        other = int(choices[int(state.random.integers(len(choices)))])
+        found = multi_view_losses(
+            image,
+            gaussians,
+            look.camera,
+            look.photo,
+            look.mask,
+            self.photos.camera(other, look.divisor),
+            self.photos.photo(other, look.divisor),
+            self.photos.mask(other, look.divisor),
+            self.multi_view,
+            state.random,
+            threads=self.threads,
+            store=self.store,
+        )
+        return found.value, found.gradients, found.other
+
+
+def trimmed(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:
+    """Return the Gaussians without the harmonics above a degree: they were never used."""
+    used = (degree + 1) ** 2
+    return dataclasses.replace(gaussians, sh=gaussians.sh[:, :used].contiguous())

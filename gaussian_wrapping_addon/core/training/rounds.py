@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Between iterations: Gaussians are added and removed, wrapped, filtered; harmonics are tried."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from .. import tolerances
+from ..gaussians.mip_filter import mip_filter
+from ..progress import Progress
+from .cancelling import checked
+from .contribution import contributions, least_contributors, prune_contributors
+from .density_control import densify_and_prune, reset_opacity
+from .harmonics_need import NeedView, harmonics_need
+from .iteration import Stepper
+from .live_view import divisor_for
+from .needs import wrapping_need
+from .photo_source import Photos
+from .schedule import Schedule
+from .state import TrainingState
+from .wrapping import WrapView, normal_errors, start_orientation, wrap
+
+_logger = logging.getLogger(__name__)
+
+MAX_ROUND_VIEWS = 60
+"""Rounds and the orientation's vote look at no more views, spread evenly."""
+
+ROUND_DIVISOR = 2
+VOTE_DIVISOR = 4
+
+TRIAL_SIDE_PX = 144
+"""Harmonics are tried at about this size: colours change slowly over the surface."""
+
+Inside = Callable[[np.ndarray], np.ndarray]
+"""Maps (n, 3) points to (n,) bool."""
+
+
+class Rounds:
+    """What changes the set of Gaussians. Everything follows from the state and the inputs.
+
+    Parameters
+    ----------
+    stepper : Stepper
+    held_out : sequence of int
+        Views that are never trained on.
+    inside : callable, optional
+        Tells which points lie in the regions that Gaussians are spent on first.
+    progress : Progress
+        Asked for cancelling before every view of a round.
+    """
+
+    def __init__(
+        self,
+        stepper: Stepper,
+        held_out: Sequence[int],
+        inside: Inside | None,
+        progress: Progress,
+    ) -> None:
+        self.stepper, self.held_out, self.inside = stepper, list(held_out), inside
+        self.photos: Photos = stepper.photos
+        self.schedule: Schedule = stepper.schedule
+        self.settings, self.views, self.threads = (
+            self.schedule.settings, stepper.views, stepper.threads,
+        )  # fmt: skip
+        self.progress = progress
+
+    def before_step(self, state: TrainingState) -> None:
+        """Do what an iteration needs first."""
+        iteration, schedule = state.iteration, self.schedule
+        if iteration > 0 and schedule.divisor(iteration) != schedule.divisor(iteration - 1):
+            self.filter(state)
+        if schedule.starts_orientation(iteration):
+            start_orientation(state.adam, self._views(VOTE_DIVISOR), threads=self.threads)
+        if self.settings.harmonics == "on":
+            state.degree = schedule.sh_degree(iteration)
+
+    def after_step(self, state: TrainingState) -> None:
+        """Change the set of Gaussians where it is due."""
+        iteration, schedule, adam = state.iteration, self.schedule, state.adam
+        if iteration >= self.settings.iterations:
+            # Also at the plan's end, so that training on later equals a longer run.
+            if (
+                iteration == self.settings.iterations
+                or iteration == schedule.total
+                or schedule.refilters(iteration)
+            ):
+                self.filter(state)
+            return
+        changed = False
+        if schedule.densifies(iteration):
+            self._densify(state)
+            changed = True
+        if schedule.prunes(iteration):
+            self._prune(state)
+            changed = True
+        if schedule.wraps(iteration) and schedule.is_oriented(iteration):
+            changed |= self._wrap(state)
+        if changed:
+            state.clear_statistics()
+        if changed or schedule.refilters(iteration):
+            self.filter(state)
+        if schedule.resets_opacity(iteration):
+            reset_opacity(adam)
+            state.visits.clear()
+        if self.settings.harmonics == "auto" and schedule.tries_harmonics(iteration):
+            self._try_harmonics(state)
+
+    def filter(self, state: TrainingState) -> None:
+        """Compute the 3D filter for the cameras of the coming iteration's image size."""
+        divisor = self.schedule.divisor(min(state.iteration, self.schedule.total - 1))
+        cameras = [self.photos.camera(i, divisor) for i in self.views]
+        filter_3d = state.adam.array("filter_3d")
+        filter_3d[:] = mip_filter(state.adam.array("means"), cameras, threads=self.threads)
+
+    def _densify(self, state: TrainingState) -> None:
+        """Add and prune; stop adding for good where it does not pay any more."""
+        setting, limit = self.settings.growth, self.schedule.budget(state.iteration)
+        known = state.needs.get("growth")
+        if setting != "auto":
+            stopped = setting == "off"
+            if known is None:
+                need = state.visits.need()
+                state.needs = state.needs.with_decision(need.decision(setting))
+        else:
+            stopped = known is not None and known.chosen == "stopped"
+            if not stopped:
+                need = state.visits.need()
+                state.needs = state.needs.with_decision(need.decision(setting))
+                stopped = not need.pays
+        weights = self._region_weights(state)
+        densify_and_prune(
+            state.adam, state.statistics, 0 if stopped else limit, state.random, weights
+        )
+
+    def _prune(self, state: TrainingState) -> None:
+        found = contributions(
+            state.adam.gaussians().detached(),
+            self._views(ROUND_DIVISOR),
+            self.stepper.renderer,
+            threads=self.threads,
+        )
+        weights = self._region_weights(state)
+        least = least_contributors(found, self.settings.prune_share, weights)
+        gone = prune_contributors(state.adam, least)
+        _logger.info("iteration %d: %d Gaussians removed", state.iteration, gone)
+
+    def _wrap(self, state: TrainingState) -> bool:
+        """Clone with the opposite orientation, where the scene needs it; tell whether it did."""
+        known = state.needs.get("wrapping")
+        if known is not None and known.chosen == "off":
+            return False
+        gaussians = state.adam.gaussians()
+        errors = normal_errors(gaussians, self._views(ROUND_DIVISOR), threads=self.threads)
+        if known is None:
+            shown = contributions(
+                gaussians.detached(), self._views(VOTE_DIVISOR), self.stepper.renderer,
+                threads=self.threads,
+            )  # fmt: skip
+            known = wrapping_need(errors, shown.share, self.settings.wrapping)
+            state.needs = state.needs.with_decision(known)
+            if known.chosen == "off":
+                return False
+        wrap(state.adam, errors, self.settings.wrap_share, self.settings.max_gaussians)
+        return True
+
+    def _try_harmonics(self, state: TrainingState) -> None:
+        """Raise the degree where the photos that are not trained on gain by it."""
+        degree = state.degree + 1
+        if degree > self.settings.sh_degree:
+            return
+        found = harmonics_need(
+            state.adam.gaussians().detached(),
+            [self._need_view(state, view) for view in checked(self.views, self.progress)],
+            [self._need_view(state, view) for view in checked(self.held_out, self.progress)],
+            degree,
+            threads=self.threads,
+        )
+        if found.coefficients is not None:
+            state.degree = degree
+            coefficients = found.coefficients
+            state.adam.array("sh")[:, : coefficients.shape[1]] = coefficients
+        state.needs = state.needs.with_decision(found.decision("auto", state.degree))
+
+    def _need_view(self, state: TrainingState, view: int) -> NeedView:
+        divisor = divisor_for(self.photos, view, TRIAL_SIDE_PX)
+        correction = None
+        if state.exposure is not None and view in self.views:
+            gain, offset = state.exposure.factors(view)
+            correction = (gain, offset)
+        return NeedView(
+            self.photos.camera(view, divisor),
+            self.photos.photo(view, divisor),
+            self.photos.mask(view, divisor),
+            correction,
+        )
+
+    def _region_weights(self, state: TrainingState) -> np.ndarray | None:
+        """Return (n,) weights of the Gaussians, or ``None`` where all count alike."""
+        if self.inside is None or self.settings.region_weight == 1.0:
+            return None
+        within = self.inside(state.adam.array("means").astype(np.float64))
+        return np.where(within, self.settings.region_weight, 1.0)
+
+    def _views(self, divisor: int) -> Iterator[WrapView]:
+        """Yield the training views at a size, at most :data:`MAX_ROUND_VIEWS` of them."""
+        count = min(len(self.views), MAX_ROUND_VIEWS)
+        spread = np.linspace(0, len(self.views) - 1, count).round().astype(int)
+        side = self.schedule.long_side_px
+        divisor = divisor if side / divisor >= 2 * tolerances.TILE_PX else 1
+        for position in checked(spread.tolist(), self.progress):
+            view = self.views[position]
+            yield WrapView(self.photos.camera(view, divisor), self.photos.mask(view, divisor))
