@@ -11,8 +11,8 @@ luminance and contrast terms then ask of the same Gaussians a different brightne
 which is the contradiction that the exposure is there to remove.
 
 The Gaussians keep the mean exposure of the training photos: the means over these of all log gains
-and of all offsets (at middle grey) are held at 0, without which colours and exposures could drift against each
-other.
+and of all offsets (at middle grey) are held at 0, without which colours and exposures could drift
+against each other.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ them. Middle grey is also what the pinned means leave in place."""
 REFERENCE_RATE = 1e-3
 """Learning rate of method.md 1.4."""
 
-TRAVEL = 0.5
-"""A short run's first rate lets a value move by this much in all of its photo's turns: exposures a
-factor of 1.35 either way are within 0.13 of log gain."""
+TRAVEL = 1.5
+"""A short run's first rate would let a value move by this much in all of its photo's turns; as the
+rate falls, it is 0.6. Light altered by a factor of 1.35 either way is a log gain of 0.13."""
 
-LARGEST_RATE = 0.01
+LARGEST_RATE = 0.02
 LAST_SHARE = 0.1
 """The last rate is this share of the first: Adam's steps are about as large as its rate, and what
 they leave at the end is an error of colour."""

