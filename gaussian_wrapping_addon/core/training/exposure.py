@@ -253,7 +253,7 @@ class Exposure:
             len(trained) and not (0 <= trained.min() <= trained.max() < count)
         ):
             raise ValueError("the trained views of the exposures are none of the scene's")
-        made = cls(count, trained)
+        made = cls(count, trained.tolist())
         for name in ("values", "first", "second", "steps"):
             like, array = getattr(made, name), arrays[name]
             if array.shape != like.shape or array.dtype != like.dtype:

@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from ..compiled import kernel
 
 
 @kernel(fast=True)
-def apply_rows(begin, end, color, alpha, gains, offsets, out):
+def apply_rows(
+    begin: int, end: int, color: Any, alpha: Any, gains: Any, offsets: Any, out: Any
+) -> None:
     """Write ``gains color + offsets alpha`` of rows; ``alpha`` of no rows stands for 1."""
     with_alpha = alpha.shape[0] > 0
     red, green, blue = gains[0], gains[1], gains[2]
@@ -20,7 +24,10 @@ def apply_rows(begin, end, color, alpha, gains, offsets, out):
 
 
 @kernel(fast=True)
-def backward_rows(begin, end, color, alpha, by_out, gains, offsets, by_color, by_alpha, sums):
+def backward_rows(
+    begin: int, end: int, color: Any, alpha: Any, by_out: Any, gains: Any, offsets: Any,
+    by_color: Any, by_alpha: Any, sums: Any,
+) -> None:  # fmt: skip
     """Write the gradients on colour and alpha, and each row's six sums for gains and offsets.
 
     ``sums[y]`` = sums over the row of ``by_out color`` (3) and ``by_out alpha`` (3), in float64:
