@@ -14,21 +14,34 @@ from .ops import (
     import_operators,
     job_operators,
     job_timer,
+    live_preview,
     region_operators,
     report_operators,
+    training_estimate,
+    training_operators,
 )
-from .ui import panels, preferences, properties, report_panel
+from .ui import (
+    panels,
+    preferences,
+    properties,
+    report_panel,
+    training_panel,
+    training_properties,
+)
 
 _logger = logging.getLogger(__name__)
 
 CLASSES: Final[tuple[type, ...]] = (
+    *training_properties.CLASSES,
     *properties.CLASSES,
     *preferences.CLASSES,
     *job_operators.CLASSES,
     *region_operators.CLASSES,
     *import_operators.CLASSES,
     *report_operators.CLASSES,
+    *training_operators.CLASSES,
     *panels.CLASSES,
+    *training_panel.CLASSES,
     *report_panel.CLASSES,
 )
 
@@ -61,7 +74,9 @@ def unregister() -> None:
     if bpy.app.timers.is_registered(job_timer.attach_later):
         bpy.app.timers.unregister(job_timer.attach_later)
     doctor.stop()
+    training_estimate.stop()
     job_timer.forget_all()
+    live_preview.stop()
     for name, handler in HANDLERS:
         handlers: list[Any] = getattr(bpy.app.handlers, name)
         while handler in handlers:

@@ -14,9 +14,9 @@ from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.job_file import make_job, read_job
 from ..core.jobs.job_folder import JobFolder
 from ..core.jobs.stages import read_done
-from ..core.settings import preset
 from . import job_timer, tags
 from .region_objects import export_region, hull_in_blender, scene_from_blender
+from .training_choices import job_settings, with_more
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,7 @@ def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     properties = scene.gwrap
     source = source_of(scene)
     folder = output_of(scene, source)
-    settings = preset(properties.preset.lower(), threads=choice.threads)
-    settings = replace(
-        settings, texture=replace(settings.texture, size_px=int(properties.texture_size))
-    )
-    job = make_job("wrap", source, settings)
+    job = make_job("wrap", source, job_settings(scene, choice.threads))
     _refuse_running(folder)
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
@@ -114,10 +110,7 @@ def start_mesh(
 
     frame = _common_frame(regions)
     folder = job_folder_of(frame)
-    if not any(read_done(path) for path in (folder / "stages").glob("train-*")):
-        raise UsageError(
-            f"{folder} holds no finished training.", "Wrap the scene again, or find its folder."
-        )
+    _require_training(folder)
     _refuse_running(folder)
     earlier = read_job(JobFolder(folder).job_path)
     edge_length = _edge_length_world(scene, regions, frame)
@@ -153,6 +146,32 @@ def start_mesh(
     return folder
 
 
+def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerChoice) -> Path:
+    """Train a finished job further, then mesh and texture it again; return the job folder.
+
+    Parameters
+    ----------
+    frame : Object
+        The frame of the job's result.
+
+    Raises
+    ------
+    WrapError
+        The job folder holds no finished training, or too many iterations are asked for.
+    """
+    folder = job_folder_of(frame)
+    _require_training(folder)
+    _refuse_running(folder)
+    earlier = read_job(JobFolder(folder).job_path)
+    job = with_more(earlier, scene.gwrap.training.more_iterations, choice.threads)
+    client = JobClient.start(
+        folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
+    )
+    scene.gwrap.job_command = "WRAP"
+    job_timer.watch(scene, folder, client)
+    return folder
+
+
 def resume(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     """Continue a scene's job; finished stages are re-used. Return the job folder."""
     if not scene.gwrap.job_folder:
@@ -180,6 +199,13 @@ def job_folder_of(frame: bpy.types.Object) -> Path:
             f"{folder} holds no job.", "Import the result again from where its folder is now."
         )
     return folder
+
+
+def _require_training(folder: Path) -> None:
+    if not any(read_done(path) for path in (folder / "stages").glob("train-*")):
+        raise UsageError(
+            f"{folder} holds no finished training.", "Wrap the scene again, or find its folder."
+        )
 
 
 def _refuse_running(folder: Path) -> None:

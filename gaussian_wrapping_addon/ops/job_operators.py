@@ -12,7 +12,8 @@ from . import doctor, job_actions, job_timer, known_jobs, tags
 from .reporting import ReportsErrors
 
 
-def _no_job_runs(cls: type, context: bpy.types.Context) -> bool:
+def no_job_runs(cls: type, context: bpy.types.Context) -> bool:
+    """Tell whether no job runs in the scene; the tooltip says why a button is grey."""
     if job_timer.is_running(context.scene.gwrap.job_folder):
         cls.poll_message_set("A job is running; cancel it or wait for it")  # type: ignore[attr-defined]
         return False
@@ -26,7 +27,7 @@ def selected_regions(context: bpy.types.Context) -> list[bpy.types.Object]:
     return sorted(things, key=lambda t: (t != active, t.name))
 
 
-class _AsksAboutFolder(ReportsErrors):
+class AsksAboutFolder(ReportsErrors):
     """Asks before it works in a folder that only the file names (it may come from elsewhere)."""
 
     def folder(self, context: bpy.types.Context) -> Path | None:
@@ -87,7 +88,7 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
         if not context.scene.gwrap.source:
             cls.poll_message_set("Choose the folder of the photos first")
             return False
-        return _no_job_runs(cls, context)
+        return no_job_runs(cls, context)
 
     def work(self, context: bpy.types.Context) -> set[str]:
         folder = job_actions.start_wrap(context.scene, job_actions.worker_choice(context))
@@ -95,7 +96,7 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_mesh_region(_AsksAboutFolder, bpy.types.Operator):
+class GWRAP_OT_mesh_region(AsksAboutFolder, bpy.types.Operator):
     bl_idname = "gwrap.mesh_region"
     bl_label = "Mesh Region"
     bl_description = "Mesh the selected regions from the finished training, without training again"
@@ -105,7 +106,7 @@ class GWRAP_OT_mesh_region(_AsksAboutFolder, bpy.types.Operator):
         if not selected_regions(context):
             cls.poll_message_set("Select a region box of a wrapped scene")
             return False
-        return _no_job_runs(cls, context)
+        return no_job_runs(cls, context)
 
     def folder(self, context: bpy.types.Context) -> Path | None:
         frame = tags.frame_of(selected_regions(context)[0])
@@ -136,7 +137,7 @@ class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_resume_job(_AsksAboutFolder, bpy.types.Operator):
+class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
     bl_idname = "gwrap.resume_job"
     bl_label = "Resume"
     bl_description = "Continue the job from its last checkpoint; finished stages are used again"
@@ -146,7 +147,7 @@ class GWRAP_OT_resume_job(_AsksAboutFolder, bpy.types.Operator):
         if not context.scene.gwrap.job_folder:
             cls.poll_message_set("This scene has no job")
             return False
-        return _no_job_runs(cls, context)
+        return no_job_runs(cls, context)
 
     def folder(self, context: bpy.types.Context) -> Path | None:
         return Path(bpy.path.abspath(context.scene.gwrap.job_folder))

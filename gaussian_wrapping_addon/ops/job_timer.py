@@ -23,7 +23,7 @@ from ..core import limits
 from ..core.errors import UsageError, WrapError
 from ..core.jobs.client import JobClient
 from ..core.jobs.job_folder import JobStatus
-from . import known_jobs, tags
+from . import known_jobs, live_preview, tags
 from .scene_objects import import_result
 
 _logger = logging.getLogger(__name__)
@@ -145,7 +145,12 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
         if not (job.status.active or job.waits_for_mode):
             continue
         before = (job.status, job.waits_for_mode)
-        _poll(folder, job, clock())
+        now_s = clock()
+        _poll(folder, job, now_s)
+        if not job.status.active:
+            live_preview.forget(folder)
+        elif job.status.stage == "train":
+            changed = live_preview.refresh(folder, now_s) or changed
         busy = busy or job.status.active or job.waits_for_mode
         changed = changed or before != (job.status, job.waits_for_mode)
     if changed:

@@ -9,6 +9,7 @@ from ..ops import job_timer, tags
 from ..ops.import_operators import materials_of
 from ..ops.materials import shading_of
 from ..ops.scene_objects import cameras_of
+from .live_view import draw_live
 from .text import characters_of, progress_text, wrapped_label
 
 _FINDING_ICONS: Final = {"error": "CANCEL", "warning": "ERROR", "fact": "INFO", "info": "INFO"}
@@ -70,7 +71,8 @@ def _draw_job(layout: Any, context: bpy.types.Context, command: str) -> bool:
             type="BAR",
         )
         cancelling = status.state == "CANCELLING"
-        if status.message and not cancelling:
+        live = draw_live(layout, folder, status)
+        if status.message and not live and not cancelling:
             layout.label(text=status.message[:1].upper() + status.message[1:], translate=False)
         row = layout.row()
         row.enabled = not cancelling

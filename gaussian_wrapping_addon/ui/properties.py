@@ -17,6 +17,8 @@ from bpy.props import (
     StringProperty,
 )
 
+from .training_properties import GWRAP_PG_training
+
 _PRESETS: Final = (
     ("DRAFT", "Draft", "A first look: small images, few Gaussians"),
     ("STANDARD", "Standard", "For most scenes"),
@@ -87,6 +89,7 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     texture_size: EnumProperty(  # type: ignore[valid-type]
         name="Texture Size", description="Side of the texture", items=_TEXTURE_SIZES, default="0"
     )
+    training: PointerProperty(type=GWRAP_PG_training)  # type: ignore[valid-type]
     job_folder: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     job_command: EnumProperty(  # type: ignore[valid-type]
         items=(("WRAP", "Wrap", ""), ("MESH", "Mesh", "")), options={"HIDDEN"}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,8 @@ class JobStatus:
     """Unix time of the last sign of life."""
     result: str = ""
     """Absolute path of the result folder, once there is one."""
+    figures: dict[str, float] = field(default_factory=dict)
+    """Live figures of the stage at work, such as ``iteration``, ``gaussians`` and ``psnr``."""
 
     @property
     def active(self) -> bool:

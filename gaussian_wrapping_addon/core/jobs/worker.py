@@ -50,6 +50,7 @@ class _Reporter:
                 fraction=event.fraction,
                 message=event.message,
                 seconds_left=event.seconds_left,
+                figures=event.figures if changed else {**self.status.figures, **event.figures},
             )
         if changed or now_s - self._written_s > STATUS_EVERY_S:
             self.write()
@@ -163,7 +164,7 @@ def main(arguments: list[str]) -> int:
         code, state, error, hint = EXIT_DONE, "DONE", "", ""
     reporter.end()
     result = str(folder.result) if folder.result.is_dir() else ""
-    figures = {"fraction": 1.0, "seconds_left": 0.0, "message": ""} if state == "DONE" else {}
-    reporter.write(state=state, error=error, hint=hint, exit_code=code, result=result, **figures)
+    full = {"fraction": 1.0, "seconds_left": 0.0, "message": ""} if state == "DONE" else {}
+    reporter.write(state=state, error=error, hint=hint, exit_code=code, result=result, **full)
     folder.unlock()
     return code

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The figures of a running training as label and text, from the job's status."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..core.evaluation.report.text import duration, measured, number, part
+from ..core.jobs.job_folder import JobStatus
+
+Row = tuple[str, str]
+
+
+def live_rows(status: JobStatus) -> tuple[Row, ...]:
+    """Return the rows that the panel shows of a running training; none in other stages.
+
+    Parameters
+    ----------
+    status : JobStatus
+        With ``figures``: ``iteration``, ``iterations`` (of the whole plan), ``gaussians``,
+        ``held_out_psnr`` (dB), ``psnr`` (dB, of the photos being trained),
+        ``iterations_per_s``, ``training_seconds_left``. What is missing has no row.
+    """
+    figures = part({"live": status.figures}, "live")
+    if not status.active or measured(figures.get("iteration")) is None:
+        return ()
+    rows = [("Iteration", _of(figures.get("iteration"), figures.get("iterations")))]
+    _add(rows, "Gaussians", figures.get("gaussians"), digits=0)
+    if measured(figures.get("held_out_psnr")) is not None:
+        _add(rows, "PSNR, Held Out", figures.get("held_out_psnr"), "dB", digits=1)
+    else:
+        _add(rows, "PSNR, Trained", figures.get("psnr"), "dB", digits=1)
+    _add(rows, "Iterations per Second", figures.get("iterations_per_s"), digits=1)
+    left_s = measured(figures.get("training_seconds_left"))
+    if left_s is not None:
+        rows.append(("Training Left", duration(left_s)))
+    return tuple(rows)
+
+
+def _add(rows: list[Row], name: str, value: Any, unit: str = "", *, digits: int) -> None:
+    if measured(value) is not None:
+        rows.append((name, number(value, unit, digits=digits)))
+
+
+def _of(done: Any, total: Any) -> str:
+    text = number(done, digits=0)
+    return f"{text} of {number(total, digits=0)}" if measured(total) else text

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From the choices of the sub-panel "Training" to the settings of a job."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import UsageError
+from ..core.jobs.job_file import JobFile
+from ..core.settings import JobSettings, preset
+from . import known_jobs
+
+DECISIONS = ("harmonics", "exposure", "multi_view", "wrapping", "growth")
+NUMBERS = ("iterations", "max_gaussians", "max_image_px")
+"""Properties whose 0 leaves the preset's number."""
+
+MAX_ITERATIONS = 1_000_000
+"""The most that ``JobSettings.validated`` accepts of extra iterations."""
+
+
+def job_settings(scene: bpy.types.Scene, threads: int) -> JobSettings:
+    """Return the settings that the panels of a scene ask for: the preset, then the choices.
+
+    Raises
+    ------
+    UsageError
+        The splat to start from is not there.
+    """
+    properties = scene.gwrap
+    choices = properties.training
+    settings = preset(properties.preset.lower(), threads=threads)
+    changes = {name: getattr(choices, name).lower() for name in (*DECISIONS, "mask_mode")}
+    changes |= {name: value for name in NUMBERS if (value := getattr(choices, name))}
+    return replace(
+        settings,
+        start_splat=_splat(choices.start_splat),
+        training=replace(settings.training, **changes),
+        texture=replace(settings.texture, size_px=int(properties.texture_size)),
+    )
+
+
+def _splat(stored: str) -> str:
+    if not stored:
+        return ""
+    path = Path(bpy.path.abspath(stored))
+    # A path in the open file may come from elsewhere: no name of a server is looked up.
+    if known_jobs.is_remote(path):
+        raise UsageError(f"{path} lies on another machine.", "Copy the splat to this one.")
+    if path.suffix.lower() != ".ply":
+        raise UsageError(f"{path.name} is no PLY file.", "Choose a splat saved as PLY, or none.")
+    if not path.is_file():
+        raise UsageError(
+            f"The splat {path} does not exist.", "Choose it again in Training, or clear the field."
+        )
+    return str(path.resolve())
+
+
+def preset_line(name: str) -> str:
+    """Return what the preset of a scene would take where a number is 0."""
+    training = preset(name.lower()).training
+    return (
+        f"0 takes the preset's: {training.iterations:,} iterations, "
+        f"{training.max_gaussians:,} Gaussians, {training.max_image_px} px"
+    )
+
+
+def with_more(job: JobFile, iterations: int, threads: int) -> JobFile:
+    """Return a finished job with more iterations of training, for the same regions.
+
+    Raises
+    ------
+    UsageError
+        The sum is more than a job may ask for.
+    """
+    training = job.settings.training
+    extra = training.extra_iterations + iterations
+    if extra > MAX_ITERATIONS:
+        raise UsageError(f"{extra:,} more iterations are too many.", f"{MAX_ITERATIONS:,} at most.")
+    settings = replace(
+        job.settings, threads=threads, training=replace(training, extra_iterations=extra)
+    )
+    # The regions' content lies in the job: their files may be gone by now.
+    return replace(job, command="more", settings=settings)
+
+
+def choices_key(scene: bpy.types.Scene) -> tuple[object, ...]:
+    """Return what an estimate of time and memory depends on; reads no file, for panels."""
+    properties, choices = scene.gwrap, scene.gwrap.training
+    names = (*DECISIONS, "mask_mode", *NUMBERS, "start_splat")
+    own = (properties.source, properties.preset, properties.texture_size)
+    return (*own, *(getattr(choices, name) for name in names))

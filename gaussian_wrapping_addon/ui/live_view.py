@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Draws a running training under its progress bar: figures and picture, from memory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..core.jobs.job_folder import JobStatus
+from ..ops import job_timer, live_preview
+from ..ops.live_figures import live_rows
+
+_PICTURE_SCALE = 9.0  # of an icon's size: about the width of the panel as Blender starts
+
+
+def draw_live(layout: Any, folder: str, status: JobStatus) -> bool:
+    """Draw figures and picture of the training at work; tell whether there was anything."""
+    rows = live_rows(status)
+    if not rows:
+        return False
+    column = layout.column(align=True)
+    for name, value in rows:
+        split = column.split(factor=0.55)
+        split.label(text=name, translate=False)
+        right = split.row()
+        right.alignment = "RIGHT"
+        right.label(text=value, translate=False)
+    icon = live_preview.icon_of(job_timer.key_of(folder))
+    if icon:
+        layout.template_icon(icon_value=icon, scale=_PICTURE_SCALE)
+    return True
