@@ -8,6 +8,8 @@ from typing import Any
 from ..core.evaluation.report.text import duration, measured, number, part
 from ..core.jobs.job_folder import JobStatus
 
+RATE = "iterations_per_s"
+
 Row = tuple[str, str]
 
 
@@ -19,7 +21,7 @@ def live_rows(status: JobStatus) -> tuple[Row, ...]:
     status : JobStatus
         With ``figures``: ``iteration``, ``iterations`` (of the whole plan), ``gaussians``,
         ``held_out_psnr`` (dB), ``psnr`` (dB, of the photos being trained),
-        ``iterations_per_s``, ``training_seconds_left``. What is missing has no row.
+        ``iterations_per_s``. What is missing has no row.
     """
     figures = part({"live": status.figures}, "live")
     if not status.active or measured(figures.get("iteration")) is None:
@@ -30,10 +32,10 @@ def live_rows(status: JobStatus) -> tuple[Row, ...]:
         _add(rows, "PSNR, Held Out", figures.get("held_out_psnr"), "dB", digits=1)
     else:
         _add(rows, "PSNR, Trained", figures.get("psnr"), "dB", digits=1)
-    _add(rows, "Iterations per Second", figures.get("iterations_per_s"), digits=1)
-    left_s = measured(figures.get("training_seconds_left"))
-    if left_s is not None:
-        rows.append(("Training Left", duration(left_s)))
+    _add(rows, "Iterations per Second", figures.get(RATE), digits=1)
+    done, total, rate = map(measured, map(figures.get, ("iteration", "iterations", RATE)))
+    if done is not None and total is not None and rate:
+        rows.append(("Training Left", duration((total - done) / rate)))
     return tuple(rows)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The picture of a running training, loaded by the job timer, drawn from memory.
 
-Panels draw often and must neither read the disk nor make anything: they ask :func:`icon_of`. The
+Panels draw often and must neither read the disk nor make anything: they ask :func:`icons_of`. The
 pictures lie in a preview collection, not in ``bpy.data``, so that no file is saved with them and
 undo does not know them.
 """
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy.utils.previews
+import numpy as np
 
 _logger = logging.getLogger(__name__)
 
@@ -30,8 +31,8 @@ _NEVER_S = float("-inf")
 class _Shown:
     looked_s: float = _NEVER_S
     stamp: tuple[str, int, int] | None = None
-    name: str = ""
-    icon: int = 0
+    names: tuple[str, ...] = ()
+    icons: tuple[int, ...] = ()
 
 
 _shown: dict[str, _Shown] = {}
@@ -39,10 +40,13 @@ _pictures: Any = None  # ImagePreviewCollection, made when the first picture is 
 _count = 0
 
 
-def icon_of(folder: str) -> int:
-    """Return the icon of a job folder's picture, 0 where there is none; reads nothing."""
+def icons_of(folder: str) -> tuple[int, ...]:
+    """Return the icons of a job folder's picture, none where there is none; reads nothing.
+
+    A photo beside its rendering gives two: an icon is drawn in a square.
+    """
     shown = _shown.get(folder)
-    return shown.icon if shown else 0
+    return shown.icons if shown else ()
 
 
 def path_of(folder: str) -> str:
@@ -87,8 +91,8 @@ def refresh(folder: str, now_s: float) -> bool:
     loaded = _load(stamp[0])
     if loaded is None:
         return False
-    _drop(shown.name)
-    shown.name, shown.icon = loaded
+    _drop(shown.names)
+    shown.names, shown.icons = loaded
     shown.stamp = stamp
     return True
 
@@ -97,7 +101,7 @@ def forget(folder: str) -> None:
     """Let go of the picture of a job that has ended."""
     shown = _shown.pop(folder, None)
     if shown is not None:
-        _drop(shown.name)
+        _drop(shown.names)
 
 
 def stop() -> None:
@@ -109,7 +113,8 @@ def stop() -> None:
         _pictures = None
 
 
-def _load(path: str) -> tuple[str, int] | None:
+def _load(path: str) -> tuple[tuple[str, ...], tuple[int, ...]] | None:
+    """Read a picture; return names and icons, or None where it is not sound."""
     global _pictures, _count
     if _pictures is None:
         _pictures = bpy.utils.previews.new()
@@ -117,15 +122,34 @@ def _load(path: str) -> tuple[str, int] | None:
     name = str(_count)  # a new name each time: Blender keeps what it has drawn of an old one
     try:
         picture = _pictures.load(name, path, "IMAGE", force_reload=True)
+        width, height = picture.image_size[:]  # reads the file now, so that drawing does not
+        if not width or not height:
+            _drop((name,))
+            return None
+        if width < 2 * height:
+            return (name,), (picture.icon_id,)
+        pixels = np.empty((height, width, 4), np.float32)
+        picture.image_pixels_float.foreach_get(pixels.ravel())
     except (KeyError, OSError, RuntimeError):
         _logger.exception("cannot show %s", path)
         return None
-    if 0 in picture.image_size[:]:  # reads the file now, so that drawing does not
-        _drop(name)
-        return None
-    return name, picture.icon_id
+    _drop((name,))
+    halves = {
+        f"{name} photo": pixels[:, : width // 2],
+        f"{name} rendering": pixels[:, -width // 2 :],
+    }
+    return tuple(halves), tuple(_new(part, values) for part, values in halves.items())
 
 
-def _drop(name: str) -> None:
-    if _pictures is not None and name in _pictures:
-        del _pictures[name]
+def _new(name: str, pixels: np.ndarray) -> int:
+    """Make a picture of (h, w, 4) float32 values; return its icon."""
+    picture = _pictures.new(name)
+    picture.image_size = pixels.shape[1::-1]
+    picture.image_pixels_float.foreach_set(np.ascontiguousarray(pixels).ravel())
+    return int(picture.icon_id)
+
+
+def _drop(names: tuple[str, ...]) -> None:
+    for name in names:
+        if _pictures is not None and name in _pictures:
+            del _pictures[name]

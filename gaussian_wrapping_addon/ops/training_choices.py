@@ -58,12 +58,12 @@ def _splat(stored: str) -> str:
     return str(path.resolve())
 
 
-def preset_line(name: str) -> str:
-    """Return what the preset of a scene would take where a number is 0."""
+def preset_lines(name: str) -> tuple[str, ...]:
+    """Return what the preset of a scene takes where a number is 0."""
     training = preset(name.lower()).training
     return (
-        f"0 takes the preset's: {training.iterations:,} iterations, "
-        f"{training.max_gaussians:,} Gaussians, {training.max_image_px} px"
+        f"0 takes {name.capitalize()}'s: {training.iterations:,},",
+        f"{training.max_gaussians:,} and {training.max_image_px:,} px",
     )
 
 

@@ -14,25 +14,27 @@ from typing import Any
 import bpy
 
 from ..core.errors import WorkerError, WrapError
-from ..core.evaluation.report.text import NOT_MEASURED, bytes_text, duration, measured
 from ..core.helper_process import child_command, child_environment, kill_group
 from ..core.jobs.client import worker_python
-from ..core.settings import to_json
+from ..core.jobs.job_file import make_job
 from .job_actions import WorkerChoice, source_of
 from .training_choices import choices_key, job_settings
 
 MODULE = "jobs.estimate"
 DEADLINE_S = 300.0
 POLL_S = 0.3
+MAX_LINES = 20
+MAX_TEXT = 300
+_WARNING = "warning: "
 
 
 @dataclass(frozen=True)
 class Estimate:
     """One answer, ready to draw."""
 
-    text: str
-    good: bool = True
-    hint: str = ""
+    lines: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """What stands in the way, or may."""
 
 
 @dataclass
@@ -66,10 +68,9 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
     WrapError
         The source, a choice or the interpreter cannot be used.
     """
-    settings = job_settings(scene, choice.threads).validated()
-    request = {"source": str(source_of(scene)), "settings": to_json(settings)}
+    job = make_job("wrap", source_of(scene), job_settings(scene, choice.threads))
     command = child_command(
-        MODULE, json.dumps(request, allow_nan=False), python=worker_python(choice.python)
+        MODULE, json.dumps(job.to_json(), allow_nan=False), python=worker_python(choice.python)
     )
     stop()
     number = _question.number
@@ -82,16 +83,16 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 def _ask(number: int, command: list[str]) -> None:
     """Thread: touches nothing of Blender."""
     try:
-        answer = estimate_of(_run(number, command))
+        answer = _run(number, command)
     except WrapError as error:
-        answer = Estimate(error.message, False, error.hint)
+        answer = Estimate((), (error.message, error.hint))
     except Exception as error:  # the queue must get an answer, or the wait would never end
-        answer = Estimate(f"{type(error).__name__}: {error}", False)
+        answer = Estimate((), (f"{type(error).__name__}: {error}",))
     _answers.put((number, answer))
 
 
-def _run(number: int, command: list[str]) -> dict[str, Any]:
-    """Return the last JSON object that the child writes."""
+def _run(number: int, command: list[str]) -> Estimate:
+    """Start the child and return what it says."""
     options: dict[str, Any] = {"start_new_session": True}
     if sys.platform == "win32":
         options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
@@ -118,56 +119,50 @@ def _run(number: int, command: list[str]) -> dict[str, Any]:
     except subprocess.TimeoutExpired:
         kill_group(process)
         raise WorkerError("The estimate took too long.", "Start the job without it.") from None
-    found: dict[str, Any] = {}
+    found = []
     for line in output.decode(errors="replace").splitlines():
         try:
             values = json.loads(line)
         except ValueError:
             continue
-        found = values if isinstance(values, dict) else found
-    if not found:
-        last = words.decode(errors="replace").strip().splitlines()
-        raise WorkerError(
-            f"There is no estimate: {last[-1] if last else 'the worker said nothing'}.",
-            "Check the worker in the add-on's preferences.",
-        )
-    return found
+        if isinstance(values, dict):
+            found.append(values)
+    last = words.decode(errors="replace").strip().splitlines()
+    return estimate_of(found, last[-1] if last else "")
 
 
-def estimate_of(values: dict[str, Any]) -> Estimate:
-    """Turn the child's figures into a line, such as ``About 4-6 min, 1.2 GiB memory``.
+def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
+    """Turn what the child said into lines for the panel.
 
     Parameters
     ----------
-    values : dict
-        ``seconds_low``, ``seconds_high``, ``memory_bytes``, ``disk_bytes``, ``warnings`` (texts);
-        or ``error`` and ``hint``.
+    said : list of dict
+        ``{"line": text}`` for each line, of which some begin with ``warning:``, or
+        ``{"error": text, "hint": text}``.
+    last_words : str
+        The end of what the child wrote to its terminal, in case it said nothing else.
+
+    Raises
+    ------
+    WorkerError
+        It said nothing.
     """
-    if values.get("error"):
-        return Estimate(str(values["error"]), False, str(values.get("hint", "")))
-    parts = [_span(measured(values.get("seconds_low")), measured(values.get("seconds_high")))]
-    for name, word in (("memory_bytes", "memory"), ("disk_bytes", "disk")):
-        text = bytes_text(values.get(name))
-        parts.append("" if text == NOT_MEASURED else f"{text} {word}")
-    text = ", ".join(part for part in parts if part)
-    if not text:
-        return Estimate("The worker's estimate holds no figures.", False, "Update the worker.")
-    warnings = values.get("warnings")
-    hint = " ".join(str(w) for w in warnings) if isinstance(warnings, list) else ""
-    return Estimate(f"About {text}", not hint, hint)
+    for values in said:
+        if values.get("error"):
+            return Estimate((), (str(values["error"]), str(values.get("hint", ""))))
+    lines = [str(values["line"])[:MAX_TEXT] for values in said if values.get("line")][:MAX_LINES]
+    if not lines:
+        raise WorkerError(
+            f"There is no estimate: {last_words or 'the worker said nothing'}.",
+            "Check the worker in the add-on's preferences.",
+        )
+    warnings = tuple(line.removeprefix(_WARNING) for line in lines if line.startswith(_WARNING))
+    plain = tuple(_capital(line) for line in lines if not line.startswith(_WARNING))
+    return Estimate(plain, tuple(_capital(text) for text in warnings))
 
 
-def _span(low_s: float | None, high_s: float | None) -> str:
-    if low_s is None or high_s is None:
-        either = high_s if low_s is None else low_s
-        return "" if either is None else duration(either)
-    if high_s < 90:
-        low, high, unit = round(low_s), round(high_s), "s"
-    elif high_s < 90 * 60:
-        low, high, unit = round(low_s / 60), round(high_s / 60), "min"
-    else:
-        return f"{duration(low_s)} to {duration(high_s)}"
-    return f"{high} {unit}" if low == high else f"{low}-{high} {unit}"
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def show() -> float | None:
@@ -193,7 +188,7 @@ def stop() -> None:
     with _guard:
         process, _question.process = _question.process, None
         _question.number += 1
-        _question.key, _question.answer = (), Estimate("", False)
+        _question.key, _question.answer = (), Estimate()
     if process is not None and process.poll() is None:
         threading.Thread(target=kill_group, args=(process,), daemon=True).start()
     if bpy.app.timers.is_registered(show):

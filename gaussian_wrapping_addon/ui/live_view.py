@@ -24,7 +24,9 @@ def draw_live(layout: Any, folder: str, status: JobStatus) -> bool:
         right = split.row()
         right.alignment = "RIGHT"
         right.label(text=value, translate=False)
-    icon = live_preview.icon_of(job_timer.key_of(folder))
-    if icon:
-        layout.template_icon(icon_value=icon, scale=_PICTURE_SCALE)
+    icons = live_preview.icons_of(job_timer.key_of(folder))
+    if icons:
+        row = layout.row(align=True)
+        for icon in icons:
+            row.template_icon(icon_value=icon, scale=_PICTURE_SCALE / len(icons))
     return True

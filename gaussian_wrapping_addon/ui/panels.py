@@ -71,12 +71,13 @@ def _draw_job(layout: Any, context: bpy.types.Context, command: str) -> bool:
             type="BAR",
         )
         cancelling = status.state == "CANCELLING"
-        live = draw_live(layout, folder, status)
-        if status.message and not live and not cancelling:
-            layout.label(text=status.message[:1].upper() + status.message[1:], translate=False)
         row = layout.row()
         row.enabled = not cancelling
         row.operator("gwrap.cancel_job", text="Cancelling…" if cancelling else "Cancel", icon="X")
+        live = draw_live(layout, folder, status)
+        if status.message and not live and not cancelling:
+            message = status.message[:1].upper() + status.message[1:]
+            wrapped_label(layout, message, characters)
         return True
     if status.state in ("FAILED", "LOST"):
         box = layout.box()

@@ -6,7 +6,7 @@ from typing import Any, Final
 import bpy
 
 from ..ops import job_timer, tags, training_estimate
-from ..ops.training_choices import DECISIONS, NUMBERS, preset_line
+from ..ops.training_choices import DECISIONS, NUMBERS, preset_lines
 from .text import characters_of, wrapped_label
 
 
@@ -38,12 +38,13 @@ class GWRAP_PT_training(bpy.types.Panel):
         for name in DECISIONS:
             column.row().prop(training, name, expand=True)
         column.separator()
-        column.row().prop(training, "mask_mode", expand=True)
+        column.prop(training, "mask_mode")
         column.separator()
         limits = column.column(align=True)
         for name in NUMBERS:
             limits.prop(training, name)
-        wrapped_label(column, preset_line(properties.preset), characters)
+        for line in preset_lines(properties.preset):
+            wrapped_label(column, line, characters)
         column.separator()
         column.prop(training, "start_splat")
         column.operator("gwrap.reset_training", icon="LOOP_BACK")
@@ -55,11 +56,14 @@ class GWRAP_PT_training(bpy.types.Panel):
         busy = training_estimate.is_busy()
         row.operator("gwrap.estimate", text="Estimating…" if busy else "Estimate", icon="TIME")
         answer = None if busy else training_estimate.answer_for(scene)
-        if answer is not None:
-            icon = "INFO" if answer.good else "ERROR"
-            wrapped_label(layout, answer.text, characters - 4, icon=icon)
-            if answer.hint:
-                wrapped_label(layout, answer.hint, characters - 4, icon="BLANK1")
+        if answer is None:
+            return
+        for line in answer.lines:
+            wrapped_label(layout, line, characters)
+        icon = "ERROR"
+        for text in filter(None, answer.warnings):
+            wrapped_label(layout, text, characters - 4, icon=icon)
+            icon = "BLANK1"
 
     def _more(self, layout: Any, context: bpy.types.Context) -> None:
         if tags.current_frame(context.scene, context.view_layer.objects.active) is None:

@@ -48,8 +48,8 @@ class GWRAP_PG_training(bpy.types.PropertyGroup):
     """Choices that go before the preset's; 0 and Auto leave it to the preset and the photos."""
 
     harmonics: EnumProperty(  # type: ignore[valid-type]
-        name="Changing Colour",
-        description="Colours that depend on where one looks from: gloss, reflections, metal",
+        name="Reflections",
+        description="Colours that change with the side one looks from: gloss, metal, glass",
         items=_HARMONICS,
         default="AUTO",
     )

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A worker that obeys the job folder protocol without torch; ``GW_FAKE`` says how it behaves.
 
-Run as ``PYTHON ... jobs.worker FOLDER PARENT`` in place of the worker's Python.
+Run as ``PYTHON ... jobs.worker FOLDER PARENT`` in place of the worker's Python,
+or as ``... jobs.estimate REQUEST``, which answers ``GW_ANSWER``.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from gaussian_wrapping_addon.core.jobs.job_file import read_job
@@ -21,10 +24,29 @@ from gaussian_wrapping_addon.core.jobs.job_folder import (
     JobStatus,
     process_start_ticks,
 )
-from tests.blender.synthetic_result import write_region_result, write_result
+from tests.blender.synthetic_result import png_bytes, write_region_result, write_result
+
+LIVE = {
+    "iteration": 750.0,
+    "iterations": 3000.0,
+    "gaussians": 12345.0,
+    "psnr": 25.04,
+    "held_out_psnr": 24.31,
+    "iterations_per_s": 16.25,
+}
+
+
+def picture() -> np.ndarray:
+    """Return a photo beside a rendering, as a training's preview shows them."""
+    y, x = np.mgrid[0:120, 0:160]
+    disc = np.hypot(x - 80, y - 60) < 45
+    photo = np.where(disc[..., None], (220, 120, 40), (90, 110, 130)).astype(np.uint8)
+    return np.concatenate([photo, np.zeros((120, 4, 3), np.uint8), photo // 8 * 7], axis=1)
 
 
 def main() -> int:
+    if sys.argv[-2] == "jobs.estimate":
+        return estimate()
     folder = JobFolder(Path(sys.argv[-2]))
     parent = int(sys.argv[-1])
     mode = os.environ.get("GW_FAKE", "quick")
@@ -40,6 +62,7 @@ def main() -> int:
                 pid=os.getpid(),
                 pid_started=process_start_ticks(os.getpid()),
                 heartbeat_s=time.time(),
+                figures=LIVE,
                 **more,  # type: ignore[arg-type]
             )
         )
@@ -55,6 +78,10 @@ def main() -> int:
     if mode == "hang":
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         time.sleep(60)
+    if mode == "slow":
+        trained = folder.stages / "train-now"
+        trained.mkdir(exist_ok=True)
+        (trained / "preview-training.png").write_bytes(png_bytes(picture()))
     while mode == "slow":
         time.sleep(0.02)
         if parent and os.getppid() != parent:
@@ -66,9 +93,9 @@ def main() -> int:
         if (folder.root / "finish").exists():
             break
     job = read_job(folder.job_path)
-    if job.command == "wrap":
+    if job.command in ("wrap", "more"):
         write_result(folder.root)
-        trained = folder.stages / "train-abc"
+        trained = folder.stages / f"train-abc{job.settings.training.extra_iterations}"
         trained.mkdir(exist_ok=True)
         (trained / "done.json").write_text(json.dumps({"seconds": 1.0}))
     for body in job.region_bodies.values():
@@ -76,6 +103,14 @@ def main() -> int:
         write_region_result(folder.result / name, half=0.3)
     say("DONE", 1.0, result=str(folder.result), exit_code=0)
     folder.unlock()
+    return 0
+
+
+def estimate() -> int:
+    """Answer as the worker's estimate does."""
+    asked = json.loads(sys.argv[-1])
+    Path(os.environ["GW_ASKED"]).write_text(json.dumps(asked))
+    print(os.environ["GW_ANSWER"])
     return 0
 
 

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Takes the picture of the panel in the documentation, of a real result.
+"""Takes the pictures of the panel in the documentation, of a real result.
 
 ``blender --addons bl_ext.user_default.gaussian_wrapping_addon -P picture_of_panel.py`` with
 ``GW_PICTURE_RESULT`` (a result folder), ``GW_PICTURE_SOURCE`` (what to show as the photo folder)
-and ``GW_PICTURE`` (the file to write).
+and ``GW_PICTURE`` (the file to write). ``GW_PICTURE_OPEN`` names the panels to open, such as
+``wrap,training`` (all others are closed); ``GW_PICTURE_ESTIMATE=1`` presses Estimate first;
+``GW_PICTURE_RUNNING=1`` shows a running job (of the worker that is set) instead of the result.
 """
 
 from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +21,22 @@ import bpy
 from mathutils import Vector
 
 
+def open_only(names: str) -> None:
+    """Register the panels again, those named open and all others closed."""
+    registration = sys.modules["bl_ext.user_default.gaussian_wrapping_addon.registration"]
+    panels = [c for c in registration.CLASSES if issubclass(c, bpy.types.Panel)]
+    for panel in reversed(panels):
+        bpy.utils.unregister_class(panel)
+    for panel in panels:
+        name = panel.__name__.removeprefix("GWRAP_PT_")
+        panel.bl_options = set() if name in names.split(",") else {"DEFAULT_CLOSED"}
+        bpy.utils.register_class(panel)
+
+
 def steps() -> Iterator[float]:
     """Import, arrange, photograph."""
+    if os.environ.get("GW_PICTURE_OPEN"):
+        open_only(os.environ["GW_PICTURE_OPEN"])
     window = bpy.context.window_manager.windows[0]
     area = next(a for a in window.screen.areas if a.type == "VIEW_3D")
     region = next(r for r in area.regions if r.type == "WINDOW")
@@ -33,6 +50,14 @@ def steps() -> Iterator[float]:
     scene = bpy.context.scene
     scene.gwrap.source = os.environ["GW_PICTURE_SOURCE"]
     scene.gwrap.resolution = "EDGE_LENGTH"
+    if os.environ.get("GW_PICTURE_RUNNING"):
+        with bpy.context.temp_override(window=window, area=area, region=region):
+            bpy.ops.gwrap.wrap_scene()
+        yield 6.0
+        subprocess.run(["import", "-window", "root", os.environ["GW_PICTURE"]], check=True)
+        bpy.ops.gwrap.cancel_job()
+        yield 2.0
+        return
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.gwrap.import_result(directory=os.environ["GW_PICTURE_RESULT"])
         space.shading.color_type = "TEXTURE"
@@ -50,6 +75,9 @@ def steps() -> Iterator[float]:
         view.view_location += 0.22 * view.view_distance * (view.view_rotation @ Vector((1, 0, 0)))
         boxes = [o for o in bpy.data.objects if o.get("gwrap_kind") == "region"]
         bpy.ops.gwrap.select_region(name=boxes[0].name)
+    if os.environ.get("GW_PICTURE_ESTIMATE"):
+        bpy.ops.gwrap.estimate()
+        yield 5.0
     yield 1.5
     subprocess.run(["import", "-window", "root", os.environ["GW_PICTURE"]], check=True)
 

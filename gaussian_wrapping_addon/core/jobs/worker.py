@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import signal
 import sys
@@ -50,7 +51,7 @@ class _Reporter:
                 fraction=event.fraction,
                 message=event.message,
                 seconds_left=event.seconds_left,
-                figures=event.figures if changed else {**self.status.figures, **event.figures},
+                figures=_merged({} if changed else self.status.figures, event.figures),
             )
         if changed or now_s - self._written_s > STATUS_EVERY_S:
             self.write()
@@ -92,6 +93,11 @@ class _Reporter:
     def end(self) -> None:
         """Stop the heartbeat."""
         self._stop.set()
+
+
+def _merged(known: dict[str, float], news: dict[str, float]) -> dict[str, float]:
+    """Return known figures with newer ones over them; JSON holds no NaN, nor any use for it."""
+    return {**known, **{name: value for name, value in news.items() if math.isfinite(value)}}
 
 
 def _log_to(path: Path) -> None:
