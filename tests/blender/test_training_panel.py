@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Training in the panel: choices become settings, the estimate, the live view, train more."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core.errors import UsageError, WorkerError
+from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE, JobClient
+from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_job, write_job
+from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.settings import DECISIONS, MASK_MODES, preset, to_json
+from gaussian_wrapping_addon.ops import (
+    job_timer,
+    known_jobs,
+    live_preview,
+    training_choices,
+    training_estimate,
+)
+from gaussian_wrapping_addon.ops.live_figures import live_rows
+from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.ui import panels, training_panel
+from tests.blender.fake_layout import draw
+from tests.blender.fake_worker import LIVE, picture
+from tests.blender.synthetic_result import png_bytes, write_result
+
+pytestmark = pytest.mark.usefixtures("addon")
+
+PANEL = training_panel.GWRAP_PT_training
+
+
+class Client:
+    """Answers with one status."""
+
+    def __init__(self, status: JobStatus) -> None:
+        self.status = status
+
+    def poll(self) -> JobStatus:
+        return self.status
+
+
+@pytest.fixture(autouse=True)
+def _nothing_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(known_jobs, "_session", [])
+    job_timer.forget_all()
+
+
+def training() -> bpy.types.PropertyGroup:
+    return bpy.context.scene.gwrap.training
+
+
+def choices_of(name: str) -> set[str]:
+    return {item.identifier.lower() for item in training().bl_rna.properties[name].enum_items}
+
+
+def test_untouched_choices_are_the_preset() -> None:
+    for name in ("draft", "standard", "fine"):
+        bpy.context.scene.gwrap.preset = name.upper()
+        assert training_choices.job_settings(bpy.context.scene, 3) == preset(name, threads=3)
+    for name in training_choices.DECISIONS:
+        assert choices_of(name) == set(DECISIONS)
+    assert choices_of("mask_mode") == set(MASK_MODES)
+
+
+def test_each_choice_changes_its_setting_and_no_other(tmp_path: Path) -> None:
+    splat = tmp_path / "splat.PLY"
+    splat.write_bytes(b"ply")
+    base = to_json(preset("standard"))
+    changes = {
+        **dict.fromkeys(training_choices.DECISIONS, "OFF"),
+        "mask_mode": "BACKGROUND",
+        "iterations": 77,
+        "max_gaussians": 7777,
+        "max_image_px": 333,
+    }
+    for name, value in changes.items():
+        setattr(training(), name, value)
+        found = to_json(training_choices.job_settings(bpy.context.scene, 0).validated())
+        wanted = value.lower() if isinstance(value, str) else value
+        assert found == {**base, "training": {**base["training"], name: wanted}}
+        training().property_unset(name)
+    training().start_splat = str(splat)
+    found = to_json(training_choices.job_settings(bpy.context.scene, 0))
+    assert found == {**base, "start_splat": str(splat)}
+    assert bpy.ops.gwrap.reset_training() == {"FINISHED"}
+    assert to_json(training_choices.job_settings(bpy.context.scene, 0)) == base
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("/nowhere/x.obj", "no PLY"),
+        ("/nowhere/missing.ply", "does not exist"),
+        (r"\\server\share\x.ply", "another machine"),
+    ],
+)
+def test_a_splat_that_cannot_be_used_is_refused(path: str, words: str) -> None:
+    training().start_splat = path
+    with pytest.raises(UsageError, match=words):
+        training_choices.job_settings(bpy.context.scene, 0)
+
+
+def test_the_panel_shows_every_choice_and_reads_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    training().start_splat = "/nowhere/missing.ply"
+    bpy.context.scene.gwrap.source = "/nowhere"
+
+    def refuse(*_arguments: object, **_keywords: object) -> None:
+        raise AssertionError("drawing read the disk")
+
+    with monkeypatch.context() as patch:
+        for name in ("stat", "is_file", "exists", "open", "glob", "iterdir"):
+            patch.setattr(Path, name, refuse)
+        layout = draw(PANEL)
+    shown = {a[1] for name, a, _ in layout.log if name == "prop"}
+    assert shown == set(training().bl_rna.properties.keys()) - {
+        "rna_type",
+        "name",
+        "more_iterations",
+    }
+    assert "80,000" in layout.texts
+    assert {"gwrap.estimate", "gwrap.reset_training"} <= set(layout.operators)
+    assert "gwrap.train_more" not in layout.operators
+
+
+def test_every_choice_has_a_tooltip_in_words() -> None:
+    for owner in training().bl_rna.properties:
+        if owner.identifier in ("rna_type", "name"):
+            continue
+        assert len(owner.description.split()) >= 5
+        assert len(owner.name) <= 16, "longer labels are cut off in the panel"
+        for item in owner.enum_items if owner.type == "ENUM" else ():
+            assert len(item.description.split()) >= 3, item.identifier
+
+
+@pytest.mark.parametrize(
+    ("figures", "rows"),
+    [
+        ({}, {}),
+        (5, {}),
+        ({"iteration": "x"}, {}),
+        ({"iteration": 3.0, "psnr": 20.0}, {"Iteration": "3", "PSNR, Trained": "20.0 dB"}),
+        (
+            LIVE,
+            {
+                "Iteration": "750 of 3,000",
+                "Gaussians": "12,345",
+                "PSNR, Held Out": "24.3 dB",
+                "Iterations per Second": "16.2",
+                "Training Left": "2 min 18 s",
+            },
+        ),
+        ({"iteration": 5.0, "iterations": 9.0, "iterations_per_s": 0.0}, None),
+    ],
+)
+def test_live_rows(figures: object, rows: dict[str, str] | None) -> None:
+    found = dict(live_rows(JobStatus("RUNNING", "train", figures=figures)))  # type: ignore[arg-type]
+    if rows is None:
+        assert "Training Left" not in found
+    else:
+        assert found == rows
+    assert live_rows(JobStatus("DONE", "train", figures=LIVE)) == ()
+
+
+def write_picture(folder: Path, name: str = "train-now", data: bytes | None = None) -> Path:
+    path = folder / "stages" / name / live_preview.PICTURE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(png_bytes(picture()) if data is None else data)
+    return path
+
+
+def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> None:
+    key = str(tmp_path)
+    assert not live_preview.refresh(key, 0.0), "no picture yet"
+    path = write_picture(tmp_path)
+    assert not live_preview.refresh(key, live_preview.EVERY_S - 0.1), "not yet time"
+    assert live_preview.refresh(key, 10.0)
+    assert live_preview.path_of(key) == str(path)
+    assert len(live_preview.icons_of(key)) == 2, "photo and rendering"
+    names = live_preview._shown[key].names
+    left, right = (live_preview._pictures[name] for name in names)
+    assert left.image_size[:] == right.image_size[:]
+    colours = [np.array(p.image_pixels_float[:]).reshape(-1, 4).mean(0) for p in (left, right)]
+    assert colours[1][:3] == pytest.approx(0.875 * colours[0][:3], abs=0.03)
+    assert not live_preview.refresh(key, 20.0), "nothing new"
+    for bad in (b"", b"no picture", png_bytes(picture())[:200]):
+        write_picture(tmp_path, data=bad)
+        live_preview.refresh(key, live_preview._shown[key].looked_s + 10.0)
+        assert live_preview.icons_of(key)
+    (path.parent / "done.json").write_text("{}")
+    assert live_preview.newest_picture(tmp_path) is None, "a finished training is not under way"
+    live_preview.forget(key)
+    assert live_preview.icons_of(key) == ()
+    assert len(live_preview._pictures) == 0
+    live_preview.stop()
+    live_preview.stop()
+
+
+def test_a_running_training_is_drawn_and_let_go(tmp_path: Path) -> None:
+    write_picture(tmp_path)
+    running = JobStatus("RUNNING", "train", 0.3, "iteration 750/3000", 90.0, figures=LIVE)
+    client = Client(running)
+    job_timer.watch(bpy.context.scene, tmp_path, client, imports=False)  # type: ignore[arg-type]
+    job_timer.poll_jobs()
+    layout = draw(panels.GWRAP_PT_wrap)
+    assert "750 of 3,000" in layout.texts
+    assert "iteration 750" not in layout.texts.lower().replace("750 of", ""), "not told twice"
+    assert [name for name, *_ in layout.log].count("template_icon") == 2
+    assert "gwrap.estimate" not in draw(PANEL).operators
+    client.status = replace(running, state="CANCELLED")
+    job_timer.poll_jobs()
+    assert live_preview.icons_of(str(tmp_path)) == ()
+    assert "template_icon" not in [name for name, *_ in draw(panels.GWRAP_PT_wrap).log]
+
+
+def finished_job(folder: Path) -> Path:
+    """Write a finished job with a region of its own, and import its result."""
+    job = JobFolder(folder)
+    job.create()
+    photos = folder.with_name("photos")
+    photos.mkdir()
+    made = make_job("wrap", photos, preset("draft"))
+    region = str(folder / "gone.json")
+    settings = replace(made.settings, regions=(region,))
+    write_job(job.job_path, JobFile("mesh", made.source, settings, {region: {"a": 1}}))
+    (job.stages / "train-abc").mkdir()
+    (job.stages / "train-abc" / "done.json").write_text('{"seconds": 1.0}')
+    import_result(write_result(folder), bpy.context.scene)
+    bpy.context.view_layer.update()
+    return folder
+
+
+def test_train_more_adds_iterations_and_changes_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not bpy.ops.gwrap.train_more.poll()
+    folder = finished_job(tmp_path / "job")
+    earlier = read_job(folder / "job.json")
+    monkeypatch.setenv(PYTHON_VARIABLE, sys.executable)
+    done = Client(JobStatus("DONE", "train", 1.0))
+    monkeypatch.setattr(JobClient, "_launch", lambda *_: done)
+    training().more_iterations = 1500
+    assert "gwrap.train_more" in draw(PANEL).operators
+    for extra in (1500, 3000):
+        assert bpy.ops.gwrap.train_more() == {"FINISHED"}
+        job = read_job(folder / "job.json")
+        assert job.command == "more"
+        assert job.settings.training.extra_iterations == extra
+        back = replace(job.settings.training, extra_iterations=0)
+        assert replace(job.settings, training=back) == earlier.settings
+        assert (job.source, job.region_bodies) == (earlier.source, earlier.region_bodies)
+    assert bpy.context.scene.gwrap.job_command == "WRAP"
+    training().more_iterations = 1_000_000
+    with pytest.raises(RuntimeError, match="too many"):
+        bpy.ops.gwrap.train_more()
+    (folder / "stages" / "train-abc" / "done.json").unlink()
+    with pytest.raises(RuntimeError, match="no finished training"):
+        bpy.ops.gwrap.train_more()
+
+
+@pytest.fixture
+def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Put the fake in the place of the worker's Python; return what it was asked."""
+    script = tmp_path / "fake-python"
+    fake = Path(__file__).with_name("fake_worker.py")
+    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{fake}" "$@"\n')
+    script.chmod(0o755)
+    monkeypatch.setenv(PYTHON_VARIABLE, str(script))
+    monkeypatch.setenv("GW_ASKED", str(tmp_path / "asked.json"))
+    bpy.context.scene.gwrap.source = str(tmp_path)
+    return tmp_path / "asked.json"
+
+
+def wait_for_answer() -> str:
+    """Play the timer, which never fires in background Blender; return what is drawn."""
+    end_s = time.monotonic() + 30.0
+    while training_estimate.show() is not None:
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+    return draw(PANEL).texts.replace("\n", " ")
+
+
+def test_estimate_asks_the_worker_and_shows_its_words(
+    worker: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = [{"line": "training: 4 to 6 min"}, {"line": "memory: 1.2 GB"}, {"line": "warning: full"}]
+    monkeypatch.setenv("GW_ANSWER", "\n".join(["noise", *map(json.dumps, said)]))
+    training().iterations = 432
+    assert bpy.ops.gwrap.estimate() == {"FINISHED"}
+    assert "Estimating…" in draw(PANEL).texts
+    assert not bpy.ops.gwrap.estimate.poll(), "one at a time"
+    texts = wait_for_answer()
+    for text in ("Training: 4 to 6 min", "Memory: 1.2 GB", "Full"):
+        assert text in texts
+    asked = JobFile.from_json(json.loads(worker.read_text()))
+    assert asked.source == str(worker.parent)
+    assert asked.settings == training_choices.job_settings(bpy.context.scene, 0)
+    training().iterations = 433
+    assert "4 to 6 min" not in draw(PANEL).texts, "it was about other choices"
+    monkeypatch.setenv("GW_ANSWER", json.dumps({"error": "No photos.", "hint": "Add some."}))
+    assert bpy.ops.gwrap.estimate() == {"FINISHED"}
+    assert "No photos. Add some." in wait_for_answer()
+
+
+def test_an_estimate_without_words_says_so() -> None:
+    with pytest.raises(WorkerError, match="Segmentation fault"):
+        training_estimate.estimate_of([{"message": "reading"}], "Segmentation fault")
+
+
+def test_stopping_forgets_the_question(worker: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GW_ANSWER", json.dumps({"line": "training: 4 to 6 min"}))
+    bpy.ops.gwrap.estimate()
+    training_estimate.stop()
+    assert not training_estimate.is_busy()
+    time.sleep(0.1)
+    training_estimate.show()
+    assert "4 to 6 min" not in draw(PANEL).texts
