@@ -77,7 +77,7 @@ def steps() -> Iterator[float]:
         bpy.ops.gwrap.select_region(name=boxes[0].name)
     if os.environ.get("GW_PICTURE_ESTIMATE"):
         bpy.ops.gwrap.estimate()
-        yield 5.0
+        yield 12.0
     yield 1.5
     subprocess.run(["import", "-window", "root", os.environ["GW_PICTURE"]], check=True)
 
