@@ -13,10 +13,11 @@ from ..core.errors import UsageError
 from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.job_file import make_job, read_job
 from ..core.jobs.job_folder import JobFolder
+from ..core.jobs.more import job_with_more
 from ..core.jobs.stages import read_done
 from . import job_timer, tags
 from .region_objects import export_region, hull_in_blender, scene_from_blender
-from .training_choices import job_settings, with_more
+from .training_choices import job_settings
 
 
 @dataclass(frozen=True)
@@ -160,10 +161,10 @@ def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerCh
         The job folder holds no finished training, or too many iterations are asked for.
     """
     folder = job_folder_of(frame)
-    _require_training(folder)
     _refuse_running(folder)
     earlier = read_job(JobFolder(folder).job_path)
-    job = with_more(earlier, scene.gwrap.training.more_iterations, choice.threads)
+    job = job_with_more(JobFolder(folder), earlier, scene.gwrap.training.more_iterations)
+    job = replace(job, settings=replace(job.settings, threads=choice.threads))
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
     )

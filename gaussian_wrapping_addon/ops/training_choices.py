@@ -9,16 +9,12 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import UsageError
-from ..core.jobs.job_file import JobFile
 from ..core.settings import JobSettings, preset
 from . import known_jobs
 
 DECISIONS = ("harmonics", "exposure", "multi_view", "wrapping", "growth")
 NUMBERS = ("iterations", "max_gaussians", "max_image_px")
 """Properties whose 0 leaves the preset's number."""
-
-MAX_ITERATIONS = 1_000_000
-"""The most that ``JobSettings.validated`` accepts of extra iterations."""
 
 
 def job_settings(scene: bpy.types.Scene, threads: int) -> JobSettings:
@@ -65,25 +61,6 @@ def preset_lines(name: str) -> tuple[str, ...]:
         f"0 takes {name.capitalize()}'s: {training.iterations:,},",
         f"{training.max_gaussians:,} and {training.max_image_px:,} px",
     )
-
-
-def with_more(job: JobFile, iterations: int, threads: int) -> JobFile:
-    """Return a finished job with more iterations of training, for the same regions.
-
-    Raises
-    ------
-    UsageError
-        The sum is more than a job may ask for.
-    """
-    training = job.settings.training
-    extra = training.extra_iterations + iterations
-    if extra > MAX_ITERATIONS:
-        raise UsageError(f"{extra:,} more iterations are too many.", f"{MAX_ITERATIONS:,} at most.")
-    settings = replace(
-        job.settings, threads=threads, training=replace(training, extra_iterations=extra)
-    )
-    # The regions' content lies in the job: their files may be gone by now.
-    return replace(job, command="more", settings=settings)
 
 
 def choices_key(scene: bpy.types.Scene) -> tuple[object, ...]:
