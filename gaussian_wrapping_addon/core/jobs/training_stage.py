@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,8 @@ from .smaller import STEPS_FILE, train_within_memory
 from .stages import Stage, note_interrupted, run_stage, stage_key
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..dataset.scene import Scene
     from ..training.result import TrainingResult
 
@@ -54,7 +57,9 @@ def training_keys(version: int, cameras_key: str, job: JobFile) -> tuple[str, st
     training = to_json(job.settings.training)
     described = {k: v for k, v in training.items() if k not in RESULT_FREE}
     start = start_fingerprint(job.settings.start_splat)
-    parts = (version, cameras_key, job.settings.seed, *([start] if start else []))
+    weighted = job.settings.training.region_weight != 1.0
+    regions = [job.region_bodies] if weighted and job.region_bodies else []
+    parts = (version, cameras_key, job.settings.seed, *([start] if start else []), *regions)
     key = stage_key(*parts, described)
     described.pop("extra_iterations")
     return key, stage_key(*parts, described)
@@ -108,15 +113,22 @@ def _train(
     from ..gaussians.gaussian_file import save_gaussians
     from ..training.checkpoint import remove_checkpoints
     from ..training.trainer import held_out_views, train
+    from .splat_scene import is_splat
 
     scene = load_saved_scene(cameras.folder)
     estimated, warnings = _estimate(scene, job, stage_folder, progress, threads)
+
+    source = Path(job.source)
+    start = Path(job.settings.start_splat) if job.settings.start_splat else None
+    if start is None and is_splat(source):
+        start = source
+    inside = _inside_regions(job, scene)
 
     def attempt(settings: TrainingSettings) -> TrainingResult:
         photos = PhotoStore(scene, settings.max_image_px)
         return train(
             scene, photos, settings, stage_folder, progress,
-            seed=job.settings.seed, threads=threads,
+            seed=job.settings.seed, threads=threads, start_splat=start, inside=inside,
         )  # fmt: skip
 
     trained = train_within_memory(
@@ -140,6 +152,27 @@ def _train(
         "estimate": estimated,
         "settings": to_json(trained.settings),
     }
+
+
+def _inside_regions(job: JobFile, scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return what tells the points of the job's regions, where these count more; scene frame."""
+    from ..meshing.region import parse_region
+
+    if job.settings.training.region_weight == 1.0 or not job.region_bodies:
+        return None
+    scene_from_world = scene.world_from_scene.inverse()
+    regions = [
+        parse_region(body, Path(request)).transformed(scene_from_world)
+        for request, body in job.region_bodies.items()
+    ]
+
+    def inside(points: np.ndarray) -> np.ndarray:
+        found = regions[0].contains(points, 0.0)
+        for region in regions[1:]:
+            found |= region.contains(points, 0.0)
+        return found
+
+    return inside
 
 
 def _estimate(

@@ -72,7 +72,9 @@ class Decision:
             An entry is missing or of the wrong type.
         """
         try:
-            texts = [values[name] for name in ("name", "setting", "chosen", "evidence")]
+            name, setting, chosen, evidence = texts = [
+                values[entry] for entry in ("name", "setting", "chosen", "evidence")
+            ]
             figures = {str(k): float(v) for k, v in values["figures"].items()}
             if not all(isinstance(text, str) for text in texts):
                 raise TypeError("not text")
@@ -80,7 +82,7 @@ class Decision:
             raise UsageError(
                 f"A stored decision cannot be read ({error}).", "Train the scene again."
             ) from error
-        return cls(*texts, figures)
+        return cls(name, setting, chosen, evidence, figures)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import logging
 import math
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -90,7 +91,7 @@ def compile_kernels(
     """
     from .trainer import train
 
-    decided = {name: "on" for name in _DECIDED if getattr(settings, name) == "auto"}
+    decided: dict[str, Any] = {name: "on" for name in _DECIDED if getattr(settings, name) == "auto"}
     tiny = dataclasses.replace(
         settings, **decided, iterations=ITERATIONS, extra_iterations=0, max_gaussians=400,
         max_image_px=SIDE_PX, densify_every=4, wrap_rounds=min(1, settings.wrap_rounds),

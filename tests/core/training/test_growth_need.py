@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Growth goes on while it pays, stops when it does not, and noise of single photos decides nothing."""
+"""Growth goes on while it pays, stops when it does not; noise of single photos decides nothing."""
 
 from __future__ import annotations
 

@@ -64,8 +64,12 @@ def test_figures_that_are_not_finite_are_left_out_of_json() -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [None, 3, {}, [3], [{"name": "a"}], [{**decide("a", "on", True, "").to_json(), "chosen": 1}]]
-)  # fmt: skip
+    "values",
+    [
+        *(None, 3, {}, [3], [{"name": "a"}]),
+        [{**decide("a", "on", True, "").to_json(), "chosen": 1}],
+    ],
+)
 def test_other_json_is_refused(values: object) -> None:
     with pytest.raises(UsageError):
         Needs.from_json(values)
