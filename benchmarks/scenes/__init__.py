@@ -7,10 +7,10 @@ role "test" are reported and nothing may be tuned on them; "development" scenes 
 
 from __future__ import annotations
 
-from .cache import ensure_scene
+from .cache import ALL_KINDS, ensure_scene
 from .catalogue import KINDS, SceneKind
 
-SCENES = tuple(KINDS)
+SCENES = tuple(ALL_KINDS)
 """Names of all scenes."""
 
-__all__ = ["KINDS", "SCENES", "SceneKind", "ensure_scene"]
+__all__ = ["ALL_KINDS", "KINDS", "SCENES", "SceneKind", "ensure_scene"]

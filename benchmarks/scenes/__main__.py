@@ -11,9 +11,10 @@ from pathlib import Path
 from gaussian_wrapping_addon.core.errors import WrapError
 
 from .build import BuildSize, build_scene
-from .cache import REPOSITORY, ensure_scene
+from .cache import ALL_KINDS, REPOSITORY, ensure_scene
 from .catalogue import KINDS, scene_kind
 from .contact_sheet import write_contact_sheet
+from .looking_in import CUP_INSIDE, build_cup_inside
 
 SHEET = REPOSITORY / "docs" / "images" / "scenes.jpg"
 
@@ -21,7 +22,7 @@ SHEET = REPOSITORY / "docs" / "images" / "scenes.jpg"
 def _arguments(given: list[str]) -> argparse.Namespace:
     size = BuildSize()
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scenes", description=__doc__)
-    parser.add_argument("name", nargs="?", default="all", help=f"all, or one of {', '.join(KINDS)}")
+    parser.add_argument("name", nargs="?", default="all", help=f"all, or one of {', '.join(ALL_KINDS)}")
     parser.add_argument("--out", type=Path, help="where scenes are kept (default .cache/scenes)")
     parser.add_argument("--photos", type=int, default=size.photos)
     parser.add_argument("--test-views", type=int, default=size.test_views)
@@ -40,9 +41,12 @@ def main(given: list[str] | None = None) -> int:
     try:
         if options.build_into is not None:
             size = BuildSize(options.photos, options.test_views, options.width, options.height)
-            build_scene(scene_kind(options.name), size, options.build_into, options.base)
+            if options.name == CUP_INSIDE.name:
+                build_cup_inside(size, options.build_into)
+            else:
+                build_scene(scene_kind(options.name), size, options.build_into, options.base)
             return 0
-        names = list(KINDS) if options.name == "all" or options.sheet else [options.name]
+        names = list(KINDS) if options.sheet else list(ALL_KINDS) if options.name == "all" else [options.name]
         folders = []
         for name in names:
             begin_s = time.perf_counter()

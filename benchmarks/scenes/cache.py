@@ -17,7 +17,8 @@ from pathlib import Path
 from gaussian_wrapping_addon.core.errors import ResourceError, WorkerError
 
 from .build import BuildSize
-from .catalogue import MESHES, scene_kind
+from .catalogue import KINDS, MESHES, SceneKind, scene_kind
+from .looking_in import CUP_INSIDE
 from .rendering import require_bpy
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -26,16 +27,39 @@ CACHE = REPOSITORY / ".cache" / "scenes"
 _DECIDES_NOTHING = {"__init__.py", "__main__.py", "cache.py", "contact_sheet.py"}
 """Files of this package that have no influence on a scene folder's content."""
 
+_OF_ONE_SCENE = {CUP_INSIDE.name: "looking_in.py"}
+"""Files of this package that have an influence on one scene only."""
+
+ALL_KINDS = {**KINDS, CUP_INSIDE.name: CUP_INSIDE}
+"""Every scene that can be rendered."""
+
 _LAST_WORDS = 1500
+
+
+def kind_named(name: str) -> SceneKind:
+    """Return the scene of this name among all.
+
+    Raises
+    ------
+    UsageError
+        There is none.
+    """
+    return ALL_KINDS[name] if name in ALL_KINDS else scene_kind(name)
+
+
+def deciding_sources(name: str) -> list[Path]:
+    """Return the files of this package that a scene folder's content depends on."""
+    others = {file for scene, file in _OF_ONE_SCENE.items() if scene != name}
+    ignored = _DECIDES_NOTHING | others
+    return sorted(p for p in Path(__file__).parent.glob("*.py") if p.name not in ignored)
 
 
 def scene_folder(name: str, size: BuildSize, root: Path | None = None) -> Path:
     """Return where a scene of this size is kept; its hash covers sources, meshes and size."""
-    kind = scene_kind(name)
+    kind = kind_named(name)
     digest = hashlib.sha256(json.dumps([asdict(kind), asdict(size)], sort_keys=True).encode())
-    here = Path(__file__).parent
-    sources = sorted(p for p in here.glob("*.py") if p.name not in _DECIDES_NOTHING)
-    for path in [*sources, *sorted(p for p in MESHES.iterdir() if p.suffix != ".md")]:
+    meshes = sorted(p for p in MESHES.iterdir() if p.suffix != ".md")
+    for path in [*deciding_sources(name), *meshes]:
         # Line ends differ between checkouts and change nothing.
         digest.update(path.name.encode() + path.read_bytes().replace(b"\r\n", b"\n"))
     return (root or CACHE) / f"{name}-{digest.hexdigest()[:12]}"
@@ -74,7 +98,7 @@ def ensure_scene(
     target = scene_folder(name, size, folder)
     if target.is_dir():
         return target
-    kind = scene_kind(name)
+    kind = kind_named(name)
     if importlib.util.find_spec("bpy") is None:
         require_bpy()  # raises with the way to get it
     for module in ("trimesh", "embreex"):

@@ -75,7 +75,7 @@ def write_document(out: Path, outcome: Outcome, facts: dict[str, Any]) -> None:
         "",
         f"![Plots]({PLOTS})",
         "",
-        *_reading(out / READING, facts["date"]),
+        *reading(out / READING, facts["date"]),
         *_headline(results),
         *pictures,
         _words("protocol"),
@@ -89,18 +89,10 @@ def write_document(out: Path, outcome: Outcome, facts: dict[str, Any]) -> None:
 
 def _origin(outcome: Outcome, facts: dict[str, Any]) -> list[str]:
     """Return where the figures come from: command, machine, versions, code, time."""
-    results, photos = outcome.results, facts["photos"]
-    codes = sorted({r.measured.get("code", "not recorded") for r in results})
-    loads = [r.measured.get("load_before") for r in results]
-    seconds = [*(r.wall_s + r.scores["seconds_scoring"] for r in results)]
-    seconds += [p["seconds"] for p in outcome.poses.values()]
-    known = [load for load in loads if load is not None]
-    load = f"{max(known):.1f}" if len(known) == len(loads) else "not recorded for all runs"
-    machine = f"{processor()}, {results[0].report['machine']['threads']} threads; {versions()}"
+    photos = facts["photos"]
+    poses_s = math.fsum(p["seconds"] for p in outcome.poses.values())
     return [
-        f"`{facts['command']}`, {facts['date']}. {machine}.",
-        f"Code: {', '.join(codes)}. {len(results)} meshes; runs and scores took",
-        f"{math.fsum(seconds) / 60:.0f} minutes; largest load average before a run: {load}.",
+        *made_by(outcome.results, facts, poses_s),
         "",
         f"{photos.count} photos of {photos.width} x {photos.height} pixels and 8 test views a",
         "scene. That is smaller than Draft, Standard and Fine would use (up to 480, 640 and 1024",
@@ -109,7 +101,30 @@ def _origin(outcome: Outcome, facts: dict[str, Any]) -> list[str]:
     ]
 
 
-def _reading(path: Path, date: str) -> list[str]:
+def made_by(results: Sequence[Result], facts: dict[str, Any], more_s: float = 0.0) -> list[str]:
+    """Return command, date, machine, versions, code, time and load of some runs, as lines.
+
+    Parameters
+    ----------
+    facts : dict
+        ``command`` and ``date``.
+    more_s : float
+        Time that was spent besides runs and scores.
+    """
+    codes = sorted({r.measured.get("code", "not recorded") for r in results})
+    loads = [r.measured.get("load_before") for r in results]
+    seconds = math.fsum(r.wall_s + r.scores.get("seconds_scoring", 0.0) for r in results) + more_s
+    known = [load for load in loads if load is not None]
+    load = f"{max(known):.1f}" if len(known) == len(loads) else "not recorded for all runs"
+    machine = f"{processor()}, {results[0].report['machine']['threads']} threads; {versions()}"
+    return [
+        f"`{facts['command']}`, {facts['date']}. {machine}.",
+        f"Code: {', '.join(codes)}. {len(results)} meshes; runs and scores took",
+        f"{seconds / 60:.0f} minutes; largest load average before a run: {load}.",
+    ]
+
+
+def reading(path: Path, date: str) -> list[str]:
     """Return the hand-written reading; its first line is the date of the figures that it reads."""
     if not path.is_file():
         return []

@@ -40,6 +40,8 @@ class Settings:
 def run_wrap(run: Run, scene: Path, settings: Settings) -> Path:
     """Wrap a scene and return the run's folder, which holds ``out/`` and ``measured.json``.
 
+    The region is that of the scene's ``region.json``, or the automatic one where it has none.
+
     Raises
     ------
     WorkerError
@@ -52,7 +54,7 @@ def run_wrap(run: Run, scene: Path, settings: Settings) -> Path:
     folder.mkdir(parents=True)
     arguments = [
         "wrap", str(scene), "--out", str(folder / "out"), "--preset", run.preset,
-        "--seed", str(run.seed), "--region", str(scene / "region.json"), *run.arguments,
+        "--seed", str(run.seed), *_region(scene), *run.arguments,
     ]  # fmt: skip
     _batch(arguments, folder, settings)
     return folder
@@ -76,8 +78,7 @@ def run_variant(variant: Variant, base: Path, scene: Path, settings: Settings) -
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     arguments = [
-        "mesh", "--out", str(base / "out"), "--region", str(scene / "region.json"),
-        *variant.arguments,
+        "mesh", "--out", str(base / "out"), *_region(scene), *variant.arguments,
     ]  # fmt: skip
     _batch(arguments, folder, settings, out=base / "out")
     return folder
@@ -126,6 +127,11 @@ def code_state() -> str:
     return commit.stdout.strip() + (" with changes" if changed.stdout.strip() else "")
 
 
+def _region(scene: Path) -> list[str]:
+    path = scene / "region.json"
+    return ["--region", str(path)] if path.is_file() else []
+
+
 def _region_names(out: Path) -> list[str]:
     return sorted(path.parent.name for path in (out / "result").glob("*/mesh.npz"))
 
@@ -141,12 +147,12 @@ def measured(folder: Path) -> dict[str, Any]:
 
 
 def judged_by(module: str, arguments: list[str], path: Path, settings: Settings) -> dict[str, Any]:
-    """Run a module of this package in a process of its own, and read the JSON that it writes.
+    """Run a module in a process of its own, and read the JSON that it writes.
 
     Parameters
     ----------
     module : str
-        Name in this package.
+        Name in this package, or a full one with dots.
     arguments : list of str
         Its command line, without the threads.
     path : Path
@@ -158,7 +164,7 @@ def judged_by(module: str, arguments: list[str], path: Path, settings: Settings)
         With the last lines of its output.
     """
     if not (settings.reuse and path.is_file()):
-        name = f"{__package__}.{module}"
+        name = module if "." in module else f"{__package__}.{module}"
         command = [sys.executable, "-m", name, *arguments, "--threads", str(settings.threads)]
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
         if done.returncode != 0:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,8 @@ def candidate_surface(
     seed: int,
     progress: Progress,
     sightings: Sightings | None = None,
+    *,
+    pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray] = two_pivots,
 ) -> CandidateSurface:
     """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and sighting.
 
@@ -59,6 +62,8 @@ def candidate_surface(
         Length of the bracket on crossing edges; 0 takes :data:`BRACKET_SHARE`.
     sightings : Sightings, optional
         Of the cameras in the region: parts about as thin as a pixel are found by these alone.
+    pivots_of : callable
+        Gives the pivots of chosen Gaussians instead of :func:`~.pivots.two_pivots`.
 
     Raises
     ------
@@ -71,7 +76,7 @@ def candidate_surface(
     if len(index) == 0:
         raise MeshingError(f"No Gaussian reaches region {region.name!r}.", hint)
     chosen = representative(arrays, index, MAX_PIVOT_GAUSSIANS)
-    pivots = two_pivots(arrays, chosen)
+    pivots = pivots_of(arrays, chosen)
     pivots = pivots[region.distance(pivots) <= 0.5 * region.diagonal]
     pivots = np.concatenate([pivots, _probes(region, margin, seed)])
     if sightings is not None:

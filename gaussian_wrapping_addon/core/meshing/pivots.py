@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Two-pivot points of oriented Gaussians (method.md 6.1)."""
+"""Pivots of oriented Gaussians: two for meshing, nine to compare with (method.md 6.1)."""
 
 from __future__ import annotations
 
@@ -62,6 +62,23 @@ def two_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
     unit = np.where(oriented[:, None], normals / np.maximum(length, 1e-300)[:, None], shortest)
     step = PIVOT_SIGMAS * directional_sigma(arrays, index, unit)[:, None] * unit  # (k, 3)
     return np.concatenate([means, means + step, means[~oriented] - step[~oriented]])
+
+
+def nine_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
+    """Return centre and the corners of the 3-sigma box of the Gaussians ``index`` on their axes.
+
+    As Gaussian Opacity Fields places them; orientation plays no part (method.md 6.1, "9p (GOF)").
+
+    Returns
+    -------
+    (9 k, 3) float64
+        Centres first, then the corners, Gaussian by Gaussian.
+    """
+    means = arrays.means[index]
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+    local = PIVOT_SIGMAS * signs * arrays.scales[index][:, None, :]  # (k, 8, 3)
+    corners = means[:, None] + np.einsum("kij,kcj->kci", arrays.rotations[index], local)
+    return np.concatenate([means, corners.reshape(-1, 3)])
 
 
 def representative(arrays: GaussianArrays, index: np.ndarray, limit: int) -> np.ndarray:

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Marching tetrahedra from two and from nine pivots of one training, against the true surface.
+
+``python -m benchmarks.training_study.pivots SCENE JOB OUT.json``. What is judged is the extracted
+surface itself, as the paper does: the add-on's mesh is made from points found on it, and from two
+pivots always.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
+from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
+from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
+from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.files import read_json, write_json
+from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
+from gaussian_wrapping_addon.core.meshing.candidate_surface import candidate_surface
+from gaussian_wrapping_addon.core.meshing.pivots import nine_pivots, two_pivots
+from gaussian_wrapping_addon.core.meshing.region import read_region
+from gaussian_wrapping_addon.core.progress import Progress
+
+from ..speed_error.plan import THRESHOLD_SHARES
+from ..speed_error.score import SURFACE_SAMPLES, stage_folder
+
+TOLERANCE_SHARE = 2e-4
+"""Of the diagonal: crossings are bisected well below the finest threshold."""
+
+PIVOTS = {"2": two_pivots, "9": nine_pivots}
+
+
+def compare(scene_folder: Path, job: Path, threads: int) -> dict[str, Any]:
+    """Return points, faces, seconds and surface scores for either number of pivots."""
+    scene = load_saved_scene(stage_folder(job, "cameras"))
+    arrays = load_gaussians(stage_folder(job, "train") / "gaussians.npz").arrays()
+    world = scene.world_from_scene
+    region = read_region(scene_folder / "region.json").transformed(world.inverse())
+    field = VacancyField(arrays, scene.cameras, threads=threads)
+    truth = read_truth(scene_folder)
+    diagonal = float(read_json(scene_folder / "scene.json")["diagonal"])
+    thresholds = [share * diagonal for share in THRESHOLD_SHARES]
+    found: dict[str, Any] = {}
+    for name, pivots_of in PIVOTS.items():
+        begun_s = time.monotonic()
+        surface = candidate_surface(
+            arrays, region, field.is_empty, TOLERANCE_SHARE * region.diagonal, 0, Progress(),
+            pivots_of=pivots_of,
+        )  # fmt: skip
+        seconds = time.monotonic() - begun_s
+        score = score_protocols(
+            world.points(surface.vertices), surface.faces, truth, [], thresholds,
+            count=SURFACE_SAMPLES, threads=threads, protocols=("uniform",),
+        )["uniform"]  # fmt: skip
+        found[name] = {
+            "points": surface.pivots,
+            "faces": len(surface.faces),
+            "seconds": seconds,
+            "surface": score.to_json(),
+        }
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the comparison."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("job", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--threads", type=int, default=0)
+    options = parser.parse_args(arguments)
+    write_json(options.out, compare(options.scene, options.job, options.threads))
+
+
+if __name__ == "__main__":
+    main()
