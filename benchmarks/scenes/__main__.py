@@ -22,7 +22,9 @@ SHEET = REPOSITORY / "docs" / "images" / "scenes.jpg"
 def _arguments(given: list[str]) -> argparse.Namespace:
     size = BuildSize()
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scenes", description=__doc__)
-    parser.add_argument("name", nargs="?", default="all", help=f"all, or one of {', '.join(ALL_KINDS)}")
+    parser.add_argument(
+        "name", nargs="?", default="all", help=f"all, or one of {', '.join(ALL_KINDS)}"
+    )
     parser.add_argument("--out", type=Path, help="where scenes are kept (default .cache/scenes)")
     parser.add_argument("--photos", type=int, default=size.photos)
     parser.add_argument("--test-views", type=int, default=size.test_views)
@@ -46,7 +48,9 @@ def main(given: list[str] | None = None) -> int:
             else:
                 build_scene(scene_kind(options.name), size, options.build_into, options.base)
             return 0
-        names = list(KINDS) if options.sheet else list(ALL_KINDS) if options.name == "all" else [options.name]
+        names = [options.name]
+        if options.sheet or options.name == "all":
+            names = list(KINDS if options.sheet else ALL_KINDS)
         folders = []
         for name in names:
             begin_s = time.perf_counter()

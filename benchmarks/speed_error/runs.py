@@ -60,11 +60,14 @@ def run_wrap(run: Run, scene: Path, settings: Settings) -> Path:
     return folder
 
 
-def warm_up(scene: Path, settings: Settings) -> None:
-    """Wrap a scene in a minute and forget it, so that no measured run compiles kernels."""
+def warm_up(scene: Path, settings: Settings, more: tuple[str, ...] = ()) -> None:
+    """Wrap a scene in a minute and forget it, so that no measured run compiles kernels.
+
+    ``more`` arguments switch on what the measured runs use.
+    """
     folder = settings.folder / "warm-up"
     shutil.rmtree(folder, ignore_errors=True)
-    arguments = ("--iterations", "400", "--max-gaussians", "8000")
+    arguments = ("--iterations", "400", "--max-gaussians", "8000", *more)
     run = Run(scene.name, "draft", 0, "warm-up", arguments)
     run_wrap(run, scene, dataclasses.replace(settings, folder=folder))
     shutil.rmtree(folder)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from gaussian_wrapping_addon.core.errors import WorkerError
 from ..scenes import ensure_scene
 from ..speed_error.results import Result
 from ..speed_error.runs import Settings, judged_by, measured, run_wrap, warm_up
-from .plan import WRAPPING, Case, Plan
+from .plan import EVERYTHING_ON, WRAPPING, Case, Plan
 
 _logger = logging.getLogger("benchmarks")
 
@@ -44,7 +45,9 @@ class Outcome:
     """Whether a run failed."""
 
 
-def carry_out(plan: Plan, settings: Settings, data: Path | None) -> Outcome:
+def carry_out(
+    plan: Plan, settings: Settings, data: Path | None, only: Sequence[str] = ()
+) -> Outcome:
     """Make the runs in their order until the plan's time is over.
 
     Parameters
@@ -53,25 +56,32 @@ def carry_out(plan: Plan, settings: Settings, data: Path | None) -> Outcome:
         Their folder gets one folder for each size of photos.
     data : Path or None
         Folder with the real sets; runs on a set that it lacks are left out, with the reason.
+    only : sequence of str
+        Runs that none of these words names are not made; finished ones are shown where the
+        settings allow it.
     """
     begun_s = time.monotonic()
     outcome = Outcome([], {}, [], False)
-    warm: set[str] = set()
+    warm = False
     for case in plan.cases:
         name = f"{case.run.identity} ({case.folder})"
         own = dataclasses.replace(settings, folder=settings.folder / case.folder)
-        if plan.minutes and time.monotonic() - begun_s > 60 * plan.minutes:
-            if not (settings.reuse and (own.folder / case.run.identity / "scores.json").is_file()):
-                outcome.missing.append((name, f"not begun within {plan.minutes:g} minutes"))
-                continue
+        finished = settings.reuse and (own.folder / case.run.identity / "measured.json").is_file()
+        late = plan.minutes and time.monotonic() - begun_s > 60 * plan.minutes
+        if not finished and only and not case.words & set(only):
+            outcome.missing.append((name, "left out by --only"))
+            continue
+        if not finished and late:
+            outcome.missing.append((name, f"not begun within {plan.minutes:g} minutes"))
+            continue
         scene = _scene(case, data)
         if isinstance(scene, str):
             outcome.missing.append((name, scene))
             continue
         try:
-            if not warm and not settings.reuse:
-                warm_up(scene, own)
-            warm.add(case.folder)
+            if not finished and not warm:
+                warm_up(scene, own, EVERYTHING_ON)
+                warm = True
             found = _measure(case, scene, own)
         except WorkerError as error:
             _logger.warning("%s failed: %s", name, error)

@@ -15,6 +15,7 @@ _FIXED = ("--harmonics", "on", "--exposure", "off", "--growth", "on")
 
 BASELINE, MULTI_VIEW, ORIENTATION, WRAPPING = "baseline", "multi-view", "orientation", "wrapping"
 AUTO, ON = "", "on"
+WITH, WITHOUT = "wrapping-on", "wrapping-off"
 
 ROWS = {
     BASELINE: (*_FIXED, "--multi-view", "off", "--wrapping", "off"),
@@ -31,6 +32,8 @@ LABELS = {
     WRAPPING: "+ wrapping rounds",
     AUTO: "needs decide",
     ON: "everything on",
+    WITH: "wrapping on",
+    WITHOUT: "wrapping off",
 }
 
 EVERYTHING_ON = tuple(
@@ -145,8 +148,3 @@ def quick_plan() -> Plan:
         *ablation("fox", None, (*few, "--max-image-px", "160")),
     )
     return Plan(cases, ("wheel",), 10.0)
-
-
-def chosen(cases: tuple[Case, ...], only: list[str]) -> tuple[Case, ...]:
-    """Return the cases that any of the words names."""
-    return tuple(case for case in cases if not only or case.words & set(only))
