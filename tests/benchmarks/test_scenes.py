@@ -20,9 +20,11 @@ import pytest
 from PIL import Image
 
 from benchmarks.scenes.build import BuildSize, build_scene
+from benchmarks.scenes.cache import ALL_KINDS, deciding_sources, kind_named
 from benchmarks.scenes.catalogue import KINDS, scene_content, scene_kind
 from benchmarks.scenes.geometry import joined, open_edges, signed_volume
 from benchmarks.scenes.ground_truth import truth_samples
+from benchmarks.scenes.looking_in import CUP_INSIDE, build_cup_inside, cup_inside_content
 from benchmarks.scenes.rendering import Light, render_photos
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.load import load_scene
@@ -253,6 +255,46 @@ def test_thickness_and_views_of_a_plate() -> None:
     assert np.mean(np.abs(samples.normals[:, 2]) > 0.5) == pytest.approx(8 / 8.8, abs=2e-3)
 
 
+def test_the_inside_of_the_cup_is_photographed() -> None:
+    """Of ``cup`` a fifth is seen by fewer than two photos; of ``cup_inside`` hardly anything."""
+    size = (64, 48)
+    inside, cup = cup_inside_content(40, 8, size), scene_content(scene_kind("cup"), 40, 8, size)
+    assert len(inside.cameras) == 40
+    assert len({camera.name for camera in (*inside.cameras, *inside.test_cameras)}) == 48
+    everything = joined(inside.parts)
+    hidden = []
+    for content in (inside, cup):
+        samples = truth_samples(
+            content.truth, everything, content.cameras, content.crop, 0.03, 1, 4000
+        )
+        hidden.append(np.mean(samples.seen < 2))
+    assert hidden[0] < 0.01
+    assert hidden[1] > 0.15
+    np.testing.assert_array_equal(inside.crop.vertices, cup.crop.vertices)
+
+
+def test_a_scene_of_its_own_module_is_built_like_the_others(
+    tmp_path: Path, folders: dict[str, Path]
+) -> None:
+    folder = tmp_path / CUP_INSIDE.name
+    _apart(build_cup_inside, SIZE, folder)
+    files = {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
+    wanted = {
+        path.relative_to(folders["spot"]) for path in folders["spot"].rglob("*") if path.is_file()
+    }
+    assert files == wanted
+    described = json.loads((folder / "scene.json").read_text())
+    assert (described["name"], described["role"]) == ("cup_inside", "test")
+
+
+def test_sources_of_one_scene_do_not_make_others_stale() -> None:
+    own = {name: {path.name for path in deciding_sources(name)} for name in ALL_KINDS}
+    assert own["cup_inside"] - own["cup"] == {"looking_in.py"}
+    assert own["cup"] < own["cup_inside"]
+    assert {"build.py", "catalogue.py", "viewpoints.py"} <= own["cup"]
+
+
 def test_unknown_scenes_are_named() -> None:
-    with pytest.raises(UsageError, match="teapot"):
-        scene_kind("teapot")
+    for find in (scene_kind, kind_named):
+        with pytest.raises(UsageError, match="teapot"):
+            find("teapot")

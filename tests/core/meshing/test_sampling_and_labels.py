@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from gaussian_wrapping_addon.core.meshing.classification import _sweeps, regularised
 from gaussian_wrapping_addon.core.meshing.pivots import (
     directional_sigma,
+    nine_pivots,
     reaching,
     representative,
     two_pivots,
@@ -97,6 +98,18 @@ def test_outer_pivots_lie_three_sigmas_out() -> None:
     np.testing.assert_allclose(
         pivots[600:], 2 * arrays.means[~oriented] - pivots[300:600][~oriented]
     )
+
+
+def test_nine_pivots_are_the_centre_and_the_corners_of_the_box() -> None:
+    arrays = random_arrays(40, 4)
+    index = np.array([7, 3, 30])
+    pivots = nine_pivots(arrays, index)
+    np.testing.assert_array_equal(pivots[:3], arrays.means[index])
+    offset = pivots[3:].reshape(3, 8, 3) - arrays.means[index][:, None]
+    white = np.einsum("nij,nci->ncj", arrays.rotations[index], offset)
+    white /= arrays.scales[index][:, None]
+    np.testing.assert_allclose(np.abs(white), 3.0, rtol=1e-9)
+    assert all(len(np.unique(np.sign(corners), axis=0)) == 8 for corners in white)
 
 
 def test_gaussians_that_reach_a_region() -> None:
