@@ -117,7 +117,7 @@ def _surfaces(runs: Sequence[Measured]) -> list[Check]:
     found = []
     for m in _of(runs, SURFACE):
         scene, r = m.case.run.scene, m.result
-        name, uniform = f"{scene}, standard, 640 px", r.scores["surface"]["uniform"]
+        name, uniform = _named(m.case), r.scores["surface"]["uniform"]
         if scene == "wheel":
             found.append(_share(f"{name}: spokes within {AT}", SPOKES, thin_recall(uniform)))
         f1 = r.f1("uniform", MIDDLE)
@@ -133,19 +133,21 @@ def _wrapping(runs: Sequence[Measured]) -> list[Check]:
     found = []
     same = _of(runs, SWITCH)
     for scene in COMPARED:
-        by_name = {m.case.run.name: m.result for m in same if m.case.run.scene == scene}
+        by_name = {m.case.run.name: m for m in same if m.case.run.scene == scene}
         if set(by_name) != {WITH, WITHOUT}:
             continue
+        title = _named(by_name[WITH].case)
         judged: list[tuple[str, Callable[[Result], float | None]]] = [
             (f"F1 at {AT}", lambda r: r.f1("uniform", MIDDLE)),
             (f"thin parts within {AT}", lambda r: thin_recall(r.scores["surface"]["uniform"])),
         ]
         for words, value in judged:
-            on, off = value(by_name[WITH]), value(by_name[WITHOUT])
-            met = None if on is None or off is None else on > off
+            on, off = (value(by_name[name].result) for name in (WITH, WITHOUT))
+            # As shown: a difference that three digits hide is none.
+            met = None if on is None or off is None else round(on, 3) > round(off, 3)
             found.append(
                 Check(
-                    f"{scene}, standard, 640 px: {words}, wrapping on against off",
+                    f"{title}: {words}, wrapping on against off",
                     "on is higher",
                     f"{three(on)} against {three(off)}",
                     met,
@@ -205,6 +207,11 @@ def _share(what: str, bound: float, value: float | None) -> Check:
         "none seen" if value is None else f"{value:.3f}",
         value is not None and value >= bound,
     )
+
+
+def _named(case: Case) -> str:
+    size = "" if case.photos is None else f", {case.photos.width} px"
+    return f"{case.run.scene}, {case.run.preset}{size}"
 
 
 def _of(runs: Sequence[Measured], part: str) -> list[Measured]:

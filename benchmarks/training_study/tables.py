@@ -169,7 +169,7 @@ def comparison(auto: Measured, everything: Measured) -> Row:
 
 def decisions(report: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the decision records of a job, empty where it took none."""
-    return list(report["training"].get("needs", ()))
+    return list(report["training"].get("decisions", ()))
 
 
 def chosen(report: dict[str, Any], name: str) -> str | None:

@@ -73,7 +73,7 @@ def measured(case: Case) -> Measured:
         "machine": {"threads": 2},
         "settings": {"training": {"max_image_px": 640}},
         "training": {
-            "gaussians": 7000, "iterations": 1000, "seconds_training": 25.0, "needs": needs,
+            "gaussians": 7000, "iterations": 1000, "seconds_training": 25.0, "decisions": needs,
             "held_out_psnr": 27.25, "held_out_ssim": 0.93,
         },
         "regions": {"box": {"statistics": {"closed": True, "components": 2}}},
@@ -188,7 +188,7 @@ def test_missed_targets_are_told() -> None:
         m.result.report["training"]["held_out_psnr"] = 20.0
         m.result.scores["gaussians"]["psnr"] = 31.0 if m.case.run.name == ON else 20.0
         m.result.report["peak_memory_bytes"]["worker"] = 5 * 2**30
-        m.result.report["training"]["needs"].clear()
+        m.result.report["training"]["decisions"].clear()
     targets = [c for c in checks(runs) if c.target]
     assert len(targets) == 19
     assert {c.met for c in targets} == {False}
