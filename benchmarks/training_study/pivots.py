@@ -2,8 +2,8 @@
 """Marching tetrahedra from two and from nine pivots of one training, against the true surface.
 
 ``python -m benchmarks.training_study.pivots SCENE JOB OUT.json``. What is judged is the extracted
-surface itself, as the paper does: the add-on's mesh is made from points found on it, and from two
-pivots always.
+surface itself, as the paper does: the add-on's mesh is made from points found on it, and always
+from two pivots and points that the cameras see.
 """
 
 from __future__ import annotations

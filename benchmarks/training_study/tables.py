@@ -79,7 +79,8 @@ def pivot_table(pivots: dict[str, dict[str, Any]]) -> Table:
         "Marching tetrahedra on the Delaunay edges of the pivots, of one training with all losses: "
         "centre and one point outside along the orientation, or centre and the corners of the "
         "3-sigma box. Judged as extracted, without removing small parts. The add-on samples its "
-        "mesh from the surface of two pivots.",
+        "mesh from the surface of two pivots and of points that its cameras see, which are left "
+        "out here.",
     )
 
 
