@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .core.settings import JobSettings
 
-NEEDS = ("harmonics", "exposure", "multi_view", "wrapping", "growth")
+NEEDS = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size")
 """What ``--needs`` decides at once; names of training settings."""
 
 _NEEDS_WORDS = {"auto": "auto", "all": "on", "none": "off"}
@@ -21,6 +21,7 @@ _NEEDS_HELP = {
     "multi_view": "terms that compare neighbouring photos",
     "wrapping": "orientation, and clones of opposite orientation",
     "growth": "more Gaussians than the start has",
+    "full_size": "photos at their full size, also where half shows as much",
 }
 
 # Options that replace one number of the preset: their type, their placeholder, their help.
@@ -29,6 +30,14 @@ _NUMBERS: tuple[tuple[str, str, type, str, str], ...] = (
     ("--max-gaussians", "max_gaussians", int, "N", "cap instead of the preset's"),
     ("--max-image-px", "max_image_px", int, "N", "training image size instead of the preset's"),
     ("--sh-degree", "sh_degree", int, "0..3", "highest degree of the harmonics"),
+    ("--wrap-rounds", "wrap_rounds", int, "N", "rounds of clones; 0 trains orientation alone"),
+    (
+        "--region-weight",
+        "region_weight",
+        float,
+        "W",
+        "Gaussians inside the regions count this many times where their number is limited",
+    ),
     ("--holdout", "holdout_every", int, "N", "keep each n-th photo for measuring; 0 keeps none"),
     (
         "--preview-every",
@@ -52,7 +61,7 @@ def add_training_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--needs",
         choices=tuple(_NEEDS_WORDS),
-        help="what the photos decide (auto), everything, or nothing of the five options below, "
+        help="what the photos decide (auto), everything, or nothing of the six options below, "
         "each of which wins over this one",
     )
     for name in NEEDS:

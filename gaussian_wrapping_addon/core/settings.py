@@ -86,9 +86,9 @@ class TrainingSettings:
     densify_from: float = 0.5 / 30
     densify_until: float = 0.5
     densify_every: int = 100
-    overlap_price: float = 0.0
+    overlap_price: float = 2e-5
     """Price, in the unit of the loss, of one more Gaussian over every pixel."""
-    prune_share: float = 0.02
+    prune_share: float = 0.005
     """Gaussians that together contribute less than this share of all blending weights are removed
     every now and then; 0 removes none."""
     orient_from: float = 20 / 30

@@ -25,7 +25,7 @@ from .stages import Stage, run_stage, source_fingerprint, stage_key
 _logger = logging.getLogger(__name__)
 
 # Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
-STAGE_VERSIONS = {"cameras": 1, "train": 4, "mesh": 2, "texture": 3}
+STAGE_VERSIONS = {"cameras": 1, "train": 5, "mesh": 3, "texture": 3}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
@@ -204,6 +204,7 @@ def _run_meshing(
         import numpy as np
 
         from ..dataset.scene_file import load_saved_scene
+        from ..field.sightings import find_sightings
         from ..field.vacancy import VacancyField
         from ..field.vector_field import VectorField
         from ..gaussians.gaussian_file import load_gaussians
@@ -213,7 +214,8 @@ def _run_meshing(
         from ..meshing.statistics import mesh_statistics
 
         scene = load_saved_scene(cameras.folder)
-        arrays = load_gaussians(trained.folder / "gaussians.npz").arrays()
+        gaussians = load_gaussians(trained.folder / "gaussians.npz")
+        arrays = gaussians.arrays()
         if request == "auto":
             region = automatic_region(scene)
         elif request == "all":
@@ -223,10 +225,15 @@ def _run_meshing(
             region = world_region.transformed(scene.world_from_scene.inverse())
         vacancy = VacancyField(arrays, scene.cameras, threads=threads)
         vectors = VectorField(arrays, threads=threads)
+        sightings = find_sightings(
+            gaussians, scene.cameras, lambda points: region.contains(points, 0.0),
+            progress.span(0.0, 0.15), threads=threads,
+        )  # fmt: skip
         mesh = mesh_region(
-            vacancy, vectors, arrays, scene.cameras, region, meshing, progress.span(0.0, 0.95),
+            vacancy, vectors, arrays, scene.cameras, region, meshing, progress.span(0.15, 0.95),
             seed=job.settings.seed, threads=threads,
             edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
+            sightings=sightings,
         )  # fmt: skip
         if not np.isfinite(mesh.vertices).all():
             raise MeshingError(
