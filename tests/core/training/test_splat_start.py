@@ -113,7 +113,9 @@ def test_a_baked_filter_changes_no_picture() -> None:
     camera = look_at((2.0, -3.0, 1.0))
     bare = baked(gaussians)
     assert not bare.filter_3d.any()
-    before, after = render_reference(gaussians, camera), render_reference(bare, camera)
+    options = RenderOptions()
+    before = render_reference(gaussians, camera, options)
+    after = render_reference(bare, camera, options)
     assert float((after.color - before.color).abs().max()) < 1e-9
 
 
