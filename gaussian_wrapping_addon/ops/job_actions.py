@@ -61,7 +61,10 @@ def output_of(scene: bpy.types.Scene, source: Path) -> Path:
         It lies inside the photo folder, which is never written to.
     """
     text = scene.gwrap.output
-    base = source.parent if source.is_file() else source
+    if source.suffix.lower() == ".ply":
+        base = source.with_suffix("")  # a splat: other files in its folder are not its input
+    else:
+        base = source.parent if source.is_file() else source
     folder = Path(bpy.path.abspath(text)).resolve() if text else base.with_name(f"{base.name}_wrap")
     if folder.is_relative_to(base):
         raise UsageError(

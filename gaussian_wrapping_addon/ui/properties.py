@@ -50,9 +50,12 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     """What a scene is made of and which job works for it."""
 
     source: StringProperty(  # type: ignore[valid-type]
-        name="Folder",
-        description="Folder of photos, of a COLMAP project, or with a transforms.json",
-        subtype="DIR_PATH",
+        name="Input",
+        description=(
+            "Folder of photos, of a COLMAP project, or with a transforms.json; or the PLY of a "
+            "3D Gaussian splat"
+        ),
+        subtype="FILE_PATH",
     )
     output: StringProperty(  # type: ignore[valid-type]
         name="Output",
