@@ -113,22 +113,18 @@ def _train(
     from ..gaussians.gaussian_file import save_gaussians
     from ..training.checkpoint import remove_checkpoints
     from ..training.trainer import held_out_views, train
-    from .splat_scene import is_splat
+    from .splat_scene import start_splat_of
 
     scene = load_saved_scene(cameras.folder)
     estimated, warnings = _estimate(scene, job, stage_folder, progress, threads)
 
-    source = Path(job.source)
-    start = Path(job.settings.start_splat) if job.settings.start_splat else None
-    if start is None and is_splat(source):
-        start = source
     inside = _inside_regions(job, scene)
 
     def attempt(settings: TrainingSettings) -> TrainingResult:
         photos = PhotoStore(scene, settings.max_image_px)
         return train(
             scene, photos, settings, stage_folder, progress,
-            seed=job.settings.seed, threads=threads, start_splat=start, inside=inside,
+            seed=job.settings.seed, threads=threads, start_splat=start_splat_of(job), inside=inside,
         )  # fmt: skip
 
     trained = train_within_memory(

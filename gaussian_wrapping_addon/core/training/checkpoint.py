@@ -29,8 +29,16 @@ _NAME = re.compile(r"checkpoint-(\d{1,9})\.json")
 _AGAIN = "Delete the folder and train again."
 
 
-def fingerprint(scene: Scene, settings: TrainingSettings, seed: int) -> str:
-    """Hash what a training's result depends on: settings, seed, cameras, photo names, points."""
+def fingerprint(
+    scene: Scene, settings: TrainingSettings, seed: int, start: Path | None = None
+) -> str:
+    """Hash what a training's result depends on: settings, seed, cameras, photo names, points.
+
+    Parameters
+    ----------
+    start : Path, optional
+        File of Gaussians that the training starts from; its content counts.
+    """
     described = {k: v for k, v in to_json(settings).items() if k not in RESULT_FREE}
     described.pop("extra_iterations")  # a longer run starts as the shorter one does
     digest = hashlib.sha256()
@@ -41,6 +49,9 @@ def fingerprint(scene: Scene, settings: TrainingSettings, seed: int) -> str:
         digest.update(repr((camera.name, view.photo_path.name, numbers)).encode())
         digest.update(np.ascontiguousarray(camera.cam_from_world, np.float64).tobytes())
     digest.update(np.ascontiguousarray(scene.points, np.float64).tobytes())
+    if start is not None:
+        with open(start, "rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
 
 

@@ -105,7 +105,8 @@ class Rounds:
         if schedule.resets_opacity(iteration):
             reset_opacity(adam)
             state.visits.clear()
-        if self.settings.harmonics == "auto" and schedule.tries_harmonics(iteration):
+        tries = self.settings.harmonics == "auto" and not schedule.refines
+        if tries and schedule.tries_harmonics(iteration):
             self._try_harmonics(state)
 
     def filter(self, state: TrainingState) -> None:

@@ -44,6 +44,9 @@ RATE_POWERS = {
 PYRAMID = ((4, 0.0), (2, 0.1), (1, 0.3))
 """Divisor of the image size, and the share of the iterations from which it is used."""
 
+REFINING_FROM = 0.7
+"""Where in the decay of the means' rate a training of finished Gaussians begins."""
+
 SMALLEST_SIDE_PX = 96
 """Where the long side of a level would be smaller than this, a finer one is used."""
 
@@ -79,11 +82,15 @@ class Schedule:
         Long side of the largest training image.
     finest : int
         Divisor of the finest level of the pyramid.
+    refines : bool
+        The Gaussians come from another training: finest level, all harmonics and late learning
+        rates from the start.
     """
 
     settings: TrainingSettings
     long_side_px: int
     finest: int = 1
+    refines: bool = False
 
     @property
     def total(self) -> int:
@@ -104,6 +111,8 @@ class Schedule:
     def divisor(self, iteration: int) -> int:
         """Return the divisor of the image size."""
         chosen = self.finest
+        if self.refines:
+            return chosen
         for divisor, start in PYRAMID:
             if self._share(iteration) >= start:
                 chosen = max(divisor, self.finest)
@@ -113,7 +122,7 @@ class Schedule:
 
     def sh_degree(self, iteration: int) -> int:
         """Return the degree of the harmonics where no evidence is asked for."""
-        share = min(1.0, self._share(iteration))
+        share = 1.0 if self.refines else min(1.0, self._share(iteration))
         return min(self.settings.sh_degree, int(share / DEGREE_SHARE))
 
     def uses_depth(self, iteration: int) -> bool:
@@ -192,6 +201,8 @@ class Schedule:
         growth = {name: self.short_run_factor**power for name, power in RATE_POWERS.items()}
         first, last = POSITION_RATE
         share = min(1.0, self._share(iteration))
+        if self.refines:
+            share = REFINING_FROM + (1.0 - REFINING_FROM) * share
         position = growth["means"] * tolerances.SCENE_RADIUS * first * (last / first) ** share
         coefficients = (self.settings.sh_degree + 1) ** 2
         rate = {name: value * growth[name] for name, value in RATES.items()}

@@ -76,6 +76,8 @@ def wrapping_settings(settings: TrainingSettings) -> TrainingSettings:
         settings,
         iterations=max(1, round(ITERATIONS_SHARE * settings.iterations)),
         growth="off",
+        full_size="on",
+        prune_share=0.0,
         depth_from=0.0,
         densify_from=0.0,
         densify_until=0.0,

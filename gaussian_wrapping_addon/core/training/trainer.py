@@ -168,7 +168,7 @@ class _Trainer:
         numbers = np.array(self.views)
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)
-        self.schedule = Schedule(settings, side_px, finest)
+        self.schedule = Schedule(settings, side_px, finest, start_splat is not None)
         self.stepper = Stepper(photos, self.schedule, self.views, self.neighbours, threads)
         self.seen: dict[str, float] = {}
         self.live = LiveView(photos, self.held_out, folder, settings, threads)
@@ -198,7 +198,7 @@ class _Trainer:
 
     def run(self, progress: Progress) -> TrainingResult:
         """Start or resume, iterate to the end, measure."""
-        key = fingerprint(self.scene, self.settings, self.seed)
+        key = fingerprint(self.scene, self.settings, self.seed, self.start_splat)
         progress.update(0.0, "preparing the Gaussians")
         rounds = Rounds(self.stepper, self.held_out, self.inside, progress)
         state = load_checkpoint(self.folder, key)
@@ -272,6 +272,8 @@ class _Trainer:
             warnings += start.warnings
         state = TrainingState.start(gaussians, self.seed)
         state.warnings = warnings
+        if self.start_splat is not None:
+            state.degree = self.settings.sh_degree if self.settings.harmonics != "off" else 0
         self._decide(state)
         rounds.filter(state)
         return state
@@ -314,9 +316,11 @@ class _Trainer:
             state.exposure = Exposure(count, self.views, exposure.log_gains)
         pairs = [self.neighbours[view] for view in self.views]
         needs = needs.with_decision(multi_view_need(pairs, settings.multi_view))
-        if settings.harmonics != "auto" or settings.sh_degree == 0:
+        if settings.harmonics != "auto" or settings.sh_degree == 0 or self.start_splat:
             degree = settings.sh_degree if settings.harmonics != "off" else 0
-            evidence = "Nothing was tried: the settings decide."
+            evidence = "Nothing was tried: " + (
+                "the splat brings its own." if self.start_splat else "the settings decide."
+            )
             needs = needs.with_decision(
                 Decision("harmonics", settings.harmonics, f"degree {degree}", evidence)
             )

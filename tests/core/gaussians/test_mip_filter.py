@@ -29,7 +29,7 @@ def test_filter_is_its_definition_for_any_thread_count() -> None:
     seen = np.isfinite(depths)
     assert 0 < seen.sum() < 400
     depths[~seen] = depths[seen].max()
-    wanted = depths / (1.03 * 60.0) * math.sqrt(0.2)
+    wanted = depths / (1.03 * 60.0) * math.sqrt(0.05)
     for threads in (1, 4):
         assert np.abs(mip_filter(means, cameras, threads=threads) - wanted).max() < 1e-12
 

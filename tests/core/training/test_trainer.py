@@ -17,6 +17,7 @@ from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.result import TrainingResult
+from gaussian_wrapping_addon.core.training.state import TrainingState
 from gaussian_wrapping_addon.core.training.trainer import held_out_views, train
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
 
@@ -99,7 +100,8 @@ def test_held_out_photos_get_a_likeness_or_the_reason_why_not(
     scene, photos = sphere_scene(views=9, size_px=24)
     monkeypatch.setattr(trainer, "lpips_if_ready", lambda: found)
     run = trainer._Trainer(scene, photos, SETTINGS, tmp_path, 0, 1)
-    figures, said = run._measure(sphere_gaussians(), Progress())
+    state = TrainingState.start(sphere_gaussians(), 0)
+    figures, said = run._measure(sphere_gaussians(), state, Progress())
     values = TrainingResult(sphere_gaussians(), 1, (), tuple(figures), 1.0, (), said).to_json()
     assert len(values["held_out"]) == 2
     assert said == values.get("lpips_note", "") == note
