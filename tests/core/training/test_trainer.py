@@ -14,8 +14,10 @@ import torch
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, UsageError, WrapError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.render.render import render
+from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training import trainer
+from gaussian_wrapping_addon.core.training import iteration, rounds, trainer
 from gaussian_wrapping_addon.core.training.result import TrainingResult
 from gaussian_wrapping_addon.core.training.state import TrainingState
 from gaussian_wrapping_addon.core.training.trainer import held_out_views, train
@@ -129,7 +131,8 @@ def test_killed_and_resumed_is_bit_for_bit_the_same(tmp_path: Path) -> None:
     resumed = train(scene, photos, SETTINGS, tmp_path / "b", Progress(), seed=3, threads=2)
     assert_same(whole.gaussians, resumed.gaussians)
     assert whole.held_out == resumed.held_out
-    other = train(scene, photos, SETTINGS, tmp_path / "a", Progress(), seed=4, threads=1)
+    (tmp_path / "c").mkdir()
+    other = train(scene, photos, SETTINGS, tmp_path / "c", Progress(), seed=4, threads=1)
     assert not torch.equal(other.gaussians.means[:50], whole.gaussians.means[:50])
 
 
@@ -170,7 +173,7 @@ def test_numbers_that_break_down_are_recovered_once(
 ) -> None:
     scene, photos = sphere_scene(views=9, size_px=24)
     settings = dataclasses.replace(SETTINGS, iterations=20)
-    honest, bad = trainer.color_loss, {7}
+    honest, bad = iteration.color_loss, {7}
     calls = [0]
 
     def sometimes_nan(*arguments, **named):  # type: ignore[no-untyped-def]
@@ -178,13 +181,14 @@ def test_numbers_that_break_down_are_recovered_once(
         loss, gradient, figures = honest(*arguments, **named)
         return (loss * float("nan") if calls[0] in bad else loss), gradient, figures
 
-    monkeypatch.setattr(trainer, "color_loss", sometimes_nan)
+    monkeypatch.setattr(iteration, "color_loss", sometimes_nan)
     result = train(scene, photos, settings, tmp_path, Progress(), threads=1)
     assert any("went back from iteration 6 to 0" in w for w in result.warnings)
     assert all(torch.isfinite(t).all() for _, t in result.gaussians.tensors())
     calls[0], bad = 0, {7, 12}
+    (tmp_path / "again").mkdir()
     with pytest.raises(WrapError, match="twice"):
-        train(scene, photos, settings, tmp_path, Progress(), threads=1)
+        train(scene, photos, settings, tmp_path / "again", Progress(), threads=1)
 
 
 def test_held_out_photos_are_every_nth_of_the_sorted_names() -> None:
@@ -196,3 +200,80 @@ def test_held_out_photos_are_every_nth_of_the_sorted_names() -> None:
     assert held_out_views(scene, 0) == []
     few = dataclasses.replace(scene, views=scene.views[:5])
     assert held_out_views(few, 2) == [0]
+
+
+def test_training_more_equals_a_longer_run(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    settings = dataclasses.replace(SETTINGS, iterations=25)
+    longer = dataclasses.replace(settings, extra_iterations=15)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    whole = train(scene, photos, longer, tmp_path / "a", Progress(), seed=2, threads=1)
+    short = train(scene, photos, settings, tmp_path / "b", Progress(), seed=2, threads=2)
+    more = train(scene, photos, longer, tmp_path / "b", Progress(), seed=2, threads=2)
+    assert (short.iterations, more.iterations) == (25, 40)
+    assert not torch.equal(short.gaussians.means[:50], more.gaussians.means[:50])
+    assert_same(whole.gaussians, more.gaussians)
+    assert whole.held_out == more.held_out
+
+
+@pytest.mark.parametrize("where", ["_prune", "_wrap"])
+def test_a_round_that_is_cancelled_half_way_is_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    settings = dataclasses.replace(SETTINGS, wrapping="on", prune_share=0.05)
+    whole = train(scene, photos, settings, tmp_path / "a", Progress(), seed=1, threads=1)
+    honest, calls = getattr(rounds.Rounds, where), [0]
+
+    def cut(self, state):  # type: ignore[no-untyped-def]
+        calls[0] += 1
+        if calls[0] == 2:
+            raise Cancelled()
+        return honest(self, state)
+
+    monkeypatch.setattr(rounds.Rounds, where, cut)
+    with pytest.raises(Cancelled):
+        train(scene, photos, settings, tmp_path / "b", Progress(), seed=1, threads=1)
+    resumed = train(scene, photos, settings, tmp_path / "b", Progress(), seed=1, threads=1)
+    assert calls[0] > 2
+    assert_same(whole.gaussians, resumed.gaussians)
+
+
+def test_every_decision_is_written_down_and_can_be_overridden(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    names = {"full_size", "exposure", "multi_view", "harmonics", "wrapping", "growth"}
+    settings = dataclasses.replace(SETTINGS, densify_until=0.9)
+    result = train(scene, photos, settings, tmp_path, Progress(), threads=1)
+    assert {d.name for d in result.needs} == names
+    assert all(d.evidence and d.setting == "auto" for d in result.needs)
+    for word, degree in (("on", 1), ("off", 0)):
+        (tmp_path / word).mkdir()
+        asked = dataclasses.replace(settings, **dict.fromkeys(names, word))
+        result = train(scene, photos, asked, tmp_path / word, Progress(), threads=1)
+        assert {d.name for d in result.needs} == names
+        assert all(d.setting == word for d in result.needs)
+        assert result.gaussians.sh_degree == degree
+        assert result.exposure_fitted == (word == "on")
+        lengths = np.linalg.norm(result.gaussians.normals().numpy(), axis=1)
+        assert (lengths.max() > 0) == (word == "on")
+
+
+def test_masks_can_mean_that_nothing_is_there(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    mask = np.zeros((24, 24), bool)
+    mask[4:20, 4:20] = True
+    store = PhotosInMemory(scene, photos.photos, [mask] * 9)
+    clear = {}
+    for mode in ("ignore", "background"):
+        (tmp_path / mode).mkdir()
+        settings = dataclasses.replace(
+            SETTINGS, iterations=150, mask_mode=mode, exposure="off", holdout_every=0
+        )
+        result = train(scene, store, settings, tmp_path / mode, Progress(), threads=1)
+        alpha = render(result.gaussians, store.camera(0), RenderOptions(threads=1)).alpha.numpy()
+        clear[mode] = float(alpha[~mask].mean())
+    assert clear["background"] < 0.5 * clear["ignore"]
+    assert clear["background"] < 0.15
