@@ -172,11 +172,12 @@ def harmonics_need(
     count = min(len(usable), MAX_FIT_VIEWS)
     spread = np.linspace(0, len(usable) - 1, count).round().astype(int)
     fitted = [usable[i] for i in spread.tolist()]
-    if not judges:
+    never_trained = bool(judges)
+    if not never_trained:
         judges = fitted[LEFT_OUT_EVERY // 2 :: LEFT_OUT_EVERY]
         fitted = [v for v in fitted if not any(v is judge for judge in judges)]
     if len(fitted) < MIN_FIT_VIEWS or not judges or len(gaussians) == 0:
-        return HarmonicsNeed(degree, 0.0, False, 0.0, 0, bool(held_out), None)
+        return HarmonicsNeed(degree, 0.0, False, 0.0, 0, never_trained, None)
     trial = _Trial(gaussians, fitted, judges, degree, threads or default_threads())
     trial.settle()
     without, _ = trial.errors(degree - 1)
@@ -193,7 +194,7 @@ def harmonics_need(
         needed,
         better,
         len(judges),
-        bool(held_out),
+        never_trained,
         sh if needed else None,
     )
 
@@ -233,6 +234,47 @@ class _Trial:
             for view in self.judges
         ]
 
+    def errors(self, degree: int) -> tuple[np.ndarray, np.ndarray]:
+        """Fit all coefficients up to a degree.
+
+        Returns
+        -------
+        errors : (judges,) float64
+            Mean squared error of each judging photo.
+        sh : (n, k, 3) float32
+            The coefficients.
+        """
+        sh = self.fit(degree)
+        errors = [
+            _mean_squared(self._image(sh, view.camera), *target)
+            for view, target in zip(self.judges, self.judged, strict=True)
+        ]
+        return np.array(errors), sh
+
+    def fit(self, degree: int) -> np.ndarray:
+        """Return (n, k, 3) float32: the coefficients with all up to a degree fitted."""
+        coefficients = (degree + 1) ** 2
+        before = [self._image(self.start, view.camera) for view in self.fitted]
+        sh = self.start
+        steps: list[np.ndarray] = []  # (n, coefficients, 3) each
+        images: list[list[np.ndarray]] = []  # of each step, what it adds to each fitted view
+        for _ in range(SWEEPS):
+            step = self._fit(sh, degree)
+            moved = self.start.copy()
+            moved[:, :coefficients] += step
+            steps.append(step)
+            images.append(
+                [
+                    self._image(moved, view.camera) - base
+                    for view, base in zip(self.fitted, before, strict=True)
+                ]
+            )
+            lengths = self._lengths(images, before)
+            sh = self.start.copy()
+            for length, one in zip(lengths, steps, strict=True):
+                sh[:, :coefficients] += (length * one).astype(np.float32)
+        return sh
+
     def _weights(self, camera: Camera) -> np.ndarray:
         """(n,) sums of blending weights, pixels."""
         options = RenderOptions(depth=False, sh_degree=0, threads=self.threads, statistics=True)
@@ -263,7 +305,12 @@ class _Trial:
             residual = (target - image.color) * counts[..., None]
             seen = image.backward(ImageGradients(color=residual.astype(np.float32)))
             sums[row, seen.ids] = seen.sh[:, 0] / _C0
-            weights[row] = image.statistics.weight_sum
+            if view.mask is None:
+                weights[row] = image.statistics.weight_sum
+            else:  # the same sums, of the pixels that count alone
+                ones = np.repeat(counts[..., None], 3, 2).astype(np.float32)
+                seen = image.backward(ImageGradients(color=ones))
+                weights[row, seen.ids] = seen.sh[:, 0].max(1) / _C0
         return _regress(sums, weights, self.shown, self.directions, degree)
 
     def _lengths(self, images: list[list[np.ndarray]], before: list[np.ndarray]) -> np.ndarray:
