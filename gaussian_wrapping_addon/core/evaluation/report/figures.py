@@ -38,6 +38,12 @@ _UNITS = {
     "seed": "number",
     "version": "number",
     "sh_degree": "degree",
+    "extra_iterations": "count",
+    "pixels_per_iteration": "px",
+    "multi_view_pixels": "px",
+    "multi_view_every": "iterations",
+    "region_weight": "weight",
+    "overlap_price": "weight",
     "euler": "number",
     "genus": "number",
 }
