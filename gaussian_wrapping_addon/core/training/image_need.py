@@ -55,6 +55,7 @@ class ImageNeed:
     useful_px: int
     """Long side: the median over the photos."""
     side_px: int
+    """Long side of the photo that is this median."""
     detail: float
     noise: float
     photos: int
@@ -126,10 +127,10 @@ def image_need(details: Sequence[PhotoDetail]) -> ImageNeed:
     if not details:
         raise ValueError("no photo was measured")
     # The upper one of two middle photos: detail is kept where half of the photos have it.
-    useful = sorted(d.useful_px for d in details)[len(details) // 2]
+    chosen = sorted(details, key=lambda d: (d.useful_px, d.side_px))[len(details) // 2]
     return ImageNeed(
-        useful,
-        max(d.side_px for d in details),
+        chosen.useful_px,
+        chosen.side_px,  # of the same photo: sizes may differ without any being halved
         float(np.median([d.detail for d in details])),
         float(np.median([d.noise for d in details])),
         len(details),

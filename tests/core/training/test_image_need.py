@@ -105,3 +105,8 @@ def test_half_of_the_photos_decide() -> None:
     assert "nothing finer" not in image_need([fine]).decision().evidence
     with pytest.raises(ValueError, match="no photo"):
         image_need([])
+
+
+def test_photos_of_several_sizes_are_not_taken_for_halved_ones() -> None:
+    details = [PhotoDetail(side, side, 0.03, 0.01) for side in (794, 790, 790)]
+    assert "nothing finer" not in image_need(details).decision().evidence
