@@ -14,6 +14,7 @@ _TITLES = {
     "wrapping": "Thin parts: surfaces with two sides",
     "growth": "Number of Gaussians",
     "image_size": "Size of the training images",
+    "full_size": "Size of the training images",
 }
 """Of each decision, what it is about in an artist's words."""
 
@@ -24,6 +25,7 @@ _EFFECTS = {
     "exposure": '"on" corrects every photo; "off" takes them as they are',
     "multi_view": '"on" or "off"',
     "wrapping": '"on" or "off"',
+    "full_size": '"on" trains on the full size up to `max_image_px`; "off" on half of it',
     "growth": '"on" lets the number grow up to `max_gaussians`; "off" adds none',
 }
 

@@ -14,7 +14,7 @@ from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training.needs import Needs, decide
 from tests.core.evaluation.report.report_examples import full_summary
 
-NAMES = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "image_size")
+NAMES = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "image_size", "full_size")
 
 
 def training() -> dict[str, Any]:
