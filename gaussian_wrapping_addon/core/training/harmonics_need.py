@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.ndimage import uniform_filter
 
 from .. import tolerances
 from ..dataset.camera import Camera
@@ -53,6 +54,10 @@ LEFT_OUT_EVERY = 5
 MIN_FIT_VIEWS = 4
 """Nothing can be told from fewer."""
 
+COARSE_SHARE = 1.0 / 16.0
+"""Residuals are averaged over squares of this share of the long side. Reflections change colours
+slowly over a surface; errors of shape and detail, which change with the view as well, average out."""
+
 _C0 = 0.5 / math.sqrt(math.pi)
 _BLOCK = 4096
 _STEP_RIDGE = 1e-6
@@ -82,7 +87,8 @@ class HarmonicsNeed:
     degree: int
     """The degree that was tried."""
     gain_db: float
-    """Fall of the judging photos' mean squared error against the best without it; 0 if unknown."""
+    """Fall of the judging photos' mean squared error against the best without it, as far as the
+    error changes slowly over the image; 0 if unknown."""
     needed: bool
     better_share: float
     """Share of the judging photos that it makes better."""
@@ -180,11 +186,12 @@ def harmonics_need(
         return HarmonicsNeed(degree, 0.0, False, 0.0, 0, never_trained, None)
     trial = _Trial(gaussians, fitted, judges, degree, threads or default_threads())
     trial.settle()
-    without, _ = trial.errors(degree - 1)
-    with_degree, sh = trial.errors(degree)
-    gain = 10.0 * math.log10(
-        max(float(without.sum()), _ERROR_FLOOR) / max(float(with_degree.sum()), _ERROR_FLOOR)
-    )
+    without, all_without, _ = trial.errors(degree - 1)
+    with_degree, _, sh = trial.errors(degree)
+    # What the degree explains of the slow residual, as a part of the whole error.
+    whole = max(float(all_without.sum()), _ERROR_FLOOR)
+    explained = min(float((without - with_degree).sum()) / whole, 1.0 - 1e-6)
+    gain = -10.0 * math.log10(1.0 - explained)
     better = float((with_degree < without).mean())
     # A single photo must not decide for all.
     needed = gain > MARGIN_DB and better > 0.5
@@ -234,22 +241,25 @@ class _Trial:
             for view in self.judges
         ]
 
-    def errors(self, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    def errors(self, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Fit all coefficients up to a degree.
 
         Returns
         -------
-        errors : (judges,) float64
-            Mean squared error of each judging photo.
+        slow : (judges,) float64
+            Mean squared :func:`coarse` error of each judging photo.
+        whole : (judges,) float64
+            Mean squared error.
         sh : (n, k, 3) float32
             The coefficients.
         """
         sh = self.fit(degree)
-        errors = [
-            _mean_squared(self._image(sh, view.camera), *target)
-            for view, target in zip(self.judges, self.judged, strict=True)
-        ]
-        return np.array(errors), sh
+        slow, whole = [], []
+        for view, (target, counts) in zip(self.judges, self.judged, strict=True):
+            difference = self._image(sh, view.camera) - target
+            slow.append(_mean_squared(coarse(difference, counts), counts))
+            whole.append(_mean_squared(difference, counts))
+        return np.array(slow), np.array(whole), sh
 
     def fit(self, degree: int) -> np.ndarray:
         """Return (n, k, 3) float32: the coefficients with all up to a degree fitted."""
@@ -302,7 +312,7 @@ class _Trial:
         for row, (view, (target, counts)) in enumerate(zip(self.fitted, self.targets, strict=True)):
             image = self.renderer.render(self._with(sh), view.camera, options)
             assert image.statistics is not None
-            residual = (target - image.color) * counts[..., None]
+            residual = coarse(target - image.color, counts)
             seen = image.backward(ImageGradients(color=residual.astype(np.float32)))
             sums[row, seen.ids] = seen.sh[:, 0] / _C0
             if view.mask is None:
@@ -318,8 +328,8 @@ class _Trial:
         size = len(images)
         normal, right = np.zeros((size, size)), np.zeros(size)
         for index, ((target, counts), base) in enumerate(zip(self.targets, before, strict=True)):
-            residual = (target - base)[counts].astype(np.float64)
-            parts = [of_step[index][counts].astype(np.float64) for of_step in images]
+            residual = coarse(target - base, counts)[counts]
+            parts = [coarse(of_step[index], counts)[counts] for of_step in images]
             for i in range(size):
                 right[i] += float((parts[i] * residual).sum())
                 for j in range(i + 1):
@@ -417,6 +427,26 @@ def match_exposure(image: np.ndarray, photo: np.ndarray) -> Correction:
     return gain, wanted - gain * mean
 
 
-def _mean_squared(image: np.ndarray, target: np.ndarray, counts: np.ndarray) -> float:
-    difference = image[counts].astype(np.float64) - target[counts]
-    return float((difference**2).mean())
+def coarse(difference: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return an image's averages over squares of :data:`COARSE_SHARE`, of the pixels that count.
+
+    Parameters
+    ----------
+    difference : (h, w, 3)
+    counts : (h, w) bool
+
+    Returns
+    -------
+    (h, w, 3) float64
+        0 where a pixel does not count.
+    """
+    size = max(1, round(COARSE_SHARE * max(counts.shape)))
+    weight = uniform_filter(counts.astype(np.float64), size, mode="constant")  # (h, w)
+    kept = np.where(counts[..., None], difference, 0.0).astype(np.float64)
+    sums = uniform_filter(kept, (size, size, 1), mode="constant")
+    mean = sums / np.maximum(weight, 1e-9)[..., None]
+    return np.where(counts[..., None], mean, 0.0)
+
+
+def _mean_squared(difference: np.ndarray, counts: np.ndarray) -> float:
+    return float((difference[counts].astype(np.float64) ** 2).mean())
