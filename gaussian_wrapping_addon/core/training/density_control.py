@@ -14,6 +14,10 @@ from .optimizer import Adam
 GRADIENT_THRESHOLD = 2e-4
 """Average loss gradient per half image from which a Gaussian is doubled (method.md 4.1)."""
 
+LOWEST_SCORE = 0.3
+"""Where the budget has room for more than qualify, those with at least this share of the threshold
+are taken, best first: the budget decides how many, the gradients decide which (Taming 3DGS)."""
+
 CLONE_SIZE = 0.01 * tolerances.SCENE_RADIUS
 """Gaussians whose largest raw standard deviation is at most this are cloned, others split."""
 
@@ -134,7 +138,7 @@ def _qualified(
         level = float(np.quantile(average_abs, 1.0 - share))
         if level > 0.0:
             score = np.maximum(score, average_abs / level)
-    chosen = (score >= 1.0) & keep & (statistics.views > 0)
+    chosen = (score >= LOWEST_SCORE) & keep & (statistics.views > 0)
     if chosen.sum() > room:
         weighted = score if weights is None else score * weights
         ranked = np.argsort(-np.where(chosen, weighted, -np.inf), kind="stable")

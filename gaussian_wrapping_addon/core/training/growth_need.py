@@ -134,7 +134,8 @@ class GrowthHistory:
         times over, and only a comparison of each with itself is not drowned by that. The median
         over the photos is not moved by single bad ones. What training itself has gained between the
         visits counts for the growth, so the decision errs towards growing on; it stops only where
-        the median lies below :data:`MIN_GAIN_DB` by more than its standard error.
+        the median lies below :data:`MIN_GAIN_DB` by more than its standard error. Errors that rise
+        say nothing about growth: another term of the loss has begun, or Gaussians were removed.
         """
         iteration, _, gaussians, _, _ = self._rows[-1] if self._rows else (0, 0, 0, 0.0, 1)
         gains = np.array(list(self._gains()))
@@ -145,6 +146,8 @@ class GrowthHistory:
         # Of a median of normally spread values: 1.2533 times that of a mean.
         spread = _SPREAD_OF_MAD * float(np.median(np.abs(gains - median)))
         spread *= 1.2533 / math.sqrt(len(gains))
+        if median + spread < -MIN_GAIN_DB:  # something else made the errors rise
+            return GrowthNeed(True, False, nan, nan, len(gains), gaussians, iteration)
         pays = median + spread >= MIN_GAIN_DB
         return GrowthNeed(pays, True, median, spread, len(gains), gaussians, iteration)
 

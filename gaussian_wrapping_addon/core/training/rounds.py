@@ -72,6 +72,8 @@ class Rounds:
         iteration, schedule = state.iteration, self.schedule
         if iteration > 0 and schedule.divisor(iteration) != schedule.divisor(iteration - 1):
             self.filter(state)
+        if schedule.starts_depth(iteration):
+            state.visits.clear()  # errors of colour rise where other terms join
         if schedule.starts_orientation(iteration):
             start_orientation(state.adam, self._views(VOTE_DIVISOR), threads=self.threads)
         if self.settings.harmonics == "on":
@@ -183,6 +185,7 @@ class Rounds:
             state.degree = degree
             coefficients = found.coefficients
             state.adam.array("sh")[:, : coefficients.shape[1]] = coefficients
+            state.visits.clear()
         state.needs = state.needs.with_decision(found.decision("auto", state.degree))
 
     def _need_view(self, state: TrainingState, view: int) -> NeedView:

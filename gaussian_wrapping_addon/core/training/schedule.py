@@ -129,6 +129,10 @@ class Schedule:
         """Tell whether the depth-normal loss is on."""
         return iteration >= self._at(self.settings.depth_from)
 
+    def starts_depth(self, iteration: int) -> bool:
+        """Tell whether this is the first iteration of the depth-normal loss."""
+        return iteration == self._at(self.settings.depth_from)
+
     def is_oriented(self, iteration: int) -> bool:
         """Tell whether the orientation is learned."""
         wanted = self.settings.wrapping != "off"

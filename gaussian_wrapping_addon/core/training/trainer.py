@@ -381,7 +381,7 @@ class _Trainer:
 
     def _report(self, state: TrainingState, progress: Progress, speed: float) -> None:
         total, figures = self.schedule.total, self._figures(state)
-        figures["iterations_per_s"] = speed
+        figures |= {"iterations": float(total), "iterations_per_s": speed}
         seen = self.live.look(state.adam.gaussians(), state.iteration, self._correction(state))
         if seen is not None:
             self.seen = seen

@@ -67,7 +67,7 @@ def test_small_ones_are_cloned_large_ones_split_quiet_ones_stay() -> None:
     adam = filled(gaussians_of_sizes([small, large, small, large]))
     before = adam.gaussians().detached().select(torch.arange(4))
     change = densify_and_prune(
-        adam, with_gradients([1.5, 1.5, 0.5, 0.5]), 100, np.random.default_rng(0)
+        adam, with_gradients([1.5, 1.5, 0.2, 0.2]), 100, np.random.default_rng(0)
     )
     assert (change.cloned, change.split, change.pruned) == (1, 1, 0)
     assert len(adam) == 6

@@ -60,8 +60,10 @@ def test_saturated_growth_stops(seed: int) -> None:
     assert need.gain_db + need.spread_db < MIN_GAIN_DB
 
 
-def test_growth_that_harms_stops() -> None:
-    assert not history(-1.0).need().pays
+def test_errors_that_rise_are_no_evidence_about_growth() -> None:
+    need = history(-1.0).need()
+    assert need.pays
+    assert not need.known
 
 
 def test_noise_that_hides_the_answer_lets_it_grow() -> None:
