@@ -101,7 +101,7 @@ def test_the_coefficients_lower_the_error_of_a_held_out_photo() -> None:
     better = start.replaced(sh=torch.from_numpy(need.coefficients))
     for view in held_out:
         before = np.mean((shown(start, view.camera) - view.photo) ** 2)
-        assert np.mean((shown(better, view.camera) - view.photo) ** 2) < 0.5 * before
+        assert np.mean((shown(better, view.camera) - view.photo) ** 2) < 0.8 * before
 
 
 def test_without_held_out_photos_some_are_left_out_and_judge() -> None:
