@@ -9,6 +9,7 @@ import pytest
 from gaussian_wrapping_addon.core.settings import PRESETS, TrainingSettings, preset
 from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
 from gaussian_wrapping_addon.core.training.schedule import (
+    FIRST_BUDGET,
     POSITION_RATE,
     PYRAMID,
     REFERENCE_ITERATIONS,
@@ -96,3 +97,63 @@ def test_short_runs_take_larger_steps_and_long_ones_the_published() -> None:
     assert rates["sh"][0] == pytest.approx(published["sh"][0] * factor, rel=1e-5)
     assert rates["sh"][3] == pytest.approx(published["sh"][3] * factor**2, rel=1e-5)
     assert Schedule(TrainingSettings(iterations=60_000), 640).short_run_factor == 1.0
+
+
+def test_the_budget_grows_evenly_to_the_cap_and_never_falls() -> None:
+    settings = TrainingSettings(iterations=1000, max_gaussians=50_000, wrap_rounds=2)
+    schedule = Schedule(settings, 640)
+    limit = schedule.growth_limit()
+    assert limit * 1.05**2 <= 50_000 < (limit + 2) * 1.05**2
+    budgets = [schedule.budget(i) for i in range(0, 1001, 50)]
+    assert budgets[0] == FIRST_BUDGET
+    assert budgets == sorted(budgets)
+    assert schedule.budget(250) == limit // 2
+    assert {schedule.budget(i) for i in (500, 700, 1000)} == {limit}
+    few = Schedule(TrainingSettings(iterations=1000, max_gaussians=400, wrap_rounds=0), 640)
+    assert few.budget(0) == 400
+
+
+def test_pruning_and_trials_happen_at_their_shares() -> None:
+    schedule = Schedule(TrainingSettings(iterations=1000), 640)
+    assert [i for i in range(1001) if schedule.prunes(i)] == [200, 300, 400, 500, 600, 700]
+    assert [i for i in range(1001) if schedule.tries_harmonics(i)] == [400, 500, 600]
+    none = Schedule(TrainingSettings(iterations=1000, prune_share=0.0), 640)
+    assert not any(none.prunes(i) for i in range(1001))
+
+
+def test_without_wrapping_nothing_is_oriented() -> None:
+    schedule = Schedule(TrainingSettings(iterations=300, wrapping="off"), 640)
+    assert not any(schedule.is_oriented(i) or schedule.starts_orientation(i) for i in range(301))
+    with_it = Schedule(TrainingSettings(iterations=300), 640)
+    assert [i for i in range(301) if with_it.starts_orientation(i)] == [200]
+    assert with_it.is_oriented(200)
+    assert [i for i in range(301) if with_it.starts_depth(i)] == [70]
+
+
+def test_more_iterations_keep_the_plan_and_its_last_rates() -> None:
+    short = Schedule(TrainingSettings(iterations=300), 640)
+    longer = Schedule(TrainingSettings(iterations=300, extra_iterations=200), 640)
+    assert (short.total, longer.total) == (300, 500)
+    for iteration in (0, 69, 150, 299):
+        assert longer.divisor(iteration) == short.divisor(iteration)
+        for name, rates in short.rates(iteration).items():
+            assert np.array_equal(longer.rates(iteration)[name], rates)
+    for name, rates in short.rates(300).items():
+        assert np.array_equal(longer.rates(480)[name], rates)
+    assert not any(longer.densifies(i) or longer.wraps(i) for i in range(301, 501))
+    assert longer.divisor(450) == 1
+
+
+def test_a_coarser_finest_level_is_never_passed() -> None:
+    schedule = Schedule(TrainingSettings(iterations=100), 800, finest=2)
+    assert [schedule.divisor(i) for i in (0, 20, 99)] == [4, 2, 2]
+
+
+def test_finished_gaussians_are_refined_at_full_size_with_late_rates() -> None:
+    settings = TrainingSettings(iterations=100, sh_degree=2)
+    schedule, plain = Schedule(settings, 800, refines=True), Schedule(settings, 800)
+    assert {schedule.divisor(i) for i in range(100)} == {1}
+    assert schedule.sh_degree(0) == 2
+    first = schedule.rates(0)["means"][0]
+    assert first == pytest.approx(plain.rates(70)["means"][0], rel=1e-6)
+    assert schedule.rates(100)["means"][0] == pytest.approx(plain.rates(100)["means"][0])
