@@ -30,8 +30,10 @@ MAX_NOISE_PX = 1.0
 MIN_NOISE_PX = 1e-9
 """Below, the direction in which a point missed its pixel is rounding: no gradient."""
 
-MIN_SPREAD = 5e-6
-"""Smallest sum of squared deviations in a patch, of grey in [0, 1]."""
+MIN_SPREAD = SAMPLES * 0.012**2
+"""Smallest sum of squared deviations in a patch, of grey in [0, 1]: contrast of three grey levels.
+Method.md 3.4 has 5e-6, which is far below the noise of photos: such patches agree by chance, pull
+the surface about at random, and a surface that is pulled about recedes."""
 SPREAD_PRODUCT = 1e-8
 """Added to the product of two such sums: patches of weak contrast correlate less."""
 MAX_ERROR = 0.9
