@@ -24,6 +24,7 @@ from gaussian_wrapping_addon.core.training.multi_view import (
     MultiViewOptions,
     multi_view_losses,
 )
+from gaussian_wrapping_addon.core.training.multi_view_kernels import MIN_SPREAD
 from gaussian_wrapping_addon.core.training.pixel_choice import choose_pixels, grey_image
 
 from .plane_scene import camera_pair, plane_gaussians, plane_photo
@@ -123,7 +124,7 @@ def definition(
     correlation = (a * b).sum(1) / torch.sqrt(spreads[0] * spreads[1] + 1e-8)
     error = 1 - (correlation if options.correlation == "signed" else correlation**2)
     kept = valid & here.all(1) & inside.all(1) & (error < 0.9)
-    kept &= (spreads[0] > 5e-6) & (spreads[1] > 5e-6)
+    kept &= (spreads[0] > MIN_SPREAD) & (spreads[1] > MIN_SPREAD)
     kept &= normal.norm(dim=1) >= 0.3 * cover
     photometric = (weight * error)[kept].mean()
     assert valid.sum() > 100

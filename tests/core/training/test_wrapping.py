@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.training.optimizer import TRAINED, Adam
+from gaussian_wrapping_addon.core.training.orientation import FIRST_SIGN
 from gaussian_wrapping_addon.core.training.wrapping import (
-    FIRST_SIGN,
     WrapView,
     normal_errors,
     start_orientation,
