@@ -166,7 +166,7 @@ def test_patches_end_at_borders_and_masks() -> None:
     size = np.array([OTHER.width, OTHER.height])
     assert (there[kept] > 0.5).all()
     assert (there[kept] < size - 0.5).all()
-    assert kept[inside & (there > 3.5).all(2) & (there < size - 3.5).all(2)].mean() > 0.95
+    assert kept[inside & (there > 3.5).all(2) & (there < size - 3.5).all(2)].mean() > 0.9
 
     mask = np.ones(row.shape, np.bool_)
     mask[:, 30] = False
