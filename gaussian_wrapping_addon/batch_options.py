@@ -20,7 +20,7 @@ _NEEDS_HELP = {
     "exposure": "gain and offset per photo",
     "multi_view": "terms that compare neighbouring photos",
     "wrapping": "orientation, and clones of opposite orientation",
-    "growth": "more Gaussians than the start has",
+    "growth": "more Gaussians: as many as pay, up to the cap, or none",
     "full_size": "photos at their full size, also where half shows as much",
 }
 

@@ -10,7 +10,7 @@ from ..speed_error.plan import PRESETS, Photos, Run
 ABLATION, PRESET, NEEDS, REAL = "ablation", "presets", "needs", "real"
 PARTS = (ABLATION, PRESET, NEEDS, REAL)
 
-_FIXED = ("--harmonics", "on", "--exposure", "off", "--growth", "on")
+_FIXED = ("--harmonics", "off", "--exposure", "off")
 """What no row of the ablation varies."""
 
 BASELINE, MULTI_VIEW, ORIENTATION, WRAPPING = "baseline", "multi-view", "orientation", "wrapping"
@@ -38,7 +38,7 @@ LABELS = {
 
 EVERYTHING_ON = tuple(
     word
-    for name in ("multi-view", "wrapping", "harmonics", "exposure", "growth")
+    for name in ("multi-view", "wrapping", "harmonics", "exposure", "growth", "full-size")
     for word in (f"--{name}", "on")
 )
 

@@ -54,10 +54,13 @@ class TrainingSettings:
     lambda_dssim: float = 0.2
     lambda_depth_normal: float = 0.05
     lambda_normal: float = 0.03
-    lambda_photometric: float = 0.6
+    lambda_photometric: float = 0.15
+    """A quarter of the method's: with its 0.6, runs of a tenth of its iterations lose detail."""
     lambda_geometric: float = 0.02
     correlation: str = "signed"
     """Of two patches: ``"signed"``, or ``"squared"``, where -1 is as good as 1 (method.md 3.4)."""
+    multi_view_until: float = 0.75
+    """The multi-view terms end here: what noise in the photos has pulled about can settle."""
     multi_view_pixels: int = 4000
     """Pixels of an iteration that the multi-view terms look at."""
     multi_view_every: int = 1
@@ -72,8 +75,9 @@ class TrainingSettings:
     wrapping: str = "auto"
     """Orientation, its loss, and clones of opposite orientation."""
     growth: str = "auto"
-    """``"auto"``: the number of Gaussians stops growing where it gains little; ``"on"``: only the
-    cap stops it; ``"off"``: none are added."""
+    """``"auto"``: the number of Gaussians stops growing where it gains little, and those that show
+    little are held small (``overlap_price``) and removed (``prune_share``); ``"on"``: only the cap
+    stops it; ``"off"``: none are added."""
     full_size: str = "auto"
     """``"auto"``: photos that show nothing finer than half their size are trained on at that size;
     ``"on"``: always at full size; ``"off"``: at half."""

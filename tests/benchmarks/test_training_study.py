@@ -190,7 +190,7 @@ def test_missed_targets_are_told() -> None:
         m.result.report["peak_memory_bytes"]["worker"] = 5 * 2**30
         m.result.report["training"]["decisions"].clear()
     targets = [c for c in checks(runs) if c.target]
-    assert len(targets) == 19
+    assert len(targets) == 18
     assert {c.met for c in targets} == {False}
 
 

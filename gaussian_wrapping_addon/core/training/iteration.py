@@ -126,7 +126,7 @@ class Stepper:
         seen = image.backward(gradients)
         if other is not None:
             seen = merge_gradients(seen, other, len(adam), threads=self.threads, store=self.store)
-        if self.settings.overlap_price > 0.0:
+        if self.schedule.spares and self.settings.overlap_price > 0.0:
             size_px = (look.camera.width, look.camera.height)
             add_overlap_price(
                 seen, adam.array("log_scales"), image.screen.boxes, size_px,
@@ -200,7 +200,7 @@ class Stepper:
     def _compares_views(self, state: TrainingState, look: _Look) -> bool:
         if not state.needs.chose("multi_view") or len(self.neighbours[look.view]) == 0:
             return False
-        return state.iteration % self.settings.multi_view_every == 0
+        return self.schedule.compares_views(state.iteration)
 
     def _compare_views(
         self, state: TrainingState, look: _Look, image: ViewPass, gaussians: RawArrays

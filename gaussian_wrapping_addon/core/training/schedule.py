@@ -129,6 +129,11 @@ class Schedule:
         """Tell whether the depth-normal loss is on."""
         return iteration >= self._at(self.settings.depth_from)
 
+    def compares_views(self, iteration: int) -> bool:
+        """Tell whether the multi-view terms are asked in this iteration."""
+        begin, end = self._at(self.settings.depth_from), self._at(self.settings.multi_view_until)
+        return begin <= iteration < end and iteration % self.settings.multi_view_every == 0
+
     def starts_depth(self, iteration: int) -> bool:
         """Tell whether this is the first iteration of the depth-normal loss."""
         return iteration == self._at(self.settings.depth_from)
@@ -156,9 +161,15 @@ class Schedule:
         begin, end = self._at(self.settings.densify_from), self._at(self.settings.densify_until)
         return begin < iteration <= end and iteration % self.settings.densify_every == 0
 
+    @property
+    def spares(self) -> bool:
+        """Tell whether Gaussians that show little are held small and few."""
+        return self.settings.growth != "on"
+
     def prunes(self, iteration: int) -> bool:
         """Tell whether Gaussians of little contribution go after this iteration's step."""
-        return self.settings.prune_share > 0.0 and iteration in {self._at(x) for x in PRUNE_AT}
+        wanted = self.spares and self.settings.prune_share > 0.0
+        return wanted and iteration in {self._at(x) for x in PRUNE_AT}
 
     def growth_limit(self) -> int:
         """Return the number of Gaussians that density control may reach in the end.

@@ -119,6 +119,11 @@ def test_pruning_and_trials_happen_at_their_shares() -> None:
     assert [i for i in range(1001) if schedule.tries_harmonics(i)] == [400, 500, 600]
     none = Schedule(TrainingSettings(iterations=1000, prune_share=0.0), 640)
     assert not any(none.prunes(i) for i in range(1001))
+    grown = Schedule(TrainingSettings(iterations=1000, growth="on"), 640)
+    assert not any(grown.prunes(i) for i in range(1001))
+    assert [i for i in range(1001) if schedule.compares_views(i)] == list(range(233, 750))
+    third = Schedule(TrainingSettings(iterations=30, multi_view_every=3), 640)
+    assert [i for i in range(31) if third.compares_views(i)] == [9, 12, 15, 18, 21]
 
 
 def test_without_wrapping_nothing_is_oriented() -> None:
