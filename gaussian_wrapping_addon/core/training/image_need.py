@@ -60,7 +60,11 @@ class ImageNeed:
     noise: float
     photos: int
 
-    def decision(self) -> Decision:
+    def wants_full(self, setting: str = "auto") -> bool:
+        """Tell whether photos are trained on at full size; else at half of it."""
+        return setting == "on" or (setting == "auto" and 2 * self.useful_px > self.side_px)
+
+    def decision(self, setting: str = "auto") -> Decision:
         """Return the record; the setting ``max_image_px`` bounds the size as well."""
         fine = self.useful_px >= self.side_px
         evidence = (
@@ -78,7 +82,8 @@ class ImageNeed:
             "photos": float(self.photos),
             "limit": DETAIL_RMS,
         }
-        return Decision("image_size", "auto", f"{self.useful_px} px", evidence, figures)
+        size_px = self.side_px if self.wants_full(setting) else self.side_px // 2
+        return Decision("full_size", setting, f"{size_px} px", evidence, figures)
 
 
 def photo_detail(photo: np.ndarray, mask: np.ndarray | None = None) -> PhotoDetail:

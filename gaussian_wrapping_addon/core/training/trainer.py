@@ -183,16 +183,10 @@ class _Trainer:
         found = image_need(
             [photo_detail(self.photos.photo(v, 1), self.photos.mask(v, 1)) for v in chosen]
         )
-        setting = self.settings.full_size
-        full = setting == "on" or (setting == "auto" and 2 * found.useful_px > side_px)
-        full |= side_px < 2 * SMALLEST_SIDE_PX
-        decision = dataclasses.replace(
-            found.decision(),
-            name="full_size",
-            setting=setting,
-            chosen=f"{side_px if full else side_px // 2} px",
-        )
-        return decision, 1 if full else 2
+        decision = found.decision(self.settings.full_size)
+        if side_px < 2 * SMALLEST_SIDE_PX:  # half would be too small to learn from
+            return dataclasses.replace(decision, chosen=f"{side_px} px"), 1
+        return decision, 1 if found.wants_full(self.settings.full_size) else 2
 
     # -- the run ----------------------------------------------------------------------------------
 

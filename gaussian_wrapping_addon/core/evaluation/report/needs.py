@@ -13,7 +13,6 @@ _TITLES = {
     "multi_view": "Comparing photos taken from similar places",
     "wrapping": "Thin parts: surfaces with two sides",
     "growth": "Number of Gaussians",
-    "image_size": "Size of the training images",
     "full_size": "Size of the training images",
 }
 """Of each decision, what it is about in an artist's words."""
@@ -28,9 +27,6 @@ _EFFECTS = {
     "full_size": '"on" trains on the full size up to `max_image_px`; "off" on half of it',
     "growth": '"on" lets the number grow up to `max_gaussians`; "off" adds none',
 }
-
-_OTHER_SETTINGS = {"image_size": "`max_image_px` (a smaller number trains on smaller images)"}
-"""Decisions that no setting of the same name overrides."""
 
 _WHO = {"auto": "the photos", "on": "you (on)", "off": "you (off)"}
 
@@ -84,8 +80,6 @@ def _evidence(entry: dict[str, Any]) -> str:
 
 def _override(entry: dict[str, Any]) -> str:
     name = str(entry["name"])
-    if name in _OTHER_SETTINGS:
-        return f"setting {_OTHER_SETTINGS[name]}"
     effect = f": {_EFFECTS[name]}" if name in _EFFECTS else ""
     back = '; "auto" leaves it to the photos' if entry.get("setting") in ("on", "off") else ""
     return f"setting `{escaped(name) if name not in _TITLES else name}`{effect}{back}"

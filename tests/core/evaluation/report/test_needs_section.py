@@ -14,7 +14,7 @@ from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training.needs import Needs, decide
 from tests.core.evaluation.report.report_examples import full_summary
 
-NAMES = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "image_size", "full_size")
+NAMES = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size")
 
 
 def training() -> dict[str, Any]:
@@ -30,9 +30,8 @@ def test_every_decision_is_listed_with_its_evidence_and_setting() -> None:
     for name in NAMES:
         if name != "exposure":
             assert f"Seen in {name.replace('_', chr(92) + '_')} a\\|b." in text
-        setting = "max_image_px" if name == "image_size" else name
-        assert f"setting `{setting}`" in text
-        assert setting in TrainingSettings.__dataclass_fields__
+        assert f"setting `{name}`" in text
+        assert name in TrainingSettings.__dataclass_fields__
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(rows) == 2 + len(NAMES)
     assert text.count("*To decide otherwise:*") == len(NAMES)
