@@ -31,6 +31,16 @@ MAX_TEXT = 400
 MAX_ROWS = 100
 """Stages and regions that are kept."""
 
+_DECISIONS = {
+    "harmonics": "Reflections",
+    "exposure": "Exposure",
+    "multi_view": "Compare Photos",
+    "wrapping": "Wrap Thin Parts",
+    "growth": "Add Gaussians",
+    "full_size": "Photo Size",
+}
+"""Labels of what was decided, as the panel Training has them."""
+
 _STAGES = {"cameras": "Cameras", "train": "Training", "mesh": "Mesh", "texture": "Texture"}
 
 Row = tuple[str, str]
@@ -50,6 +60,8 @@ class ReportData:
 
     rows: tuple[Row, ...] = ()
     stages: tuple[Row, ...] = ()
+    decisions: tuple[Row, ...] = ()
+    """What the scene needed, or what somebody decided instead."""
     regions: tuple[RegionRows, ...] = ()
     warnings: tuple[str, ...] = ()
     known: bool = False
@@ -68,7 +80,8 @@ def figures_of_report(report: Any) -> dict[str, Any]:
     -------
     dict
         ``seconds``, ``gaussians``, ``psnr`` (held-out photos, dB), ``psnr_count``,
-        ``memory_bytes``, ``stages`` (pairs of name and seconds), ``warnings`` (texts), and
+        ``memory_bytes``, ``stages`` (pairs of name and seconds), ``decisions`` (name, choice and
+        setting), ``warnings`` (texts), and
         ``regions``: for each name ``faces``, ``vertices``, ``closed``, ``coverage`` and
         ``mesh_psnr`` (dB).
     """
@@ -88,6 +101,10 @@ def figures_of_report(report: Any) -> dict[str, Any]:
         [str(stage.get("name", ""))[:MAX_TEXT], stage["seconds"]]
         for stage in map(part, items(report.get("stages"))[:MAX_ROWS])
         if measured(stage.get("seconds")) is not None
+    ]
+    figures["decisions"] = [
+        [str(entry.get(key, ""))[:MAX_TEXT] for key in ("name", "chosen", "setting")]
+        for entry in map(part, items(training.get("decisions"))[:MAX_ROWS])
     ]
     figures["warnings"] = [
         f"{warning.stage}: {warning.text} {warning.next_step}".strip()[:MAX_TEXT]
@@ -158,7 +175,18 @@ def _report_data(figures: dict[str, Any]) -> ReportData:
         for text in items(figures.get("warnings"))[:MAX_WARNINGS]
         if isinstance(text, str)
     )
-    return ReportData(rows, stages, regions, warnings, True)
+    decisions = tuple(
+        _decision(*map(str, entry))
+        for entry in items(figures.get("decisions"))[:MAX_ROWS]
+        if isinstance(entry, list) and len(entry) == 3
+    )
+    return ReportData(rows, stages, decisions, regions, warnings, True)
+
+
+def _decision(name: str, chosen: str, setting: str) -> Row:
+    """Return what was decided, in the panel's words; who decided where it was not the photos."""
+    value = chosen.capitalize()[:MAX_TEXT]
+    return _DECISIONS.get(name, name), value if setting == "auto" else f"{value} (set by you)"
 
 
 def _region_rows(region: dict[str, Any]) -> tuple[Row, ...]:

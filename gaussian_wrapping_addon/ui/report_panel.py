@@ -31,6 +31,10 @@ class GWRAP_PT_report(bpy.types.Panel):
             box = layout.box()
             box.label(text="Time of the Stages", icon="TIME")
             self._table(box, report.stages)
+        if report.decisions:
+            box = layout.box()
+            box.label(text="What the Scene Needed", icon="OPTIONS")
+            self._table(box, report.decisions)
         for region in report.regions:
             box = layout.box()
             box.label(text=region.name, icon="MESH_DATA", translate=False)

@@ -131,6 +131,20 @@ def test_edited_figures_are_survived(tmp_path: Path, text: str) -> None:
     assert draw(GWRAP_PT_report).texts == "No report yet"
 
 
+def test_what_the_scene_needed_is_shown_with_who_decided(tmp_path: Path) -> None:
+    report = full_report()
+    report["training"]["decisions"] = [
+        {"name": "harmonics", "setting": "auto", "chosen": "degree 0", "evidence": "a"},
+        {"name": "exposure", "setting": "on", "chosen": "on", "evidence": "b"},
+        {"name": "of a newer version", "setting": "auto", "chosen": "much", "evidence": "c"},
+        "broken",
+    ]
+    found = rows(show(tmp_path / "job", report))
+    assert found["Reflections"] == "Degree 0"
+    assert found["Exposure"] == "On (set by you)"
+    assert found["of a newer version"] == "Much"
+
+
 def test_figures_kept_in_a_file_are_bounded() -> None:
     report = full_report()
     report["cameras"]["warnings"] = [f"{k} " + "x" * 10_000 for k in range(1000)]
