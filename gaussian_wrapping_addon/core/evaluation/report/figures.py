@@ -44,6 +44,9 @@ _UNITS = {
     "multi_view_every": "iterations",
     "region_weight": "weight",
     "overlap_price": "weight",
+    "seconds_low": "s",
+    "seconds_high": "s",
+    "speed": "times the reference machine",
     "euler": "number",
     "genus": "number",
 }
@@ -72,7 +75,7 @@ _COUNTS = frozenset(
         "iterations", "jump_points", "left_out", "max_gaussians", "nonmanifold_edges",
         "nonmanifold_vertices", "photos", "photos_placed", "photos_undistorted", "photos_used",
         "photos_with_focal_length", "pivots", "points", "points_in_model",
-        "projection_evaluations", "relabelled_tetrahedra", "removed_cavities",
+        "projection_evaluations", "relabelled_tetrahedra", "removed_cavities", "sightings",
         "removed_solids", "split_edges", "split_vertices", "surface_points", "tetrahedra",
         "texels_filled", "texels_overlapping", "texels_seen", "texels_seen_at_outlines_only",
         "texels_used", "threads", "undecided_tetrahedra", "unused_vertices", "vertices",
