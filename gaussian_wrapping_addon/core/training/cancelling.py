@@ -6,7 +6,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
+import numpy as np
+
+from ..dataset.camera import Camera
 from ..progress import Progress
+from .photo_source import Photos
 
 Item = TypeVar("Item")
 
@@ -31,3 +35,27 @@ def checked(items: Iterable[Item], progress: Progress) -> Iterator[Item]:
         except StopIteration:
             return
         yield item
+
+
+class CheckedPhotos:
+    """Photos that ask for cancelling whenever one is fetched.
+
+    For what looks at all photos before the first iteration, or after the last.
+    """
+
+    def __init__(self, photos: Photos, progress: Progress) -> None:
+        self._photos, self._progress = photos, progress
+
+    def camera(self, index: int, divisor: int = 1) -> Camera:
+        """Return the camera of a level."""
+        return self._photos.camera(index, divisor)
+
+    def photo(self, index: int, divisor: int = 1) -> np.ndarray:
+        """Return (h, w, 3) uint8, or raise :class:`Cancelled`."""
+        self._progress.check()
+        return self._photos.photo(index, divisor)
+
+    def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
+        """Return (h, w) bool or ``None``, or raise :class:`Cancelled`."""
+        self._progress.check()
+        return self._photos.mask(index, divisor)

@@ -140,6 +140,7 @@ def harmonics_need(
     degree: int,
     *,
     threads: int = 0,
+    check: Callable[[], None] | None = None,
 ) -> HarmonicsNeed:
     """Try a degree of the harmonics on Gaussians that were trained below it.
 
@@ -164,6 +165,8 @@ def harmonics_need(
         The degree to try, from 1 to 3.
     threads : int
         0 uses every core. The result does not depend on it.
+    check : callable, optional
+        Called before each view is rendered; what it raises ends the trial.
 
     Returns
     -------
@@ -187,7 +190,7 @@ def harmonics_need(
         fitted = [v for v in fitted if not any(v is judge for judge in judges)]
     if len(fitted) < MIN_FIT_VIEWS or not judges or len(gaussians) == 0:
         return HarmonicsNeed(degree, 0.0, False, 0.0, 0, never_trained, None)
-    trial = _Trial(gaussians, fitted, judges, degree, threads or default_threads())
+    trial = _Trial(gaussians, fitted, judges, degree, threads or default_threads(), check)
     trial.settle()
     without, all_without, _ = trial.errors(degree - 1)
     with_degree, _, sh = trial.errors(degree)
@@ -219,7 +222,9 @@ class _Trial:
         judges: list[NeedView],
         degree: int,
         threads: int,
+        check: Callable[[], None] | None,
     ) -> None:
+        self.check = check or (lambda: None)
         self.renderer, self.threads, self.degree = ViewRenderer(), threads, degree
         raw = RawArrays.from_gaussians(gaussians)
         count, kept = len(raw), min(raw.sh.shape[1], degree**2)
@@ -290,12 +295,14 @@ class _Trial:
 
     def _weights(self, camera: Camera) -> np.ndarray:
         """(n,) sums of blending weights, pixels."""
+        self.check()
         options = RenderOptions(depth=False, sh_degree=0, threads=self.threads, statistics=True)
         statistics = self.renderer.render(self.raw, camera, options).statistics
         assert statistics is not None
         return statistics.weight_sum
 
     def _image(self, sh: np.ndarray, camera: Camera) -> np.ndarray:
+        self.check()
         options = RenderOptions(depth=False, threads=self.threads)
         return self.renderer.render(self._with(sh), camera, options).color.copy()
 
@@ -313,6 +320,7 @@ class _Trial:
         sums = np.zeros((len(self.fitted), count, 3), np.float32)  # blended residuals, in pixels
         weights = np.zeros((len(self.fitted), count), np.float32)
         for row, (view, (target, counts)) in enumerate(zip(self.fitted, self.targets, strict=True)):
+            self.check()
             image = self.renderer.render(self._with(sh), view.camera, options)
             assert image.statistics is not None
             residual = coarse(target - image.color, counts)

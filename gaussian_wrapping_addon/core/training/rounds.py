@@ -180,6 +180,7 @@ class Rounds:
             [self._need_view(state, view) for view in checked(self.held_out, self.progress)],
             degree,
             threads=self.threads,
+            check=self.progress.check,
         )
         if found.coefficients is not None:
             state.degree = degree

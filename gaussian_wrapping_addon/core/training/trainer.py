@@ -24,6 +24,7 @@ from ..render.projection import RawArrays
 from ..render.types import RenderOptions
 from ..settings import TrainingSettings
 from .background import inside_masks
+from .cancelling import CheckedPhotos
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from .exposure import Exposure, corrected_for_measuring
 from .exposure_need import exposure_need
@@ -132,7 +133,9 @@ def train(
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        run = _Trainer(scene, photos, settings, folder, seed, threads, start_splat, inside)
+        run = _Trainer(
+            scene, photos, settings, folder, seed, threads, start_splat, inside, progress
+        )  # fmt: skip
         return run.run(progress)
     finally:
         torch.set_num_threads(before)
@@ -151,10 +154,12 @@ class _Trainer:
         threads: int,
         start_splat: Path | None = None,
         inside: Inside | None = None,
+        progress: Progress | None = None,
     ) -> None:
         if start_splat is not None:
             settings = wrapping_settings(settings)
-        self.scene, self.photos, self.settings = scene, photos, settings
+        self.scene, self.settings = scene, settings
+        self.photos = CheckedPhotos(photos, progress or Progress())
         self.folder, self.seed, self.threads = folder, seed, threads
         self.start_splat, self.inside = start_splat, inside
         self.held_out = held_out_views(scene, settings.holdout_every)

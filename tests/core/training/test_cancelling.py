@@ -4,14 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.training import wrapping
-from gaussian_wrapping_addon.core.training.cancelling import checked
+from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
+from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.training import trainer
+from gaussian_wrapping_addon.core.training.cancelling import CheckedPhotos, checked
+from gaussian_wrapping_addon.core.training.contribution import contributions
+from gaussian_wrapping_addon.core.training.harmonics_need import NeedView, harmonics_need
 from gaussian_wrapping_addon.core.training.optimizer import Adam
 from gaussian_wrapping_addon.core.training.wrapping import (
     WrapView,
@@ -21,6 +26,7 @@ from gaussian_wrapping_addon.core.training.wrapping import (
 from tests.core.training.small_scene import sphere_gaussians, sphere_scene
 
 VIEWS = 5
+SMALL = TrainingSettings(iterations=10, max_gaussians=200, wrap_rounds=1)
 
 
 def vote(adam: Adam, views: object) -> None:
@@ -31,7 +37,11 @@ def look_at_normals(adam: Adam, views: object) -> None:
     normal_errors(adam.gaussians(), views, threads=1)
 
 
-@pytest.mark.parametrize("loop", [vote, look_at_normals])
+def look_at_contributions(adam: Adam, views: object) -> None:
+    contributions(adam.gaussians().detached(), views, ViewRenderer(), threads=1)
+
+
+@pytest.mark.parametrize("loop", [vote, look_at_normals, look_at_contributions])
 @pytest.mark.parametrize("after", [0, 1, 3])
 def test_no_view_is_rendered_after_the_request(
     monkeypatch: pytest.MonkeyPatch, loop: Callable[[Adam, object], None], after: int
@@ -39,13 +49,11 @@ def test_no_view_is_rendered_after_the_request(
     _, photos = sphere_scene()
     adam = Adam(sphere_gaussians(40))
     before = {name: adam.array(name).copy() for name in adam.values}
-    rendered, real = [], wrapping.render
-
-    def counted(*arguments: object, **options: object) -> object:
-        rendered.append(1)
-        return real(*arguments, **options)
-
-    monkeypatch.setattr(wrapping, "render", counted)
+    rendered: list[int] = []
+    honest = ViewRenderer.render
+    monkeypatch.setattr(
+        ViewRenderer, "render", lambda *a, **o: rendered.append(1) or honest(*a, **o)
+    )
     progress = Progress(is_cancelled=lambda: len(rendered) >= after)
     views = (WrapView(photos.camera(i), None) for i in range(VIEWS))
     with pytest.raises(Cancelled):
@@ -57,3 +65,36 @@ def test_no_view_is_rendered_after_the_request(
 def test_without_a_request_every_item_comes_once() -> None:
     assert list(checked(range(VIEWS), Progress())) == list(range(VIEWS))
     assert list(checked(np.arange(0), Progress())) == []
+
+
+def test_a_trial_of_harmonics_ends_before_the_next_view() -> None:
+    _, photos = sphere_scene()
+    views = [NeedView(photos.camera(i), photos.photo(i)) for i in range(8)]
+    calls = [0]
+
+    def check() -> None:
+        calls[0] += 1
+        if calls[0] == 5:
+            raise Cancelled()
+
+    with pytest.raises(Cancelled):
+        harmonics_need(sphere_gaussians(40), views, views[:2], 1, threads=1, check=check)
+    assert calls[0] == 5
+
+
+@pytest.mark.parametrize("fetched", [1, 7, 20])
+def test_looking_at_photos_before_the_first_iteration_can_be_cancelled(
+    tmp_path: Path, fetched: int
+) -> None:
+    scene, photos = sphere_scene()
+    seen = [0]
+
+    class Counted(CheckedPhotos):
+        def photo(self, index: int, divisor: int = 1) -> np.ndarray:
+            seen[0] += 1
+            return super().photo(index, divisor)
+
+    progress = Progress(is_cancelled=lambda: seen[0] >= fetched)
+    with pytest.raises(Cancelled):
+        trainer.train(scene, Counted(photos, Progress()), SMALL, tmp_path, progress, threads=1)
+    assert seen[0] <= fetched + 1

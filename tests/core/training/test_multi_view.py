@@ -267,7 +267,7 @@ def test_bytes_are_read_like_floats() -> None:
 
 def test_options_and_sizes() -> None:
     options = MultiViewOptions.of_settings(TrainingSettings(multi_view_every=3))
-    assert options == MultiViewOptions(0.6, 0.02, "signed", 4000, 3.0)
+    assert options == MultiViewOptions(0.15, 0.02, "signed", 4000, 3.0)
     with pytest.raises(UsageError, match="cubed"):
         MultiViewOptions(correlation="cubed")
     with pytest.raises(UsageError, match="photo is"):
