@@ -180,9 +180,13 @@ def _estimate(
     """
     from ..training.estimate import estimate, judge, scene_facts, this_machine
     from ..training.machine_speed import machine_speed, renderer_is_compiled
+    from ..training.splat_start import wrapping_settings
     from ..training.warm_up import compile_kernels
+    from .splat_scene import start_splat_of
 
     training = job.settings.training
+    if start_splat_of(job) is not None:
+        training = wrapping_settings(training)
     if not renderer_is_compiled():
         progress.update(0.0, COMPILING)
         compile_kernels(training, stage_folder, progress, threads=threads)

@@ -34,8 +34,10 @@ if TYPE_CHECKING:
 ITERATION_S = 2.06e-3
 """Of each iteration, whatever its size."""
 
-PIXEL_S = 1.136e-6
-"""Of each pixel of an iteration with isosurface depth: rendering, losses and their gradients."""
+PIXEL_S = 0.75e-6
+"""Of each pixel of an iteration with isosurface depth: rendering, losses and their gradients. With
+it, and the figures below, 3000 iterations on 40 photos of 640 x 480 px come to 284 s; they took
+335 s on two cores with a little other work (benchmarks/scenes wheel, preset standard)."""
 
 WITHOUT_DEPTH = 0.45
 """Share of :data:`PIXEL_S` before the depth is asked for (docs/benchmarks/kernels.md: depth adds
@@ -44,15 +46,15 @@ WITHOUT_DEPTH = 0.45
 GAUSSIAN_S = 0.254e-6
 """Of each Gaussian in each iteration: projection, and the step of those that were seen."""
 
-MULTI_VIEW_SHARE = 0.6
-"""What a multi-view iteration adds, as a share of a plain one: it looks at a second view where the
-first one's samples fall. Taken from the design, not from the measurements above."""
+MULTI_VIEW_SHARE = 0.4
+"""What a multi-view iteration adds, as a share of a plain one (57 ms against 144 ms of one thread,
+40 000 Gaussians, 4000 places)."""
 
 LOW, HIGH = 0.75, 1.95
 """The range told is the model's figure times these: it holds every measured training."""
 
 ROUND_GROWTH = 1.8
-"""Growth of the number of Gaussians in one round of densification, until the limit (measured: 1.55
+"""Growth of the number of Gaussians in one round of densification, until the budget (measured: 1.55
 to 1.87 in the first round)."""
 
 LITTLE_GROWTH = 0.4
@@ -213,7 +215,7 @@ def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float
         if done >= settings.iterations:
             continue
         if schedule.densifies(done):
-            count = max(count, min(top, count * ROUND_GROWTH))
+            count = max(count, min(top, schedule.budget(done), count * ROUND_GROWTH))
         if settings.wrapping != "off" and schedule.wraps(done):
             count = min(settings.max_gaussians, count * (1.0 + settings.wrap_share))
     return counts
@@ -236,13 +238,20 @@ def _seconds(facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray) 
     total_s = 0.0
     for iteration, count in enumerate(counts.tolist()):
         planned = min(iteration, last)
-        size = pixels / schedule.divisor(planned) ** 2
+        size = _window(pixels / schedule.divisor(planned) ** 2, settings.pixels_per_iteration)
         depth = schedule.uses_depth(planned)
         spent_s = size * PIXEL_S * (1.0 if depth else WITHOUT_DEPTH) + count * GAUSSIAN_S
-        if depth and settings.multi_view != "off" and facts.photos > 1:
-            spent_s *= 1.0 + MULTI_VIEW_SHARE / settings.multi_view_every
+        compares = settings.multi_view != "off" and facts.photos > 1
+        if compares and schedule.compares_views(planned):
+            spent_s *= 1.0 + MULTI_VIEW_SHARE
         total_s += ITERATION_S + spent_s
     return total_s
+
+
+def _window(pixels: float, most: int) -> float:
+    """Return about how many pixels of an image an iteration looks at (:mod:`.windows`)."""
+    across = math.ceil(math.sqrt(pixels / most))
+    return pixels / across**2 if across > 1 else pixels
 
 
 def estimate(scene_facts: SceneFacts, settings: TrainingSettings, machine: Machine) -> Estimate:
