@@ -124,6 +124,7 @@ class TextureSettings:
     size_px: int = 0
     """Side of the square texture; 0 chooses it from the photos' footprint."""
     gutter_px: int = 8
+    """Texels around each chart of a texture of 4096; in proportion below, but 2 at least."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from .fill import (
     surface_positions,
 )
 from .photo_samples import SurfaceArrays, SurfacePoints
-from .texture_size import automatic_size
+from .texture_size import automatic_size, gutter_for
 from .textured_mesh import TexturedMesh
 from .unwrap import Unwrap, unwrap
 
@@ -85,8 +85,9 @@ def texture_mesh(
     count = len(scene.views)
     size_px = settings.size_px or automatic_size(graph, photos, count)
     progress.update(0.0, f"unwrapping for {size_px} x {size_px} texels")
+    gutter_px = gutter_for(size_px, settings.gutter_px)
     unwrapped = unwrap(
-        mesh, size_px, settings.gutter_px, work_folder, progress.span(0.0, 0.3), threads=threads
+        mesh, size_px, gutter_px, work_folder, progress.span(0.0, 0.3), threads=threads
     )
     raster = raster_atlas(unwrapped.corner_uvs, size_px, threads)
     texels = np.flatnonzero(raster.face.ravel() >= 0)
@@ -102,7 +103,7 @@ def texture_mesh(
     )
     baked = bake(points, surface, photos, count, progress.span(0.3, 0.9), threads=threads)
     progress.update(0.9, "filling what no photo saw")
-    albedo = _image(size_px, texels, points, surface, baked, raster, unwrapped, settings.gutter_px)
+    albedo = _image(size_px, texels, points, surface, baked, raster, unwrapped, gutter_px)
     statistics = _statistics(size_px, settings, unwrapped, raster, points, baked, graph.areas)
     if statistics["texels_seen"] == 0:
         _logger.warning("no photo sees the mesh: its texture is plain grey")

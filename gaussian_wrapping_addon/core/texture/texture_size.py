@@ -13,6 +13,11 @@ from .face_graph import FaceGraph
 from .photo_samples import MIN_COSINE
 
 SAMPLED_FACES = 2_000
+TEXELS_PER_FACE = 12
+"""Many small charts need room for their faces, however little the photos show of each: with less,
+most faces of a wheel with 28 spokes had no texel at all."""
+FULL_GUTTER_SIDE_PX = 4096
+MIN_GUTTER_PX = 2
 MIN_SIZE_PX = 256
 MAX_AUTOMATIC_SIZE_PX = 4096
 EXPECTED_UTILISATION = 0.5
@@ -26,7 +31,7 @@ def automatic_size(graph: FaceGraph, photos: Photos, count: int, seed: int = 0) 
 
     The footprint of a photo's pixel on the surface is ``z / focal``; each sampled face takes its
     best photo, and the surface their median (by area). Occlusion is not tested: a size needs no
-    more than the order.
+    more than the order. There is also room for :data:`TEXELS_PER_FACE`.
     """
     area = float(graph.areas.sum())
     generator = np.random.default_rng(seed)
@@ -46,6 +51,17 @@ def automatic_size(graph: FaceGraph, photos: Photos, count: int, seed: int = 0) 
         return MIN_SIZE_PX
     footprint = float(np.median(best))
     wanted = ENOUGH * math.sqrt(area / EXPECTED_UTILISATION) / footprint
+    wanted = max(wanted, math.sqrt(TEXELS_PER_FACE * len(graph.areas) / EXPECTED_UTILISATION))
     exponent = math.ceil(math.log2(max(wanted, 1.0)))
     largest = min(MAX_AUTOMATIC_SIZE_PX, limits.MAX_TEXTURE_SIDE_PX)
     return int(min(max(2**exponent, MIN_SIZE_PX), largest))
+
+
+def gutter_for(size_px: int, gutter_px: int) -> int:
+    """Return the gutter of a texture: ``gutter_px`` at 4096 texels, in proportion below.
+
+    Smaller textures have fewer mip levels to keep apart, and charts hardly larger than a full
+    gutter would leave no room for texels.
+    """
+    share = min(1.0, size_px / FULL_GUTTER_SIDE_PX)
+    return max(min(MIN_GUTTER_PX, gutter_px), round(gutter_px * share))

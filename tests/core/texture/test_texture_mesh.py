@@ -21,7 +21,7 @@ from gaussian_wrapping_addon.core.texture.face_graph import face_graph
 from gaussian_wrapping_addon.core.texture.fill import surface_positions
 from gaussian_wrapping_addon.core.texture.photo_samples import SurfaceArrays, SurfacePoints
 from gaussian_wrapping_addon.core.texture.texture_mesh import _statistics, texture_mesh
-from gaussian_wrapping_addon.core.texture.texture_size import automatic_size
+from gaussian_wrapping_addon.core.texture.texture_size import automatic_size, gutter_for
 from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.texture.unwrap import Unwrap
 from tests.core.texture.texture_scenes import (
@@ -285,7 +285,8 @@ def test_the_automatic_size_follows_the_photos() -> None:
         photos = FakePhotos(cameras, [])
         sizes[focal] = automatic_size(graph, photos, len(cameras))
     # 4 pi area; footprint about 2.3 / focal: 0.8 sqrt(4 pi / 0.5) focal / 2.3 = 1.7 focal.
-    assert sizes == {85.0: 256, 170.0: 512, 340.0: 1024, 1e5: 4096}
+    # However coarse the photos are, the faces need room.
+    assert sizes == {85.0: 512, 170.0: 512, 340.0: 1024, 1e5: 4096}
     assert automatic_size(graph, FakePhotos([], []), 0) == 256
 
 
@@ -351,3 +352,8 @@ def test_cancelling_is_obeyed_between_photos(tmp_path: Path) -> None:
         )  # fmt: skip
     assert "photo 3 of 3" not in messages[-1]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_gutter_shrinks_with_the_texture() -> None:
+    assert [gutter_for(side, 8) for side in (8192, 4096, 2048, 1024, 512)] == [8, 8, 4, 2, 2]
+    assert gutter_for(512, 1) == 1
