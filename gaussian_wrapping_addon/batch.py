@@ -227,8 +227,12 @@ def _resume(options: Namespace) -> int:
     _require_bpy(job, options)
     if options.max_gaussians is None:
         return _follow(JobClient.resume(options.out, python=worker_python()), job, options)
-    training = replace(job.settings.training, max_gaussians=options.max_gaussians)
-    job = replace(job, settings=replace(job.settings, training=training).validated())
+    # A training with another cap starts anew: there is nothing that it could add to.
+    training = replace(
+        job.settings.training, max_gaussians=options.max_gaussians, extra_iterations=0
+    )
+    settings = replace(job.settings, training=training).validated()
+    job = replace(job, command="wrap" if job.command == "more" else job.command, settings=settings)
     return _follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 
 

@@ -83,6 +83,9 @@ class TrainingSettings:
     ``"on"``: always at full size; ``"off"``: at half."""
     region_weight: float = 1.0
     """Gaussians inside the job's regions count this many times where their number is limited."""
+    focus: str = ""
+    """JSON list of the bodies of these regions, world coordinates; written when a job is made that
+    trains. Other regions are meshed from the same training later."""
     mask_mode: str = "ignore"
     """What masks leave out: ``"ignore"``: anything may stand there; ``"background"``: nothing."""
     depth_from: float = 7 / 30
@@ -193,6 +196,17 @@ class JobSettings:
                 "from 0 to 1",
             ),
             ("training.prune_share", 0.0 <= self.training.prune_share < 0.5, "from 0 to 0.5"),
+            ("training.wrap_rounds", 0 <= self.training.wrap_rounds <= 20, "from 0 to 20"),
+            ("training.holdout_every", 0 <= self.training.holdout_every <= 10**6, "0 or more"),
+            *(
+                (
+                    f"training.{name}",
+                    math.isfinite(getattr(self.training, name))
+                    and getattr(self.training, name) >= 0.0,
+                    "a number of seconds, 0 or more",
+                )
+                for name in RESULT_FREE
+            ),
             (
                 "training.multi_view_pixels",
                 1 <= self.training.multi_view_pixels <= 10**6,

@@ -63,3 +63,19 @@ def test_what_a_scene_may_need_is_auto_on_or_off(name: str) -> None:
     wrong = replace(preset("draft"), training=replace(TrainingSettings(), **{name: "maybe"}))
     with pytest.raises(UsageError, match=f"training.{name}"):
         wrong.validated()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("wrap_rounds", -1), ("wrap_rounds", 100_000), ("holdout_every", -1),
+        ("preview_every_s", float("nan")), ("preview_every_s", float("inf")),
+        ("preview_every_s", -1.0), ("checkpoint_every_s", float("nan")),
+        ("region_weight", 0.5), ("overlap_price", -1.0), ("prune_share", 0.7),
+        ("pixels_per_iteration", 3),
+    ],
+)  # fmt: skip
+def test_numbers_that_make_no_sense_are_refused(name: str, value: float) -> None:
+    wrong = replace(preset("draft"), training=replace(TrainingSettings(), **{name: value}))
+    with pytest.raises(UsageError, match=f"training.{name}"):
+        wrong.validated()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -90,8 +91,14 @@ def make_job(command: str, source: Path, settings: JobSettings) -> JobFile:
     start = settings.start_splat
     if start and not Path(start).is_file():
         raise DatasetError(f"The start splat {start} does not exist.", "Check the path.")
+    training = settings.training
+    if command == "wrap":
+        weighted = training.region_weight != 1.0 and bodies
+        focus = json.dumps(list(bodies.values()), sort_keys=True) if weighted else ""
+        training = replace(training, focus=focus)
     settings = replace(
         settings,
+        training=training,
         regions=tuple(names),
         start_splat=str(Path(start).resolve()) if start else "",
     )

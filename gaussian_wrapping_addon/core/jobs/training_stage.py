@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import logging
 import time
 from collections.abc import Callable
@@ -57,9 +58,7 @@ def training_keys(version: int, cameras_key: str, job: JobFile) -> tuple[str, st
     training = to_json(job.settings.training)
     described = {k: v for k, v in training.items() if k not in RESULT_FREE}
     start = start_fingerprint(job.settings.start_splat)
-    weighted = job.settings.training.region_weight != 1.0
-    regions = [job.region_bodies] if weighted and job.region_bodies else []
-    parts = (version, cameras_key, job.settings.seed, *([start] if start else []), *regions)
+    parts = (version, cameras_key, job.settings.seed, *([start] if start else []))
     key = stage_key(*parts, described)
     described.pop("extra_iterations")
     return key, stage_key(*parts, described)
@@ -154,12 +153,13 @@ def _inside_regions(job: JobFile, scene: Scene) -> Callable[[np.ndarray], np.nda
     """Return what tells the points of the job's regions, where these count more; scene frame."""
     from ..meshing.region import parse_region
 
-    if job.settings.training.region_weight == 1.0 or not job.region_bodies:
+    focus = job.settings.training.focus
+    if not focus:
         return None
     scene_from_world = scene.world_from_scene.inverse()
     regions = [
-        parse_region(body, Path(request)).transformed(scene_from_world)
-        for request, body in job.region_bodies.items()
+        parse_region(body, Path("job.json")).transformed(scene_from_world)
+        for body in json.loads(focus)
     ]
 
     def inside(points: np.ndarray) -> np.ndarray:

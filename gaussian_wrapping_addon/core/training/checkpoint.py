@@ -129,7 +129,10 @@ def _load(path: Path, key: str) -> TrainingState:
         )
     arrays = _read_arrays(path.with_suffix(".npz"), values.get("sha256"))
     try:
-        return TrainingState.restore(arrays, values["state"])
+        state = TrainingState.restore(arrays, values["state"])
+        if not state.adam.is_finite():
+            raise ValueError("a parameter is not finite")
+        return state
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         raise ParseError(path, "state", f"does not fit together ({error}).", _AGAIN) from None
 

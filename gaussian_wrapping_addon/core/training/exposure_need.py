@@ -146,7 +146,7 @@ def exposure_need(scene: Scene, photos: Photos, views: Sequence[int]) -> Exposur
     points = np.asarray(scene.points, np.float64).reshape(-1, 3)[kept]
     if len(views) < MIN_PHOTOS or len(points) < MIN_POINTS:
         few = f"{len(views)} photos and {len(points)} sparse points"
-        return _unknown(count, f"Exposure per photo is off: {few} are too few to compare.")
+        return _unknown(count, f"Not known: {few} are too few to compare.")
     colors, valid = sample_points(points, photos, views)
     reference = np.asarray(scene.point_colors).reshape(-1, 3)[kept] / 255.0
     found = solve_log_gains(colors, valid, reference)
@@ -285,7 +285,7 @@ def judge(
     if number < max(MIN_PHOTOS, MIN_KNOWN_SHARE * len(views)):
         return _unknown(
             count,
-            f"Exposure per photo is off: only {number} of {len(views)} photos share enough sparse "
+            f"Not known: only {number} of {len(views)} photos share enough sparse "
             "points to be compared.",
             photos=number,
             points=points,
@@ -303,7 +303,7 @@ def judge(
     log_gains = np.zeros((count, 3))
     log_gains[np.asarray(views)[known]] = values
     evidence = (
-        f"Exposure per photo is {'on' if needed else 'off'}: gains of {number} photos, from "
+        f"Gains of {number} photos, from "
         f"{points} sparse points, spread by {100 * spread:.1f} % where the scene's parts agree "
         f"(limit {100 * NEEDED_SPREAD:.1f} %; one photo's error {100 * error:.1f} %; all points "
         f"together {100 * _spread(values):.1f} %), and {outliers} photos differ by more than "

@@ -26,7 +26,7 @@ MAX_GROWTH = 3.0
 MIN_VIEWS = 5
 """No decision from fewer photos that were visited before and after."""
 
-CAPACITY = 4096
+CAPACITY = 32_768
 """Visits that are remembered; older ones are forgotten."""
 
 _COLUMNS = 5
@@ -59,7 +59,7 @@ class GrowthNeed:
         }.get(setting, "")
         figures = {"gaussians": float(self.gaussians), "iteration": float(self.iteration)}
         if not self.known:
-            evidence = "Too few photos were seen before and after the Gaussians grew in number."
+            evidence = "Too few parts of photos were seen again after the Gaussians grew in number."
             return Decision("growth", setting, chosen, evidence, figures)
         evidence = (
             f"At iteration {self.iteration}, with {self.gaussians} Gaussians, twice as many would "

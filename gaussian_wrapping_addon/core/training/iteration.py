@@ -124,14 +124,15 @@ class Stepper:
         if not math.isfinite(value):
             raise NotFinite()
         seen = image.backward(gradients)
-        if other is not None:
-            seen = merge_gradients(seen, other, len(adam), threads=self.threads, store=self.store)
+        # Before the other view's Gaussians join: this one knows no boxes of those it has culled.
         if self.schedule.spares and self.settings.overlap_price > 0.0:
             size_px = (look.camera.width, look.camera.height)
             add_overlap_price(
                 seen, adam.array("log_scales"), image.screen.boxes, size_px,
                 self.settings.overlap_price,
             )  # fmt: skip
+        if other is not None:
+            seen = merge_gradients(seen, other, len(adam), threads=self.threads, store=self.store)
         if gathers:
             assert image.statistics is not None
             part = look.camera.width * look.camera.height / (look.whole.width * look.whole.height)
@@ -141,19 +142,25 @@ class Stepper:
         if state.exposure is not None:
             rate = exposure_rate(iteration, self.settings.iterations, len(self.views))
             state.exposure.step(look.view, state.rate_factor * rate)
+        state.iteration = iteration + 1
+        if self._is_empty(look):
+            return  # nothing was compared: nothing is known
         place = look.view * _MOST_WINDOWS + look.number
         state.visits.add(iteration, place, len(adam), mean_squared, look.divisor)
-        share = AVERAGE_SHARE if iteration > 0 else 1.0
+        share = AVERAGE_SHARE if state.error_average > 0.0 else 1.0
         state.error_average += share * (mean_squared - state.error_average)
         state.loss_average += share * (value - state.loss_average)
-        state.iteration = iteration + 1
 
     def _look(self, state: TrainingState) -> _Look:
         view = state.next_view(self.views)
         divisor = self.schedule.divisor(state.iteration)
         whole, mask = self.photos.camera(view, divisor), self.photos.mask(view, divisor)
         choices = windows(whole.width, whole.height, self.settings.pixels_per_iteration)
-        number = int(state.random.integers(len(choices)))
+        numbers = np.arange(len(choices))
+        if mask is not None and self.settings.mask_mode == "ignore":
+            shown = np.array([bool(window.of(mask).any()) for window in choices])
+            numbers = np.flatnonzero(shown) if shown.any() else numbers
+        number = int(numbers[int(state.random.integers(len(numbers)))])
         window = choices[number]
         return _Look(
             view,
@@ -165,6 +172,11 @@ class Stepper:
             window.of(self.photos.photo(view, divisor)),
             None if mask is None else window.of(mask),
         )
+
+    def _is_empty(self, look: _Look) -> bool:
+        """Tell whether the mask leaves nothing to compare."""
+        ignores = self.settings.mask_mode == "ignore"
+        return ignores and look.mask is not None and not look.mask.any()
 
     def _compare_colors(
         self, state: TrainingState, look: _Look, image: ViewPass

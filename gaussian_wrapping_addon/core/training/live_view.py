@@ -164,8 +164,10 @@ class LiveView:
         gaussians: OrientedGaussians,
         iteration: int,
         exposure_correction: Correction | None = None,
+        *,
+        force: bool = False,
     ) -> dict[str, float] | None:
-        """Write the preview and measure, where it is time.
+        """Write the preview and measure, where it is time, or ``force`` asks for it.
 
         Returns
         -------
@@ -173,7 +175,8 @@ class LiveView:
             ``held_out_psnr`` (dB) and ``held_out_iteration`` for the progress' figures, empty
             without held-out photos; ``None`` where it is not time yet.
         """
-        if self._every_s <= 0 or self._clock() - self._looked_s < self._every_s:
+        waits = not force and self._clock() - self._looked_s < self._every_s
+        if self._every_s <= 0 or waits:
             return None
         figures = {}
         quality = measure_held_out(

@@ -208,7 +208,7 @@ def wrapping_need(errors: np.ndarray, weights: np.ndarray, setting: str = "auto"
     mean = float(np.average(errors[known].astype(np.float64), weights=weights[known]))
     figures = {"mean_normal_error": mean, "share_two_sided": against, "limit": WRAPPING_SHARE}
     evidence = (
-        f"{100.0 * against:.1f} % of the shown surface is also seen from behind, as thin parts "
-        f"are (limit {100.0 * WRAPPING_SHARE:.0f} %)."
+        f"Of the shown surface {100.0 * against:.1f} % faces another way than its depth says, as "
+        f"thin parts that are seen from behind do (limit {100.0 * WRAPPING_SHARE:.0f} %)."
     )
     return decide("wrapping", setting, against >= WRAPPING_SHARE, evidence, figures)

@@ -7,9 +7,11 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+import torch
 
 from .. import tolerances
 from ..gaussians.mip_filter import mip_filter
+from ..gaussians.model import OrientedGaussians
 from ..progress import Progress
 from .cancelling import checked
 from .contribution import contributions, least_contributors, prune_contributors
@@ -83,12 +85,7 @@ class Rounds:
         """Change the set of Gaussians where it is due."""
         iteration, schedule, adam = state.iteration, self.schedule, state.adam
         if iteration >= self.settings.iterations:
-            # Also at the plan's end, so that training on later equals a longer run.
-            if (
-                iteration == self.settings.iterations
-                or iteration == schedule.total
-                or schedule.refilters(iteration)
-            ):
+            if schedule.refilters(iteration):
                 self.filter(state)
             return
         changed = False
@@ -113,10 +110,17 @@ class Rounds:
 
     def filter(self, state: TrainingState) -> None:
         """Compute the 3D filter for the cameras of the coming iteration's image size."""
+        state.adam.array("filter_3d")[:] = self._filter_of(state)
+
+    def filtered(self, state: TrainingState) -> OrientedGaussians:
+        """Return the Gaussians with a fresh filter; the state stays, so that it can train on."""
+        fresh = torch.from_numpy(self._filter_of(state).astype(np.float32))
+        return state.adam.gaussians().detached().replaced(filter_3d=fresh)
+
+    def _filter_of(self, state: TrainingState) -> np.ndarray:
         divisor = self.schedule.divisor(min(state.iteration, self.schedule.total - 1))
         cameras = [self.photos.camera(i, divisor) for i in self.views]
-        filter_3d = state.adam.array("filter_3d")
-        filter_3d[:] = mip_filter(state.adam.array("means"), cameras, threads=self.threads)
+        return mip_filter(state.adam.array("means"), cameras, threads=self.threads)
 
     def _densify(self, state: TrainingState) -> None:
         """Add and prune; stop adding for good where it does not pay any more."""

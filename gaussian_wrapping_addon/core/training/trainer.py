@@ -92,7 +92,8 @@ def train(
     """Train oriented Gaussians on the photos of a scene.
 
     Resumes from the newest checkpoint in ``folder``; the result is then bit for bit that of a run
-    without interruption on the same machine. A checkpoint stays at the end, from which more
+    without interruption on the same machine, unless numbers break down after it was resumed: the
+    state to go back to is then the resumed one. A checkpoint stays at the end, from which more
     iterations can go on.
 
     Parameters
@@ -189,8 +190,10 @@ class _Trainer:
             [photo_detail(self.photos.photo(v, 1), self.photos.mask(v, 1)) for v in chosen]
         )
         decision = found.decision(self.settings.full_size)
-        if side_px < 2 * SMALLEST_SIDE_PX:  # half would be too small to learn from
-            return dataclasses.replace(decision, chosen=f"{side_px} px"), 1
+        if side_px < 2 * SMALLEST_SIDE_PX:
+            evidence = f"{decision.evidence} Half of it would be too small to learn from."
+            size = f"{side_px} px"
+            return dataclasses.replace(decision, chosen=size, evidence=evidence), 1
         return decision, 1 if found.wants_full(self.settings.full_size) else 2
 
     # -- the run ----------------------------------------------------------------------------------
@@ -232,15 +235,20 @@ class _Trainer:
                     speed = (state.iteration - begun_at) / max(now_s - begun_s, 1e-9)
                     self._report(state, progress, speed)
                 if now_s - saved_s >= self.settings.checkpoint_every_s:
+                    if not state.adam.is_finite():
+                        state = self._fall_back(state, good)
+                        continue
                     save_checkpoint(self.folder, state, key)
                     saved_s = time.monotonic()
         except Cancelled:
-            if not settled:  # a round was left half done; what is saved must be whole
+            # A round was left half done, or numbers broke down: what is saved must be whole.
+            if not (settled and state.adam.is_finite()):
                 state = TrainingState.restore(*good)
             save_checkpoint(self.folder, state, key)
             raise
         save_checkpoint(self.folder, state, key)
-        gaussians = trimmed(state.adam.gaussians().detached(), state.degree)
+        gaussians = trimmed(rounds.filtered(state), state.degree)
+        self.live.look(gaussians, state.iteration, self._correction(state), force=True)
         held_out, lpips_note = self._measure(gaussians, state, progress)
         return TrainingResult(
             gaussians,
@@ -257,9 +265,8 @@ class _Trainer:
     def _start(self, rounds: Rounds, progress: Progress) -> TrainingState:
         warnings = []
         if self.settings.holdout_every > 0 and len(self.scene.views) < FEW_PHOTOS:
-            warnings.append(
-                f"Only {len(self.scene.views)} photos: {len(self.held_out)} held out for measuring."
-            )
+            count = len(self.scene.views)
+            warnings.append(f"Few photos ({count}): {len(self.held_out)} held out for measuring.")
         if self.start_splat is None:
             gaussians = self._initial()
         else:

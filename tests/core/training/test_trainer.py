@@ -217,6 +217,75 @@ def test_training_more_equals_a_longer_run(tmp_path: Path) -> None:
     assert whole.held_out == more.held_out
 
 
+def test_training_more_twice_equals_once(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    settings = dataclasses.replace(SETTINGS, iterations=20)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        for extra in (0, 15, 30) if name == "a" else (30,):
+            longer = dataclasses.replace(settings, extra_iterations=extra)
+            last = train(scene, photos, longer, tmp_path / name, Progress(), seed=2, threads=1)
+        if name == "a":
+            twice = last.gaussians
+    assert_same(twice, last.gaussians)
+
+
+def test_windows_and_neighbours_resume_bit_for_bit(tmp_path: Path) -> None:
+    """Neighbours bring Gaussians that the window has culled: memory of other views is no state."""
+    scene, photos = sphere_scene(views=12, size_px=40)
+    settings = dataclasses.replace(
+        SETTINGS, iterations=60, pixels_per_iteration=450, multi_view="on", overlap_price=1e-3,
+        multi_view_pixels=100, max_gaussians=1500,
+    )  # fmt: skip
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    whole = train(scene, photos, settings, tmp_path / "a", Progress(), seed=3, threads=1)
+    for stop in (30, 40):
+        with pytest.raises(Cancelled):
+            train(scene, photos, settings, tmp_path / "b", StopAt(stop).progress(), seed=3)
+    resumed = train(scene, photos, settings, tmp_path / "b", Progress(), seed=3, threads=2)
+    assert_same(whole.gaussians, resumed.gaussians)
+
+
+def test_broken_numbers_are_never_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    watch = StopAt(30)
+    honest = iteration.Stepper.step
+
+    def breaks(self, state):  # type: ignore[no-untyped-def]
+        honest(self, state)
+        if state.iteration == 25:
+            state.adam.array("means")[3, 1] = np.nan
+
+    monkeypatch.setattr(iteration.Stepper, "step", breaks)
+    with pytest.raises(Cancelled):
+        train(scene, photos, SETTINGS, tmp_path, watch.progress(), threads=1)
+    monkeypatch.setattr(iteration.Stepper, "step", honest)
+    for path in tmp_path.glob("checkpoint-*.npz"):
+        with np.load(path) as arrays:
+            assert all(np.isfinite(arrays[name]).all() for name in arrays.files)
+    result = train(scene, photos, SETTINGS, tmp_path, Progress(), threads=1)
+    assert all(torch.isfinite(t).all() for _, t in result.gaussians.tensors())
+
+
+def test_windows_that_a_mask_empties_say_nothing(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=9, size_px=40)
+    mask = np.zeros((40, 40), bool)
+    mask[:12, :12] = True
+    store = PhotosInMemory(scene, photos.photos, [mask] * 9)
+    settings = dataclasses.replace(
+        SETTINGS, iterations=30, pixels_per_iteration=450, holdout_every=0, exposure="off"
+    )
+    run = trainer._Trainer(scene, store, settings, tmp_path, 0, 1)
+    state = run._start(rounds.Rounds(run.stepper, [], None, Progress()), Progress())
+    for _ in range(30):
+        run.stepper.step(state)
+    numbers = {row[1] % iteration._MOST_WINDOWS for row in state.visits._rows}
+    assert numbers == {0}
+    assert len(state.visits) == 30
+    assert state.error_average > 0
+
+
 @pytest.mark.parametrize("where", ["_prune", "_wrap"])
 def test_a_round_that_is_cancelled_half_way_is_done_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str

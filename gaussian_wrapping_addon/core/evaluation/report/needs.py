@@ -73,7 +73,7 @@ def _who(entry: dict[str, Any]) -> str:
 
 def _evidence(entry: dict[str, Any]) -> str:
     evidence = words(entry.get("evidence"), "No evidence was recorded.")
-    if entry.get("setting") in ("on", "off"):
+    if entry.get("setting") in ("on", "off") and not evidence.startswith("Nothing was"):
         return f"You decided this. What the photos say: {evidence}"
     return evidence
 
