@@ -16,6 +16,7 @@ from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import iteration, rounds, trainer
 from gaussian_wrapping_addon.core.training.result import TrainingResult
@@ -232,7 +233,7 @@ def test_training_more_twice_equals_once(tmp_path: Path) -> None:
 
 def test_windows_and_neighbours_resume_bit_for_bit(tmp_path: Path) -> None:
     """Neighbours bring Gaussians that the window has culled: memory of other views is no state."""
-    scene, photos = sphere_scene(views=12, size_px=40)
+    scene, photos = sphere_scene(views=30, size_px=40)
     settings = dataclasses.replace(
         SETTINGS, iterations=60, pixels_per_iteration=450, multi_view="on", overlap_price=1e-3,
         multi_view_pixels=100, max_gaussians=1500,
@@ -240,11 +241,45 @@ def test_windows_and_neighbours_resume_bit_for_bit(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
     whole = train(scene, photos, settings, tmp_path / "a", Progress(), seed=3, threads=1)
+    assert whole.needs.chose("multi_view")
     for stop in (30, 40):
         with pytest.raises(Cancelled):
             train(scene, photos, settings, tmp_path / "b", StopAt(stop).progress(), seed=3)
     resumed = train(scene, photos, settings, tmp_path / "b", Progress(), seed=3, threads=2)
     assert_same(whole.gaussians, resumed.gaussians)
+
+
+def test_the_price_is_asked_of_gaussians_that_this_view_has_placed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that only the neighbour brings have no box here; memory of other views is no state."""
+    scene, photos = sphere_scene(views=30, size_px=40)
+    settings = dataclasses.replace(
+        SETTINGS, iterations=60, pixels_per_iteration=450, multi_view="on", overlap_price=1e-3,
+        multi_view_pixels=300, max_gaussians=1500,
+    )  # fmt: skip
+    views, brought = [], [0]
+    render_view, merge, price = (
+        ViewRenderer.render, iteration.merge_gradients, iteration.add_overlap_price,
+    )  # fmt: skip
+
+    def rendered(self, *arguments, **named):  # type: ignore[no-untyped-def]
+        views.append(render_view(self, *arguments, **named))
+        return views[-1]
+
+    def merged(first, second, *arguments, **named):  # type: ignore[no-untyped-def]
+        brought[0] += len(np.setdiff1d(second.ids, first.ids))
+        return merge(first, second, *arguments, **named)
+
+    def priced(gradients, *arguments):  # type: ignore[no-untyped-def]
+        assert np.isin(gradients.ids, views[-1].ids).all()
+        return price(gradients, *arguments)
+
+    monkeypatch.setattr(ViewRenderer, "render", rendered)
+    monkeypatch.setattr(iteration, "merge_gradients", merged)
+    monkeypatch.setattr(iteration, "add_overlap_price", priced)
+    train(scene, photos, settings, tmp_path, Progress(), seed=3, threads=1)
+    assert brought[0] > 0
 
 
 def test_broken_numbers_are_never_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
