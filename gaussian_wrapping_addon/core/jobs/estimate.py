@@ -48,13 +48,18 @@ def _estimate(job: JobFile) -> list[str]:
     from ..parallel import default_threads
     from ..training.estimate import estimate, judge, this_machine
     from ..training.machine_speed import machine_speed, renderer_is_compiled
+    from ..training.splat_start import wrapping_settings
+    from .splat_scene import start_splat_of
 
     facts = input_facts(Path(job.source))
+    training = job.settings.training
+    if start_splat_of(job) is not None:
+        training = wrapping_settings(training)
     threads = job.settings.threads or default_threads()
     compiled = renderer_is_compiled()
     speed = machine_speed(threads) if compiled else 1.0
     machine = this_machine(Path.cwd(), threads, speed)
-    expected = estimate(facts, job.settings.training, machine)
+    expected = estimate(facts, training, machine)
     points = f"{facts.points} sparse points" if facts.points else "camera poses still to be solved"
     lines = [
         f"{facts.photos} photos, long side {facts.long_side_px} px, {points}",
@@ -80,10 +85,18 @@ def input_facts(source: Path) -> SceneFacts:
     """
     from ..dataset.photo_file import photo_header
     from ..dataset.photo_finder import PhotoIndex, find_mask, list_photos, photo_root
-    from ..dataset.source_kind import read_poses, source_kind
+    from ..dataset.source_kind import SPLAT, read_poses, source_kind
+    from ..dataset.splat_header import read_splat_header
+    from ..dataset.splat_source import FAR_VIEWS, NEAR_VIEWS, PHOTO_SIDE_PX
     from ..training.estimate import SceneFacts
+    from .splat_scene import MAX_START_POINTS
 
     kind = source_kind(source.resolve())
+    if kind.kind == SPLAT:
+        header = read_splat_header(source)
+        views = FAR_VIEWS + NEAR_VIEWS
+        points = min(header.count, MAX_START_POINTS)
+        return SceneFacts(views, float(PHOTO_SIDE_PX**2), PHOTO_SIDE_PX, points)
     points = 0
     if kind.kind == "photos":
         root = photo_root(kind.folder)

@@ -192,7 +192,9 @@ def _estimate(
         compile_kernels(training, stage_folder, progress, threads=threads)
     progress.update(0.0, "timing this machine")
     machine = this_machine(stage_folder, threads, machine_speed(threads))
-    expected = estimate(scene_facts(scene), training, machine)
+    done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
+    first = max(done, default=0)
+    expected = estimate(scene_facts(scene), training, machine, first=first)
     warnings = judge(expected, machine)  # raises where the disk is too full
     _logger.info("estimate: %s", expected.sentence())
     for text in warnings:

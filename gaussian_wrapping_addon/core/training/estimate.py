@@ -231,12 +231,16 @@ def _trained_pixels(facts: SceneFacts, settings: TrainingSettings) -> float:
     return facts.pixels * factor * factor
 
 
-def _seconds(facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray) -> float:
-    """Return the model's time on the reference machine."""
+def _seconds(
+    facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray, first: int = 0
+) -> float:
+    """Return the model's time on the reference machine, from iteration ``first`` on."""
     schedule, pixels = _schedule(facts, settings), _trained_pixels(facts, settings)
     last = settings.iterations - 1
     total_s = 0.0
     for iteration, count in enumerate(counts.tolist()):
+        if iteration < first:
+            continue
         planned = min(iteration, last)
         size = _window(pixels / schedule.divisor(planned) ** 2, settings.pixels_per_iteration)
         depth = schedule.uses_depth(planned)
@@ -254,7 +258,9 @@ def _window(pixels: float, most: int) -> float:
     return pixels / across**2 if across > 1 else pixels
 
 
-def estimate(scene_facts: SceneFacts, settings: TrainingSettings, machine: Machine) -> Estimate:
+def estimate(
+    scene_facts: SceneFacts, settings: TrainingSettings, machine: Machine, *, first: int = 0
+) -> Estimate:
     """Return what a training will take.
 
     Where the photos decide (``"auto"``), the range reaches from "not needed" to "needed".
@@ -264,6 +270,8 @@ def estimate(scene_facts: SceneFacts, settings: TrainingSettings, machine: Machi
     scene_facts : SceneFacts
     settings : TrainingSettings
     machine : Machine
+    first : int
+        Iterations that a checkpoint has done already.
 
     Returns
     -------
@@ -275,8 +283,8 @@ def estimate(scene_facts: SceneFacts, settings: TrainingSettings, machine: Machi
     cheap = dataclasses.replace(settings, multi_view="off") if decided else settings
     least = gaussian_counts(scene_facts, settings, LITTLE_GROWTH)
     most = gaussian_counts(scene_facts, settings, 1.0)
-    low_s = LOW * _seconds(scene_facts, cheap, least) / machine.speed
-    high_s = HIGH * _seconds(scene_facts, settings, most) / machine.speed
+    low_s = LOW * _seconds(scene_facts, cheap, least, first) / machine.speed
+    high_s = HIGH * _seconds(scene_facts, settings, most, first) / machine.speed
     count = math.ceil(float(most.max()))
     coefficients = 3 * (settings.sh_degree + 1) ** 2
     trained = 3 + 3 + 4 + 1 + coefficients + 4  # values of a Gaussian that are trained

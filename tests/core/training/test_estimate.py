@@ -119,3 +119,11 @@ def test_this_machine_reads_what_is_free_also_for_folders_to_come(tmp_path: Path
     assert (machine.threads, machine.speed) == (3, 1.5)
     assert machine.disk_free_bytes > 0
     assert machine.memory_bytes >= 0
+
+
+def test_what_a_checkpoint_has_done_costs_nothing_more() -> None:
+    longer = replace(STANDARD, extra_iterations=500)
+    whole, rest = estimate(FACTS, longer, MACHINE), estimate(FACTS, longer, MACHINE, first=3000)
+    base = estimate(FACTS, STANDARD, MACHINE)
+    assert rest.seconds_low == pytest.approx(whole.seconds_low - base.seconds_low)
+    assert 0 < rest.seconds_high < 0.3 * whole.seconds_high

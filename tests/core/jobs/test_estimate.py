@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the command ``estimate`` reads of an input before anything is made of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.dataset.splat_source import FAR_VIEWS, NEAR_VIEWS, PHOTO_SIDE_PX
+from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.gaussians.splat_ply import write_splat_ply
+from gaussian_wrapping_addon.core.jobs.estimate import input_facts
+from tests.core.training.small_scene import sphere_gaussians
+
+
+def test_a_folder_of_photos(tmp_path: Path) -> None:
+    for index, size in enumerate(((40, 30), (60, 20), (40, 30))):
+        Image.fromarray(np.zeros((size[1], size[0], 3), np.uint8)).save(tmp_path / f"{index}.png")
+    facts = input_facts(tmp_path)
+    assert (facts.photos, facts.pixels, facts.long_side_px) == (3, 1200.0, 60)
+    assert (facts.points, facts.masked) == (0, False)
+
+
+def test_a_splat_is_looked_at_from_made_up_views(tmp_path: Path) -> None:
+    path = tmp_path / "some.ply"
+    write_splat_ply(path, sphere_gaussians(120), Similarity())
+    facts = input_facts(path)
+    assert facts.photos == FAR_VIEWS + NEAR_VIEWS
+    assert (facts.points, facts.long_side_px) == (120, PHOTO_SIDE_PX)
+
+
+def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError):
+        input_facts(tmp_path)
