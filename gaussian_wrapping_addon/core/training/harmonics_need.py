@@ -151,7 +151,7 @@ def harmonics_need(
     overshoot.
 
     Errors of geometry that change with the view gain by a degree too, on matte scenes as well, the
-    more the coarser the Gaussians are. Ask late: after they have stopped growing in number.
+    more the coarser the Gaussians are.
 
     Parameters
     ----------

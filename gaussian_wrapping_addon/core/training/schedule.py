@@ -50,9 +50,9 @@ REFINING_FROM = 0.7
 SMALLEST_SIDE_PX = 96
 """Where the long side of a level would be smaller than this, a finer one is used."""
 
-TRY_HARMONICS_AT = (0.5, 0.6, 0.7)
+TRY_HARMONICS_AT = (0.4, 0.5, 0.6)
 """Shares of the iterations at which photos are asked whether the next degree is worth it: not
-before shapes and plain colours explain what they can, and the Gaussians have their number."""
+before shapes and plain colours explain what they can, and early enough to be trained."""
 
 DEGREE_SHARE = 1.0 / 6.0
 """The harmonics' degree rises by one whenever this share of the iterations has passed."""
