@@ -12,6 +12,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_job, write_job
 from gaussian_wrapping_addon.core.jobs.runner import region_name
+from gaussian_wrapping_addon.core.jobs.training_stage import training_keys
 from gaussian_wrapping_addon.core.settings import JobSettings, preset
 
 
@@ -85,3 +86,28 @@ def test_region_names_are_safe_folder_names(request_: str, body: object, name: s
 def test_a_region_name_never_hides_the_automatic_one() -> None:
     assert region_name("x/auto.json", {}) not in ("auto", "all", "")
     assert region_name("x/\u4e2d.json", {}) not in ("auto", "all", "")
+
+
+def test_regions_that_a_training_favours_stay_its_own(tmp_path: Path) -> None:
+    """Another region is meshed from the same training: the training's key must not change."""
+    bodies = {}
+    for name, size in (("head", 1.0), ("foot", 2.0)):
+        bodies[name] = {
+            "class_name": "GaussianWrappingBoundingVolume",
+            "version": 1,
+            "blender_object_name": name,
+            "vertices": [[0, 0, 0], [size, 0, 0], [0, size, 0], [0, 0, size]],
+            "hull_simplices": None,
+        }
+        (tmp_path / f"{name}.json").write_text(json.dumps(bodies[name]))
+    settings = preset("draft", regions=(str(tmp_path / "head.json"),))
+    assert make_job("wrap", tmp_path, settings).settings.training.focus == ""
+    weighted = replace(settings, training=replace(settings.training, region_weight=4.0))
+    trained = make_job("wrap", tmp_path, weighted)
+    assert json.loads(trained.settings.training.focus) == [bodies["head"]]
+    other = replace(trained.settings, regions=(str(tmp_path / "foot.json"),))
+    meshed = make_job("mesh", tmp_path, other)
+    assert meshed.settings.training == trained.settings.training
+    assert training_keys(1, "cameras", meshed) == training_keys(1, "cameras", trained)
+    again = make_job("wrap", tmp_path, other)
+    assert training_keys(1, "cameras", again) != training_keys(1, "cameras", trained)
