@@ -132,7 +132,7 @@ def test_imports_are_followed_however_they_are_written() -> None:
     assert core / "render" / "harmonics_kernels.py" in found
     found = kernel_cache._imported(core / "render" / "raster_forward.py")
     assert core / "render" / "raster_math.py" in found  # names in brackets, over many lines
-    found = kernel_cache._imported(core / "jobs" / "runner.py")
+    found = kernel_cache._imported(core / "jobs" / "training_stage.py")
     assert core / "training" / "trainer.py" in found  # within a function
     assert all(path.is_file() for path in found)
 

@@ -175,8 +175,9 @@ class LiveView:
             ``held_out_psnr`` (dB) and ``held_out_iteration`` for the progress' figures, empty
             without held-out photos; ``None`` where it is not time yet.
         """
-        waits = not force and self._clock() - self._looked_s < self._every_s
-        if self._every_s <= 0 or waits:
+        if self._every_s <= 0:
+            return None
+        if not force and self._clock() - self._looked_s < self._every_s:
             return None
         figures = {}
         quality = measure_held_out(
