@@ -29,7 +29,15 @@ from ..render.types import ImageGradients, RenderOptions, VisibleGradients
 from ..render.view_renderer import ViewPass
 from ..settings import CORRELATIONS, TrainingSettings
 from .gradient_sums import add_image_gradients, merge_gradients
-from .multi_view_kernels import BROKEN, KEPT, compare_range, lift_range, return_range
+from .multi_view_kernels import (
+    BROKEN,
+    KEPT,
+    MAX_RISE,
+    PATCH_SIZES,
+    compare_range,
+    lift_range,
+    return_range,
+)
 from .pixel_choice import NO_MASK, choose_pixels, grey_image
 
 __all__ = [
@@ -54,6 +62,10 @@ class MultiViewOptions:
     correlation: str = "signed"
     pixels: int = 4000
     """Most pixels that are looked at."""
+    patch_sizes: int = PATCH_SIZES
+    """Sizes of patch that are tried where smaller ones are flat."""
+    max_rise: float = MAX_RISE
+    """How far the surface may leave a patch's plane within it, in half sides of the patch."""
     weight: float = 1.0
     """Of both terms: n where they are asked in every n-th iteration."""
 
@@ -72,7 +84,7 @@ class MultiViewOptions:
             settings.lambda_geometric,
             settings.correlation,
             settings.multi_view_pixels,
-            float(settings.multi_view_every),
+            weight=float(settings.multi_view_every),
         )
 
 
@@ -192,6 +204,8 @@ def multi_view_losses(
         NO_MASK if mask is None else np.ascontiguousarray(mask, np.bool_),
         kept_there,
         settings.correlation == "squared",
+        settings.patch_sizes,
+        settings.max_rise,
     )
     kept = states == KEPT
     photometric, geometric = _mean(weights * errors, kept), _mean(weights * _finite(noise), valid)
@@ -279,6 +293,8 @@ class _Pair:
         mask: np.ndarray,
         other_mask: np.ndarray,
         squared: bool,
+        sizes: int,
+        max_rise: float,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return states (m,), errors (m,), their derivatives by depth (m,) and normal (m, 3)."""
         count, image = len(self.pixels), self.image
@@ -289,7 +305,7 @@ class _Pair:
             compare_range(
                 begin, end, self.pixels, noise, image.depth, image.geometric_normal, image.alpha,
                 self.rotation, self.camera, self.other, self.pose, self.near_z, grey, other_grey,
-                mask, other_mask, squared, states, errors, by_depth, by_normals,
+                mask, other_mask, squared, sizes, max_rise, states, errors, by_depth, by_normals,
             )  # fmt: skip
 
         run_chunks(run, self.bounds, self.threads)

@@ -22,7 +22,10 @@ CAMERA_VALUES = 6
 HALF_PATCH = 3
 """A patch has ``2 * 3 + 1`` samples per side ..."""
 PATCH_STEP_PX = 0.5
-"""... half a pixel of the reference apart."""
+"""... half a pixel of the reference apart, where that is not flat."""
+PATCH_SIZES = 3
+"""Where it is flat, patches of twice and four times the size are tried: plain walls and glaze show
+their shading and stains only from farther apart."""
 SAMPLES = (2 * HALF_PATCH + 1) ** 2
 
 MAX_NOISE_PX = 1.0
@@ -42,6 +45,11 @@ MIN_NORMAL = 0.3
 """Shortest mean normal that stands for a plane (method.md 11, row 9)."""
 MIN_FACING = 0.1
 """Least cosine between normal and ray (84 degrees): a plane seen more edge-on has no patch."""
+MAX_RISE = 4.0
+"""Where the surface leaves the plane by more than so many half sides of the patch within it, there
+is no plane, as for a spoke before a wall: thin parts would be pulled towards what lies behind. With
+1, thin parts gain a little more, but rooms lose most of what the terms give them: early surfaces
+are rough."""
 
 # States of a compared pixel.
 SKIPPED, KEPT, BROKEN = 0, 1, 2
@@ -205,7 +213,7 @@ def _all_count(mask: Any, row: Any, column: Any) -> Any:
 @kernel(fast=False, fused=True)
 def compare_range(  # type: ignore[no-untyped-def]
     begin, end, pixels, noise, depth, normals, alpha, rotation, camera, other, pose, near_z,
-    grey, other_grey, mask, other_mask, squared, states, errors, by_depth, by_normals,
+    grey, other_grey, mask, other_mask, squared, sizes, max_rise, states, errors, by_depth, by_normals,
 ):  # fmt: skip
     """Compare the patches around pixels with what their planes show of the other photo.
 
@@ -220,6 +228,8 @@ def compare_range(  # type: ignore[no-untyped-def]
     grey, other_grey : (h, w) float32, mask, other_mask : bool or (0, 0) for none
     squared : bool
         Correlation -1 is as good as 1.
+    sizes : int
+        Sizes of patch that are tried, each twice as large as the one before, until one is not flat.
     states : (m,) uint8
         Written: :data:`KEPT` where the patch counts, :data:`BROKEN` where numbers were not finite.
     errors : (m,) float64
@@ -248,67 +258,83 @@ def compare_range(  # type: ignore[no-untyped-def]
         facing = n0 * px + n1 * py + n2  # n . r_p
         if not abs(facing) >= MIN_FACING * math.sqrt(px * px + py * py + 1.0):
             continue
-        whole, sample = True, 0
-        our_sum, their_sum = 0.0, 0.0
-        for i in range(-HALF_PATCH, HALF_PATCH + 1):
-            for j in range(-HALF_PATCH, HALF_PATCH + 1):
-                at_x, at_y = column + 0.5 + PATCH_STEP_PX * j, row + 0.5 + PATCH_STEP_PX * i
-                if not _between(grey, at_x, at_y):
-                    whole = False
+        step_px, flat = 0.5 * PATCH_STEP_PX, True
+        rise = max_rise * HALF_PATCH / camera[0]
+        our_spread, their_spread, common = 0.0, 0.0, 0.0
+        for _ in range(sizes):
+            step_px *= 2.0
+            whole, sample = True, 0
+            our_sum, their_sum = 0.0, 0.0
+            for i in range(-HALF_PATCH, HALF_PATCH + 1):
+                for j in range(-HALF_PATCH, HALF_PATCH + 1):
+                    at_x, at_y = column + 0.5 + step_px * j, row + 0.5 + step_px * i
+                    if not _between(grey, at_x, at_y):
+                        whole = False
+                        break
+                    top, left, right, low = _corner(grey, at_x, at_y)
+                    if not _all_count(mask, top, left):
+                        whole = False
+                        break
+                    high = grey[top, left] + right * (grey[top, left + 1] - grey[top, left])
+                    below = grey[top + 1, left] + right * (
+                        grey[top + 1, left + 1] - grey[top + 1, left]
+                    )
+                    ours[sample] = high + low * (below - high)
+                    x, y = (at_x - camera[2]) / camera[0], (at_y - camera[3]) / camera[1]
+                    ratio = (n0 * x + n1 * y + n2) / (facing * z)
+                    h0 = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] + ratio * pose[0, 3]
+                    h1 = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] + ratio * pose[1, 3]
+                    h2 = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] + ratio * pose[2, 3]
+                    # The point of the plane has depth 1 / ratio in the reference.
+                    if not (ratio > 0.0 and h2 > near_z * ratio):
+                        whole = False
+                        break
+                    if i % HALF_PATCH == 0 and j % HALF_PATCH == 0 and (i != 0 or j != 0):
+                        there = float(depth[int(at_y), int(at_x)])
+                        if not abs(there * ratio - 1.0) < rise * step_px:
+                            whole = False
+                            break
+                    u, v = h0 / h2, h1 / h2
+                    to_x, to_y = other[0] * u + other[2], other[1] * v + other[3]
+                    if not _between(other_grey, to_x, to_y):
+                        whole = False
+                        break
+                    top, left, right, low = _corner(other_grey, to_x, to_y)
+                    if not _all_count(other_mask, top, left):
+                        whole = False
+                        break
+                    g00, g01 = float(other_grey[top, left]), float(other_grey[top, left + 1])
+                    g10, g11 = (
+                        float(other_grey[top + 1, left]),
+                        float(other_grey[top + 1, left + 1]),
+                    )
+                    high, below = g00 + right * (g01 - g00), g10 + right * (g11 - g10)
+                    theirs[sample] = high + low * (below - high)
+                    across = (g01 - g00) + low * ((g11 - g10) - (g01 - g00))
+                    # How the sample changes with the ratio.
+                    slopes[sample] = (
+                        across * other[0] * (pose[0, 3] - u * pose[2, 3])
+                        + (below - high) * other[1] * (pose[1, 3] - v * pose[2, 3])
+                    ) / h2
+                    ratios[sample] = ratio
+                    our_sum += ours[sample]
+                    their_sum += theirs[sample]
+                    sample += 1
+                if not whole:
                     break
-                top, left, right, low = _corner(grey, at_x, at_y)
-                if not _all_count(mask, top, left):
-                    whole = False
-                    break
-                high = grey[top, left] + right * (grey[top, left + 1] - grey[top, left])
-                below = grey[top + 1, left] + right * (
-                    grey[top + 1, left + 1] - grey[top + 1, left]
-                )
-                ours[sample] = high + low * (below - high)
-                x, y = (at_x - camera[2]) / camera[0], (at_y - camera[3]) / camera[1]
-                ratio = (n0 * x + n1 * y + n2) / (facing * z)
-                h0 = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] + ratio * pose[0, 3]
-                h1 = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] + ratio * pose[1, 3]
-                h2 = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] + ratio * pose[2, 3]
-                # The point of the plane has depth 1 / ratio in the reference.
-                if not (ratio > 0.0 and h2 > near_z * ratio):
-                    whole = False
-                    break
-                u, v = h0 / h2, h1 / h2
-                to_x, to_y = other[0] * u + other[2], other[1] * v + other[3]
-                if not _between(other_grey, to_x, to_y):
-                    whole = False
-                    break
-                top, left, right, low = _corner(other_grey, to_x, to_y)
-                if not _all_count(other_mask, top, left):
-                    whole = False
-                    break
-                g00, g01 = float(other_grey[top, left]), float(other_grey[top, left + 1])
-                g10, g11 = float(other_grey[top + 1, left]), float(other_grey[top + 1, left + 1])
-                high, below = g00 + right * (g01 - g00), g10 + right * (g11 - g10)
-                theirs[sample] = high + low * (below - high)
-                across = (g01 - g00) + low * ((g11 - g10) - (g01 - g00))
-                # How the sample changes with the ratio.
-                slopes[sample] = (
-                    across * other[0] * (pose[0, 3] - u * pose[2, 3])
-                    + (below - high) * other[1] * (pose[1, 3] - v * pose[2, 3])
-                ) / h2
-                ratios[sample] = ratio
-                our_sum += ours[sample]
-                their_sum += theirs[sample]
-                sample += 1
             if not whole:
                 break
-        if not whole:
-            continue
-        our_mean, their_mean = our_sum / SAMPLES, their_sum / SAMPLES
-        our_spread, their_spread, common = 0.0, 0.0, 0.0
-        for sample in range(SAMPLES):
-            a, b = ours[sample] - our_mean, theirs[sample] - their_mean
-            our_spread += a * a
-            their_spread += b * b
-            common += a * b
-        if not (our_spread > MIN_SPREAD and their_spread > MIN_SPREAD):
+            our_mean, their_mean = our_sum / SAMPLES, their_sum / SAMPLES
+            our_spread = their_spread = common = 0.0
+            for sample in range(SAMPLES):
+                a, b = ours[sample] - our_mean, theirs[sample] - their_mean
+                our_spread += a * a
+                their_spread += b * b
+                common += a * b
+            flat = not (our_spread > MIN_SPREAD and their_spread > MIN_SPREAD)
+            if not flat:
+                break
+        if flat:
             continue
         product = our_spread * their_spread + SPREAD_PRODUCT
         root = math.sqrt(product)
@@ -330,8 +356,8 @@ def compare_range(  # type: ignore[no-untyped-def]
                 by_ratio = chain * (a - pull * b) / root * slopes[sample]
                 share = ratios[sample] * z
                 of_depth -= by_ratio * ratios[sample]
-                x = px + PATCH_STEP_PX * j / camera[0]
-                y = py + PATCH_STEP_PX * i / camera[1]
+                x = px + step_px * j / camera[0]
+                y = py + step_px * i / camera[1]
                 d0 += by_ratio * (x - share * px)
                 d1 += by_ratio * (y - share * py)
                 d2 += by_ratio * (1.0 - share)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -24,14 +25,16 @@ from gaussian_wrapping_addon.core.training.multi_view import (
     MultiViewOptions,
     multi_view_losses,
 )
-from gaussian_wrapping_addon.core.training.multi_view_kernels import MIN_SPREAD
+from gaussian_wrapping_addon.core.training.multi_view_kernels import MAX_RISE, MIN_SPREAD
 from gaussian_wrapping_addon.core.training.pixel_choice import choose_pixels, grey_image
 
 from .plane_scene import camera_pair, plane_gaussians, plane_photo
 
 REFERENCE, OTHER = camera_pair()
 PHOTO, OTHER_PHOTO = plane_photo(REFERENCE), plane_photo(OTHER)
-OPTIONS = MultiViewOptions(0.6, 0.3, "signed", 400, 2.0)
+OPTIONS = MultiViewOptions(0.6, 0.3, "signed", 400, weight=2.0)
+RIM = [7 * i + j for i in (0, 3, 6) for j in (0, 3, 6) if (i, j) != (3, 3)]
+"""Samples of a patch where the surface must lie near its plane."""
 TRAINED = ("means", "log_scales", "quats", "opacity_logits")
 
 
@@ -72,7 +75,10 @@ def bilinear(grey: torch.Tensor, places: torch.Tensor) -> tuple[torch.Tensor, to
 
 
 def definition(
-    gaussians: OrientedGaussians, pixels: np.ndarray, options: MultiViewOptions
+    gaussians: OrientedGaussians,
+    pixels: np.ndarray,
+    options: MultiViewOptions,
+    photo: np.ndarray,
 ) -> torch.Tensor:
     """Return the loss of method.md 3.4 with its homography, differentiable by autograd."""
     image = render(gaussians, REFERENCE, RenderOptions(sh_degree=0))
@@ -103,8 +109,8 @@ def definition(
     again = ((back - shift) @ turn) @ k_r.T
     again = again[:, :2] / again[:, 2:]
     noise = (again - centres[:, :2]).norm(dim=1)
-    size = torch.tensor([REFERENCE.width, REFERENCE.height])
-    valid = (found > 0.2) & (noise < 1) & (again >= 0).all(1) & (again <= size).all(1)
+    size_px = torch.tensor([REFERENCE.width, REFERENCE.height])
+    valid = (found > 0.2) & (noise < 1) & (again >= 0).all(1) & (again <= size_px).all(1)
     weight = torch.exp(-noise).detach()
     geometric = (weight * noise)[valid].mean()
 
@@ -112,20 +118,34 @@ def definition(
     delta = (unit * point).sum(1)
     plane = turn + shift[None, :, None] * unit[:, None, :] / delta[:, None, None]
     homography = k_c @ plane @ torch.linalg.inv(k_r)  # (m, 3, 3)
-    steps = torch.arange(-3, 4) * 0.5
-    grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
-    patch = centres[:, None, :2] + grid  # (m, 49, 2)
-    warped = torch.cat([patch, torch.ones_like(patch[..., :1])], 2) @ homography.transpose(1, 2)
-    warped = warped[..., :2] / warped[..., 2:]
-    ours, here = bilinear(torch.from_numpy(PHOTO[..., 0]), patch)
-    theirs, inside = bilinear(torch.from_numpy(OTHER_PHOTO[..., 0]), warped)
-    a, b = ours - ours.mean(1, keepdim=True), theirs - theirs.mean(1, keepdim=True)
-    spreads = (a * a).sum(1), (b * b).sum(1)
-    correlation = (a * b).sum(1) / torch.sqrt(spreads[0] * spreads[1] + 1e-8)
-    error = 1 - (correlation if options.correlation == "signed" else correlation**2)
-    kept = valid & here.all(1) & inside.all(1) & (error < 0.9)
-    kept &= (spreads[0] > MIN_SPREAD) & (spreads[1] > MIN_SPREAD)
-    kept &= normal.norm(dim=1) >= 0.3 * cover
+    error = torch.zeros_like(depth)
+    kept, undecided = torch.zeros_like(valid), valid.clone()
+    for size in range(options.patch_sizes):
+        steps = torch.arange(-3, 4) * 0.5 * 2**size
+        grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
+        patch = centres[:, None, :2] + grid  # (m, 49, 2)
+        corners = torch.cat([patch, torch.ones_like(patch[..., :1])], 2)  # (m, 49, 3)
+        warped = corners @ homography.transpose(1, 2)
+        warped = warped[..., :2] / warped[..., 2:]
+        ours, here = bilinear(torch.from_numpy(photo[..., 0]), patch)
+        theirs, inside = bilinear(torch.from_numpy(OTHER_PHOTO[..., 0]), warped)
+        rays = corners @ torch.linalg.inv(k_r).T
+        of_plane = delta[:, None] / (rays * unit[:, None]).sum(2)  # (m, 49) depths
+        at = patch.long()
+        at_x, at_y = (
+            v.clamp(0, n - 1) for v, n in ((at[..., 0], size_px[0]), (at[..., 1], size_px[1]))
+        )
+        rise = (image.depth[at_y, at_x] / of_plane - 1).abs() * REFERENCE.fx / (3 * steps[4])
+        flat_enough = (rise[:, RIM] < options.max_rise).all(1)
+        undecided = undecided & here.all(1) & inside.all(1) & flat_enough
+        a, b = ours - ours.mean(1, keepdim=True), theirs - theirs.mean(1, keepdim=True)
+        spreads = (a * a).sum(1), (b * b).sum(1)
+        correlation = (a * b).sum(1) / torch.sqrt(spreads[0] * spreads[1] + 1e-8)
+        found_error = 1 - (correlation if options.correlation == "signed" else correlation**2)
+        clear = undecided & (spreads[0] > MIN_SPREAD) & (spreads[1] > MIN_SPREAD)
+        error = torch.where(clear, found_error, error)
+        kept, undecided = kept | clear, undecided & ~clear
+    kept = kept & (error < 0.9) & (normal.norm(dim=1) >= 0.3 * cover)
     photometric = (weight * error)[kept].mean()
     assert valid.sum() > 100
     assert kept.sum() > 100
@@ -135,22 +155,32 @@ def definition(
 
 
 @pytest.mark.parametrize("correlation", ["signed", "squared"])
-def test_value_and_gradients_are_those_of_the_definition(correlation: str) -> None:
-    options = dataclasses.replace(OPTIONS, correlation=correlation)
+@pytest.mark.parametrize("patch_sizes", [1, 3])
+@pytest.mark.parametrize("max_rise", [0.5, MAX_RISE])
+def test_value_and_gradients_are_those_of_the_definition(
+    correlation: str, patch_sizes: int, max_rise: float
+) -> None:
+    options = dataclasses.replace(
+        OPTIONS, correlation=correlation, patch_sizes=patch_sizes, max_rise=max_rise
+    )
+    # Half of the photo is so weak that only large patches show something.
+    photo = PHOTO.copy()
+    half = photo.shape[1] // 2
+    photo[:, :half] = 0.5 + 0.25 * (photo[:, :half] - 0.5)
     gaussians = plane_gaussians(noise=0.03)
     raw, image = rendered(gaussians)
     random = np.random.default_rng(1)
     found = multi_view_losses(
-        image, raw, REFERENCE, PHOTO, None, OTHER, OTHER_PHOTO, None, options, random
+        image, raw, REFERENCE, photo, None, OTHER, OTHER_PHOTO, None, options, random
     )
     assert found.other is not None
     merged = merge_gradients(image.backward(found.gradients), found.other, len(raw))
 
     random = np.random.default_rng(1)
-    grey = grey_image(PHOTO, "grey", threads=1)
+    grey = grey_image(photo, "grey", threads=1)
     pixels = choose_pixels(grey, image.depth, None, options.pixels, random, threads=1)
     leaves = {name: getattr(gaussians, name).clone().requires_grad_() for name in TRAINED}
-    wanted = definition(gaussians.replaced(**leaves), pixels, options)
+    wanted = definition(gaussians.replaced(**leaves), pixels, options, photo)
     assert found.value == pytest.approx(wanted.item(), rel=1e-4)
     wanted.backward()  # type: ignore[no-untyped-call]
     for name, leaf in leaves.items():
@@ -218,6 +248,46 @@ def test_constant_photos_leave_the_geometric_term() -> None:
     assert found.other is not None
 
 
+def test_weak_texture_is_seen_by_larger_patches() -> None:
+    weak = 0.5 + 0.25 * (PHOTO - 0.5)
+    other = 0.5 + 0.25 * (OTHER_PHOTO - 0.5)
+    kept = [
+        losses(
+            plane_gaussians(side=40),
+            dataclasses.replace(OPTIONS, patch_sizes=sizes),
+            photo=weak,
+            other_photo=other,
+        ).figures.kept
+        for sizes in (1, 2, 3)
+    ]
+    assert kept[0] < kept[1] < kept[2]
+    assert kept[2] > 2 * kept[0]
+
+
+def test_patches_across_a_step_of_the_surface_are_left_out() -> None:
+    raw, image = rendered(plane_gaussians(side=40))
+    depth = image.depth.copy()
+    edge = 30
+    depth[:, edge:] *= 0.7
+    stepped = types.SimpleNamespace(
+        depth=depth, geometric_normal=image.geometric_normal, alpha=image.alpha
+    )
+    options = dataclasses.replace(OPTIONS, lambda_geometric=0.0, patch_sizes=1, pixels=3000)
+
+    def pulled(max_rise: float) -> np.ndarray:
+        found = multi_view_losses(
+            stepped, raw, REFERENCE, PHOTO, None, OTHER, OTHER_PHOTO, None,  # type: ignore[arg-type]
+            dataclasses.replace(options, max_rise=max_rise), np.random.default_rng(1),
+        )  # fmt: skip
+        return np.asarray(found.gradients.depth != 0.0)
+
+    all_of_them, on_planes = pulled(np.inf), pulled(MAX_RISE)
+    assert all_of_them[:, edge - 1].any()
+    assert not on_planes[:, edge - 1].any()
+    far = np.s_[:, : edge - 3]
+    assert np.array_equal(all_of_them[far], on_planes[far])
+
+
 def test_a_camera_that_looks_away_has_no_part() -> None:
     pose = OTHER.cam_from_world.copy()
     pose[0], pose[2] = -pose[0], -pose[2]
@@ -267,7 +337,7 @@ def test_bytes_are_read_like_floats() -> None:
 
 def test_options_and_sizes() -> None:
     options = MultiViewOptions.of_settings(TrainingSettings(multi_view_every=3))
-    assert options == MultiViewOptions(0.15, 0.02, "signed", 4000, 3.0)
+    assert options == MultiViewOptions(0.15, 0.02, "signed", 4000, weight=3.0)
     with pytest.raises(UsageError, match="cubed"):
         MultiViewOptions(correlation="cubed")
     with pytest.raises(UsageError, match="photo is"):
