@@ -213,7 +213,8 @@ def _all_count(mask: Any, row: Any, column: Any) -> Any:
 @kernel(fast=False, fused=True)
 def compare_range(  # type: ignore[no-untyped-def]
     begin, end, pixels, noise, depth, normals, alpha, rotation, camera, other, pose, near_z,
-    grey, other_grey, mask, other_mask, squared, sizes, max_rise, states, errors, by_depth, by_normals,
+    grey, other_grey, mask, other_mask, squared, sizes, max_rise, states, errors, by_depth,
+    by_normals,
 ):  # fmt: skip
     """Compare the patches around pixels with what their planes show of the other photo.
 
@@ -230,6 +231,8 @@ def compare_range(  # type: ignore[no-untyped-def]
         Correlation -1 is as good as 1.
     sizes : int
         Sizes of patch that are tried, each twice as large as the one before, until one is not flat.
+    max_rise : float
+        See :data:`MAX_RISE`.
     states : (m,) uint8
         Written: :data:`KEPT` where the patch counts, :data:`BROKEN` where numbers were not finite.
     errors : (m,) float64
