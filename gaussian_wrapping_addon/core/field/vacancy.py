@@ -126,6 +126,16 @@ class VacancyField:
         self._cache: dict[int, CameraBins | None] = {}
         self._cache_left = default_cache_bytes() if cache_bytes is None else cache_bytes
 
+    def prepare(self, progress: Progress | None = None) -> None:
+        """Project and bin the Gaussians for all cameras now, as far as memory allows.
+
+        Otherwise the first query that needs a camera does it.
+        """
+        progress = progress or Progress()
+        for done, index in enumerate(self.visiting_order().tolist()):
+            progress.update(done / len(self.cameras), "Preparing cameras")
+            self._bins(index)
+
     def vacancy(self, points: np.ndarray, progress: Progress | None = None) -> VacancyResult:
         """Evaluate vacancy and its arg-max camera at (n, 3) float64 scene points."""
         points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
@@ -291,8 +301,7 @@ class VacancyField:
         def evaluate(begin: int, end: int) -> None:
             transmittance_of_cells(
                 begin, end, start, order, screen, bins.rows, bins.bounds, bins.tile_start,
-                bins.tile_ids, bins.longest_list, np.float32(TILE_PX), shift, view.tiles_x,
-                index, best, winner,
+                bins.tile_ids, bins.longest_list, shift, index, best, winner,
             )  # fmt: skip
 
         points_in_cell = np.diff(start[:-1])

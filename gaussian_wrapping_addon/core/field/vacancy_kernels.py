@@ -25,6 +25,7 @@ CHECK_EVERY = 16
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
+_FAR = np.float32(1e30)
 _HALF = np.float32(0.5)
 _FACTOR_MIN = np.float32(1e-7)
 _T_MIN = np.float32(1e-4)
@@ -51,10 +52,11 @@ def _exp_minus(x):
 
 
 @inline
-def _strip_misses(bounds, i, x, y, half):
-    """Tell whether the square of half side ``half`` around (x, y) lies outside the strip."""
+def _strip_misses(bounds, i, x, y, half_x, half_y):
+    """Tell whether the rectangle of these half sides around (x, y) lies outside the strip."""
     nx, ny = bounds[i, 4], bounds[i, 5]
-    return abs(nx * x + ny * y - bounds[i, 6]) > bounds[i, 7] + half * (abs(nx) + abs(ny))
+    outside = abs(nx * x + ny * y - bounds[i, 6]) - bounds[i, 7]
+    return outside > half_x * abs(nx) + half_y * abs(ny)
 
 
 @kernel(fast=False)
@@ -73,7 +75,7 @@ def list_tiles(bounds, tile_px, tiles_x, tiles_y, heads, ids, write):
             for x in range(x0, x1 + 1):
                 middle_x = np.float32(x) * tile_px + half
                 middle_y = np.float32(y) * tile_px + half
-                if _strip_misses(bounds, i, middle_x, middle_y, half):
+                if _strip_misses(bounds, i, middle_x, middle_y, half, half):
                     continue
                 t = y * tiles_x + x
                 if write:
@@ -137,16 +139,13 @@ def sort_by_cell(cells, start, order):
 
 @kernel(fast=True)
 def transmittance_of_cells(
-    begin, end, cell_start, order, screen, rows, bounds, tile_start, tile_ids, list_capacity,
-    tile_px, shift, tiles_x, camera_index, best, winner,
+    begin, end, cell_start, order, screen, rows, bounds, tile_start, tile_ids, list_capacity, shift,
+    camera_index, best, winner,
 ):  # fmt: skip
     """Raise ``best`` and ``winner`` of the points of cells ``begin .. end`` by one camera.
 
     A product that falls below 1e-4 counts as 0. Ties go to the lower camera index.
     """
-    mask = (1 << shift) - 1
-    cell_px = tile_px / np.float32(mask + 1)
-    half = _HALF * cell_px
     near = np.empty(list_capacity, np.int32)
     # Rows of GROUP: x, y, depth, transmittance, value to beat. One array at constant offsets lets
     # the compiler prove that nothing overlaps (kernels.md 4).
@@ -156,28 +155,18 @@ def transmittance_of_cells(
         if last <= first:
             continue
         tile = cell >> (2 * shift)
-        sub = cell & ((1 << (2 * shift)) - 1)
-        tile_y = tile // tiles_x
-        tile_x = tile - tile_y * tiles_x
-        x0 = np.float32(tile_x) * tile_px + np.float32(sub & mask) * cell_px
-        y0 = np.float32(tile_y) * tile_px + np.float32(sub >> shift) * cell_px
-        x1, y1 = x0 + cell_px, y0 + cell_px
-        deepest = _ZERO
+        # Only what reaches the points themselves: often much less than what reaches the cell.
+        x0, y0 = _FAR, _FAR
+        x1, y1, deepest = -_ONE, -_ONE, _ZERO
         for p in range(first, last):
+            u, v = screen[order[p], 0], screen[order[p], 1]
+            x0, x1 = min(x0, u), max(x1, u)
+            y0, y1 = min(y0, v), max(y1, v)
             deepest = max(deepest, screen[order[p], 2])
+        middle_x, middle_y = _HALF * (x0 + x1), _HALF * (y0 + y1)
+        half_x, half_y = _HALF * (x1 - x0), _HALF * (y1 - y0)
         count = 0
-        for k in range(tile_start[tile], tile_start[tile + 1]):
-            i = tile_ids[k]
-            if (
-                bounds[i, 0] <= x1
-                and bounds[i, 2] >= x0
-                and bounds[i, 1] <= y1
-                and bounds[i, 3] >= y0
-                and rows[i, 14] <= deepest
-                and not _strip_misses(bounds, i, x0 + half, y0 + half, half)
-            ):
-                near[count] = i
-                count += 1
+        scan, scan_end = tile_start[tile], tile_start[tile + 1]
         for group in range(first, last, GROUP):
             size = min(GROUP, last - group)
             lanes_used = ((size + LANES - 1) // LANES) * LANES
@@ -189,8 +178,26 @@ def transmittance_of_cells(
                 M[3 * GROUP + x] = _ONE if x < size else _ZERO
                 M[4 * GROUP + x] = max(best[p], _T_MIN)
             blocks = lanes_used // LANES
-            for k in range(count):
+            k = 0
+            while True:
+                # The list is culled no further than some group of the cell walks it.
+                while count <= k and scan < scan_end:
+                    i = tile_ids[scan]
+                    scan += 1
+                    if (
+                        bounds[i, 0] <= x1
+                        and bounds[i, 2] >= x0
+                        and bounds[i, 1] <= y1
+                        and bounds[i, 3] >= y0
+                        and rows[i, 14] <= deepest
+                        and not _strip_misses(bounds, i, middle_x, middle_y, half_x, half_y)
+                    ):
+                        near[count] = i
+                        count += 1
+                if k >= count:
+                    break
                 i = near[k]
+                k += 1
                 u, v = rows[i, 0], rows[i, 1]
                 qa, qb, qc = rows[i, 2], rows[i, 3], rows[i, 4]
                 px, py = rows[i, 5], rows[i, 6]
@@ -213,7 +220,7 @@ def transmittance_of_cells(
                         g = g if foot <= reach else _ZERO
                         g = g if depth >= begin_z else _ZERO
                         M[3 * GROUP + b + x] *= max(_ONE - g, _FACTOR_MIN)
-                if (k & (CHECK_EVERY - 1)) == CHECK_EVERY - 1:
+                if (k & (CHECK_EVERY - 1)) == 0:
                     lead = -_ONE
                     for x in range(lanes_used):
                         lead = max(lead, M[3 * GROUP + x] - M[4 * GROUP + x])
