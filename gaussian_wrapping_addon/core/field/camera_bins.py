@@ -65,11 +65,14 @@ class CameraBins:
     tile_ids: np.ndarray
     """(pairs,) int32."""
     longest_list: int
+    ids: np.ndarray
+    """(m,) int32: the Gaussian of each row."""
 
     @property
     def size_bytes(self) -> int:
         """Memory held."""
-        return sum(a.nbytes for a in (self.rows, self.bounds, self.tile_start, self.tile_ids))
+        arrays = (self.rows, self.bounds, self.tile_start, self.tile_ids, self.ids)
+        return sum(a.nbytes for a in arrays)
 
 
 def region_window(
@@ -193,4 +196,4 @@ def bin_camera(
         )
     tile_ids = np.empty(start[-1], np.int32)
     list_tiles(footprints, tile_px, tiles_x, tiles_y, start[:-1].copy(), tile_ids, True)
-    return CameraBins(rows, footprints, start, tile_ids, longest)
+    return CameraBins(rows, footprints, start, tile_ids, longest, ids.astype(np.int32))

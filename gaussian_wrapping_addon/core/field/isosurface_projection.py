@@ -17,9 +17,19 @@ from .vacancy import SETTLED, VacancyResult
 from .vector_field import MIN_SLOPE, VectorFieldResult
 
 TOLERANCE = 0.01
+"""Points no further than this from 0.5 are on the surface: about the error that dropped tails of
+Gaussians leave in the field."""
+AIM = 0.005
+"""Points move on until they are this close, where the field is smooth enough. On trained scenes the
+median is then below 0.001, for a tenth more evaluations than with 0.01 (median 0.002)."""
 MAX_ROUNDS = 40
 MAX_TRAVEL_SIGMAS = 16.0
-MAX_HALVINGS = 4
+MAX_HALVINGS = 1
+MAX_NEWTON_STEPS = 3
+"""Where Newton does not converge at once, V is not the slope (it knows nothing of the camera), and
+the search for a bracket is the shorter way: with four halvings and any number of steps more points
+ran out of rounds. The exact gradient of the arg-max camera saves 3 % of the evaluations and takes
+longer than that to compute."""
 MAX_STEP_SIGMAS = 1.0
 MAX_INWARD_MARCH = 8
 BRACKET_END_SIGMAS = 1e-3
@@ -101,7 +111,7 @@ def project_to_isosurface(
     """Move points onto the surface ``vacancy = 0.5`` (method.md 5.6).
 
     Newton steps on ``log v`` along V, at most one local sigma long, are taken while they lessen
-    ``|v - 0.5|`` and are halved up to four times where they do not. As soon as two points on
+    ``|v - 0.5|`` and are halved once where they do not. As soon as two points on
     opposite sides are known, the segment between them is cut (false position, every third time in
     the middle) until the tolerance is reached. Where Newton fails or the field is flat, a bracket
     is searched along the outward direction of the vector field (occupied points outwards, by
@@ -117,7 +127,8 @@ def project_to_isosurface(
     vector_field : VectorField
     progress : Progress, optional
     tolerance : float
-        Largest ``|v - 0.5|`` of a point that is kept; 1e-3 to 2e-2 make sense.
+        Largest ``|v - 0.5|`` of a point that is kept; 1e-3 to 2e-2 make sense. Points that get
+        there move on until they are within :data:`AIM`, or can not.
     max_steps : int
         Batches of vacancy evaluations at most; points still under way then are dropped.
     max_travel_sigmas : float
@@ -165,6 +176,7 @@ class _Walk:
         n = len(points)
         self.centers = centers
         self.tolerance = tolerance
+        self.aim = min(AIM, tolerance)
         self.sigma = vectors.sigma_local
         self.max_travel = max_travel_sigmas * self.sigma
         self.start = points
@@ -176,6 +188,7 @@ class _Walk:
         self.camera = first.camera.copy()
         self.slope = np.ones(n)  # how much of |V| the last step showed to be true
         self.halvings = np.zeros(n, np.int64)
+        self.steps = np.zeros(n, np.int64)
         # The march's last point and its direction.
         self.marched = np.zeros(n, np.int64)
         self.along_ray = np.zeros(n, bool)
@@ -194,7 +207,7 @@ class _Walk:
         self.phase = np.full(n, _NEWTON, np.int8)
         self.status = np.full(n, ProjectionStatus.DROPPED, np.uint8)
         seen = first.camera >= 0
-        done = seen & (np.abs(self.v - tolerances.ISO_LEVEL) <= tolerance)
+        done = seen & (np.abs(self.v - tolerances.ISO_LEVEL) <= self.aim)
         self.status[done] = ProjectionStatus.CONVERGED
         # Unseen points have no vacancy of their own; without Gaussians there is no length.
         self.rows = np.flatnonzero(seen & ~done & (self.sigma > 0.0))
@@ -202,6 +215,11 @@ class _Walk:
     def result(self, rounds: int, evaluations: int) -> ProjectionResult:
         """Return where all points are now."""
         residual = np.abs(self.best_v - tolerances.ISO_LEVEL)
+        close = (self.status == ProjectionStatus.DROPPED) & (residual <= self.tolerance)
+        close &= self.best_camera >= 0
+        newton = self.phase == _NEWTON
+        self.status[close & newton] = ProjectionStatus.CONVERGED
+        self.status[close & ~newton] = ProjectionStatus.BISECTED
         return ProjectionResult(
             self.best_x,
             self.best_v.astype(np.float32),
@@ -222,6 +240,7 @@ class _Walk:
         flat = ~(length * self.sigma[newton] > MIN_SLOPE) | ~np.isfinite(length)
         flat |= (self.v[newton] < RESOLVED[0]) | (self.v[newton] > RESOLVED[1])
         flat |= self.halvings[newton] > MAX_HALVINGS
+        flat |= self.steps[newton] >= MAX_NEWTON_STEPS
         self._begin_march(newton[flat])
 
         trial = np.empty((len(rows), 3))
@@ -298,7 +317,7 @@ class _Walk:
         self.best_v[rows[better]] = v[better]
         self.best_camera[rows[better]] = answer.camera[better]
 
-        done = seen & (error <= self.tolerance)
+        done = seen & (error <= self.aim)
         newton = self.phase[rows] == _NEWTON
         march = self.phase[rows] == _MARCH
         cut = self.phase[rows] == _BRACKET
@@ -322,6 +341,7 @@ class _Walk:
         self.slope[now] = np.clip(shown, 1.0 / SLOPE_RATIO, SLOPE_RATIO)
         self.x[now], self.v[now], self.camera[now] = trial[taken], v[taken], answer.camera[taken]
         self.halvings[now] = 0
+        self.steps[now] += 1
         self.halvings[rows[newton & ~taken & ~crossed & ~done]] += 1
 
         on = march & ~crossed & ~done

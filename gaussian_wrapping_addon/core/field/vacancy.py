@@ -17,6 +17,8 @@ from ..gaussians.model import GaussianArrays
 from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
 from ..progress import Progress
 from .camera_bins import TILE_PX, CameraBins, VirtualScreen, bin_camera
+from .log_gradient import gradient_from_camera, gradient_table
+from .photo_masks import MaskMode, checked_masks, masked_points
 from .vacancy_kernels import project_points, sort_by_cell, transmittance_of_cells
 
 SETTLED = 1.0 - 1e-3
@@ -30,7 +32,8 @@ POINTS_PER_CELL = 40
 the lists of Gaussians."""
 MAX_CELL_SHIFT = 3
 
-Unseen = Literal["empty", "occupied"]
+Unseen = Literal["empty", "occupied", "invalid"]
+_UNSEEN_VALUES = {"empty": 1.0, "occupied": 0.0, "invalid": float("nan")}
 
 
 @dataclass(frozen=True)
@@ -39,9 +42,14 @@ class VacancyResult:
 
     vacancy: np.ndarray
     """(n,) float32 in [0, 1]; 1 is empty, the surface is at 0.5. Values above 0.999 are lower
-    bounds, values below 1e-4 are 0."""
+    bounds, values below 1e-4 are 0. NaN where no camera sees the point and that is invalid."""
     camera: np.ndarray
     """(n,) int32: the camera that sees the point best, or -1 where none sees it."""
+
+    @property
+    def filled(self) -> np.ndarray:
+        """(n,) float32: vacancy with invalid points taken for empty, as the mesher takes them."""
+        return np.where(np.isnan(self.vacancy), np.float32(1.0), self.vacancy)
 
 
 def default_cache_bytes() -> int:
@@ -74,8 +82,14 @@ class VacancyField:
         In the scene frame, of any resolution: vacancy does not depend on it.
     threads : int
         0 uses every core.
-    unseen : {"empty", "occupied"}
-        Vacancy 1 or 0 of points that no camera sees (method.md 5.3).
+    unseen : {"empty", "occupied", "invalid"}
+        Vacancy 1, 0 or NaN of points that no camera sees (method.md 5.3). Invalid points count as
+        empty where only a side is asked for, and ``unseen_evaluations`` says how many there were.
+    masks : sequence of (h, w) bool or None, optional
+        One a camera, true where its photo counts, of any resolution.
+    mask_mode : {"ignore", "background"}
+        A camera does not see points in masked pixels; or sees that nothing is there, so that they
+        are empty whatever other cameras say, as far as training was told so too.
     region_bounds : (2, 3) float64, optional
         Box that holds all points that will be asked for, scene frame. Cameras that do not see it
         and Gaussians that cannot change anything in it are left out, which saves time and memory
@@ -89,7 +103,7 @@ class VacancyField:
     Raises
     ------
     UsageError
-        If there are no cameras, or the bounds or ``unseen`` make no sense.
+        If there are no cameras, or the bounds, masks or ``unseen`` make no sense.
     """
 
     def __init__(
@@ -102,11 +116,13 @@ class VacancyField:
         region_bounds: np.ndarray | None = None,
         near_z: float = tolerances.NEAR_Z,
         cache_bytes: int | None = None,
+        masks: Sequence[np.ndarray | None] | None = None,
+        mask_mode: MaskMode = "ignore",
     ) -> None:
         if len(cameras) == 0:
             raise UsageError("Vacancy needs at least one camera.", "Check the scene's views.")
-        if unseen not in ("empty", "occupied"):
-            raise UsageError(f"unseen is {unseen!r}.", 'Use "empty" or "occupied".')
+        if unseen not in _UNSEEN_VALUES:
+            raise UsageError(f"unseen is {unseen!r}.", 'Use "empty", "occupied" or "invalid".')
         self.arrays = arrays
         self.cameras = tuple(cameras)
         self.threads = threads or default_threads()
@@ -122,6 +138,11 @@ class VacancyField:
         """How often each camera was the arg-max so far."""
         self.evaluations = 0
         """Points asked for so far."""
+        self.unseen_evaluations = 0
+        """Those of them that no camera saw."""
+        self._masks = checked_masks(masks, self.cameras, mask_mode)
+        self._mask_mode = mask_mode
+        self._gradient_table: np.ndarray | None = None
         self._screens = [VirtualScreen.of(camera, near_z) for camera in self.cameras]
         self._cache: dict[int, CameraBins | None] = {}
         self._cache_left = default_cache_bytes() if cache_bytes is None else cache_bytes
@@ -148,6 +169,7 @@ class VacancyField:
             self._raise_best(points[begin:end], SETTLED, best, winner, None, part)
             seen = winner >= 0
             self.wins += np.bincount(winner[seen], minlength=len(self.cameras))
+            self.unseen_evaluations += int((~seen).sum())
             vacancy[begin:end] = np.where(seen, best, self._unseen_value)
             camera[begin:end] = winner
         return VacancyResult(vacancy, camera)
@@ -180,7 +202,8 @@ class VacancyField:
             self._raise_best(points[begin:end], float(level32), best, winner, seen, part)
             won = winner[best > level32]
             self.wins += np.bincount(won, minlength=len(self.cameras))
-            out[begin:end] = np.where(seen, best > level32, self._unseen_value > level)
+            self.unseen_evaluations += int((~seen).sum())
+            out[begin:end] = np.where(seen, best > level32, not self._unseen_value <= level)
         return out
 
     def transmittance(self, points: np.ndarray, camera_index: int) -> np.ndarray:
@@ -196,6 +219,41 @@ class VacancyField:
             )
         return np.where(winner >= 0, best, np.float32(np.nan))
 
+    def log_gradient(self, points: np.ndarray, camera: np.ndarray) -> np.ndarray:
+        """Return the gradient of log T at points, each as its own camera sees it.
+
+        With the arg-max camera of :meth:`vacancy` that is the gradient of log vacancy, exact up to
+        rounding in float64 (where the arg-max changes, vacancy has a kink).
+
+        Parameters
+        ----------
+        points : (n, 3) float64
+            Scene frame.
+        camera : (n,) int
+            Camera indices; -1 for none.
+
+        Returns
+        -------
+        (n, 3) float64, 1 / scene units
+            0 where the camera does not see the point.
+        """
+        points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
+        camera = np.asarray(camera)
+        gradient, log_t = np.zeros((len(points), 3)), np.empty(len(points))
+        if self._gradient_table is None:
+            self._gradient_table = gradient_table(self.arrays)
+        order = np.argsort(camera, kind="stable")
+        bounds = np.searchsorted(camera[order], np.arange(len(self.cameras) + 1))
+        for index in range(len(self.cameras)):
+            rows = order[bounds[index] : bounds[index + 1]]
+            bins = self._bins(index) if len(rows) else None
+            if bins is not None:
+                gradient_from_camera(
+                    self._gradient_table, self._screens[index], bins, points, rows, log_t,
+                    gradient, self.threads,
+                )  # fmt: skip
+        return gradient
+
     def visiting_order(self) -> np.ndarray:
         """Return camera indices, most frequent winners first; ties are spread over the list."""
         count = len(self.cameras)
@@ -210,7 +268,7 @@ class VacancyField:
 
     @property
     def _unseen_value(self) -> float:
-        return 1.0 if self.unseen == "empty" else 0.0
+        return _UNSEEN_VALUES[self.unseen]
 
     def _passes(self, count: int, progress: Progress) -> list[tuple[int, int, Progress]]:
         self.evaluations += count
@@ -242,6 +300,33 @@ class VacancyField:
             self._cache[index] = bins
             self._cache_left -= size
         return bins
+
+    def _apply_mask(
+        self,
+        index: int,
+        screen: np.ndarray,
+        cells: np.ndarray,
+        best: np.ndarray,
+        winner: np.ndarray,
+        seen: np.ndarray | None,
+    ) -> None:
+        """Take masked points out of the camera's view, or settle them as empty."""
+        mask, virtual = self._masks[index], self._screens[index].camera
+        assert mask is not None
+        masked = np.empty(len(cells), np.bool_)
+        scale_x, scale_y = mask.shape[1] / virtual.width, mask.shape[0] / virtual.height
+        run_chunks(
+            lambda begin, end: masked_points(
+                begin, end, screen, cells, mask, scale_x, scale_y, masked
+            ),
+            even_bounds(len(cells), self.threads),
+            self.threads,
+        )
+        cells[masked] = -1
+        if self._mask_mode == "background":
+            best[masked], winner[masked] = 1.0, index
+            if seen is not None:
+                seen |= masked
 
     def _raise_best(
         self,
@@ -289,6 +374,8 @@ class VacancyField:
         run_chunks(project, even_bounds(len(points), self.threads), self.threads)
         if inside is not None:
             cells[~inside] = -1
+        if self._masks[index] is not None:
+            self._apply_mask(index, screen, cells, best, winner, seen)
         if seen is not None:
             seen |= cells >= 0
         start = np.zeros((view.tiles << (2 * shift)) + 2, np.int64)

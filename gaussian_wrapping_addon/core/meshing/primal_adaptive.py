@@ -146,7 +146,7 @@ def _connect(
         neighbours,
         outer,
         on_one_sheet(points, tetrahedra, cloud.normals, outer, cloud.radius),
-        lambda where: vacancy.vacancy(where).vacancy,
+        lambda where: vacancy.vacancy(where).filled,
         rng,
         progress.span(0.65, 0.9),
     )
@@ -190,7 +190,7 @@ def _distance_to_level(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> 
     on_surface = vertices[kind == KIND_SURFACE]
     if len(on_surface) == 0:
         return {}
-    away = np.abs(vacancy.vacancy(on_surface).vacancy.astype(np.float64) - tolerances.ISO_LEVEL)
+    away = np.abs(vacancy.vacancy(on_surface).filled.astype(np.float64) - tolerances.ISO_LEVEL)
     return {
         "level_error_mean": float(away.mean()),
         "level_error_median": float(np.median(away)),

@@ -295,7 +295,7 @@ def test_bad_input_and_cancelling() -> None:
     with pytest.raises(UsageError, match="at least one camera"):
         VacancyField(arrays, [])
     with pytest.raises(UsageError, match="unseen"):
-        VacancyField(arrays, cameras, unseen="invalid")  # type: ignore[arg-type]
+        VacancyField(arrays, cameras, unseen="solid")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="bounds"):
         VacancyField(arrays, cameras, region_bounds=np.array([[1.0, 1, 1], [0.0, 0, 0]]))
     with pytest.raises(Cancelled):
