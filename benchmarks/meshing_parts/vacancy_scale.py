@@ -42,6 +42,7 @@ class VacancyScale:
     threads: int
     prepare_s: float
     """Projecting and binning the Gaussians for all cameras, once for all later queries."""
+    prepare_cpu_s: float
     values_s: float
     """Vacancy and arg-max camera, the cameras being prepared."""
     values_cpu_s: float
@@ -128,7 +129,7 @@ def measure(
     warm.is_empty(asked[:1000])
 
     field = VacancyField(arrays, views, threads=threads)
-    prepare_s, _, _ = _timed(field.prepare)
+    prepare_s, prepare_cpu_s, _ = _timed(field.prepare)
     values_s, values_cpu_s, result = _timed(lambda: field.vacancy(asked))
     # A field of its own: its order of cameras must not come from the values.
     signs = VacancyField(arrays, views, threads=threads)
@@ -147,6 +148,7 @@ def measure(
         points=points,
         threads=threads,
         prepare_s=prepare_s,
+        prepare_cpu_s=prepare_cpu_s,
         values_s=values_s,
         values_cpu_s=values_cpu_s,
         sign_s=sign_s,

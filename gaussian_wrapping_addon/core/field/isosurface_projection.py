@@ -265,7 +265,15 @@ class _Walk:
     def _is_spent(self, rows: np.ndarray, trial: np.ndarray) -> np.ndarray:
         inward = self.v[rows] > tolerances.ISO_LEVEL
         too_far = self._travel(rows, trial) > self.max_travel[rows]
-        return too_far | (inward & (self.marched[rows] > MAX_INWARD_MARCH))
+        too_far |= inward & (self.marched[rows] > MAX_INWARD_MARCH)
+        # Outwards, the last step ends at the limit itself.
+        before = np.where(self.marched[rows] > 1, 2.0 ** (self.marched[rows] - 2), 0.0)
+        return too_far | (~inward & (before >= self._room(rows)))
+
+    def _room(self, rows: np.ndarray) -> np.ndarray:
+        """Sigmas that a march from the current point may go in any direction."""
+        gone = self._travel(rows, self.x[rows])
+        return (1.0 - 1e-9) * (self.max_travel[rows] - gone) / self.sigma[rows]
 
     def _newton(self, rows: np.ndarray) -> np.ndarray:
         length = np.linalg.norm(self.V[rows], axis=1)  # > 0
@@ -292,7 +300,8 @@ class _Walk:
         count = self.marched[rows]
         # Inwards, longer steps could miss a thin wall.
         occupied = self.v[rows] < tolerances.ISO_LEVEL
-        reach = np.where(occupied, 2.0 ** (count - 1), count) * self.sigma[rows]
+        outward = np.minimum(2.0 ** (count - 1), self._room(rows))
+        reach = np.where(occupied, outward, count) * self.sigma[rows]
         return self.x[rows] + reach[:, None] * self.direction[rows]
 
     def _cut(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

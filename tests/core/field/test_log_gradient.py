@@ -51,7 +51,7 @@ def test_gradient_equals_central_differences(scale: float) -> None:
     frame = Similarity(scale, np.eye(3), np.zeros(3))
     cameras = [camera.moved(frame) for camera in cameras_around(4)]
     field = VacancyField(arrays, cameras, near_z=0.2 * scale)
-    points = 0.3 * scale * np.random.default_rng(0).normal(size=(200, 3))
+    points = 0.1 * scale * np.random.default_rng(0).normal(size=(200, 3))
     camera = np.arange(200) % 4
     got = field.log_gradient(points, camera)
     for index in range(4):
@@ -63,7 +63,7 @@ def test_gradient_equals_central_differences(scale: float) -> None:
         assert np.median(size) > 1.0 / scale
         # T falls along the ray.
         away = points[rows] - cameras[index].center
-        assert ((got[rows] * away).sum(1) <= 0.0).all()
+        assert ((got[rows] * away).sum(1) <= 1e-9).all()
 
 
 def test_gradient_of_the_arg_max_camera_is_that_of_log_vacancy() -> None:

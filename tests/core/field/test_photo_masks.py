@@ -38,7 +38,9 @@ def test_masked_views_equal_the_definition(mode: str, divisor: int) -> None:
     arrays = random_arrays(300)
     cameras = cameras_around(5)
     masks = random_masks(cameras, divisor)
-    points = np.random.default_rng(1).normal(size=(3000, 3))
+    rng = np.random.default_rng(1)
+    near = arrays.means[rng.integers(0, len(arrays), 2500)] + 0.01 * rng.normal(size=(2500, 3))
+    points = np.concatenate([near, rng.normal(size=(1500, 3))])
     plain = VacancyField(arrays, cameras, near_z=0.2)
     each = np.stack([plain.transmittance(points, c) for c in range(5)])  # (5, n)
     for c in range(5):
@@ -52,7 +54,7 @@ def test_masked_views_equal_the_definition(mode: str, divisor: int) -> None:
     np.testing.assert_array_equal(result.camera >= 0, seen)
     np.testing.assert_array_equal(np.isnan(result.vacancy), ~seen)
     resolved = seen & (expected <= SETTLED)
-    assert resolved.sum() > 50
+    assert resolved.sum() > 20
     np.testing.assert_array_equal(result.vacancy[resolved], expected[resolved].astype(np.float32))
     assert (result.vacancy[seen & ~resolved] > SETTLED).all()
     assert field.unseen_evaluations == (~seen).sum()
