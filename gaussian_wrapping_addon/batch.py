@@ -57,7 +57,7 @@ class _Parser(ArgumentParser):
 
 
 def _parser() -> ArgumentParser:
-    from .batch_options import add_training_options
+    from .batch_options import add_clean_up_options, add_training_options
     from .core.settings import EXPORT_FORMATS
 
     parser = _Parser(prog="batch.py", description="Photos in, a textured mesh out.")
@@ -91,6 +91,7 @@ def _parser() -> ArgumentParser:
         size = command.add_mutually_exclusive_group()
         size.add_argument("--edge-length", type=float, default=0.0, help="world units of the input")
         size.add_argument("--points", type=int, default=0, help="number of surface points")
+        add_clean_up_options(command)
         command.add_argument("--texture-size", default="auto", metavar="auto|N")
         command.add_argument(
             "--export", default="glb", help=f"comma separated, of {','.join(EXPORT_FORMATS)}"
@@ -238,6 +239,7 @@ def _resume(options: Namespace) -> int:
 
 def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
     """Put the options that ``wrap`` and ``mesh`` share into the settings."""
+    from .batch_options import clean_up_settings
     from .core.errors import UsageError
 
     size = options.texture_size
@@ -250,7 +252,12 @@ def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
         threads=options.threads,
         regions=tuple(dict.fromkeys(options.region or ["auto"])),
         export=tuple(dict.fromkeys(f for f in options.export.split(",") if f)),
-        meshing=replace(settings.meshing, edge_length=options.edge_length, points=options.points),
+        meshing=replace(
+            settings.meshing,
+            edge_length=options.edge_length,
+            points=options.points,
+            **clean_up_settings(options),
+        ),
         texture=replace(settings.texture, size_px=0 if size == "auto" else int(size)),
     )
 

@@ -80,6 +80,38 @@ def add_training_options(parser: ArgumentParser) -> None:
     )
 
 
+# Options of ``wrap`` and ``mesh`` that name one number of the meshing.
+_MESHING: tuple[tuple[str, str, type, str, str], ...] = (
+    ("--faces", "target_faces", int, "N", "decimate the mesh to N faces; 0 leaves all"),
+    ("--smooth", "smooth_steps", int, "N", "steps of smoothing that keeps the volume; 0 for none"),
+    (
+        "--min-part",
+        "min_component_share",
+        float,
+        "SHARE",
+        "parts smaller than this share of the largest one's area are removed; 0 keeps all",
+    ),
+)
+
+
+def add_clean_up_options(parser: ArgumentParser) -> None:
+    """Add what happens to a mesh after it was made."""
+    for option, name, kind, metavar, text in _MESHING:
+        parser.add_argument(option, dest=name, type=kind, metavar=metavar, help=text)
+
+
+def clean_up_settings(options: Namespace) -> dict[str, Any]:
+    """Return the meshing settings that :func:`add_clean_up_options` was given.
+
+    What was not given has its default, not that of an earlier mesh, as the edge length has.
+    """
+    from .core.settings import MeshingSettings
+
+    default = MeshingSettings()
+    given = {name: getattr(options, name) for _, name, *_ in _MESHING}
+    return {n: getattr(default, n) if value is None else value for n, value in given.items()}
+
+
 def training_settings(options: Namespace) -> JobSettings:
     """Return the preset's settings with what :func:`add_training_options` was given.
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Parts of meshing, each timed and compared with its definition alone."""
+"""Measurements of single parts of the meshing."""

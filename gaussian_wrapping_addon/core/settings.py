@@ -118,6 +118,10 @@ class MeshingSettings:
     """Target number of surface points."""
     min_component_share: float = 0.01
     """Solids smaller than this share of the largest (by area) are removed and counted."""
+    target_faces: int = 0
+    """The mesh is decimated to this number of faces; 0 leaves all."""
+    smooth_steps: int = 0
+    """Steps of a filter that keeps the volume; 0 smooths nothing."""
 
 
 @dataclass(frozen=True)
@@ -223,6 +227,17 @@ class JobSettings:
                 "a positive length",
             ),
             ("meshing.points", 0 <= self.meshing.points <= 5_000_000, "from 0 to 5000000"),
+            (
+                "meshing.min_component_share",
+                0.0 <= self.meshing.min_component_share <= 1.0,
+                "from 0 to 1",
+            ),
+            (
+                "meshing.target_faces",
+                self.meshing.target_faces == 0 or 4 <= self.meshing.target_faces <= 20_000_000,
+                "0 (all) or from 4 to 20000000",
+            ),
+            ("meshing.smooth_steps", 0 <= self.meshing.smooth_steps <= 1000, "from 0 to 1000"),
             (
                 "texture.size_px",
                 self.texture.size_px == 0 or 64 <= self.texture.size_px <= 8192,

@@ -133,6 +133,8 @@ def start_mesh(
             earlier.settings.meshing,
             edge_length=edge_length,
             points=properties.points if properties.resolution == "POINTS" else 0,
+            target_faces=properties.target_faces if properties.decimate else 0,
+            smooth_steps=properties.smooth_steps,
         ),
         texture=replace(earlier.settings.texture, size_px=int(properties.texture_size)),
     )

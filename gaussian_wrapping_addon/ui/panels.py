@@ -165,6 +165,10 @@ class GWRAP_PT_mesh(_Panel, bpy.types.Panel):
             column.prop(properties, "edge_length")
         elif properties.resolution == "POINTS":
             column.prop(properties, "points")
+        column.prop(properties, "decimate")
+        if properties.decimate:
+            column.prop(properties, "target_faces")
+        column.prop(properties, "smooth_steps")
         if _draw_job(layout, context, "MESH"):
             return
         selected = [t for t in context.selected_objects if tags.kind_of(t) == "region"]

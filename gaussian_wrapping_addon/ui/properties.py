@@ -9,6 +9,7 @@ from typing import Final
 
 import bpy
 from bpy.props import (
+    BoolProperty,
     CollectionProperty,
     EnumProperty,
     FloatProperty,
@@ -88,6 +89,27 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
         min=100,
         max=5_000_000,
         soft_max=500_000,
+    )
+    decimate: BoolProperty(  # type: ignore[valid-type]
+        name="Limit Faces",
+        description="Decimate the mesh; it stays closed, and its parts and holes stay",
+        default=False,
+    )
+    target_faces: IntProperty(  # type: ignore[valid-type]
+        name="Faces",
+        description="Number of triangles that the mesh is decimated to",
+        default=20_000,
+        min=4,
+        max=20_000_000,
+        soft_max=1_000_000,
+    )
+    smooth_steps: IntProperty(  # type: ignore[valid-type]
+        name="Smooth Steps",
+        description="Steps of smoothing that keeps the volume; 0 leaves the surface as measured",
+        default=0,
+        min=0,
+        max=1000,
+        soft_max=20,
     )
     texture_size: EnumProperty(  # type: ignore[valid-type]
         name="Texture Size", description="Side of the texture", items=_TEXTURE_SIZES, default="0"

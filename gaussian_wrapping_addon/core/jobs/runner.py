@@ -25,7 +25,7 @@ from .stages import Stage, run_stage, source_fingerprint, stage_key
 _logger = logging.getLogger(__name__)
 
 # Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
-STAGE_VERSIONS = {"cameras": 1, "train": 5, "mesh": 3, "texture": 4}
+STAGE_VERSIONS = {"cameras": 1, "train": 5, "mesh": 4, "texture": 4}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
@@ -208,6 +208,8 @@ def _run_meshing(
         from ..field.vacancy import VacancyField
         from ..field.vector_field import VectorField
         from ..gaussians.gaussian_file import load_gaussians
+        from ..meshing.clean_up import clean_up
+        from ..meshing.mesh_check import check_mesh
         from ..meshing.mesh_file import save_mesh
         from ..meshing.primal_adaptive import mesh_region
         from ..meshing.region import automatic_region, parse_region, whole_region, write_region
@@ -230,11 +232,12 @@ def _run_meshing(
             progress.span(0.0, 0.15), threads=threads,
         )  # fmt: skip
         mesh = mesh_region(
-            vacancy, vectors, arrays, scene.cameras, region, meshing, progress.span(0.15, 0.95),
+            vacancy, vectors, arrays, scene.cameras, region, meshing, progress.span(0.15, 0.9),
             seed=job.settings.seed, threads=threads,
             edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
             sightings=sightings,
         )  # fmt: skip
+        mesh = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
         if not np.isfinite(mesh.vertices).all():
             raise MeshingError(
                 "The mesh has vertices that are not finite.",
@@ -245,6 +248,7 @@ def _run_meshing(
         progress.update(0.97, "measuring the mesh")
         return {
             "statistics": mesh_statistics(mesh).to_json(),
+            "check": check_mesh(mesh.vertices, mesh.faces).to_json(),
             "provenance": mesh.provenance,
             "edge_length_world": meshing.edge_length,
         }

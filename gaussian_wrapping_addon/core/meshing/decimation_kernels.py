@@ -14,7 +14,7 @@ import numpy as np
 
 from ..compiled import kernel, part
 
-POINT_WEIGHT = 1e-4
+POINT_WEIGHT = 1e-7
 """Weight of the distance to the vertices beside the distance to the planes: a flat patch has a best
 point and even faces, and curved ones are hardly moved by it."""
 

@@ -17,6 +17,9 @@ MIN_HEIGHT_SHARE = 1e-6
 """A face lower than this share of its longest edge counts as degenerate. Files hold float32, about
 seven digits: below that such a face has no direction any more."""
 
+PARTS_TOLD = 20
+"""Parts that the report lists one by one, the largest."""
+
 
 @dataclass(frozen=True)
 class CheckedPart:
@@ -79,13 +82,14 @@ class MeshCheck:
         return found
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values, with ``good`` and ``defects``."""
-        values = dataclasses.asdict(self)
-        values["parts"] = list(values["parts"])
-        if not np.isfinite(self.volume):
-            values["volume"] = None
-            values["parts"] = [{**part, "volume": None} for part in values["parts"]]
-        return {**values, "good": self.good, "defects": self.defects()}
+        """Return plain JSON values, with ``good``, ``defects`` and the number of parts."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        values["parts"] = [dataclasses.asdict(part) for part in self.parts[:PARTS_TOLD]]
+        for holder in (values, *values["parts"]):
+            if not np.isfinite(holder["volume"]):
+                holder["volume"] = None
+        counts = {"part_count": len(self.parts), "good": self.good, "defects": self.defects()}
+        return {**values, **counts}
 
 
 def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> MeshCheck:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import tolerances
 from ..dataset.camera import Camera
 from ..errors import MeshingError
 from ..field.sightings import Sightings
@@ -23,6 +22,7 @@ from .convex_region import Region
 from .degenerate import remove_degenerate
 from .delaunay import delaunay, far_points
 from .extraction import boundary_faces, tetrahedron_neighbours
+from .level_error import level_errors
 from .repair import split_nonmanifold
 from .resolution import checked_request
 from .sampling import EDGE_PER_RADIUS
@@ -187,6 +187,7 @@ def _connect(
 
 def _distance_to_level(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:
     """Measure ``|v - 0.5|`` at the vertices that should lie on the isosurface."""
+<<<<<<< HEAD
     on_surface = vertices[kind == KIND_SURFACE]
     if len(on_surface) == 0:
         return {}
@@ -198,3 +199,6 @@ def _distance_to_level(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> 
         "level_error_p99": float(np.quantile(away, 0.99)),
         "level_error_max": float(away.max()),
     }
+=======
+    return level_errors(vacancy, vertices[kind == KIND_SURFACE])
+>>>>>>> 243e8fd (Smoothing, clean-up after meshing, its options and panel fields, the check in the report; benchmark of decimation)

@@ -94,7 +94,9 @@ def _mesh(region: dict[str, Any]) -> list[str]:
         ("Faces", number(statistics.get("faces"), "faces")),
         ("Vertices", number(statistics.get("vertices"), "vertices")),
         ("Closed", topology),
+        ("Check of closedness and manifold", _checked(part(region, "check"))),
         ("Separate parts", plural(statistics.get("components"), "part")),
+        *_removed(provenance),
         ("Size (x, y, z)", extent),
         ("Surface area", number(world.get("area"), "square world units")),
         ("Edge length, mean", number(world.get("edge_mean"), "world units")),
@@ -103,6 +105,7 @@ def _mesh(region: dict[str, Any]) -> list[str]:
         ("Residual, mean", _residual(provenance, "mean")),
         ("Residual, 99 % of vertices below", _residual(provenance, "p99")),
         ("Residual, largest", _residual(provenance, "max")),
+        *_cleaned(provenance),
         ("Time", duration(seconds.get("mesh"))),
     ]
     lines = table(("mesh", "figure"), rows, "lr")
@@ -126,6 +129,36 @@ def _mesh(region: dict[str, Any]) -> list[str]:
                 "cuts through things."
             )
     return lines
+
+
+def _checked(check: dict[str, Any]) -> str:
+    defects = check.get("defects")
+    if not isinstance(defects, list):
+        return NOT_MEASURED
+    return "; ".join(words(defect) for defect in defects) or "no defect"
+
+
+def _removed(provenance: dict[str, Any]) -> list[tuple[str, str]]:
+    solids = measured(provenance.get("removed_solids"))
+    cavities = measured(provenance.get("removed_cavities"))
+    if solids is None or cavities is None:
+        return []
+    text = f"{plural(int(solids), 'floater')}, {plural(int(cavities), 'small cavity', 'small cavities')}"
+    if solids or cavities:
+        text += f": {percent(provenance.get('removed_area_share'))} of the area"
+    return [("Removed for their size", text)]
+
+
+def _cleaned(provenance: dict[str, Any]) -> list[tuple[str, str]]:
+    before = measured(provenance.get("faces_before_clean_up"))
+    if before is None:
+        return []
+    rows = []
+    if steps := measured(provenance.get("smooth_steps")):
+        rows.append(("Smoothed", plural(int(steps), "step")))
+    if target := measured(provenance.get("target_faces")):
+        rows.append(("Decimated", f"from {number(before)} faces, {number(target)} asked for"))
+    return rows
 
 
 def _residual(provenance: dict[str, Any], which: str) -> str:

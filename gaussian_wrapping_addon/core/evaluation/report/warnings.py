@@ -72,6 +72,7 @@ def collect_warnings(report: dict[str, Any]) -> list[ReportWarning]:
         found += _said(f"mesh {name}", provenance.get("warnings"))
         found += _said(f"mesh {name}", provenance.get("notes"))
         found += _judge_mesh(f"mesh {name}", part(region, "statistics"), provenance)
+        found += _judge_check(f"mesh {name}", part(region, "check"))
         found += _said(f"texture {name}", texture.get("warnings"))
         found += _said(f"texture {name}", part(region).get("warnings"))
         found += _judge_texture(f"texture {name}", texture)
@@ -151,6 +152,15 @@ def _judge_mesh(
         text = f"{plural(int(left), 'face')} without area could not be removed."
         found.append(ReportWarning(stage, text, "Blender: Mesh > Clean Up > Degenerate Dissolve."))
     return found
+
+
+def _judge_check(stage: str, check: dict[str, Any]) -> list[ReportWarning]:
+    defects = [words for words in items(check.get("defects")) if isinstance(words, str)]
+    if not defects:
+        return []
+    text = f"The check of the finished mesh found defects ({'; '.join(defects)})."
+    step = "Mesh with other points; send the job folder's log.txt with a bug report."
+    return [ReportWarning(stage, text, step)]
 
 
 def _judge_texture(stage: str, texture: dict[str, Any]) -> list[ReportWarning]:
