@@ -6,14 +6,21 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.batch import _parser
+from gaussian_wrapping_addon.batch import _parser, _region_settings
 from gaussian_wrapping_addon.batch_options import NEEDS, training_settings
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.settings import PRESETS, JobSettings, preset, to_json
+from gaussian_wrapping_addon.core.settings import (
+    PRESETS,
+    JobSettings,
+    MeshingSettings,
+    preset,
+    to_json,
+)
 
 BATCH = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon" / "batch.py"
 
@@ -54,6 +61,19 @@ def test_an_option_changes_its_setting_alone(
     assert after == before
 
 
+@pytest.mark.parametrize("command", ["wrap photos", "mesh"])
+def test_clean_up_options_become_meshing_settings(command: str) -> None:
+    def meshing(*arguments: str) -> MeshingSettings:
+        options = _parser().parse_args([*command.split(), "--out", "o", *arguments])
+        earlier = replace(preset("draft"), meshing=MeshingSettings(target_faces=77, smooth_steps=7))
+        return _region_settings(earlier, options).meshing
+
+    assert meshing() == MeshingSettings(), "what an earlier mesh was given does not stay"
+    assert meshing("--faces", "5000") == MeshingSettings(target_faces=5000)
+    assert meshing("--smooth", "3") == MeshingSettings(smooth_steps=3)
+    assert meshing("--min-part", "0.2") == MeshingSettings(min_component_share=0.2)
+
+
 @pytest.mark.parametrize(("word", "wanted"), [("auto", "auto"), ("all", "on"), ("none", "off")])
 def test_needs_sets_all_five_and_a_single_option_wins(word: str, wanted: str) -> None:
     training = settings_of("--needs", word).training
@@ -86,6 +106,8 @@ def test_every_need_is_a_setting() -> None:
     [
         (["wrap", "photos", "--out", "o", "--start-splat", "no.ply", "--no-blend"], 3, "no.ply"),
         (["wrap", "photos", "--out", "o", "--sh-degree", "4", "--no-blend"], 2, "sh_degree"),
+        (["wrap", "photos", "--out", "o", "--faces", "3", "--no-blend"], 2, "target_faces"),
+        (["wrap", "photos", "--out", "o", "--smooth", "-1", "--no-blend"], 2, "smooth_steps"),
         (["more", "--out", "photos", "--iterations", "10", "--no-blend"], 2, "job.json"),
         (["more", "--out", "photos", "--no-blend"], 2, "--iterations"),
         (["estimate", "missing"], 3, "missing"),

@@ -87,7 +87,14 @@ def test_a_first_wrap_can_be_started_at_one_glance() -> None:
 def test_mesh_panel_shows_what_decides(resolution: str, shown: set[str]) -> None:
     bpy.context.scene.gwrap.resolution = resolution
     properties = {a[1] for name, a, _ in draw(panels.GWRAP_PT_mesh).log if name == "prop"}
-    assert properties == {"resolution"} | shown
+    assert properties == {"resolution", "decimate", "smooth_steps"} | shown
+
+
+@pytest.mark.parametrize("decimate", [False, True])
+def test_mesh_panel_asks_for_faces_only_where_they_are_limited(decimate: bool) -> None:
+    bpy.context.scene.gwrap.decimate = decimate
+    properties = {a[1] for name, a, _ in draw(panels.GWRAP_PT_mesh).log if name == "prop"}
+    assert ("target_faces" in properties) == decimate
 
 
 def test_region_and_result_panels_with_a_result(tmp_path: Path) -> None:

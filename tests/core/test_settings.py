@@ -43,6 +43,12 @@ def test_unknown_preset_is_refused() -> None:
         {"meshing": MeshingSettings(edge_length=float("nan"))},
         {"meshing": MeshingSettings(edge_length=-1.0)},
         {"meshing": MeshingSettings(points=-5)},
+        {"meshing": MeshingSettings(target_faces=3)},
+        {"meshing": MeshingSettings(target_faces=-1)},
+        {"meshing": MeshingSettings(smooth_steps=-1)},
+        {"meshing": MeshingSettings(smooth_steps=1001)},
+        {"meshing": MeshingSettings(min_component_share=float("nan"))},
+        {"meshing": MeshingSettings(min_component_share=1.5)},
     ],
 )  # fmt: skip
 def test_values_out_of_range_are_named(change: dict) -> None:

@@ -28,7 +28,7 @@ def clean_up(
     vacancy: Any,
     progress: Progress,
 ) -> SurfaceMesh:
-    """Smooth, then decimate, as the settings ask; a mesh nobody asks to change is returned as it is.
+    """Smooth, then decimate, as the settings ask; without a request the mesh stays as it is.
 
     Both keep a closed 2-manifold closed and manifold, with its parts and their genus. Vertices then
     lie off the isosurface by what was asked for: ``level_error_*`` of the provenance is measured

@@ -44,8 +44,9 @@ def smooth(
     """Return smoothed positions, (v, 3) float64; the faces stay as they are.
 
     Taubin's two-sided filter, with neighbours weighted by the inverse of their distance so that
-    uneven spacing does not drift. Each part then gets its volume again, or, where it cannot, stays as it was. Vertices on the region's
-    faces stay on them, those on a boundary stay where they are, and none leaves the region.
+    uneven spacing does not drift. Each part then gets its volume again, or stays as it was where
+    it cannot. Vertices on the region's faces stay on them, those on a boundary stay where they are,
+    and none leaves the region.
 
     Parameters
     ----------

@@ -19,9 +19,7 @@ def ball(subdivisions: int = 4) -> Mesh:
 
 def ring(around: int = 120, across: int = 40) -> Mesh:
     """A torus of radii 1 and 0.3."""
-    return _plain(
-        trimesh.creation.torus(1.0, 0.3, major_sections=around, minor_sections=across)
-    )
+    return _plain(trimesh.creation.torus(1.0, 0.3, major_sections=around, minor_sections=across))
 
 
 def slab(half: tuple[float, float, float], edge: float) -> Mesh:
@@ -56,9 +54,7 @@ def wire(length: float = 2.0, radius: float = 0.02, rings: int = 150, sides: int
 def lattice(bars: int = 3, edge: float = 0.12) -> Mesh:
     """A grid of square bars in a plane: genus ``bars**2``, made of unit cells."""
     size = 2 * bars + 1
-    cells = [
-        (x, y, 0) for x in range(size) for y in range(size) if x % 2 == 0 or y % 2 == 0
-    ]
+    cells = [(x, y, 0) for x in range(size) for y in range(size) if x % 2 == 0 or y % 2 == 0]
     from tests.core.meshing.test_repair import cubes
 
     vertices, faces = cubes(*cells)

@@ -11,7 +11,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError
 from gaussian_wrapping_addon.core.evaluation.surface.distance import distances_to_mesh
 from gaussian_wrapping_addon.core.meshing import decimation
-from gaussian_wrapping_addon.core.meshing.decimation import LEVELS, Decimated, decimate
+from gaussian_wrapping_addon.core.meshing.decimation import LIMITS, Decimated, decimate
 from gaussian_wrapping_addon.core.meshing.mesh_check import check_mesh
 from gaussian_wrapping_addon.core.meshing.region import Region
 from gaussian_wrapping_addon.core.progress import Progress
@@ -55,7 +55,7 @@ def test_target_is_met_and_the_mesh_stays_closed_with_its_genus(name: str, share
     assert after.good, after.defects()
     assert sorted(p.genus or 0 for p in after.parts) == sorted(p.genus or 0 for p in before.parts)
     assert after.volume == pytest.approx(before.volume, rel=0.1)
-    worst = min(LEVELS[-1].fold_cos, sharpest_bend_cos(mesh))
+    worst = min(LIMITS.fold_cos, sharpest_bend_cos(mesh))
     assert sharpest_bend_cos((result.vertices, result.faces)) >= worst - 1e-9
     size = np.ptp(mesh[0], axis=0).max()
     for points, to in ((mesh[0], result), (result.vertices, None)):

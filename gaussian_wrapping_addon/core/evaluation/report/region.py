@@ -143,7 +143,8 @@ def _removed(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     cavities = measured(provenance.get("removed_cavities"))
     if solids is None or cavities is None:
         return []
-    text = f"{plural(int(solids), 'floater')}, {plural(int(cavities), 'small cavity', 'small cavities')}"
+    hollows = plural(int(cavities), "small cavity", "small cavities")
+    text = f"{plural(int(solids), 'floater')}, {hollows}"
     if solids or cavities:
         text += f": {percent(provenance.get('removed_area_share'))} of the area"
     return [("Removed for their size", text)]

@@ -222,6 +222,29 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         assert words in machine
 
 
+def test_defects_of_the_last_check_are_told_and_what_was_cleaned_up(tmp_path: Path) -> None:
+    region = full_region()
+    region["check"] = {"good": False, "defects": ["edges have one face only: 4"]}
+    region["provenance"].update(
+        removed_solids=2, removed_cavities=1, removed_area_share=0.03, faces_before_clean_up=9000,
+        target_faces=196, smooth_steps=3,
+    )  # fmt: skip
+    _, text = write(tmp_path, None, {REGION: region})
+    told = section(text, f"## Region {escaped(REGION)}")
+    for name, figure in (
+        ("Check of closedness and manifold", "edges have one face only: 4"),
+        ("Removed for their size", "2 floaters, 1 small cavity: 3.0 % of the area"),
+        ("Smoothed", "3 steps"),
+        ("Decimated", "from 9,000, 196 asked for"),
+    ):
+        assert row(told, name) == figure
+    assert "edges have one face only: 4" in section(text, "## Warnings")
+    region["check"] = {"good": True, "defects": []}
+    found = collect_warnings({"regions": {REGION: region}})
+    assert not [w for w in found if "check of the finished mesh" in w.text]
+    assert "| no defect |" in write(tmp_path, None, {REGION: region})[1]
+
+
 def test_pictures_are_linked_exactly_where_they_are(tmp_path: Path) -> None:
     _, text = write(tmp_path)
     assert LINK.findall(text) == []
