@@ -38,9 +38,9 @@ class Limits(NamedTuple):
 
 
 LIMITS = Limits(0.0, -0.97, 1e-4)
-"""Bends up to 166 degrees, and no face ever turns over (90 degrees). Tighter bounds were measured and
-are worse: they make collapses go where they cost more. Needles are allowed, for wires and plates
-need long narrow faces; the bound still lies far above what counts as degenerate (1e-6)."""
+"""Bends up to 166 degrees, and no face ever turns over (90 degrees). Tighter bounds were measured
+and are worse: they make collapses go where they cost more. Needles are allowed, for wires and
+plates need long narrow faces; the bound still lies far above what counts as degenerate (1e-6)."""
 
 
 @dataclass(frozen=True)
