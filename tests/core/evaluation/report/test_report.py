@@ -235,7 +235,7 @@ def test_defects_of_the_last_check_are_told_and_what_was_cleaned_up(tmp_path: Pa
         ("Check of closedness and manifold", "edges have one face only: 4"),
         ("Removed for their size", "2 floaters, 1 small cavity: 3.0 % of the area"),
         ("Smoothed", "3 steps"),
-        ("Decimated", "from 9,000, 196 asked for"),
+        ("Decimated", "from 9,000 faces, 196 asked for"),
     ):
         assert row(told, name) == figure
     assert "edges have one face only: 4" in section(text, "## Warnings")
