@@ -22,7 +22,7 @@ def level_errors(vacancy: Any, points: np.ndarray) -> dict[str, Any]:
     """
     if len(points) == 0:
         return {}
-    away = np.abs(vacancy.vacancy(points).vacancy.astype(np.float64) - tolerances.ISO_LEVEL)
+    away = np.abs(vacancy.vacancy(points).filled.astype(np.float64) - tolerances.ISO_LEVEL)
     return {
         "level_error_mean": float(away.mean()),
         "level_error_median": float(np.median(away)),

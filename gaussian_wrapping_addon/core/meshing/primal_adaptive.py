@@ -187,18 +187,4 @@ def _connect(
 
 def _distance_to_level(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:
     """Measure ``|v - 0.5|`` at the vertices that should lie on the isosurface."""
-<<<<<<< HEAD
-    on_surface = vertices[kind == KIND_SURFACE]
-    if len(on_surface) == 0:
-        return {}
-    away = np.abs(vacancy.vacancy(on_surface).filled.astype(np.float64) - tolerances.ISO_LEVEL)
-    return {
-        "level_error_mean": float(away.mean()),
-        "level_error_median": float(np.median(away)),
-        "level_error_p95": float(np.quantile(away, 0.95)),
-        "level_error_p99": float(np.quantile(away, 0.99)),
-        "level_error_max": float(away.max()),
-    }
-=======
     return level_errors(vacancy, vertices[kind == KIND_SURFACE])
->>>>>>> 243e8fd (Smoothing, clean-up after meshing, its options and panel fields, the check in the report; benchmark of decimation)
