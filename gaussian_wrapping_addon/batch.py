@@ -58,7 +58,7 @@ class _Parser(ArgumentParser):
 
 def _parser() -> ArgumentParser:
     from .batch_options import add_clean_up_options, add_training_options
-    from .core.settings import EXPORT_FORMATS
+    from .core.settings import EXPORT_FORMATS, SPACINGS
 
     parser = _Parser(prog="batch.py", description="Photos in, a textured mesh out.")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
@@ -92,6 +92,9 @@ def _parser() -> ArgumentParser:
         size.add_argument("--edge-length", type=float, default=0.0, help="world units of the input")
         size.add_argument("--points", type=int, default=0, help="number of surface points")
         add_clean_up_options(command)
+        command.add_argument(
+            "--spacing", choices=SPACINGS, default="adaptive", help="of the mesh's vertices"
+        )
         command.add_argument("--texture-size", default="auto", metavar="auto|N")
         command.add_argument(
             "--export", default="glb", help=f"comma separated, of {','.join(EXPORT_FORMATS)}"
@@ -256,6 +259,7 @@ def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
             settings.meshing,
             edge_length=options.edge_length,
             points=options.points,
+            spacing=options.spacing,
             **clean_up_settings(options),
         ),
         texture=replace(settings.texture, size_px=0 if size == "auto" else int(size)),

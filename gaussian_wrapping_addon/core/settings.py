@@ -17,6 +17,7 @@ DECISIONS = ("auto", "on", "off")
 
 MASK_MODES = ("ignore", "background")
 CORRELATIONS = ("signed", "squared")
+SPACINGS = ("adaptive", "uniform")
 EXPORT_FORMATS = ("glb", "obj", "ply", "usd")
 
 
@@ -113,9 +114,13 @@ class MeshingSettings:
     """How a region is meshed. Exactly one of ``edge_length`` and ``points`` decides; 0 = unset."""
 
     edge_length: float = 0.0
-    """Target edge length in world units of the input."""
+    """Target edge length in world units of the input. With adaptive spacing that of the strongly
+    curved parts: flatter ones get longer edges, only parts thinner than it get shorter ones."""
     points: int = 0
     """Target number of surface points."""
+    spacing: str = "adaptive"
+    """``"adaptive"``: dense where the surface curves, and no denser than the photos resolve;
+    ``"uniform"``: the same edge length everywhere."""
     min_component_share: float = 0.01
     """Solids smaller than this share of the largest (by area) are removed and counted."""
     target_faces: int = 0
@@ -225,6 +230,11 @@ class JobSettings:
                 "meshing.edge_length",
                 math.isfinite(self.meshing.edge_length) and self.meshing.edge_length >= 0,
                 "a positive length",
+            ),
+            (
+                "meshing.spacing",
+                self.meshing.spacing in SPACINGS,
+                _one_of(SPACINGS),
             ),
             ("meshing.points", 0 <= self.meshing.points <= 5_000_000, "from 0 to 5000000"),
             (

@@ -146,7 +146,7 @@ def on_one_sheet(
     tetrahedra: np.ndarray,
     normals: np.ndarray,
     outer: np.ndarray,
-    radius: float,
+    radii: np.ndarray,
 ) -> Sheet:
     """Find flat tetrahedra: normals agree at all corners, and the edges run across them.
 
@@ -154,8 +154,8 @@ def on_one_sheet(
     ----------
     normals : (k, 3) float64
         Of the first k points; tetrahedra with other corners are ``outer``.
-    radius : float
-        The spacing.
+    radii : (k,) float64
+        Local spacing at the first k points.
     """
     rows = np.flatnonzero(~outer)
     corners = tetrahedra[rows]
@@ -169,8 +169,9 @@ def on_one_sheet(
         edge = points[corners[:, i]] - points[corners[:, j]]
         length = np.linalg.norm(edge, axis=1)
         flat = np.abs((edge * up).sum(1)) < SHEET_SLOPE * length
-        flat &= length < SHEET_EDGE * radius
+        flat &= length < SHEET_EDGE * np.minimum(radii[corners[:, i]], radii[corners[:, j]])
         rows, corners, up = rows[flat], corners[flat], up[flat]
+    radius = radii[corners].mean(1)  # (k,)
     base = points[corners[:, 0]]
     a, b, c = (points[corners[:, k]] - base for k in (1, 2, 3))
     cross = np.cross(b, c), np.cross(c, a), np.cross(a, b)

@@ -100,7 +100,10 @@ def mesh_region(
         arrays, region, vacancy.is_empty, 0.5 * request.edge_length, seed, progress.span(0.0, 0.3),
         sightings,
     )  # fmt: skip
-    sampler = SurfaceSampler(vacancy, vectors, region, surface, threads)
+    sampler = SurfaceSampler(
+        vacancy, vectors, region, surface, threads, cameras=cameras,
+        adaptive=settings.spacing == "adaptive",
+    )  # fmt: skip
     cloud = sampler.sample(request, rng, progress.span(0.3, 0.6))
     vertices, faces, kind, figures = _connect(cloud, vacancy, region, settings, seed, rng, progress)
     provenance = {
@@ -111,7 +114,8 @@ def mesh_region(
         "pivots": surface.pivots,
         "sightings": 0 if sightings is None else len(sightings),
         "candidate_area": sampler.area,
-        "notes": list(request.notes),
+        "spacing": settings.spacing,
+        "notes": [*request.notes, *cloud.notes],
         "seed": seed,
         **cloud.figures,
         **figures,
@@ -145,7 +149,7 @@ def _connect(
         tetrahedra,
         neighbours,
         outer,
-        on_one_sheet(points, tetrahedra, cloud.normals, outer, cloud.radius),
+        on_one_sheet(points, tetrahedra, cloud.normals, outer, cloud.radii),
         lambda where: vacancy.vacancy(where).filled,
         rng,
         progress.span(0.65, 0.9),
@@ -157,7 +161,7 @@ def _connect(
     repaired = split_nonmanifold(points, faces)
     floaters = without_floaters(repaired.vertices, repaired.faces, settings.min_component_share)
     kept, degenerate = remove_degenerate(
-        repaired.vertices, floaters.faces, DEGENERATE_SHARE * cloud.radius
+        repaired.vertices, floaters.faces, DEGENERATE_SHARE * float(cloud.radii.min())
     )
     vertices, kept, source = compacted(repaired.vertices, kept)
     origin = repaired.origin[source]

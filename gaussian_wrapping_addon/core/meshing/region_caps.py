@@ -12,6 +12,7 @@ from ..progress import Progress
 from .convex_region import Region
 from .marching_tetrahedra import IsEmpty, bisect
 from .sampling import sample_triangles, thin
+from .spacing import Spacing
 
 MAX_CANDIDATES = 1_500_000
 """Samples of the region's boundary; a finer request gets coarser caps, which are flat anyway."""
@@ -21,7 +22,7 @@ RIM_TOLERANCE_SHARE = 1e-3
 """Length of the bracket around the rim of a cap, in edge lengths."""
 
 INNER_RADII = 2.0
-"""Spacing inside a cap, in radii: it is flat."""
+"""Spacing inside a cap, in local radii: it is flat."""
 
 # Corners first, then edges, rims, the inner part: what defines the shape stays.
 PRIORITY_CORNER, PRIORITY_EDGE, PRIORITY_RIM, PRIORITY_INNER = 0.0, 1.0, 2.0, 4.0
@@ -44,7 +45,7 @@ class Caps:
 def cap_points(
     region: Region,
     is_empty: IsEmpty,
-    radius: float,
+    spacing: Spacing,
     rng: np.random.Generator,
     progress: Progress,
 ) -> Caps:
@@ -55,10 +56,10 @@ def cap_points(
 
     Parameters
     ----------
-    radius : float
-        Thinning radius of the surface.
+    spacing : Spacing
+        Of the surface. Inside a cap it grows with the distance to the rim.
     """
-    radius = max(radius, np.sqrt(region.area * OVERSAMPLING / MAX_CANDIDATES))
+    radius = max(spacing.nominal, np.sqrt(region.area * OVERSAMPLING / MAX_CANDIDATES))
     points, normals, face = _face_samples(region, radius, rng)
     progress.update(0.1, f"closing the region's boundary ({len(points)} samples)")
     empty = is_empty(points)
@@ -85,7 +86,8 @@ def cap_points(
     all_points = np.concatenate([g[0] for g in groups])
     all_normals = np.concatenate([np.zeros_like(g[0]) if g[1] is None else g[1] for g in groups])
     priority = np.concatenate([np.full(len(g[0]), g[2]) for g in groups])
-    radii = np.where(priority == PRIORITY_INNER, INNER_RADII * radius, radius)
+    local = spacing.at(all_points)  # (n,)
+    radii = np.where(priority == PRIORITY_INNER, INNER_RADII * local, local)
     kept = thin(all_points, all_normals, radii, priority)
     return Caps(all_points[kept], all_normals[kept], radii[kept], priority[kept])
 

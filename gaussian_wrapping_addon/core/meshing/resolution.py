@@ -69,32 +69,33 @@ def checked_request(edge_length: float, points: int, region: Region) -> Request:
     return Request(edge_length, points)
 
 
-def thinning_radius(request: Request, area: float, density: float, region: Region) -> float:
-    """Return the largest thinning radius of the surface points.
+def thinning_radius(request: Request, area: float, region: Region) -> float:
+    """Return the thinning radius that answers the request with the same spacing everywhere.
 
     Parameters
     ----------
     area : float
         Area of the candidate surface in the region.
-    density : float
-        Points relative to a uniform radius, >= 1 (denser where the surface turns quickly).
+    """
+    if request.edge_length > 0:
+        return request.edge_length / EDGE_PER_RADIUS
+    points = request.points or AUTOMATIC_POINTS
+    radius = float(np.sqrt(POINTS_PER_SQUARE * area / points))
+    return min(radius, COARSEST_SHARE * region.diagonal)
+
+
+def check_expected(points: float, request: Request) -> None:
+    """Refuse an edge length that needs too many points.
 
     Raises
     ------
     ResourceError
-        The expected number of points passes ``limits.MAX_MESH_POINTS``.
+        More than ``limits.MAX_MESH_POINTS`` are expected.
     """
-    if request.edge_length > 0:
-        radius = request.edge_length / EDGE_PER_RADIUS
-        expected = POINTS_PER_SQUARE * area * density / radius**2
-        if expected > limits.MAX_MESH_POINTS:
-            factor = math.sqrt(expected / limits.MAX_MESH_POINTS)
-            raise ResourceError(
-                f"This edge length needs about {expected:.1e} surface points; "
-                f"{limits.MAX_MESH_POINTS:.0e} is the most.",
-                f"Use edges at least {factor:.2g} times longer, or a smaller region.",
-            )
-        return radius
-    points = request.points or AUTOMATIC_POINTS
-    radius = float(np.sqrt(POINTS_PER_SQUARE * area * density / points))
-    return min(radius, COARSEST_SHARE * region.diagonal)
+    if request.edge_length > 0 and points > limits.MAX_MESH_POINTS:
+        factor = math.sqrt(points / limits.MAX_MESH_POINTS)
+        raise ResourceError(
+            f"This edge length needs about {points:.1e} surface points; "
+            f"{limits.MAX_MESH_POINTS:.0e} is the most.",
+            f"Use edges at least {factor:.2g} times longer, or a smaller region.",
+        )

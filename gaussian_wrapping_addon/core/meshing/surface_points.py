@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from .. import tolerances
+from ..dataset.camera import Camera
 from ..field.isosurface_projection import TOLERANCE, project_to_isosurface
 from ..parallel import balanced_bounds
 from ..progress import Progress
@@ -18,15 +19,15 @@ from .candidate_surface import CandidateSurface
 from .convex_region import Region
 from .marching_tetrahedra import bisect
 from .region_caps import cap_points
-from .resolution import Request, thinning_radius
+from .resolution import Request, check_expected, thinning_radius
 from .sampling import (
+    EDGE_PER_RADIUS,
     POINTS_PER_SQUARE,
-    curvature,
-    local_radii,
     sample_triangles,
     thin,
     triangle_normals,
 )
+from .spacing import LONGEST_SHARE, Spacing, adaptive_spacing, footprints, measure_shape
 
 KIND_SURFACE, KIND_CAP, KIND_JUMP = 0, 1, 2
 """On the isosurface; on the region's boundary; where vacancy jumps over 0.5 (the end of what the
@@ -42,11 +43,13 @@ FIRST_THINNING = 0.4
 even the points become (and sampling.POINTS_PER_SQUARE)."""
 MAX_BLOCK = 2_000_000
 """Candidates drawn at a time (memory)."""
-SCOUTS = 20_000
-"""Candidates from which curvature, and so the local radius, is estimated."""
-SCOUTS_PER_FACE = 5
-MOST_DENSE = 2.0
-"""Curvature may multiply the number of points by this at most."""
+FEWEST_SCOUTS, MOST_SCOUTS = 20_000, 200_000
+FEWEST_SHAPED = 100
+"""With fewer scouts that reached a surface there is no shape to adapt to."""
+NOTED_SHARE = 0.1
+"""Share of the surface from which on it is worth a note that the photos limit the edges."""
+SCOUTS_PER_POINT = 2.5
+"""Even points on the isosurface from which the local spacing is found; they are candidates too."""
 
 MAX_PROJECTION_STEPS = 14
 """Nearly all points need two or three; each further batch looks from all cameras again."""
@@ -67,18 +70,48 @@ class SurfacePoints:
     """(n, 3) float64 unit vectors towards the empty side; 0 on edges of the region."""
     kind: np.ndarray
     """(n,) uint8."""
+    radii: np.ndarray
+    """(n,) float64 local thinning radius."""
     radius: float
-    """Largest thinning radius."""
+    """Radius that answers to the requested edge length."""
+    notes: tuple[str, ...]
     figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """Candidates that reached a surface."""
+
+    points: np.ndarray
+    """(n, 3) float64."""
+    normals: np.ndarray
+    """(n, 3) float64."""
+    kind: np.ndarray
+    """(n,) uint8."""
+    started: int
+    evaluations: int
+
+    @classmethod
+    def none(cls) -> _Settled:
+        return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.uint8), 0, 0)
 
 
 class SurfaceSampler:
     """Spreads points over a candidate surface and moves them onto the isosurface."""
 
     def __init__(
-        self, vacancy: Any, vectors: Any, region: Region, surface: CandidateSurface, threads: int
+        self,
+        vacancy: Any,
+        vectors: Any,
+        region: Region,
+        surface: CandidateSurface,
+        threads: int,
+        *,
+        cameras: Sequence[Camera] = (),
+        adaptive: bool = False,
     ) -> None:
         self._vacancy, self._vectors, self._region = vacancy, vectors, region
+        self._cameras, self._adaptive = cameras, adaptive
         self._vertices = surface.vertices
         centers = surface.vertices[surface.faces].mean(1)
         self._faces = surface.faces[region.contains(centers, 0.0)]
@@ -98,54 +131,105 @@ class SurfaceSampler:
         ResourceError
             The request needs more points than the cap.
         """
-        radius, density, share = self._scout(request, rng)
-        progress.update(0.05, "spreading points")
-        expected = POINTS_PER_SQUARE * density * self.area / radius**2
-        points, face = self._candidates(radius, share, int(OVERSAMPLING * expected) + 64, rng)
-        radii = radius * share[face]
-        normals = self._normals_at(points, self._normals[face])
-        progress.update(0.2, f"moving {len(points)} points onto the surface")
-        found = project_to_isosurface(
-            points,
-            self._vacancy,
-            self._vectors,
-            progress.span(0.2, 0.7),
-            max_steps=MAX_PROJECTION_STEPS,
+        spacing, scouts, notes = self._spacing(request, rng, progress.span(0.0, 0.3))
+        share = spacing.at(self._vertices[self._faces].mean(1), self._threads) / spacing.nominal
+        progress.update(0.3, "spreading points")
+        _, areas = triangle_normals(self._vertices, self._faces)
+        expected = POINTS_PER_SQUARE * float((areas * share**-2.0).sum()) / spacing.nominal**2
+        check_expected(expected, request)
+        points, face = self._candidates(
+            spacing.nominal, share, int(OVERSAMPLING * expected) + 64, rng
         )
-        kind = np.full(len(points), KIND_SURFACE, np.uint8)
-        lost = np.flatnonzero(~found.on_surface)
-        moved = found.points.copy()
-        searched, kind_of_lost = self._search(points[lost], normals[lost], radius, progress)
-        moved[lost] = searched
-        good = found.on_surface.copy()
-        good[lost] = kind_of_lost >= 0
-        kind[lost] = np.maximum(kind_of_lost, 0)
-        good &= self._region.contains(moved, 0.0)
-        moved, kind, radii = moved[good], kind[good], radii[good]
-        normals = self._normals_at(moved, normals[good])
+        progress.update(0.35, f"moving {len(points)} points onto the surface")
+        radii = spacing.at(points, self._threads)
+        settled = self._settled(points, face, radii, progress.span(0.35, 0.8))
+        moved = np.concatenate([scouts.points, settled.points])
+        normals = np.concatenate([scouts.normals, settled.normals])
+        kind = np.concatenate([scouts.kind, settled.kind])
+        radii = spacing.at(moved, self._threads)
         caps = cap_points(
-            self._region, self._vacancy.is_empty, radius, rng, progress.span(0.8, 1.0)
+            self._region, self._vacancy.is_empty, spacing, rng, progress.span(0.8, 1.0)
         )
         # Jumps last among surface points: where both are near, the isosurface is the better one.
         priority = PRIORITY_SURFACE + 0.5 * (rng.random(len(moved)) + (kind == KIND_JUMP))
         everything = np.concatenate([caps.points, moved])
         normals = np.concatenate([caps.normals, normals])
-        kept = thin(
-            everything,
-            normals,
-            np.concatenate([caps.radii, radii]),
-            np.concatenate([caps.priority, priority]),
-        )
+        radii = np.concatenate([caps.radii, radii])
+        kept = thin(everything, normals, radii, np.concatenate([caps.priority, priority]))
         kinds = np.concatenate([np.full(len(caps.points), KIND_CAP, np.uint8), kind])[kept]
         figures = {
-            "candidates": len(points),
-            "dropped_candidates": int((~good).sum()),
+            "candidates": len(points) + scouts.started,
+            "dropped_candidates": len(points) + scouts.started - len(moved),
             "surface_points": int((kinds == KIND_SURFACE).sum()),
             "jump_points": int((kinds == KIND_JUMP).sum()),
             "cap_points": int((kinds == KIND_CAP).sum()),
-            "projection_evaluations": int(found.vacancy_evaluations),
+            "projection_evaluations": settled.evaluations + scouts.evaluations,
+            "shortest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].min(initial=np.inf)),
+            "longest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].max(initial=0.0)),
+            "limited_by_photos_share": spacing.limited,
         }
-        return SurfacePoints(everything[kept], normals[kept], kinds, radius, figures)
+        return SurfacePoints(
+            everything[kept], normals[kept], kinds, radii[kept], spacing.nominal, notes, figures
+        )
+
+    def _spacing(
+        self, request: Request, rng: np.random.Generator, progress: Progress
+    ) -> tuple[Spacing, _Settled, tuple[str, ...]]:
+        """Choose the local radii, from even points on the isosurface where they shall adapt."""
+        radius = thinning_radius(request, self.area, self._region)
+        if not self._adaptive:
+            return Spacing.uniform(radius), _Settled.none(), ()
+        expected = POINTS_PER_SQUARE * self.area / radius**2
+        count = int(np.clip(SCOUTS_PER_POINT * expected, FEWEST_SCOUTS, MOST_SCOUTS))
+        points, face = sample_triangles(self._vertices, self._faces, count, rng)
+        order = rng.permutation(count)
+        settled = self._settled(points[order], face[order], np.full(count, radius), progress)
+        if len(settled.points) < FEWEST_SHAPED:
+            return Spacing.uniform(radius), settled, ()
+        edge = EDGE_PER_RADIUS * radius
+        shape = measure_shape(
+            settled.points, settled.normals, self.area * len(settled.points) / count,
+            LONGEST_SHARE * edge, self._threads,
+        )  # fmt: skip
+        spacing = adaptive_spacing(
+            settled.points, shape, footprints(settled.points, self._cameras), self.area,
+            edge_length=request.edge_length, budget=round(expected), uniform_edge=edge,
+        )  # fmt: skip
+        notes = ()
+        if spacing.limited > NOTED_SHARE:
+            notes = (
+                f"On {spacing.limited:.0%} of the surface the photos resolve no finer edges than "
+                "they got; uniform spacing would make them.",
+            )
+        return spacing, settled, notes
+
+    def _settled(
+        self, points: np.ndarray, face: np.ndarray, radii: np.ndarray, progress: Progress
+    ) -> _Settled:
+        """Move points of the candidate surface onto the isosurface, or where vacancy jumps."""
+        normals = self._normals_at(points, self._normals[face])
+        found = project_to_isosurface(
+            points,
+            self._vacancy,
+            self._vectors,
+            progress.span(0.0, 0.8),
+            max_steps=MAX_PROJECTION_STEPS,
+        )
+        kind = np.full(len(points), KIND_SURFACE, np.uint8)
+        lost = np.flatnonzero(~found.on_surface)
+        moved = found.points.copy()
+        searched, kind_of_lost = self._search(
+            points[lost], normals[lost], radii[lost], progress.span(0.8, 1.0)
+        )
+        moved[lost] = searched
+        good = found.on_surface.copy()
+        good[lost] = kind_of_lost >= 0
+        kind[lost] = np.maximum(kind_of_lost, 0)
+        good &= self._region.contains(moved, 0.0)
+        normals = self._normals_at(moved[good], normals[good])
+        return _Settled(
+            moved[good], normals, kind[good], len(points), int(found.vacancy_evaluations)
+        )
 
     def _candidates(
         self, radius: float, share: np.ndarray, count: int, rng: np.random.Generator
@@ -182,37 +266,6 @@ class SurfaceSampler:
         priority = rng.random(len(points))
         return thin(points, self._normals[face], FIRST_THINNING * radii[face], priority)
 
-    def _scout(self, request: Request, rng: np.random.Generator) -> tuple[float, float, np.ndarray]:
-        """Find where the surface turns quickly, and with that the radius.
-
-        Returns
-        -------
-        radius : float
-            The largest thinning radius.
-        density : float
-            Expected number of points relative to the same radius everywhere.
-        share : (f,) float64
-            Local radius of each face, as a share of ``radius``.
-        """
-        radius = thinning_radius(request, self.area, 1.0, self._region)
-        points, face = sample_triangles(self._vertices, self._faces, SCOUTS, rng)
-        normals = self._normals_at(points, self._normals[face])
-        # Far enough that a scout has about a dozen neighbours.
-        reach = float(np.sqrt(4.0 * self.area / SCOUTS))
-        shares, density = np.ones(SCOUTS), 1.0
-        for _ in range(3):  # density depends on the radius, which depends on the density
-            turning = curvature(points, normals, max(1.3 * radius, reach), self._threads)
-            shares = local_radii(turning, radius, MOST_DENSE) / radius
-            density = float(np.mean(shares**-2.0))
-            wanted = thinning_radius(request, self.area, density, self._region)
-            if abs(wanted - radius) < 0.02 * radius:
-                break
-            radius = wanted
-        # Each face takes the median of a few scouts: single ones are noisy.
-        centers = self._vertices[self._faces].mean(1)
-        nearest = cKDTree(points).query(centers, k=SCOUTS_PER_FACE)[1]  # (f, k)
-        return radius, density, np.median(shares[nearest], axis=1)
-
     def _normals_at(self, points: np.ndarray, fallback: np.ndarray) -> np.ndarray:
         """Outward directions of the field, or the triangle's normal where none is known or the
         two disagree (the far side of a thin wall, a Gaussian that was oriented wrongly)."""
@@ -221,7 +274,7 @@ class SurfaceSampler:
         return np.where(agree[:, None], outward, fallback)
 
     def _search(
-        self, points: np.ndarray, normals: np.ndarray, radius: float, progress: Progress
+        self, points: np.ndarray, normals: np.ndarray, radii: np.ndarray, progress: Progress
     ) -> tuple[np.ndarray, np.ndarray]:
         """Look for a crossing along the normal where the projection found none.
 
@@ -239,7 +292,8 @@ class SurfaceSampler:
         start = self._vacancy.is_empty(points)
         other, open_rows = points.copy(), np.arange(len(points))
         for share in SEARCH_SHARES:
-            trial = points[open_rows] + share * radius * normals[open_rows]
+            step = share * radii[open_rows, None]
+            trial = points[open_rows] + step * normals[open_rows]
             hit = self._vacancy.is_empty(trial) != start[open_rows]
             other[open_rows[hit]] = trial[hit]
             kind[open_rows[hit]] = KIND_JUMP
@@ -250,8 +304,8 @@ class SurfaceSampler:
             np.where(empty, other[rows], points[rows]),
             np.where(empty, points[rows], other[rows]),
             self._vacancy.is_empty,
-            BRACKET_SHARE * radius,
-            progress.span(0.7, 0.8),
+            BRACKET_SHARE * float(radii.min()),
+            progress,
         )
         moved[rows] = (inside + outside) / 2
         value = self._vacancy.vacancy(moved[rows]).vacancy
