@@ -114,12 +114,12 @@ class MeshingSettings:
     """How a region is meshed. Exactly one of ``edge_length`` and ``points`` decides; 0 = unset."""
 
     edge_length: float = 0.0
-    """Target edge length in world units of the input. With adaptive spacing that of the strongly
-    curved parts: flatter ones get longer edges, only parts thinner than it get shorter ones."""
+    """Target edge length in world units of the input. With adaptive spacing the mesh comes as close
+    to the surface as a uniform one with such edges, with about half as many vertices."""
     points: int = 0
     """Target number of surface points."""
     spacing: str = "adaptive"
-    """``"adaptive"``: dense where the surface curves, and no denser than the photos resolve;
+    """``"adaptive"``: vertices where the shape needs them, no denser than the photos resolve;
     ``"uniform"``: the same edge length everywhere."""
     min_component_share: float = 0.01
     """Solids smaller than this share of the largest (by area) are removed and counted."""

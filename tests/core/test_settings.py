@@ -49,6 +49,7 @@ def test_unknown_preset_is_refused() -> None:
         {"meshing": MeshingSettings(smooth_steps=1001)},
         {"meshing": MeshingSettings(min_component_share=float("nan"))},
         {"meshing": MeshingSettings(min_component_share=1.5)},
+        {"meshing": MeshingSettings(spacing="dense")},
     ],
 )  # fmt: skip
 def test_values_out_of_range_are_named(change: dict) -> None:

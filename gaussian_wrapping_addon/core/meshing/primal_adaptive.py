@@ -24,10 +24,10 @@ from .delaunay import delaunay, far_points
 from .extraction import boundary_faces, tetrahedron_neighbours
 from .level_error import level_errors
 from .repair import split_nonmanifold
-from .resolution import checked_request
-from .sampling import EDGE_PER_RADIUS
+from .resolution import Dense, checked_request, dense_request, nominal_edge
 from .surface_mesh import SurfaceMesh
 from .surface_points import KIND_CAP, KIND_JUMP, KIND_SURFACE, SurfacePoints, SurfaceSampler
+from .vertex_selection import select_vertices
 
 _logger = logging.getLogger(__name__)
 
@@ -37,6 +37,9 @@ KIND_SPLIT = 3
 DEGENERATE_SHARE = 1e-3
 """Faces narrower than this share of the spacing are removed: collinear points on the region's edges
 have them, of either orientation."""
+
+LONGEST_EDGE_SHARE = 1 / 8
+"""Edges of the adaptive mesh are at most this share of the region's diagonal."""
 
 
 def mesh_region(
@@ -55,8 +58,9 @@ def mesh_region(
 ) -> SurfaceMesh:
     """Mesh the surface ``vacancy = 0.5`` inside a region; the boundary closes the solid.
 
-    Points that no camera sees count as empty. With neither an edge length nor a number of points
-    the mesh gets 40 to 50 thousand faces.
+    With adaptive spacing a denser mesh is made, and of its vertices those stay that the shape needs
+    (:mod:`.vertex_selection`). Points that no camera sees count as empty. With neither an edge
+    length nor a number of points the mesh gets 40 to 50 thousand faces.
 
     Parameters
     ----------
@@ -75,7 +79,8 @@ def mesh_region(
     seed : int
         The same seed gives the same mesh, for any number of threads.
     edge_length_scene : float
-        Target edge length in scene units; 0 leaves it to ``settings.points``.
+        Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices
+        as that one. 0 leaves it to ``settings.points``.
     sightings : Sightings, optional
         Where the cameras see the isosurface in the region (:func:`~..field.sightings`).
 
@@ -100,16 +105,24 @@ def mesh_region(
         arrays, region, vacancy.is_empty, 0.5 * request.edge_length, seed, progress.span(0.0, 0.3),
         sightings,
     )  # fmt: skip
+    adaptive = settings.spacing == "adaptive"
     sampler = SurfaceSampler(
-        vacancy, vectors, region, surface, threads, cameras=cameras,
-        adaptive=settings.spacing == "adaptive",
-    )  # fmt: skip
-    cloud = sampler.sample(request, rng, progress.span(0.3, 0.6))
+        vacancy, vectors, region, surface, threads, cameras=cameras if adaptive else ()
+    )
+    wanted = dense_request(request, sampler.area, region) if adaptive else Dense(request, 0)
+    cloud = sampler.sample(wanted.request, rng, progress.span(0.3, 0.6))
     vertices, faces, kind, figures = _connect(cloud, vacancy, region, settings, seed, rng, progress)
+    figures["dense_vertices"] = len(vertices)
+    if adaptive:
+        longest = LONGEST_EDGE_SHARE * region.diagonal
+        faces = select_vertices(vertices, faces, wanted.target, longest)
+        vertices, faces, chosen = compacted(vertices, faces)
+        kind = kind[chosen]
+    figures |= _counts(kind)
     provenance = {
         "method": "primal adaptive meshing",
         "region": region.name,
-        "edge_length_scene": EDGE_PER_RADIUS * cloud.radius,
+        "edge_length_scene": nominal_edge(request, sampler.area, region),
         "gaussians_in_region": surface.gaussians,
         "pivots": surface.pivots,
         "sightings": 0 if sightings is None else len(sightings),
@@ -180,13 +193,18 @@ def _connect(
         "removed_cavities": floaters.removed_cavities,
         "removed_area_share": floaters.removed_area_share,
         "degenerate_faces_left": degenerate,
+    }
+    progress.update(0.95, "repairing")
+    return vertices, kept, kind, figures
+
+
+def _counts(kind: np.ndarray) -> dict[str, int]:
+    return {
         "vertices_on_surface": int((kind == KIND_SURFACE).sum()),
         "vertices_on_region_boundary": int((kind == KIND_CAP).sum()),
         "vertices_at_end_of_sight": int((kind == KIND_JUMP).sum()),
         "vertices_moved_apart": int((kind == KIND_SPLIT).sum()),
     }
-    progress.update(0.95, "repairing")
-    return vertices, kept, kind, figures
 
 
 def _distance_to_level(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:

@@ -16,8 +16,21 @@ from .sampling import EDGE_PER_RADIUS, POINTS_PER_SQUARE
 AUTOMATIC_POINTS = 24_000
 """Surface points where nothing is asked for: 40 to 50 thousand faces."""
 
+MIN_VERTICES = 100
+"""An adaptive mesh keeps at least so many."""
+
 COARSEST_SHARE = 1 / 8
 """Edges longer than this share of the diagonal would not show a region's contents."""
+
+DENSE_FACTOR = 6.0
+"""Vertices of the mesh from which adaptive spacing selects, for each one that stays. With fewer,
+the errors of that mesh are what is left; more cost time without lessening them much."""
+DENSE_POINTS, LEAST_DENSE_FACTOR = 200_000, 2.0
+"""Beyond so many points the factor falls, to this one: time stays in proportion to the request."""
+
+VERTICES_PER_UNIFORM = 0.5
+"""Vertices of an adaptive mesh, of those of the uniform one with the requested edge length: it
+reaches the same distance to the surface with these (benchmarks/meshing_parts/spacing.py)."""
 
 FINEST_SHARE = 1e-6
 """Edges shorter than this share of the diagonal are refused without any computation."""
@@ -99,3 +112,29 @@ def check_expected(points: float, request: Request) -> None:
             f"{limits.MAX_MESH_POINTS:.0e} is the most.",
             f"Use edges at least {factor:.2g} times longer, or a smaller region.",
         )
+
+
+@dataclass(frozen=True)
+class Dense:
+    """The mesh from which the vertices of an adaptive one are selected."""
+
+    request: Request
+    target: int
+    """Vertices that stay."""
+
+
+def dense_request(request: Request, area: float, region: Region) -> Dense:
+    """Tell how dense a mesh to make, and how many of its vertices to keep, for a request."""
+    expected = POINTS_PER_SQUARE * area / thinning_radius(request, area, region) ** 2
+    share = VERTICES_PER_UNIFORM if request.edge_length > 0 else 1.0
+    target = max(MIN_VERTICES, round(share * expected))
+    dense = max(min(DENSE_FACTOR * target, DENSE_POINTS), LEAST_DENSE_FACTOR * target)
+    if request.edge_length > 0:
+        edge = request.edge_length * math.sqrt(expected / dense)
+        return Dense(Request(edge, 0, request.notes), target)
+    return Dense(Request(0.0, round(dense), request.notes), target)
+
+
+def nominal_edge(request: Request, area: float, region: Region) -> float:
+    """Return the edge length of the uniform mesh that a request stands for."""
+    return EDGE_PER_RADIUS * thinning_radius(request, area, region)

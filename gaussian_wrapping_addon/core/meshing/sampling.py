@@ -88,7 +88,7 @@ def thin(
     sides = finest * LEVEL_STEP ** (1.0 + 1e-6 + np.arange(level.max() + 1))
     _thin_kernel(
         np.argsort(priority, kind="stable"), points - points.min(0), normals, radii, level, sides,
-        2 ** max(4, int(len(points)).bit_length()) - 1, SAME_SIDE_COSINE, OTHER_SIDE_SHARE, kept,
+        2 ** max(4, len(points).bit_length()) - 1, SAME_SIDE_COSINE, OTHER_SIDE_SHARE, kept,
     )  # fmt: skip
     return kept
 

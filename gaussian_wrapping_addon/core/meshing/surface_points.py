@@ -27,7 +27,7 @@ from .sampling import (
     thin,
     triangle_normals,
 )
-from .spacing import LONGEST_SHARE, Spacing, adaptive_spacing, footprints, measure_shape
+from .spacing import Spacing, footprint_spacing
 
 KIND_SURFACE, KIND_CAP, KIND_JUMP = 0, 1, 2
 """On the isosurface; on the region's boundary; where vacancy jumps over 0.5 (the end of what the
@@ -43,13 +43,10 @@ FIRST_THINNING = 0.4
 even the points become (and sampling.POINTS_PER_SQUARE)."""
 MAX_BLOCK = 2_000_000
 """Candidates drawn at a time (memory)."""
-FEWEST_SCOUTS, MOST_SCOUTS = 20_000, 200_000
-FEWEST_SHAPED = 100
-"""With fewer scouts that reached a surface there is no shape to adapt to."""
+SCOUTS = 20_000
+"""Even points on the candidate surface at which the photos' footprint is looked up."""
 NOTED_SHARE = 0.1
 """Share of the surface from which on it is worth a note that the photos limit the edges."""
-SCOUTS_PER_POINT = 2.5
-"""Even points on the isosurface from which the local spacing is found; they are candidates too."""
 
 MAX_PROJECTION_STEPS = 14
 """Nearly all points need two or three; each further batch looks from all cameras again."""
@@ -73,7 +70,7 @@ class SurfacePoints:
     radii: np.ndarray
     """(n,) float64 local thinning radius."""
     radius: float
-    """Radius that answers to the requested edge length."""
+    """The smallest of them, where nothing limits it."""
     notes: tuple[str, ...]
     figures: dict[str, Any]
 
@@ -88,12 +85,7 @@ class _Settled:
     """(n, 3) float64."""
     kind: np.ndarray
     """(n,) uint8."""
-    started: int
     evaluations: int
-
-    @classmethod
-    def none(cls) -> _Settled:
-        return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.uint8), 0, 0)
 
 
 class SurfaceSampler:
@@ -108,10 +100,10 @@ class SurfaceSampler:
         threads: int,
         *,
         cameras: Sequence[Camera] = (),
-        adaptive: bool = False,
     ) -> None:
+        """Cameras, where given, limit how close points lie by what they resolve."""
         self._vacancy, self._vectors, self._region = vacancy, vectors, region
-        self._cameras, self._adaptive = cameras, adaptive
+        self._cameras = cameras
         self._vertices = surface.vertices
         centers = surface.vertices[surface.faces].mean(1)
         self._faces = surface.faces[region.contains(centers, 0.0)]
@@ -131,21 +123,19 @@ class SurfaceSampler:
         ResourceError
             The request needs more points than the cap.
         """
-        spacing, scouts, notes = self._spacing(request, rng, progress.span(0.0, 0.3))
+        spacing, notes = self._spacing(request, rng)
         share = spacing.at(self._vertices[self._faces].mean(1), self._threads) / spacing.nominal
-        progress.update(0.3, "spreading points")
+        progress.update(0.0, "spreading points")
         _, areas = triangle_normals(self._vertices, self._faces)
         expected = POINTS_PER_SQUARE * float((areas * share**-2.0).sum()) / spacing.nominal**2
         check_expected(expected, request)
         points, face = self._candidates(
             spacing.nominal, share, int(OVERSAMPLING * expected) + 64, rng
         )
-        progress.update(0.35, f"moving {len(points)} points onto the surface")
+        progress.update(0.1, f"moving {len(points)} points onto the surface")
         radii = spacing.at(points, self._threads)
-        settled = self._settled(points, face, radii, progress.span(0.35, 0.8))
-        moved = np.concatenate([scouts.points, settled.points])
-        normals = np.concatenate([scouts.normals, settled.normals])
-        kind = np.concatenate([scouts.kind, settled.kind])
+        settled = self._settled(points, face, radii, progress.span(0.1, 0.8))
+        moved, normals, kind = settled.points, settled.normals, settled.kind
         radii = spacing.at(moved, self._threads)
         caps = cap_points(
             self._region, self._vacancy.is_empty, spacing, rng, progress.span(0.8, 1.0)
@@ -158,12 +148,12 @@ class SurfaceSampler:
         kept = thin(everything, normals, radii, np.concatenate([caps.priority, priority]))
         kinds = np.concatenate([np.full(len(caps.points), KIND_CAP, np.uint8), kind])[kept]
         figures = {
-            "candidates": len(points) + scouts.started,
-            "dropped_candidates": len(points) + scouts.started - len(moved),
+            "candidates": len(points),
+            "dropped_candidates": len(points) - len(moved),
             "surface_points": int((kinds == KIND_SURFACE).sum()),
             "jump_points": int((kinds == KIND_JUMP).sum()),
             "cap_points": int((kinds == KIND_CAP).sum()),
-            "projection_evaluations": settled.evaluations + scouts.evaluations,
+            "projection_evaluations": settled.evaluations,
             "shortest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].min(initial=np.inf)),
             "longest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].max(initial=0.0)),
             "limited_by_photos_share": spacing.limited,
@@ -173,35 +163,19 @@ class SurfaceSampler:
         )
 
     def _spacing(
-        self, request: Request, rng: np.random.Generator, progress: Progress
-    ) -> tuple[Spacing, _Settled, tuple[str, ...]]:
-        """Choose the local radii, from even points on the isosurface where they shall adapt."""
+        self, request: Request, rng: np.random.Generator
+    ) -> tuple[Spacing, tuple[str, ...]]:
+        """Choose the local radii, and tell where the photos limit them."""
         radius = thinning_radius(request, self.area, self._region)
-        if not self._adaptive:
-            return Spacing.uniform(radius), _Settled.none(), ()
-        expected = POINTS_PER_SQUARE * self.area / radius**2
-        count = int(np.clip(SCOUTS_PER_POINT * expected, FEWEST_SCOUTS, MOST_SCOUTS))
-        points, face = sample_triangles(self._vertices, self._faces, count, rng)
-        order = rng.permutation(count)
-        settled = self._settled(points[order], face[order], np.full(count, radius), progress)
-        if len(settled.points) < FEWEST_SHAPED:
-            return Spacing.uniform(radius), settled, ()
-        edge = EDGE_PER_RADIUS * radius
-        shape = measure_shape(
-            settled.points, settled.normals, self.area * len(settled.points) / count,
-            LONGEST_SHARE * edge, self._threads,
-        )  # fmt: skip
-        spacing = adaptive_spacing(
-            settled.points, shape, footprints(settled.points, self._cameras), self.area,
-            edge_length=request.edge_length, budget=round(expected), uniform_edge=edge,
-        )  # fmt: skip
-        notes = ()
+        if len(self._cameras) == 0:
+            return Spacing.uniform(radius), ()
+        points, _ = sample_triangles(self._vertices, self._faces, SCOUTS, rng)
+        spacing = footprint_spacing(points, self._cameras, radius)
+        notes: tuple[str, ...] = ()
         if spacing.limited > NOTED_SHARE:
-            notes = (
-                f"On {spacing.limited:.0%} of the surface the photos resolve no finer edges than "
-                "they got; uniform spacing would make them.",
-            )
-        return spacing, settled, notes
+            share = f"On {spacing.limited:.0%} of the surface"
+            notes = (f"{share} the photos resolve no finer edges; uniform spacing makes them.",)
+        return spacing, notes
 
     def _settled(
         self, points: np.ndarray, face: np.ndarray, radii: np.ndarray, progress: Progress
@@ -227,9 +201,7 @@ class SurfaceSampler:
         kind[lost] = np.maximum(kind_of_lost, 0)
         good &= self._region.contains(moved, 0.0)
         normals = self._normals_at(moved[good], normals[good])
-        return _Settled(
-            moved[good], normals, kind[good], len(points), int(found.vacancy_evaluations)
-        )
+        return _Settled(moved[good], normals, kind[good], int(found.vacancy_evaluations))
 
     def _candidates(
         self, radius: float, share: np.ndarray, count: int, rng: np.random.Generator

@@ -9,7 +9,6 @@ directions in which edges may be long. No vertex moves, so all stay on the isosu
 from __future__ import annotations
 
 import heapq
-from typing import Any
 
 import numpy as np
 
@@ -190,8 +189,9 @@ def _select_kernel(  # type: ignore[no-untyped-def]
     plane = np.empty(4)
     for face in range(len(faces)):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-        ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-        wx, wy, wz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+        ux, wx = points[b, 0] - points[a, 0], points[c, 0] - points[a, 0]
+        uy, wy = points[b, 1] - points[a, 1], points[c, 1] - points[a, 1]
+        uz, wz = points[b, 2] - points[a, 2], points[c, 2] - points[a, 2]
         plane[0], plane[1], plane[2] = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
         area = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
         if area > 0.0:

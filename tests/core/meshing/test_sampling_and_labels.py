@@ -18,12 +18,10 @@ from gaussian_wrapping_addon.core.meshing.pivots import (
     two_pivots,
 )
 from gaussian_wrapping_addon.core.meshing.sampling import (
-    curvature,
-    local_radii,
     sample_triangles,
     thin,
 )
-from tests.core.field.field_scenes import make_arrays, random_arrays, unit_sphere
+from tests.core.field.field_scenes import make_arrays, random_arrays
 from tests.core.meshing.meshing_scenes import cube
 
 
@@ -69,17 +67,6 @@ def test_thinning_with_local_radii() -> None:
     left = kept[points[:, 0] < 0.48].sum()
     right = kept[points[:, 0] > 0.52].sum()
     assert 9 < left / right < 20  # areas of the discs differ by 16
-
-
-def test_curvature_of_a_sphere() -> None:
-    points = 0.5 * unit_sphere(4000)
-    values = curvature(points, points / 0.5, 0.1, 2)
-    np.testing.assert_allclose(values, 2.0, rtol=0.01)
-    np.testing.assert_array_equal(values, curvature(points, points / 0.5, 0.1, 1))
-    assert (local_radii(values, 0.05, 4.0) == 0.05).all()
-    coarse = local_radii(values, 0.4, 100.0)
-    assert (coarse < 0.4).all()
-    assert np.mean((local_radii(values, 0.4, 1.5) / 0.4) ** -2.0) <= 1.5
 
 
 def test_outer_pivots_lie_three_sigmas_out() -> None:
