@@ -109,13 +109,14 @@ def mesh_region(
     sampler = SurfaceSampler(
         vacancy, vectors, region, surface, threads, cameras=cameras if adaptive else ()
     )
-    wanted = dense_request(request, sampler.area, region) if adaptive else Dense(request, 0)
+    wanted = dense_request(request, sampler.area, region) if adaptive else Dense(request, 0, 1.0)
     cloud = sampler.sample(wanted.request, rng, progress.span(0.3, 0.6))
     vertices, faces, kind, figures = _connect(cloud, vacancy, region, settings, seed, rng, progress)
     figures["dense_vertices"] = len(vertices)
     if adaptive:
         longest = LONGEST_EDGE_SHARE * region.diagonal
-        faces = select_vertices(vertices, faces, wanted.target, longest)
+        target = max(wanted.target, round(wanted.share * len(vertices)))
+        faces = select_vertices(vertices, faces, target, longest)
         vertices, faces, chosen = compacted(vertices, faces)
         kind = kind[chosen]
     figures |= _counts(kind)

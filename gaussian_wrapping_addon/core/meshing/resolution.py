@@ -120,19 +120,28 @@ class Dense:
 
     request: Request
     target: int
-    """Vertices that stay."""
+    """Vertices that stay, for the surface alone."""
+    share: float
+    """The same, of the dense mesh: where the region cuts the solid, its boundary has some too."""
 
 
 def dense_request(request: Request, area: float, region: Region) -> Dense:
-    """Tell how dense a mesh to make, and how many of its vertices to keep, for a request."""
+    """Tell how dense a mesh to make, and how many of its vertices to keep, for a request.
+
+    Raises
+    ------
+    ResourceError
+        The dense mesh needs more points than the cap.
+    """
     expected = POINTS_PER_SQUARE * area / thinning_radius(request, area, region) ** 2
     share = VERTICES_PER_UNIFORM if request.edge_length > 0 else 1.0
     target = max(MIN_VERTICES, round(share * expected))
     dense = max(min(DENSE_FACTOR * target, DENSE_POINTS), LEAST_DENSE_FACTOR * target)
     if request.edge_length > 0:
+        check_expected(dense, request)
         edge = request.edge_length * math.sqrt(expected / dense)
-        return Dense(Request(edge, 0, request.notes), target)
-    return Dense(Request(0.0, round(dense), request.notes), target)
+        return Dense(Request(edge, 0, request.notes), target, target / dense)
+    return Dense(Request(0.0, round(dense), request.notes), target, target / dense)
 
 
 def nominal_edge(request: Request, area: float, region: Region) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..compiled import kernel, part
 
-SHAPE_WEIGHT = 1e-5
+SHAPE_WEIGHT = 1e-6
 """Price of length beside that of height, both squared: it decides where the surface is flat."""
 
 LEAST_ROUNDNESS = 0.03

@@ -104,8 +104,8 @@ def some_cameras() -> list[Camera]:
     return [camera_at(np.array([0.0, -5.0, 1.0]))]
 
 
-def settings(points: int = 0, share: float = 0.01) -> MeshingSettings:
-    return MeshingSettings(points=points, min_component_share=share)
+def settings(points: int = 0, share: float = 0.01, spacing: str = "adaptive") -> MeshingSettings:
+    return MeshingSettings(points=points, min_component_share=share, spacing=spacing)
 
 
 def assert_closed_manifold(mesh: SurfaceMesh) -> MeshStatistics:

@@ -14,6 +14,7 @@ from gaussian_wrapping_addon.core.field.vacancy import VacancyResult
 from gaussian_wrapping_addon.core.meshing import surface_points
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.meshing.region import Region
+from gaussian_wrapping_addon.core.meshing.sampling import sample_triangles
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from tests.core.meshing.meshing_scenes import (
@@ -40,11 +41,12 @@ def mesh_shape(
     share: float = 0.01,
     seed: int = 0,
     threads: int = 1,
+    spacing: str = "adaptive",
 ) -> SurfaceMesh:
     field = ShapeField(distance, sigma)
     arrays = gaussians_on(distance, region, 800, sigma)
     return mesh_region(
-        field, field, arrays, some_cameras(), region, settings(points, share), Progress(),
+        field, field, arrays, some_cameras(), region, settings(points, share, spacing), Progress(),
         seed=seed, threads=threads, edge_length_scene=edge,
     )  # fmt: skip
 
@@ -69,7 +71,7 @@ def test_sphere_is_closed_of_genus_0_and_on_the_surface() -> None:
 
 
 def test_torus_has_genus_1_and_even_triangles() -> None:
-    mesh = mesh_shape(torus(), cube(1.5), edge=0.08)
+    mesh = mesh_shape(torus(), cube(1.5), edge=0.08, spacing="uniform")
     figures = assert_closed_manifold(mesh)
     assert (figures.components, figures.genus) == (1, 1)
     assert figures.volume == pytest.approx(2 * np.pi**2 * 0.35**2, rel=0.02)
@@ -88,6 +90,28 @@ def test_thin_plate_keeps_both_sides_at_edges_longer_than_its_thickness() -> Non
     figures = assert_closed_manifold(mesh)
     assert (figures.components, figures.genus) == (1, 0)
     assert figures.volume == pytest.approx(1.6 * 1.6 * thickness, rel=0.06)
+
+
+def test_plate_of_half_a_percent_of_the_region_stays_whole() -> None:
+    thickness = 0.01
+    plate = rounded_box((0.8, 0.8, thickness / 2), 0.0049)
+    mesh = mesh_shape(plate, cube(1.0), points=3000, sigma=0.001)
+    figures = assert_closed_manifold(mesh)
+    assert (figures.components, figures.genus) == (1, 0)
+    assert figures.volume == pytest.approx(1.6 * 1.6 * thickness, rel=0.08)
+
+
+def test_adaptive_spacing_halves_the_vertices_of_a_rounded_box() -> None:
+    box = rounded_box((0.8, 0.6, 0.5), 0.15)
+    errors = []
+    for points, spacing in ((2000, "uniform"), (1000, "adaptive")):
+        mesh = mesh_shape(box, cube(1.0), points=points, spacing=spacing)
+        assert assert_closed_manifold(mesh).genus == 0
+        drawn, _ = sample_triangles(mesh.vertices, mesh.faces, 50_000, np.random.default_rng(0))
+        away = np.abs(box(drawn))
+        errors.append((away.mean(), np.quantile(away, 0.99)))
+    assert errors[1] < errors[0]
+    assert errors[1][1] < errors[0][1]
 
 
 def test_wire_thinner_than_the_edge_length_is_one_piece() -> None:
