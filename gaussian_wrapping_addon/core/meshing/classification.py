@@ -31,10 +31,11 @@ MIXED_DEVIATION = 0.1
 nothing, and the minimum cut decides."""
 
 SHEET_COSINE = 0.5
-SHEET_SLOPE = 0.4
+SHEET_SLOPE = 0.2
 SHEET_EDGE = 12.0
 """Normals at all corners of a flat tetrahedron agree at least this well, its edges rise at most so
-much along them, and are at most this many spacings long."""
+much along them, and are at most this many spacings long. With a slope of 0.4, edges that cross a
+plate five times thinner than they are long counted as lying on one side: it got holes."""
 
 FIXED_MARGIN = 0.1
 """Tetrahedra at least this far from 0.5 after all rounds keep their label. With 0.25, smoothing

@@ -17,6 +17,7 @@ from gaussian_wrapping_addon.core.meshing.region import Region
 from gaussian_wrapping_addon.core.meshing.sampling import sample_triangles
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from tests.core.field.field_scenes import camera_at
 from tests.core.meshing.meshing_scenes import (
     Distance,
     ShapeField,
@@ -172,7 +173,7 @@ def test_solid_ends_with_a_flat_wall_where_sight_ends() -> None:
     missing = 0.7**2 * (3 - 0.7) * np.pi / 3
     assert figures.volume == pytest.approx(4 / 3 * np.pi - missing, rel=0.02)
     assert mesh.vertices[:, 0].max() < 0.3 + 0.01
-    assert mesh.provenance["vertices_at_end_of_sight"] > 50
+    assert mesh.provenance["vertices_at_end_of_sight"] > 30
 
 
 def test_two_touching_solids_and_a_floater() -> None:
@@ -209,8 +210,9 @@ def test_scale_invariance(scale: float) -> None:
     field = ShapeField(lambda p: scale * torus()(p / scale), 0.02 * scale)
     arrays = gaussians_on(torus(), cube(1.5), 800, 0.02)
     arrays = dataclasses.replace(arrays, means=scale * arrays.means, scales=scale * arrays.scales)
+    cameras = [camera_at(scale * np.array([0.0, -5.0, 1.0]))]
     other = mesh_region(
-        field, field, arrays, some_cameras(), region, settings(800), Progress(), seed=0, threads=1
+        field, field, arrays, cameras, region, settings(800), Progress(), seed=0, threads=1
     )
     figures, small = assert_closed_manifold(other), assert_closed_manifold(small_torus())
     assert (figures.genus, figures.components) == (small.genus, small.components) == (1, 1)
