@@ -8,6 +8,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.training.growth_need import (
     CAPACITY,
+    CERTAINTY,
     MIN_GAIN_DB,
     GrowthHistory,
 )
@@ -57,7 +58,16 @@ def test_growth_that_pays_goes_on(gain_db: float) -> None:
 def test_saturated_growth_stops(seed: int) -> None:
     need = history(0.0, seed=seed, noise=0.01).need()
     assert not need.pays
-    assert need.gain_db + need.spread_db < MIN_GAIN_DB
+    assert need.gain_db + CERTAINTY * need.spread_db < MIN_GAIN_DB
+
+
+def test_one_standard_error_is_not_enough_to_stop() -> None:
+    found = [history(0.0, seed=seed, noise=0.1).need() for seed in range(40)]
+    close = [
+        n for n in found if n.gain_db + n.spread_db < MIN_GAIN_DB <= n.gain_db + 2 * n.spread_db
+    ]
+    assert close
+    assert all(n.pays for n in close)
 
 
 def test_errors_that_rise_are_no_evidence_about_growth() -> None:
