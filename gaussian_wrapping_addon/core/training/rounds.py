@@ -16,7 +16,8 @@ from ..progress import Progress
 from .cancelling import checked
 from .contribution import contributions, least_contributors, prune_contributors
 from .density_control import densify_and_prune, reset_opacity
-from .harmonics_need import NeedView, harmonics_need
+from .harmonics_need import harmonics_need
+from .harmonics_trial import NeedView
 from .iteration import Stepper
 from .live_view import divisor_for
 from .needs import wrapping_need
@@ -174,7 +175,7 @@ class Rounds:
         return True
 
     def _try_harmonics(self, state: TrainingState) -> None:
-        """Raise the degree where the photos that are not trained on gain by it."""
+        """Raise the degree where enough of the surface gains by it."""
         degree = state.degree + 1
         if degree > self.settings.sh_degree:
             return

@@ -16,7 +16,8 @@ from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.cancelling import CheckedPhotos, checked
 from gaussian_wrapping_addon.core.training.contribution import contributions
-from gaussian_wrapping_addon.core.training.harmonics_need import NeedView, harmonics_need
+from gaussian_wrapping_addon.core.training.harmonics_need import harmonics_need
+from gaussian_wrapping_addon.core.training.harmonics_trial import NeedView
 from gaussian_wrapping_addon.core.training.optimizer import Adam
 from gaussian_wrapping_addon.core.training.wrapping import (
     WrapView,
