@@ -27,9 +27,9 @@ MIN_VIEWS = 5
 """No decision from fewer photos that were visited before and after."""
 
 CERTAINTY = 2.0
-"""Standard errors that must lie between the gain and :data:`MIN_GAIN_DB`. Growth is asked after every
-round and stops for good: with one, a scene of 40 photos stopped by chance at 36 000 of 80 000
-Gaussians and lost 3.5 dB on photos that were kept back."""
+"""Standard errors that must lie between the gain and :data:`MIN_GAIN_DB`. Growth is asked about
+after every round and stops for good: with one, a scene of 40 photos stopped by chance at 36 000 of
+80 000 Gaussians and lost 3.5 dB on photos that were kept back."""
 
 CAPACITY = 32_768
 """Visits that are remembered; older ones are forgotten."""
@@ -139,8 +139,8 @@ class GrowthHistory:
         times over, and only a comparison of each with itself is not drowned by that. The median
         over the photos is not moved by single bad ones. What training itself has gained between the
         visits counts for the growth, so the decision errs towards growing on; it stops only where
-        the median lies below :data:`MIN_GAIN_DB` by :data:`CERTAINTY` standard errors. Errors that rise
-        say nothing about growth: another term of the loss has begun, or Gaussians were removed.
+        the median lies below :data:`MIN_GAIN_DB` by :data:`CERTAINTY` standard errors. Errors that
+        rise say nothing about growth: another term of the loss began, or Gaussians were removed.
         """
         iteration, _, gaussians, _, _ = self._rows[-1] if self._rows else (0, 0, 0, 0.0, 1)
         gains = np.array(list(self._gains()))
