@@ -85,7 +85,7 @@ def carry_out(
             found = _measure(case, scene, own)
         except WorkerError as error:
             _logger.warning("%s failed: %s", name, error)
-            outcome.missing.append((name, f"failed: {_first_line(str(error))}"))
+            outcome.missing.append((name, f"failed: {first_line(str(error))}"))
             outcome = dataclasses.replace(outcome, failed=True)
             continue
         outcome.runs.append(found)
@@ -141,7 +141,7 @@ def held_out_scores(report: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _first_line(text: str) -> str:
+def first_line(text: str) -> str:
     """Return the line of a job's output that names the error, or the last one."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     named = [line for line in lines if "error" in line.lower()]
