@@ -74,18 +74,12 @@ def _made_by(outcome: Outcome, facts: dict[str, Any]) -> list[str]:
     seconds += sum(run["wall_s"] for run in outcome.trainings.values())
     load = f"{max(loads):.1f}" if loads else "not recorded"
     return [
-        (
-            f"`{facts['command']}`, {facts['date']}. {processor()}, {facts['threads']} threads; "
-            f"{versions()}, Open3D {_open3d()}."
-        ),
-        (
-            f"Code of the meshes: {', '.join(codes) or 'none'}; of the trainings: "
-            f"{', '.join(trained) or 'none'}. {len(made)} meshes; they, their scores and"
-        ),
-        (
-            f"{len(outcome.trainings)} trainings took {seconds / 60:.0f} minutes (references not "
-            f"counted); largest load average before a mesh: {load}."
-        ),
+        f"`{facts['command']}`, {facts['date']}. {processor()}, {facts['threads']} threads;",
+        f"{versions()}, Open3D {_open3d()}.",
+        f"Code of the meshes: {', '.join(codes) or 'none'}; of the trainings:",
+        f"{', '.join(trained) or 'none'}. {len(made)} meshes; they, their scores and the trainings",
+        f"took {seconds / 60:.0f} minutes (references not counted); largest load average before a",
+        f"mesh: {load}.",
     ]
 
 

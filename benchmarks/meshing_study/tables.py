@@ -12,7 +12,11 @@ from ..speed_error.tables import AT, SHARES, Row, table_of, thin_recall, three
 from ..tables import Table
 from .acceptance import good
 from .carry_out import Made
-from .plan import METHODS, UNITS
+from .plan import METHODS, PAM, UNITS
+
+FINER = 3
+"""A reference with so many times the vertices has a third of the chord errors: below that, what is
+measured would be its own."""
 
 
 def ordered(made: Sequence[Made]) -> list[Made]:
@@ -60,6 +64,8 @@ def isosurface_table(made: Sequence[Made]) -> Table:
     rows: list[Row] = []
     for m in ordered(made):
         level, distance = m.scores["level"], m.scores["distance"]
+        if too_fine(m):
+            distance = dict.fromkeys(distance)
         rows.append({
             **_named(m),
             "vertices": m.figures["vertices"],
@@ -75,13 +81,25 @@ def isosurface_table(made: Sequence[Made]) -> Table:
         rows,
         "\\|v - 0.5\\|: at all vertices of the mesh inside of the region, whatever they were made "
         "for; those where the sight of all cameras ends lie on no isosurface. Distances are shares "
-        "of the region's diagonal, to a uniform mesh of the same field with eight times the points "
-        "of the finest one in the plan; that reference is made by the same program and has an "
-        "error of its own, about an eighth of theirs. Mean and 99 %: from the mesh to it; mean "
+        "of the region's diagonal, to a uniform mesh of the same field with "
+        f"{_counts(made)} points. That reference is made by the same program and has an error of "
+        f"its own: PAM meshes with more than 1/{FINER} of its vertices get no distances. Mean and "
+        "99 %: from the mesh to it; mean "
         "from it: large where the mesh lacks a part. Hausdorff: the largest of both directions, "
         "over 100 000 samples and all vertices of either. What lies within 0.5 % of the region's "
         "boundary is not judged.",
     )
+
+
+def too_fine(made: Made) -> bool:
+    """Tell whether a mesh is about as fine as the reference that it would be compared with."""
+    finest = made.scores["reference_vertices"] / FINER
+    return made.method.name in PAM and made.figures["vertices"] > finest
+
+
+def _counts(made: Sequence[Made]) -> str:
+    """Return the points of the references, in words."""
+    return " or ".join(str(n) for n in sorted({m.subject.reference_points for m in made}))
 
 
 def truth_table(made: Sequence[Made]) -> Table:

@@ -67,7 +67,7 @@ def made(subject: Subject, method: Method) -> Made:
     check = {"good": not defects, "euler": euler, "part_count": 1, "defects": defects}
     scores: dict[str, Any] = {
         "level": level, "distance": distance, "check": check, "seconds_scoring": 2.0,
-        "trimesh_good": method.name != FUSION,
+        "trimesh_good": method.name != FUSION, "reference_vertices": subject.reference_points,
     }  # fmt: skip
     if subject.photos is not None:
         uniform = {"f1": [0.7, 0.8, 0.9], "precision": [0.71, 0.81, 0.91], "truth_count": 1000,
@@ -211,6 +211,11 @@ def test_headings_stand_over_their_figures() -> None:
     assert levels == ["1.0e-04", "1.0e-03", "1.0e-02"]
     shown = [row[n] for n in ("mean %", "99 % of it", "mean from it %", "Hausdorff %")]
     assert shown == ["0.2000", "0.8000", "0.3000", "1.8000"]
+    table = isosurface_table(meshes)
+    assert "with 192000 points" in table.notes[0]
+    rows = [dict(zip(table.header, r, strict=True)) for r in table.rows]
+    unjudged = {(r["scene"], r["size"]) for r in rows if r["mean %"] is None}
+    assert unjudged == {("fox", "200000 points")}
     row = first_row(truth_table(meshes))
     assert [row[f"F1 {s}"] for s in ("0.25 %", "0.5 %", "1 %")] == ["0.700", "0.800", "0.900"]
     assert [row[f"{n} 0.5 %"] for n in ("precision", "recall", "thin recall")] == [
