@@ -38,6 +38,18 @@ class Result:
             entry["seconds"] for entry in self.report["stages"] if entry["name"].startswith(stage)
         )
 
+    def processor_s(self, stage: str) -> float:
+        """Return the seconds of all cores that the stage's process computed; NaN if unknown.
+
+        Unlike time on the clock it hardly depends on what else the machine does.
+        """
+        found = [
+            entry.get("processor_seconds")
+            for entry in self.report["stages"]
+            if entry["name"].startswith(stage)
+        ]
+        return math.fsum(found) if found and None not in found else math.nan
+
     @property
     def wall_s(self) -> float:
         """Time on the clock of the whole command."""

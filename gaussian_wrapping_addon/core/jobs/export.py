@@ -76,7 +76,13 @@ def _whole(
     stages = [cameras, trained, *(s for _, m, t in regions for s in (m, t))]
     return {
         "stages": [
-            {"name": s.name, "seconds": s.done.get("seconds"), "reused": s.reused} for s in stages
+            {
+                "name": s.name,
+                "seconds": s.done.get("seconds"),
+                "processor_seconds": s.done.get("processor_seconds"),
+                "reused": s.reused,
+            }
+            for s in stages
         ],
         "cameras": {k: v for k, v in cameras.done.items() if k != "finished_unix_s"},
         "training": {k: v for k, v in trained.done.items() if k != "finished_unix_s"},

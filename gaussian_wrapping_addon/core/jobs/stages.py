@@ -108,11 +108,18 @@ def run_stage(
         progress.update(1.0, f"{name}: finished before")
         return Stage(name, key, folder, done, True)
     folder.mkdir(parents=True, exist_ok=True)
-    begun_s = time.monotonic()
+    begun_s, begun_processor_s = time.monotonic(), time.process_time()
     progress.update(0.0, f"{name}: starting")
     done = work(folder, progress)
     seconds = _seconds_before(folder) + time.monotonic() - begun_s
-    done = {**done, "seconds": round(seconds, 3), "finished_unix_s": round(time.time(), 1)}
+    # Of this process and this run alone, not of helpers.
+    processor_s = time.process_time() - begun_processor_s
+    done = {
+        **done,
+        "seconds": round(seconds, 3),
+        "processor_seconds": round(processor_s, 3),
+        "finished_unix_s": round(time.time(), 1),
+    }
     write_json(folder / "done.json", done)
     progress.update(1.0, f"{name}: finished")
     return Stage(name, key, folder, done, False)
