@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Marching tetrahedra from two and from nine pivots of one training, against the true surface.
 
-``python -m benchmarks.training_study.pivots SCENE JOB OUT.json``. What is judged is the extracted
-surface itself, as the paper does: the add-on's mesh is made from points found on it, and always
-from two pivots and points that the cameras see.
+``python -m benchmarks.training_study.pivots SCENE JOB OUT.json``. Judged is the mesh of the pivots
+alone, as the paper does: without the points that the cameras see, nothing removed for its size.
 """
 
 from __future__ import annotations
@@ -20,18 +19,16 @@ from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
-from gaussian_wrapping_addon.core.meshing.candidate_surface import candidate_surface
-from gaussian_wrapping_addon.core.meshing.pivots import nine_pivots, two_pivots
+from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
 from gaussian_wrapping_addon.core.meshing.region import read_region
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.settings import MeshingSettings
 
 from ..speed_error.plan import THRESHOLD_SHARES
 from ..speed_error.score import SURFACE_SAMPLES, stage_folder
 
-TOLERANCE_SHARE = 2e-4
-"""Of the diagonal: crossings are bisected well below the finest threshold."""
-
-PIVOTS = {"2": two_pivots, "9": nine_pivots}
+PIVOTS = (2, 9)
+"""Of each Gaussian, as in the paper's table."""
 
 
 def compare(scene_folder: Path, job: Path, threads: int) -> dict[str, Any]:
@@ -46,20 +43,18 @@ def compare(scene_folder: Path, job: Path, threads: int) -> dict[str, Any]:
     thresholds = [share * diagonal for share in THRESHOLD_SHARES]
     field.is_empty(arrays.means[:64])  # kernels and cameras are prepared before anything is timed
     found: dict[str, Any] = {}
-    for name, pivots_of in PIVOTS.items():
+    for number in PIVOTS:
         begun_s = time.monotonic()
-        surface = candidate_surface(
-            arrays, region, field.is_empty, TOLERANCE_SHARE * region.diagonal, 0, Progress(),
-            pivots_of=pivots_of,
-        )  # fmt: skip
+        settings = MeshingSettings(method="pivots", pivots=number, min_component_share=0.0)
+        mesh = mesh_by_pivots(field, arrays, scene.cameras, region, settings, Progress(), seed=0)
         seconds = time.monotonic() - begun_s
         score = score_protocols(
-            world.points(surface.vertices), surface.faces, truth, [], thresholds,
+            world.points(mesh.vertices), mesh.faces, truth, [], thresholds,
             count=SURFACE_SAMPLES, threads=threads, protocols=("uniform",),
         )["uniform"]  # fmt: skip
-        found[name] = {
-            "points": surface.pivots,
-            "faces": len(surface.faces),
+        found[str(number)] = {
+            "points": mesh.provenance["pivots"],
+            "faces": len(mesh.faces),
             "seconds": seconds,
             "surface": score.to_json(),
         }

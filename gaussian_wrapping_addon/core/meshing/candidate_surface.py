@@ -25,6 +25,12 @@ MARGIN_SHARE = 0.02
 """Gaussians this share of the diagonal beyond the region take part, so that the surface near the
 boundary is not the hull of too few pivots."""
 
+HALO_SHARE = 0.5
+"""Pivots farther from the region than this share of its diagonal take no part: the far points alone
+close the triangulation, and the field need not be known there."""
+
+NO_SURFACE_HINT = "Draw the region around something that was photographed."
+
 BRACKET_SHARE = 0.003
 """Edges are bisected to this share of the region's diagonal; later steps find the surface."""
 
@@ -51,8 +57,6 @@ def candidate_surface(
     seed: int,
     progress: Progress,
     sightings: Sightings | None = None,
-    *,
-    pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray] = two_pivots,
 ) -> CandidateSurface:
     """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and sighting.
 
@@ -62,8 +66,6 @@ def candidate_surface(
         Length of the bracket on crossing edges; 0 takes :data:`BRACKET_SHARE`.
     sightings : Sightings, optional
         Of the cameras in the region: parts about as thin as a pixel are found by these alone.
-    pivots_of : callable
-        Gives the pivots of chosen Gaussians instead of :func:`~.pivots.two_pivots`.
 
     Raises
     ------
@@ -71,16 +73,9 @@ def candidate_surface(
         No Gaussian reaches the region, or nothing in it is occupied.
     """
     margin = MARGIN_SHARE * region.diagonal
-    index = reaching(arrays, region, margin)
-    hint = "Draw the region around something that was photographed."
-    if len(index) == 0:
-        raise MeshingError(f"No Gaussian reaches region {region.name!r}.", hint)
-    chosen = representative(arrays, index, MAX_PIVOT_GAUSSIANS)
-    pivots = pivots_of(arrays, chosen)
-    pivots = pivots[region.distance(pivots) <= 0.5 * region.diagonal]
-    pivots = np.concatenate([pivots, _probes(region, margin, seed)])
-    if sightings is not None:
-        pivots = np.concatenate([pivots, *bracket_pairs(sightings, is_empty)])
+    is_empty = _within_halo(is_empty, region)
+    cloud = pivot_cloud(arrays, region, is_empty, seed, sightings)
+    pivots = cloud.points
     points = np.concatenate([pivots, far_points(pivots, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
     progress.update(0.3, f"evaluating {len(pivots)} pivots")
@@ -88,15 +83,83 @@ def candidate_surface(
     inside[: len(pivots)] = ~is_empty(pivots)
     edges, faces = marching_tetrahedra(_near(points, tetrahedra, region, margin), inside)
     if len(faces) == 0:
-        raise MeshingError(f"Region {region.name!r} holds no surface.", hint)
+        raise no_surface(region)
     tolerance = tolerance or BRACKET_SHARE * region.diagonal
     ends = bisect(points[edges[:, 0]], points[edges[:, 1]], is_empty, tolerance,
                   progress.span(0.6, 1.0))  # fmt: skip
     vertices = (ends[0] + ends[1]) / 2
     kept = region.distance(vertices[faces].mean(1)) <= margin
     if not kept.any():
-        raise MeshingError(f"Region {region.name!r} holds no surface.", hint)
-    return CandidateSurface(vertices, faces[kept], len(index), len(pivots))
+        raise no_surface(region)
+    return CandidateSurface(vertices, faces[kept], cloud.gaussians, len(pivots))
+
+
+@dataclass(frozen=True)
+class PivotCloud:
+    """Points whose Delaunay edges the isosurface of a region is looked for on."""
+
+    points: np.ndarray
+    """(p, 3) float64, all within :func:`halo_bounds`."""
+    gaussians: int
+    """Gaussians that reach the region."""
+    chosen: int
+    """Those of them that gave pivots."""
+
+
+def pivot_cloud(
+    arrays: GaussianArrays,
+    region: Region,
+    is_empty: IsEmpty,
+    seed: int,
+    sightings: Sightings | None,
+    *,
+    pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray] = two_pivots,
+) -> PivotCloud:
+    """Collect pivots, probes and pairs across what the cameras see, in and around a region.
+
+    Raises
+    ------
+    MeshingError
+        No Gaussian reaches the region.
+    """
+    margin = MARGIN_SHARE * region.diagonal
+    index = reaching(arrays, region, margin)
+    if len(index) == 0:
+        raise MeshingError(f"No Gaussian reaches region {region.name!r}.", NO_SURFACE_HINT)
+    chosen = representative(arrays, index, MAX_PIVOT_GAUSSIANS)
+    pivots = pivots_of(arrays, chosen)
+    parts = [pivots[region.distance(pivots) <= HALO_SHARE * region.diagonal]]
+    parts.append(_probes(region, margin, seed))
+    if sightings is not None:
+        parts.extend(bracket_pairs(sightings, is_empty))
+    points = np.concatenate(parts)
+    low, high = halo_bounds(region)
+    return PivotCloud(points[((points >= low) & (points <= high)).all(1)], len(index), len(chosen))
+
+
+def halo_bounds(region: Region) -> np.ndarray:
+    """Return the box, (2, 3) float64, that holds every point whose side matters for a region."""
+    low, high = region.bounds
+    halo = HALO_SHARE * region.diagonal
+    return np.stack([low - halo, high + halo])
+
+
+def _within_halo(is_empty: IsEmpty, region: Region) -> IsEmpty:
+    """Return ``is_empty`` for points in the halo; all others are empty, as the far points are."""
+    low, high = halo_bounds(region)
+
+    def inside_only(points: np.ndarray) -> np.ndarray:
+        near = ((points >= low) & (points <= high)).all(1)
+        empty = np.ones(len(points), np.bool_)
+        empty[near] = is_empty(points[near])
+        return empty
+
+    return inside_only
+
+
+def no_surface(region: Region) -> MeshingError:
+    """Return the error for a region without a surface."""
+    return MeshingError(f"Region {region.name!r} holds no surface.", NO_SURFACE_HINT)
 
 
 def _probes(region: Region, margin: float, seed: int) -> np.ndarray:

@@ -5,9 +5,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from .cap_planes import ON_PLANE_SHARE
+from .convex_region import Region
 from .sampling import triangle_normals
 
-MAX_PASSES = 12
+MAX_PASSES = 14
+
+SHORT_HEIGHTS = 2.0
+"""Edges shorter than this many heights are collapsed."""
+
+PATIENT_PASSES = 5
+MAX_SHORT_HEIGHTS = 64.0
+"""After some passes longer ones are as well, twice as long each time up to this: where several flat
+faces lie together, flips can go round in circles."""
 
 
 def narrow_faces(vertices: np.ndarray, faces: np.ndarray, height: float) -> np.ndarray:
@@ -24,18 +34,21 @@ def edge_lengths(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def remove_degenerate(
-    vertices: np.ndarray, faces: np.ndarray, height: float
+    vertices: np.ndarray, faces: np.ndarray, height: float, region: Region | None = None
 ) -> tuple[np.ndarray, int]:
     """Remove faces narrower than ``height``: needles by collapse, flat ones by flipping.
 
     Every step keeps a closed 2-manifold closed and manifold; a face that no step can remove
-    stays. Vertices are not moved, so the surface changes by at most ``height``.
+    stays. Vertices are not moved, so the surface changes by about ``height``.
 
     Parameters
     ----------
     vertices : (v, 3) float64
     faces : (f, 3) int64
         A closed 2-manifold.
+    region : Region, optional
+        No vertex on its boundary is merged into one that lies on fewer of its planes, and no edge
+        of its own is flipped: caps stay on their planes.
 
     Returns
     -------
@@ -45,19 +58,42 @@ def remove_degenerate(
         Degenerate faces that stay.
     """
     narrow = narrow_faces(vertices, faces, height)
-    for _ in range(MAX_PASSES):
+    planes = _plane_sets(vertices, faces, narrow, region)
+    for done in range(MAX_PASSES):
         if len(narrow) == 0:
             break
+        longer = 2.0 ** max(0, done - PATIENT_PASSES)
+        short = height * min(SHORT_HEIGHTS * longer, MAX_SHORT_HEIGHTS)
         mesh = _Editable(faces)
         changed = False
         for face in narrow.tolist():
             if mesh.faces[face] is not None:
-                changed |= _improve(mesh, vertices, face, height)
+                changed |= _improve(mesh, vertices, face, short, planes)
         if not changed:
             break
         faces = np.array([f for f in mesh.faces if f is not None], np.int64).reshape(-1, 3)
         narrow = narrow_faces(vertices, faces, height)
+        planes = _plane_sets(vertices, faces, narrow, region)
     return faces, len(narrow)
+
+
+_NO_PLANES: frozenset[int] = frozenset()
+
+
+def _plane_sets(
+    vertices: np.ndarray, faces: np.ndarray, narrow: np.ndarray, region: Region | None
+) -> dict[int, frozenset[int]]:
+    """Return the region's planes that each corner of a narrow face lies on, where there are any."""
+    if region is None or len(narrow) == 0:
+        return {}
+    corners = np.unique(faces[narrow])
+    local = vertices[corners] - region.center
+    found: dict[int, set[int]] = {}
+    for number, (normal, offset) in enumerate(zip(*region.half_spaces, strict=True)):
+        on_it = np.abs(local @ normal - offset) <= ON_PLANE_SHARE * region.diagonal
+        for corner in corners[on_it].tolist():
+            found.setdefault(corner, set()).add(number)
+    return {corner: frozenset(numbers) for corner, numbers in found.items()}
 
 
 class _Editable:
@@ -130,7 +166,13 @@ class _Editable:
         return next(v for v in face if v not in (begin, end))
 
 
-def _improve(mesh: _Editable, vertices: np.ndarray, face: int, height: float) -> bool:
+def _improve(
+    mesh: _Editable,
+    vertices: np.ndarray,
+    face: int,
+    short: float,
+    planes: dict[int, frozenset[int]],
+) -> bool:
     corners = mesh.faces[face]
     assert corners is not None
     lengths = [
@@ -138,7 +180,20 @@ def _improve(mesh: _Editable, vertices: np.ndarray, face: int, height: float) ->
         for k in range(3)
     ]
     shortest, longest = int(np.argmin(lengths)), int(np.argmax(lengths))
-    if lengths[shortest] < 2.0 * height:
+
+    def merged(gone: int, stays: int) -> bool:
+        of_gone, of_stays = planes.get(gone, _NO_PLANES), planes.get(stays, _NO_PLANES)
+        return of_gone <= of_stays and mesh.collapse(gone, stays)
+
+    if lengths[shortest] < short:
         a, b = corners[shortest], corners[(shortest + 1) % 3]
-        return mesh.collapse(a, b) or mesh.collapse(b, a)
-    return mesh.flip(corners[longest], corners[(longest + 1) % 3])
+        if merged(a, b) or merged(b, a):
+            return True
+        # Both have a third neighbour in common. Often that is a tip whose three faces are a fin
+        # without volume, for its base is as short as this edge.
+        for tip in corners:
+            if len(mesh.around[tip]) == 3 and any(merged(tip, v) for v in sorted(mesh.ring(tip))):
+                return True
+    a, b = corners[longest], corners[(longest + 1) % 3]
+    shared = planes.get(a, _NO_PLANES) & planes.get(b, _NO_PLANES)
+    return len(shared) < 2 and mesh.flip(a, b)

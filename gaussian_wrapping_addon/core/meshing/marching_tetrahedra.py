@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..progress import Progress
+from .extraction import OUTWARD_FACES
 
 IsEmpty = Callable[[np.ndarray], np.ndarray]
 """Maps (n, 3) points to (n,) bool: on the empty side."""
@@ -70,25 +71,84 @@ def marching_tetrahedra(
     faces : (f, 3) int64
         Triangles, counter-clockwise seen from the empty side.
     """
+    return _indexed(_separating(tetrahedra, inside), len(inside))
+
+
+def marching_closed(
+    tetrahedra: np.ndarray, neighbours: np.ndarray, inside: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bound the inside part of tetrahedra, on their hull as well.
+
+    The set of triangles is a closed 2-manifold if the tetrahedra are a 3-manifold with boundary:
+    signs alone decide, no sign is zero, so that the level meets every tetrahedron and every face of
+    the hull across.
+
+    Parameters
+    ----------
+    tetrahedra : (m, 4) int64
+        Positively oriented, face to face.
+    neighbours : (m, 4) int64
+        :func:`.extraction.tetrahedron_neighbours`.
+    inside : (n,) bool
+
+    Returns
+    -------
+    pairs : (e, 2) int64
+        The crossing edge (inside point, outside point) that each vertex of the mesh lies on, or an
+        inside point on the hull twice.
+    faces : (f, 3) int64
+        Triangles, counter-clockwise seen from outside.
+    """
+    pieces = _separating(tetrahedra, inside)
+    tetrahedron, corner = np.nonzero(neighbours < 0)
+    hull = tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]  # (h, 3)
+    codes = inside[hull] @ np.array([1, 2, 4])
+    for code, triangles in enumerate(_CAP_TRIANGLES):
+        rows = np.flatnonzero(codes == code)
+        pieces.extend(hull[rows[:, None, None], np.array(t)] for t in triangles)
+    return _indexed(pieces, len(inside))
+
+
+def _separating(tetrahedra: np.ndarray, inside: np.ndarray) -> list[np.ndarray]:
+    """Return triangles between inside and outside points, arrays of (r, 3, 2) points."""
     counts, corners = case_tables()
     codes = inside[tetrahedra] @ np.array([1, 2, 4, 8])  # (m,)
     pieces = []
     for t in range(2):
         rows = np.flatnonzero(counts[codes] > t)
-        local = corners[codes[rows], t]  # (r, 3, 2)
-        pieces.append(tetrahedra[rows[:, None, None], local])
-    pairs = np.concatenate(pieces).reshape(-1, 2)  # (3f, 2) inside, outside
-    keys = pairs[:, 0] * np.int64(len(inside)) + pairs[:, 1]
+        pieces.append(tetrahedra[rows[:, None, None], corners[codes[rows], t]])
+    return pieces
+
+
+def _cap_triangles(code: int) -> list[list[tuple[int, int]]]:
+    """Return the triangles of the inside part of a triangle; bit k of the code: corner k inside."""
+    ring: list[tuple[int, int]] = []
+    for k in range(3):
+        following = (k + 1) % 3
+        here, there = code >> k & 1, code >> following & 1
+        if here:
+            ring.append((k, k))
+        if here != there:
+            ring.append((k, following) if here else (following, k))
+    return [[ring[0], ring[t], ring[t + 1]] for t in range(1, len(ring) - 1)]
+
+
+_CAP_TRIANGLES = [_cap_triangles(code) for code in range(8)]
+
+
+def _indexed(pieces: list[np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Number the different pairs of points of triangles (r, 3, 2); make faces of the numbers."""
+    pairs = np.concatenate(pieces).reshape(-1, 2)  # (3f, 2)
+    keys = pairs[:, 0] * np.int64(count) + pairs[:, 1]
     unique, index = np.unique(keys, return_inverse=True)
-    edges = np.stack([unique // len(inside), unique % len(inside)], 1)
-    return edges, index.reshape(-1, 3)
+    return np.stack([unique // count, unique % count], 1), index.reshape(-1, 3)
 
 
 def bisect(
     inside_points: np.ndarray,
     outside_points: np.ndarray,
     is_empty: IsEmpty,
-    tolerance: float,
+    tolerance: float | np.ndarray,
     progress: Progress,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Halve segments until both ends of the sign change lie within ``tolerance``.
@@ -99,8 +159,8 @@ def bisect(
     ----------
     inside_points, outside_points : (n, 3) float64
         Occupied and empty ends.
-    tolerance : float
-        Length of the bracket that is small enough.
+    tolerance : float or (n,) float64
+        Length of the bracket that is small enough, of all or of each.
 
     Returns
     -------

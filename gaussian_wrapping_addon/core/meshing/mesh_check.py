@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The last check of a closed mesh, by other means than the code that makes and measures meshes.
+"""The last check of a mesh, by other means than the code that makes and measures meshes.
 
 It walks around vertices and over edges by permutations of half-edges alone and shares nothing with
 :mod:`.repair` and :mod:`.statistics`, so that a fault there does not hide itself here.
@@ -13,9 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from .convex_region import Region
+
 MIN_HEIGHT_SHARE = 1e-6
 """A face lower than this share of its longest edge counts as degenerate. Files hold float32, about
 seven digits: below that such a face has no direction any more."""
+
+ON_PLANE_SHARE = 1e-7
+"""A vertex so near the plane of a region's face lies on it, in diagonals of the region: what
+float32 can tell apart."""
 
 PARTS_TOLD = 20
 """Parts that the report lists one by one, the largest."""
@@ -56,10 +62,16 @@ class MeshCheck:
     volume: float
     parts: tuple[CheckedPart, ...]
     """From the largest number of faces to the smallest."""
+    open_at_region: int | None = None
+    """Of the open edges, those that lie on one plane of the region's boundary. ``None`` where the
+    mesh is to be closed."""
 
     @property
     def good(self) -> bool:
-        """Whether the mesh is a closed, oriented 2-manifold with positive volume and no defect."""
+        """Whether the mesh is an oriented 2-manifold without defect.
+
+        It must be closed, with positive volume; or open on the region's planes alone, if asked so.
+        """
         return not self.defects()
 
     def defects(self) -> list[str]:
@@ -70,14 +82,14 @@ class MeshCheck:
             (self.bad_indices, "faces name vertices that are not there"),
             (self.not_finite_vertices, "vertices are not finite"),
             (self.unused_vertices, "vertices belong to no face"),
-            (self.open_edges, "edges have one face only"),
+            (self.open_edges - (self.open_at_region or 0), "edges have one face only"),
             (self.nonmanifold_edges, "edges have more than two faces"),
             (self.inconsistent_edges, "edges have faces of opposite orientation"),
             (self.nonmanifold_vertices, "vertices join more than one ring of faces"),
             (self.degenerate_faces, "faces have no area"),
         )
         found = [f"{words}: {count}" for count, words in counted if count]
-        if not self.volume > 0.0:
+        if self.open_at_region is None and not self.volume > 0.0:
             found.append("the enclosed volume is not positive")
         return found
 
@@ -92,7 +104,7 @@ class MeshCheck:
         return {**values, **counts}
 
 
-def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> MeshCheck:
+def check_mesh(vertices: np.ndarray, faces: np.ndarray, open_at: Region | None = None) -> MeshCheck:
     """Check a triangle mesh; anything is accepted, an empty one too.
 
     Parameters
@@ -100,6 +112,8 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> MeshCheck:
     vertices : (v, 3) float
     faces : (f, 3) int
         Counter-clockwise seen from outside.
+    open_at : Region, optional
+        The mesh may be open where an edge lies on a face of this region.
     """
     vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
@@ -115,6 +129,7 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> MeshCheck:
     rings = _rings(edges.twin, faces, count) if sound else None
     corners = vertices[faces]  # (f, 3, 3)
     parts, volume = _measure_parts(corners, faces, part, edges, sound and rings == 0)
+    allowed = None if open_at is None else _on_boundary(vertices, edges.open_pairs, open_at)
     return MeshCheck(
         faces=given,
         bad_indices=given - len(faces),
@@ -128,6 +143,7 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> MeshCheck:
         euler=int(used.sum()) - edges.count + len(faces),
         volume=volume,
         parts=parts,
+        open_at_region=allowed,
     )
 
 
@@ -142,12 +158,24 @@ class _Edges:
         )
         self.count = len(lines)
         self.open, self.crowded = int((sizes == 1).sum()), int((sizes > 2).sum())
+        once = sizes[self.line] == 1
+        self.open_pairs = np.stack([begin[once], end[once]], 1)
+        """(o, 2) ends of the edges with one face."""
         balance = np.bincount(self.line, weights=np.where(begin < end, 1.0, -1.0))
         self.turned = int(((sizes == 2) & (balance != 0)).sum()) if len(lines) else 0
         order = np.argsort(forward, kind="stable")
         place = np.searchsorted(forward[order], backward)
         self.twin = order[np.minimum(place, max(len(order) - 1, 0))]
         """The opposite half-edge; only where the mesh is closed and consistent."""
+
+
+def _on_boundary(vertices: np.ndarray, pairs: np.ndarray, region: Region) -> int:
+    """Count the edges (o, 2) with both ends on one plane of the region."""
+    found = np.zeros(len(pairs), np.bool_)
+    for normal, offset in zip(*region.half_spaces, strict=True):
+        away = np.abs((vertices[pairs] - region.center) @ normal - offset)  # (o, 2)
+        found |= (away <= ON_PLANE_SHARE * region.diagonal).all(1)
+    return int(found.sum())
 
 
 def _rings(twin: np.ndarray, faces: np.ndarray, vertex_count: int) -> int:

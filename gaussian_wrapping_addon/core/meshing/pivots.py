@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pivots of oriented Gaussians: two for meshing, nine to compare with (method.md 6.1)."""
+"""Pivots of oriented Gaussians: two, three or nine each (method.md 6.1)."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -53,6 +55,20 @@ def two_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
     (p, 3) float64
         Centres first, then outer pivots.
     """
+    means, step, oriented = _outer_steps(arrays, index)
+    return np.concatenate([means, means + step, means[~oriented] - step[~oriented]])
+
+
+def three_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
+    """Return centre and outer pivots on both sides of the Gaussians ``index``, (3 k, 3) float64."""
+    means, step, _ = _outer_steps(arrays, index)
+    return np.concatenate([means, means + step, means - step])
+
+
+def _outer_steps(
+    arrays: GaussianArrays, index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return centres (k, 3), the way to the outer pivot (k, 3), and what is oriented (k,) bool."""
     means = arrays.means[index]
     normals = arrays.normals[index]
     length = np.linalg.norm(normals, axis=1)
@@ -61,7 +77,7 @@ def two_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
     shortest = arrays.rotations[index][rows, :, arrays.scales[index].argmin(1)]  # (k, 3)
     unit = np.where(oriented[:, None], normals / np.maximum(length, 1e-300)[:, None], shortest)
     step = PIVOT_SIGMAS * directional_sigma(arrays, index, unit)[:, None] * unit  # (k, 3)
-    return np.concatenate([means, means + step, means[~oriented] - step[~oriented]])
+    return means, step, oriented
 
 
 def nine_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
@@ -79,6 +95,14 @@ def nine_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
     local = PIVOT_SIGMAS * signs * arrays.scales[index][:, None, :]  # (k, 8, 3)
     corners = means[:, None] + np.einsum("kij,kcj->kci", arrays.rotations[index], local)
     return np.concatenate([means, corners.reshape(-1, 3)])
+
+
+PIVOTS: dict[int, Callable[[GaussianArrays, np.ndarray], np.ndarray]] = {
+    2: two_pivots,
+    3: three_pivots,
+    9: nine_pivots,
+}
+"""By their number."""
 
 
 def representative(arrays: GaussianArrays, index: np.ndarray, limit: int) -> np.ndarray:

@@ -175,7 +175,7 @@ def _connect(
     repaired = split_nonmanifold(points, faces)
     floaters = without_floaters(repaired.vertices, repaired.faces, settings.min_component_share)
     kept, degenerate = remove_degenerate(
-        repaired.vertices, floaters.faces, DEGENERATE_SHARE * float(cloud.radii.min())
+        repaired.vertices, floaters.faces, DEGENERATE_SHARE * float(cloud.radii.min()), region
     )
     vertices, kept, source = compacted(repaired.vertices, kept)
     origin = repaired.origin[source]
