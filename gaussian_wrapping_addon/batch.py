@@ -57,7 +57,7 @@ class _Parser(ArgumentParser):
 
 
 def _parser() -> ArgumentParser:
-    from .batch_options import add_clean_up_options, add_training_options
+    from .batch_options import add_clean_up_options, add_method_options, add_training_options
     from .core.settings import EXPORT_FORMATS, SPACINGS
 
     parser = _Parser(prog="batch.py", description="Photos in, a textured mesh out.")
@@ -91,6 +91,7 @@ def _parser() -> ArgumentParser:
         size = command.add_mutually_exclusive_group()
         size.add_argument("--edge-length", type=float, default=0.0, help="world units of the input")
         size.add_argument("--points", type=int, default=0, help="number of surface points")
+        add_method_options(command)
         add_clean_up_options(command)
         command.add_argument(
             "--spacing", choices=SPACINGS, default="adaptive", help="of the mesh's vertices"
@@ -242,7 +243,7 @@ def _resume(options: Namespace) -> int:
 
 def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
     """Put the options that ``wrap`` and ``mesh`` share into the settings."""
-    from .batch_options import clean_up_settings
+    from .batch_options import clean_up_settings, method_settings
     from .core.errors import UsageError
 
     size = options.texture_size
@@ -260,6 +261,7 @@ def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
             edge_length=options.edge_length,
             points=options.points,
             spacing=options.spacing,
+            **method_settings(options),
             **clean_up_settings(options),
         ),
         texture=replace(settings.texture, size_px=0 if size == "auto" else int(size)),

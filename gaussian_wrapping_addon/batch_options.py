@@ -94,6 +94,32 @@ _MESHING: tuple[tuple[str, str, type, str, str], ...] = (
 )
 
 
+# Options of ``wrap`` and ``mesh`` that choose one word or number: their help.
+_CHOICES = {
+    "method": "primal adaptive meshing, or marching tetrahedra on the Gaussians' pivots",
+    "pivots": "of each Gaussian, where --method pivots",
+    "boundary": "of the region where it cuts a solid: faces close it there, or it stays open",
+    "unseen": "what stands where no camera looks: nothing, or something",
+}
+
+
+def add_method_options(parser: ArgumentParser) -> None:
+    """Add how a mesh is made, of which field, and how it ends at the region's boundary."""
+    from .core.settings import BOUNDARIES, MESH_METHODS, PIVOT_COUNTS, UNSEEN, MeshingSettings
+
+    of_option = zip(_CHOICES, (MESH_METHODS, PIVOT_COUNTS, BOUNDARIES, UNSEEN), strict=True)
+    for name, choices in of_option:
+        default = getattr(MeshingSettings(), name)
+        parser.add_argument(
+            f"--{name}", type=type(default), choices=choices, default=default, help=_CHOICES[name]
+        )
+
+
+def method_settings(options: Namespace) -> dict[str, Any]:
+    """Return the meshing settings that :func:`add_method_options` was given."""
+    return {name: getattr(options, name) for name in _CHOICES}
+
+
 def add_clean_up_options(parser: ArgumentParser) -> None:
     """Add what happens to a mesh after it was made."""
     for option, name, kind, metavar, text in _MESHING:

@@ -69,6 +69,11 @@ def test_clean_up_options_become_meshing_settings(command: str) -> None:
         return _region_settings(earlier, options).meshing
 
     assert meshing() == MeshingSettings(), "what an earlier mesh was given does not stay"
+    assert meshing("--method", "pivots", "--pivots", "9") == MeshingSettings(
+        method="pivots", pivots=9
+    )
+    assert meshing("--boundary", "open") == MeshingSettings(boundary="open")
+    assert meshing("--unseen", "occupied") == MeshingSettings(unseen="occupied")
     assert meshing("--faces", "5000") == MeshingSettings(target_faces=5000)
     assert meshing("--smooth", "3") == MeshingSettings(smooth_steps=3)
     assert meshing("--min-part", "0.2") == MeshingSettings(min_component_share=0.2)
@@ -108,6 +113,7 @@ def test_every_need_is_a_setting() -> None:
         (["wrap", "photos", "--out", "o", "--sh-degree", "4", "--no-blend"], 2, "sh_degree"),
         (["wrap", "photos", "--out", "o", "--faces", "3", "--no-blend"], 2, "target_faces"),
         (["wrap", "photos", "--out", "o", "--smooth", "-1", "--no-blend"], 2, "smooth_steps"),
+        (["wrap", "photos", "--out", "o", "--pivots", "4", "--no-blend"], 2, "--pivots"),
         (["more", "--out", "photos", "--iterations", "10", "--no-blend"], 2, "job.json"),
         (["more", "--out", "photos", "--no-blend"], 2, "--iterations"),
         (["estimate", "missing"], 3, "missing"),

@@ -18,6 +18,10 @@ DECISIONS = ("auto", "on", "off")
 MASK_MODES = ("ignore", "background")
 CORRELATIONS = ("signed", "squared")
 SPACINGS = ("adaptive", "uniform")
+MESH_METHODS = ("pam", "pivots")
+PIVOT_COUNTS = (2, 3, 9)
+BOUNDARIES = ("closed", "open")
+UNSEEN = ("empty", "occupied")
 EXPORT_FORMATS = ("glb", "obj", "ply", "usd")
 
 
@@ -121,6 +125,16 @@ class MeshingSettings:
     spacing: str = "adaptive"
     """``"adaptive"``: vertices where the shape needs them, no denser than the photos resolve;
     ``"uniform"``: the same edge length everywhere."""
+    method: str = "pam"
+    """``"pam"``: primal adaptive meshing; ``"pivots"``: marching tetrahedra on pivots, as fine as
+    the Gaussians lie: edge length, number of points do not apply."""
+    pivots: int = 2
+    """Pivots of each Gaussian where they make the mesh (method.md 6.1)."""
+    boundary: str = "closed"
+    """Where the region cuts the solid: ``"closed"`` by faces on the region's planes; ``"open"``
+    leaves those out."""
+    unseen: str = "empty"
+    """What stands where no camera looks: nothing (``"empty"``), or something (``"occupied"``)."""
     min_component_share: float = 0.01
     """Solids smaller than this share of the largest (by area) are removed and counted."""
     target_faces: int = 0
@@ -237,6 +251,14 @@ class JobSettings:
                 _one_of(SPACINGS),
             ),
             ("meshing.points", 0 <= self.meshing.points <= 5_000_000, "from 0 to 5000000"),
+            ("meshing.method", self.meshing.method in MESH_METHODS, _one_of(MESH_METHODS)),
+            (
+                "meshing.pivots",
+                self.meshing.pivots in PIVOT_COUNTS,
+                _one_of(tuple(str(count) for count in PIVOT_COUNTS)),
+            ),
+            ("meshing.boundary", self.meshing.boundary in BOUNDARIES, _one_of(BOUNDARIES)),
+            ("meshing.unseen", self.meshing.unseen in UNSEEN, _one_of(UNSEEN)),
             (
                 "meshing.min_component_share",
                 0.0 <= self.meshing.min_component_share <= 1.0,

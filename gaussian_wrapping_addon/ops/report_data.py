@@ -127,6 +127,7 @@ def _region(region: Any) -> dict[str, Any]:
     )
     if isinstance(statistics.get("closed"), bool):
         figures["closed"] = statistics["closed"]
+    figures["open_by_request"] = part(region, "provenance").get("boundary") == "open"
     return figures
 
 
@@ -191,9 +192,10 @@ def _decision(name: str, chosen: str, setting: str) -> Row:
 
 def _region_rows(region: dict[str, Any]) -> tuple[Row, ...]:
     closed = region.get("closed")
+    no = "Open by request" if region.get("open_by_request") else "No"
     return (
         ("Faces", number(region.get("faces"))),
-        ("Closed", ("Yes" if closed else "No") if isinstance(closed, bool) else NOT_MEASURED),
+        ("Closed", ("Yes" if closed else no) if isinstance(closed, bool) else NOT_MEASURED),
         ("Texture Seen", percent(region.get("coverage"))),
         ("Textured Mesh PSNR", number(region.get("mesh_psnr"), "dB", digits=1)),
     )

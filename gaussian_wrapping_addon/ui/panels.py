@@ -178,6 +178,24 @@ class GWRAP_PT_mesh(_Panel, bpy.types.Panel):
         row.operator("gwrap.mesh_region", text=text, icon="MESH_DATA")
 
 
+class GWRAP_PT_mesh_advanced(_Panel, bpy.types.Panel):
+    bl_parent_id = "GWRAP_PT_mesh"
+    bl_label = "Advanced"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - Blender's convention
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        properties = context.scene.gwrap
+        _plain(layout)
+        column = layout.column()
+        column.enabled = not job_timer.is_running(properties.job_folder)
+        column.prop(properties, "method")
+        if properties.method == "PIVOTS":
+            column.prop(properties, "pivots")
+        column.prop(properties, "boundary")
+        column.prop(properties, "unseen")
+
+
 class GWRAP_PT_result(_Panel, bpy.types.Panel):
     bl_label = "Result"
 
@@ -212,5 +230,6 @@ CLASSES: Final = (
     GWRAP_PT_wrap,
     GWRAP_PT_region,
     GWRAP_PT_mesh,
+    GWRAP_PT_mesh_advanced,
     GWRAP_PT_result,
 )

@@ -30,6 +30,23 @@ _RESOLUTIONS: Final = (
     ("EDGE_LENGTH", "Edge Length", "Triangles with edges of this length"),
     ("POINTS", "Points", "This many points on the surface"),
 )
+_METHODS: Final = (
+    ("PAM", "Adaptive", "Primal adaptive meshing: at the chosen resolution"),
+    ("PIVOTS", "Pivots", "Marching tetrahedra on the Gaussians' pivots: as fine as they lie"),
+)
+_PIVOTS: Final = (
+    ("2", "2", "Centre and outer pivot"),
+    ("3", "3", "Outer pivots on both sides"),
+    ("9", "9", "Centre and the corners of a box; several times as many triangles"),
+)
+_BOUNDARIES: Final = (
+    ("CLOSED", "Closed", "Flat faces close the mesh where the region cuts through things"),
+    ("OPEN", "Open", "The mesh ends there with an open edge"),
+)
+_UNSEEN: Final = (
+    ("EMPTY", "Empty", "Nothing stands where no camera looks"),
+    ("OCCUPIED", "Occupied", "Something stands there: closes the backs of things"),
+)
 _TEXTURE_SIZES: Final = (
     ("0", "Automatic", "As many pixels as the photos hold"),
     ("1024", "1024", "1024 pixels each way"),
@@ -90,6 +107,22 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
         max=5_000_000,
         soft_max=500_000,
     )
+    method: EnumProperty(  # type: ignore[valid-type]
+        name="Method", description="How the mesh is made", items=_METHODS, default="PAM"
+    )
+    pivots: EnumProperty(  # type: ignore[valid-type]
+        name="Pivots", description="Points of each Gaussian", items=_PIVOTS, default="2"
+    )
+    boundary: EnumProperty(  # type: ignore[valid-type]
+        name="Boundary",
+        description="How the mesh ends at the region's boundary",
+        items=_BOUNDARIES,
+        default="CLOSED",
+    )
+    unseen: EnumProperty(  # type: ignore[valid-type]
+        name="Unseen", description="What stands where no camera looks", items=_UNSEEN,
+        default="EMPTY",
+    )  # fmt: skip
     decimate: BoolProperty(  # type: ignore[valid-type]
         name="Limit Faces",
         description="Decimate the mesh; it stays closed, and its parts and holes stay",

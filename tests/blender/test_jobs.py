@@ -219,6 +219,8 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     properties.resolution = "EDGE_LENGTH"
     properties.edge_length = 0.1
     properties.decimate, properties.target_faces, properties.smooth_steps = True, 1234, 2
+    properties.method, properties.pivots = "PIVOTS", "9"
+    properties.boundary, properties.unseen = "OPEN", "OCCUPIED"
     select(region)
     region.name = "Front Door"
     assert "Mesh Region" in draw(panels.GWRAP_PT_mesh).texts
@@ -228,6 +230,9 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     assert job.settings.preset == "standard"
     assert job.settings.meshing.edge_length == pytest.approx(0.1 / 2 * WORLD_FROM_SCENE.scale)
     assert (job.settings.meshing.target_faces, job.settings.meshing.smooth_steps) == (1234, 2)
+    meshing = job.settings.meshing
+    assert (meshing.method, meshing.pivots) == ("pivots", 9)
+    assert (meshing.boundary, meshing.unseen) == ("open", "occupied")
     ((_, body),) = job.region_bodies.items()
     expected = WORLD_FROM_SCENE.points(BOX_SCENE)
     distances = np.linalg.norm(np.array(body["vertices"])[:, None] - expected, axis=2)

@@ -90,6 +90,14 @@ def test_mesh_panel_shows_what_decides(resolution: str, shown: set[str]) -> None
     assert properties == {"resolution", "decimate", "smooth_steps"} | shown
 
 
+@pytest.mark.parametrize("method", ["PAM", "PIVOTS"])
+def test_advanced_panel_asks_for_pivots_only_where_they_count(method: str) -> None:
+    bpy.context.scene.gwrap.method = method
+    log = draw(panels.GWRAP_PT_mesh_advanced).log
+    properties = {a[1] for name, a, _ in log if name == "prop"}
+    assert properties == {"method", "boundary", "unseen"} | ({"pivots"} & {method.lower()})
+
+
 @pytest.mark.parametrize("decimate", [False, True])
 def test_mesh_panel_asks_for_faces_only_where_they_are_limited(decimate: bool) -> None:
     bpy.context.scene.gwrap.decimate = decimate

@@ -49,6 +49,10 @@ def test_unknown_preset_is_refused() -> None:
         {"meshing": MeshingSettings(smooth_steps=1001)},
         {"meshing": MeshingSettings(min_component_share=float("nan"))},
         {"meshing": MeshingSettings(min_component_share=1.5)},
+        {"meshing": MeshingSettings(method="poisson")},
+        {"meshing": MeshingSettings(pivots=4)},
+        {"meshing": MeshingSettings(boundary="ajar")},
+        {"meshing": MeshingSettings(unseen="invalid")},
         {"meshing": MeshingSettings(spacing="dense")},
     ],
 )  # fmt: skip

@@ -25,7 +25,7 @@ from .stages import Stage, run_stage, source_fingerprint, stage_key
 _logger = logging.getLogger(__name__)
 
 # Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
-STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 4, "texture": 4}
+STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 5, "texture": 4}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
@@ -205,15 +205,17 @@ def _run_meshing(
 
         from ..dataset.scene_file import load_saved_scene
         from ..field.sightings import find_sightings
-        from ..field.vacancy import VacancyField
         from ..field.vector_field import VectorField
         from ..gaussians.gaussian_file import load_gaussians
         from ..meshing.clean_up import clean_up
         from ..meshing.mesh_check import check_mesh
         from ..meshing.mesh_file import save_mesh
+        from ..meshing.open_boundary import opened
+        from ..meshing.pivot_meshing import mesh_by_pivots
         from ..meshing.primal_adaptive import mesh_region
         from ..meshing.region import automatic_region, parse_region, whole_region, write_region
         from ..meshing.statistics import mesh_statistics
+        from .region_field import field_figures, region_field
 
         scene = load_saved_scene(cameras.folder)
         gaussians = load_gaussians(trained.folder / "gaussians.npz")
@@ -225,19 +227,30 @@ def _run_meshing(
         else:
             world_region = parse_region(body, Path(request))
             region = world_region.transformed(scene.world_from_scene.inverse())
-        vacancy = VacancyField(arrays, scene.cameras, threads=threads)
-        vectors = VectorField(arrays, threads=threads)
+        vacancy = region_field(
+            scene, arrays, region, job.settings.training, meshing, threads=threads
+        )
         sightings = find_sightings(
             gaussians, scene.cameras, lambda points: region.contains(points, 0.0),
             progress.span(0.0, 0.15), threads=threads,
         )  # fmt: skip
-        mesh = mesh_region(
-            vacancy, vectors, arrays, scene.cameras, region, meshing, progress.span(0.15, 0.9),
-            seed=job.settings.seed, threads=threads,
-            edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
-            sightings=sightings,
-        )  # fmt: skip
+        if meshing.method == "pivots":
+            mesh = mesh_by_pivots(
+                vacancy, arrays, scene.cameras, region, meshing, progress.span(0.15, 0.9),
+                seed=job.settings.seed, sightings=sightings,
+            )  # fmt: skip
+        else:
+            mesh = mesh_region(
+                vacancy, VectorField(arrays, threads=threads), arrays, scene.cameras, region,
+                meshing, progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
+                edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
+                sightings=sightings,
+            )  # fmt: skip
         mesh = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
+        open_at = region if meshing.boundary == "open" else None
+        if open_at is not None:
+            mesh = opened(mesh, open_at)
+        mesh.provenance.update(field_figures(vacancy))
         if not np.isfinite(mesh.vertices).all():
             raise MeshingError(
                 "The mesh has vertices that are not finite.",
@@ -248,7 +261,7 @@ def _run_meshing(
         progress.update(0.97, "measuring the mesh")
         return {
             "statistics": mesh_statistics(mesh).to_json(),
-            "check": check_mesh(mesh.vertices, mesh.faces).to_json(),
+            "check": check_mesh(mesh.vertices, mesh.faces, open_at).to_json(),
             "provenance": mesh.provenance,
             "edge_length_world": meshing.edge_length,
         }

@@ -176,6 +176,26 @@ def test_another_region_and_resolution_needs_no_training(
     assert 0.02 < np.median(edges) < 0.08
 
 
+def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str]) -> None:
+    scene, root, _ = wrapped
+    box = write_box(root / "open.json", scene, 0.6, (0, 0, 1.0))
+    done = batch(
+        "mesh", "--out", str(root / "out"), "--region", str(box), "--method", "pivots",
+        "--pivots", "3", "--boundary", "open", "--texture-size", "256", "--no-blend",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads((root / "out" / "result" / "report.json").read_text())
+    figures = report["regions"]["open"]
+    assert figures["check"]["good"], figures["check"]["defects"]
+    assert figures["check"]["open_at_region"] == figures["statistics"]["boundary_edges"] > 10
+    assert figures["provenance"]["field_evaluations"] > figures["provenance"]["unseen_evaluations"]
+    assert "open by request" in (root / "out" / "result" / "report.md").read_text(encoding="utf-8")
+    local = (world_mesh(root, "open").vertices - scene.offset) / scene.scale
+    assert np.abs(local[:, :2]).max() < 0.6 + 1e-6
+    distance = np.abs(np.linalg.norm(local, axis=1) - BALL_RADIUS)
+    assert np.median(distance) < 0.03
+
+
 def test_a_killed_training_resumes_to_the_same_gaussians(
     wrapped: tuple[BallScene, Path, str], tmp_path: Path
 ) -> None:

@@ -68,20 +68,21 @@ _ENDINGS = (
 )
 _COUNTS = frozenset(
     (
-        "bad_indices", "boundary_edges", "candidates", "cap_points", "charts", "components",
-        "cores", "degenerate_faces", "degenerate_faces_left", "densify_every", "dropped_candidates",
-        "faces", "faces_before_clean_up", "faces_without_texel", "frames", "gaussians",
-        "gaussians_in_region", "holdout_every", "images_in_model", "inconsistent_edges",
-        "interior_samples", "iterations", "jump_points", "left_out", "max_gaussians",
-        "nonmanifold_edges", "nonmanifold_vertices", "not_finite_vertices", "open_edges",
-        "part_count", "photos", "photos_placed", "photos_undistorted", "photos_used",
-        "photos_with_focal_length", "pivots", "points", "points_in_model", "projection_evaluations",
+        "bad_indices", "boundary_edges", "candidates", "cap_faces_left_out", "cap_points", "charts",
+        "components", "cores", "degenerate_faces", "degenerate_faces_left", "densify_every",
+        "dropped_candidates", "faces", "faces_before_clean_up", "faces_without_texel",
+        "field_evaluations", "frames", "gaussians", "gaussians_in_region", "holdout_every",
+        "images_in_model", "inconsistent_edges", "interior_samples", "iterations", "jump_points",
+        "left_out", "max_gaussians", "nonmanifold_edges", "nonmanifold_vertices",
+        "not_finite_vertices", "open_at_region", "open_edges", "part_count", "photos",
+        "photos_placed", "photos_undistorted", "photos_used", "photos_with_focal_length", "pivots",
+        "pivots_each", "points", "points_in_model", "projection_evaluations",
         "relabelled_tetrahedra", "removed_cavities", "sightings", "removed_solids", "smooth_steps",
         "split_edges", "split_vertices", "surface_points", "target_faces", "tetrahedra",
         "texels_filled", "texels_overlapping", "texels_seen", "texels_seen_at_outlines_only",
-        "texels_used", "threads", "undecided_tetrahedra", "unused_vertices", "vertices",
-        "vertices_at_end_of_sight", "vertices_moved_apart", "vertices_on_region_boundary",
-        "vertices_on_surface", "views", "wrap_rounds",
+        "texels_used", "threads", "undecided_tetrahedra", "unseen_evaluations", "unused_vertices",
+        "vertices", "vertices_at_end_of_sight", "vertices_moved_apart",
+        "vertices_on_region_boundary", "vertices_on_surface", "views", "wrap_rounds",
     )
 )  # fmt: skip
 _STARTS = (("level_error_", "of vacancy"), ("lambda_", "weight"))

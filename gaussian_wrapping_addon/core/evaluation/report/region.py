@@ -37,15 +37,17 @@ def region_summary(name: str, region: dict[str, Any]) -> str:
     )
     return (
         f"Region **{escaped(name)}** is a mesh of {number(statistics.get('faces'), 'faces')}, "
-        f"{closedness(statistics)}; {seen}."
+        f"{closedness(statistics, part(region, 'provenance'))}; {seen}."
     )
 
 
-def closedness(statistics: dict[str, Any]) -> str:
-    """Return whether a mesh is closed, in words."""
+def closedness(statistics: dict[str, Any], provenance: dict[str, Any]) -> str:
+    """Return whether a mesh is closed, in words; an open boundary may have been asked for."""
     closed = statistics.get("closed")
     if not isinstance(closed, bool):
         return "closedness not measured"
+    if not closed and provenance.get("boundary") == "open":
+        return "open by request where the region cuts through things"
     return "closed (watertight)" if closed else "not closed"
 
 
@@ -87,7 +89,7 @@ def _mesh(region: dict[str, Any]) -> list[str]:
     size = [measured(side) for side in items(world.get("size"))]
     extent = " x ".join(number(s) for s in size) + " world units" if size else NOT_MEASURED
     holes = statistics.get("boundary_edges")
-    topology = closedness(statistics)
+    topology = closedness(statistics, provenance)
     if statistics.get("closed") is False:
         topology += f", {plural(holes, 'open edge')}"
     rows = [
@@ -124,8 +126,9 @@ def _mesh(region: dict[str, Any]) -> list[str]:
         lines[-1] += f" Measured at the {percent(on_surface / vertices)} of the vertices"
         lines[-1] += " that should lie on the surface."
         if capped:
+            does = "end" if provenance.get("boundary") == "open" else "close"
             lines[-1] += (
-                f" {percent(capped / vertices)} of the vertices close the mesh where the region "
+                f" {percent(capped / vertices)} of the vertices {does} the mesh where the region "
                 "cuts through things."
             )
     return lines

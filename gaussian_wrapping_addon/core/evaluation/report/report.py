@@ -46,7 +46,7 @@ def headline(report: dict[str, Any]) -> list[str]:
     for name, region in part(report, "regions").items():
         statistics = part(region, "statistics")
         line = f"region {name}: {number(statistics.get('faces'), 'faces')}, "
-        line += f"{closedness(statistics)}, "
+        line += f"{closedness(statistics, part(region, 'provenance'))}, "
         line += f"{percent(part(region, 'texture').get('coverage'))} of the texture seen by photos"
         rendered = measured(part(region, "mesh_rendering").get("psnr"))
         if rendered is not None:

@@ -138,7 +138,8 @@ def _judge_mesh(
     stage: str, statistics: dict[str, Any], provenance: dict[str, Any]
 ) -> list[ReportWarning]:
     found = []
-    if statistics.get("closed") is False:
+    by_request = provenance.get("boundary") == "open"
+    if statistics.get("closed") is False and not by_request:
         edges = plural(statistics.get("boundary_edges"), "open edge")
         text = f"The mesh is not closed ({edges}); volumes and 3D prints need a closed one."
         step = "Fill the holes in Blender; send the job folder's log.txt with a bug report."

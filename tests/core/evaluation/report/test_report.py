@@ -146,6 +146,17 @@ def test_nothing_is_judged_where_nothing_is_wrong(tmp_path: Path) -> None:
     assert "had anything to warn about" in section(report_markdown(good(), tmp_path), "## Warnings")
 
 
+def test_a_boundary_that_is_open_by_request_is_no_defect(tmp_path: Path) -> None:
+    report = good()
+    region = report["regions"][REGION]
+    region["statistics"].update(closed=False, boundary_edges=4)
+    region["provenance"].update(boundary="open")
+    assert collect_warnings(report) == []
+    text = report_markdown(report, tmp_path)
+    assert "open by request where the region cuts through things" in text
+    assert "not closed" not in text
+
+
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [
