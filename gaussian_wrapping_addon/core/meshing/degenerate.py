@@ -64,14 +64,18 @@ def remove_degenerate(
             break
         longer = 2.0 ** max(0, done - PATIENT_PASSES)
         short = height * min(SHORT_HEIGHTS * longer, MAX_SHORT_HEIGHTS)
-        mesh = _Editable(faces)
+        near, frozen = _surroundings(len(vertices), faces, narrow)
+        mesh = _Editable(faces[near], frozen)
         changed = False
-        for face in narrow.tolist():
+        for face in np.searchsorted(near, narrow).tolist():
             if mesh.faces[face] is not None:
                 changed |= _improve(mesh, vertices, face, short, planes)
         if not changed:
             break
-        faces = np.array([f for f in mesh.faces if f is not None], np.int64).reshape(-1, 3)
+        gone = np.array([f is None for f in mesh.faces])
+        faces = faces.copy()
+        faces[near[~gone]] = np.array([f for f in mesh.faces if f is not None]).reshape(-1, 3)
+        faces = np.delete(faces, near[gone], 0)
         narrow = narrow_faces(vertices, faces, height)
         planes = _plane_sets(vertices, faces, narrow, region)
     return faces, len(narrow)
@@ -96,10 +100,28 @@ def _plane_sets(
     return {corner: frozenset(numbers) for corner, numbers in found.items()}
 
 
+def _surroundings(count: int, faces: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, set[int]]:
+    """Return indices of all faces around the chosen ones and their neighbours, increasing.
+
+    A step looks at the faces around the corners of a narrow face and of its neighbours; the lists
+    that it edits would take ten times the memory of the mesh, if they held all of it. Also returns
+    the vertices that have faces beyond: steps that would need to know those wait for the next pass.
+    """
+    for _ in range(2):
+        touched = np.zeros(count, np.bool_)
+        touched[faces[chosen]] = True
+        chosen = np.flatnonzero(touched[faces].any(1))
+    beyond = np.zeros(count, np.bool_)
+    beyond[np.delete(faces, chosen, 0)] = True
+    here = np.unique(faces[chosen])
+    return chosen, set(here[beyond[here]].tolist())
+
+
 class _Editable:
     """Faces by half-edge, for a few local changes."""
 
-    def __init__(self, faces: np.ndarray) -> None:
+    def __init__(self, faces: np.ndarray, frozen: set[int]) -> None:
+        self.frozen = frozen
         self.faces: list[tuple[int, int, int] | None] = [tuple(f) for f in faces.tolist()]
         self.left_of: dict[tuple[int, int], int] = {}
         self.around: dict[int, set[int]] = {}
@@ -138,15 +160,19 @@ class _Editable:
 
     def flip(self, begin: int, end: int) -> bool:
         """Exchange the diagonal ``begin``-``end`` for the other one of its quad."""
+        if begin in self.frozen and end in self.frozen:
+            return False
         first, second = self.left_of[begin, end], self.left_of[end, begin]
         p, q = self.apex(first, begin, end), self.apex(second, begin, end)
-        if p == q or q in self.ring(p):
+        if p == q or q in self.ring(p) or (p in self.frozen and q in self.frozen):
             return False
         self.replace([first, second], [(p, q, end), (q, p, begin)])
         return True
 
     def collapse(self, gone: int, stays: int) -> bool:
         """Merge ``gone`` into ``stays`` where the link condition allows it."""
+        if gone in self.frozen or stays in self.frozen:
+            return False
         common = self.ring(gone) & self.ring(stays)
         if len(common) != 2 or len(self.ring(gone)) + len(self.ring(stays)) <= 6:
             return False
@@ -192,7 +218,11 @@ def _improve(
         # Both have a third neighbour in common. Often that is a tip whose three faces are a fin
         # without volume, for its base is as short as this edge.
         for tip in corners:
-            if len(mesh.around[tip]) == 3 and any(merged(tip, v) for v in sorted(mesh.ring(tip))):
+            if (
+                len(mesh.around[tip]) == 3
+                and tip not in mesh.frozen
+                and any(merged(tip, v) for v in sorted(mesh.ring(tip)))
+            ):
                 return True
     a, b = corners[longest], corners[(longest + 1) % 3]
     shared = planes.get(a, _NO_PLANES) & planes.get(b, _NO_PLANES)

@@ -43,7 +43,9 @@ def far_points(points: np.ndarray, seed: int) -> np.ndarray:
     return (low + high) / 2 + (corners * FAR_SHARE + noise * FAR_SPREAD_SHARE) * extent
 
 
-def delaunay(points: np.ndarray, *, seed: int, progress: Progress) -> np.ndarray:
+def delaunay(
+    points: np.ndarray, *, seed: int, progress: Progress, jitter_share: float = JITTER_SHARE
+) -> np.ndarray:
     """Return the Delaunay tetrahedra of ``points``.
 
     Exact duplicates take part once, through their first occurrence. All coordinates are shifted by
@@ -55,6 +57,8 @@ def delaunay(points: np.ndarray, *, seed: int, progress: Progress) -> np.ndarray
     points : (n, 3) float64
     seed : int
         Seed of the shifts.
+    jitter_share : float
+        Size of the shifts; 0 where the caller has shifted the points already.
 
     Returns
     -------
@@ -84,7 +88,7 @@ def delaunay(points: np.ndarray, *, seed: int, progress: Progress) -> np.ndarray
     # Centred: at UTM coordinates the shift would be lost in rounding.
     local = (points[first] - (low + high) / 2) / extent
     shifts = np.random.default_rng(seed).uniform(-1.0, 1.0, local.shape)
-    local += JITTER_SHARE * shifts
+    local += jitter_share * shifts
     progress.update(0.0, f"connecting {len(local)} points")
     try:
         import shull

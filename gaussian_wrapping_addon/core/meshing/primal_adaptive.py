@@ -113,13 +113,8 @@ def mesh_region(
     cloud = sampler.sample(wanted.request, rng, progress.span(0.3, 0.6))
     vertices, faces, kind, figures = _connect(cloud, vacancy, region, settings, seed, rng, progress)
     figures["dense_vertices"] = len(vertices)
-    if adaptive:
-        longest = LONGEST_EDGE_SHARE * region.diagonal
-        target = max(wanted.target, round(wanted.share * len(vertices)))
-        faces = select_vertices(vertices, faces, target, longest)
-        vertices, faces, chosen = compacted(vertices, faces)
-        kind = kind[chosen]
-    figures |= _counts(kind)
+    vertices, faces, kind = selected(vertices, faces, kind, wanted.target, wanted.share, region)
+    figures |= counts(kind)
     provenance = {
         "method": "primal adaptive meshing",
         "region": region.name,
@@ -133,7 +128,7 @@ def mesh_region(
         "seed": seed,
         **cloud.figures,
         **figures,
-        **_distance_to_level(vacancy, vertices, kind),
+        **distance_to_level(vacancy, vertices, kind),
     }
     progress.update(1.0, f"{len(faces)} faces")
     _logger.info("Meshed region %s: %d faces", region.name, len(faces))
@@ -169,6 +164,45 @@ def _connect(
         progress.span(0.65, 0.9),
     )
     faces = boundary_faces(tetrahedra, neighbours, labels.inside)
+    figures = {
+        "tetrahedra": len(tetrahedra),
+        "interior_samples": int(labels.samples[~outer].sum()),
+        "undecided_tetrahedra": labels.undecided,
+        "relabelled_tetrahedra": labels.flipped,
+    }
+    vertices, faces, kind, repairs = finished(points, faces, cloud, region, settings, progress)
+    return vertices, faces, kind, {**figures, **repairs}
+
+
+def finished(
+    points: np.ndarray,
+    faces: np.ndarray,
+    cloud: SurfacePoints,
+    region: Region,
+    settings: MeshingSettings,
+    progress: Progress,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    """Make closed faces a manifold, without floaters and faces of no area.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        The cloud's points first.
+    faces : (f, 3) int64
+
+    Returns
+    -------
+    vertices : (v, 3) float64
+    faces : (g, 3) int64
+    kind : (v,)
+    figures : dict
+
+    Raises
+    ------
+    MeshingError
+        There is no face.
+    """
+    hint = "Draw the region around something that was photographed."
     if len(faces) == 0:
         raise MeshingError(f"Region {region.name!r} holds no solid.", hint)
     progress.update(0.9, "repairing")
@@ -183,10 +217,6 @@ def _connect(
     copies = np.bincount(repaired.origin[repaired.origin >= 0], minlength=len(cloud.kind))
     kind[(origin >= 0) & (copies[np.maximum(origin, 0)] > 1)] = KIND_SPLIT
     figures = {
-        "tetrahedra": len(tetrahedra),
-        "interior_samples": int(labels.samples[~outer].sum()),
-        "undecided_tetrahedra": labels.undecided,
-        "relabelled_tetrahedra": labels.flipped,
         "split_vertices": repaired.split_vertices,
         "split_edges": repaired.split_edges,
         "components": floaters.kept,
@@ -199,7 +229,31 @@ def _connect(
     return vertices, kept, kind, figures
 
 
-def _counts(kind: np.ndarray) -> dict[str, int]:
+def selected(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    kind: np.ndarray,
+    target: int,
+    share: float,
+    region: Region,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Keep the vertices that the shape needs, of a closed 2-manifold, and their kinds.
+
+    Parameters
+    ----------
+    target : int
+        So many stay at least.
+    share : float
+        Share that stays where that is more; with 1, as for uniform spacing, all do.
+    """
+    target = max(target, round(share * len(vertices)))
+    faces = select_vertices(vertices, faces, target, LONGEST_EDGE_SHARE * region.diagonal)
+    vertices, faces, chosen = compacted(vertices, faces)
+    return vertices, faces, kind[chosen]
+
+
+def counts(kind: np.ndarray) -> dict[str, int]:
+    """Return how many vertices there are of each kind, for the report."""
     return {
         "vertices_on_surface": int((kind == KIND_SURFACE).sum()),
         "vertices_on_region_boundary": int((kind == KIND_CAP).sum()),
@@ -208,6 +262,6 @@ def _counts(kind: np.ndarray) -> dict[str, int]:
     }
 
 
-def _distance_to_level(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:
+def distance_to_level(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:
     """Measure ``|v - 0.5|`` at the vertices that should lie on the isosurface."""
     return level_errors(vacancy, vertices[kind == KIND_SURFACE])

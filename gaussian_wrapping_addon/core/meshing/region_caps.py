@@ -42,6 +42,11 @@ class Caps:
     """(n,) float64 for the same."""
 
 
+def no_caps() -> Caps:
+    """Return the caps of a region whose boundary stays open."""
+    return Caps(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+
+
 def cap_points(
     region: Region,
     is_empty: IsEmpty,

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from ..progress import Progress
 from .candidate_surface import CandidateSurface
 from .convex_region import Region
 from .marching_tetrahedra import bisect
-from .region_caps import cap_points
+from .region_caps import cap_points, no_caps
 from .resolution import Request, check_expected, thinning_radius
 from .sampling import (
     EDGE_PER_RADIUS,
@@ -113,10 +113,10 @@ class SurfaceSampler:
         self.area = float(areas.sum())
         self._threads = threads
 
-    def sample(
-        self, request: Request, rng: np.random.Generator, progress: Progress
-    ) -> SurfacePoints:
-        """Return surface, jump and cap points at the requested density.
+    def spacing(
+        self, request: Request, rng: np.random.Generator
+    ) -> tuple[Spacing, tuple[str, ...]]:
+        """Return the local radii that answer to a request, and notes for the report.
 
         Raises
         ------
@@ -124,10 +124,45 @@ class SurfaceSampler:
             The request needs more points than the cap.
         """
         spacing, notes = self._spacing(request, rng)
+        check_expected(self._expected(spacing)[1], request)
+        return spacing, notes
+
+    def _expected(self, spacing: Spacing) -> tuple[np.ndarray, float]:
+        """Return the radius of each face as a share of the nominal one, and the points in all."""
         share = spacing.at(self._vertices[self._faces].mean(1), self._threads) / spacing.nominal
-        progress.update(0.0, "spreading points")
         _, areas = triangle_normals(self._vertices, self._faces)
-        expected = POINTS_PER_SQUARE * float((areas * share**-2.0).sum()) / spacing.nominal**2
+        weight = float((areas * share**-2.0).sum())
+        return share, POINTS_PER_SQUARE * weight / spacing.nominal**2
+
+    def sample(
+        self,
+        request: Request,
+        rng: np.random.Generator,
+        progress: Progress,
+        *,
+        spacing: Spacing | None = None,
+        owned: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> SurfacePoints:
+        """Return surface, jump and cap points at the requested density.
+
+        Parameters
+        ----------
+        spacing : Spacing, optional
+            Known already, from :meth:`spacing` of the whole surface.
+        owned : callable, optional
+            Maps (n, 3) points to (n,) bool: only these are kept, and the region's boundary gets no
+            points. For tiles, whose boundary is none of the solid's.
+
+        Raises
+        ------
+        ResourceError
+            The request needs more points than the cap.
+        """
+        notes: tuple[str, ...] = ()
+        if spacing is None:
+            spacing, notes = self._spacing(request, rng)
+        progress.update(0.0, "spreading points")
+        share, expected = self._expected(spacing)
         check_expected(expected, request)
         points, face = self._candidates(
             spacing.nominal, share, int(OVERSAMPLING * expected) + 64, rng
@@ -136,10 +171,15 @@ class SurfaceSampler:
         radii = spacing.at(points, self._threads)
         settled = self._settled(points, face, radii, progress.span(0.1, 0.8))
         moved, normals, kind = settled.points, settled.normals, settled.kind
+        caps = no_caps()
+        if owned is None:
+            caps = cap_points(
+                self._region, self._vacancy.is_empty, spacing, rng, progress.span(0.8, 1.0)
+            )
+        else:
+            mine = owned(moved)
+            moved, normals, kind = moved[mine], normals[mine], kind[mine]
         radii = spacing.at(moved, self._threads)
-        caps = cap_points(
-            self._region, self._vacancy.is_empty, spacing, rng, progress.span(0.8, 1.0)
-        )
         # Jumps last among surface points: where both are near, the isosurface is the better one.
         priority = PRIORITY_SURFACE + 0.5 * (rng.random(len(moved)) + (kind == KIND_JUMP))
         everything = np.concatenate([caps.points, moved])

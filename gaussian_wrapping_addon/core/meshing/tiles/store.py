@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The files of a tiled mesh (docs/file-formats.md, Tiles); each is written whole or not at all."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import ParseError
+from ...files import read_json, write_bytes, write_json
+from ..candidate_surface import CandidateSurface
+from ..convex_region import Region
+from ..region_caps import Caps
+from ..spacing import Spacing
+from ..surface_points import SurfacePoints
+from .plan import TilePlan
+from .tile_faces import TileFaces
+from .tile_points import AllPoints
+from .tiling import Tiling
+
+LIST_NAME = "tiles.json"
+VERSION = 1
+
+
+def points_path(folder: Path, tile: int) -> Path:
+    """Return where the points of a tile lie."""
+    return folder / f"points-{tile:04d}.npz"
+
+
+def faces_path(folder: Path, tile: int) -> Path:
+    """Return where the faces of a tile lie."""
+    return folder / f"faces-{tile:04d}.npz"
+
+
+def gathered_path(folder: Path) -> Path:
+    """Return where the points of all tiles lie."""
+    return folder / "points.npz"
+
+
+def save_plan(folder: Path, plan: TilePlan, origin: dict[str, Any]) -> None:
+    """Write a plan; the list itself comes last.
+
+    Parameters
+    ----------
+    origin : dict
+        JSON values with which another process finds the Gaussians and cameras.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    _save(
+        folder / "plan.npz",
+        vertices=plan.surface.vertices, faces=plan.surface.faces, fillers=plan.fillers,
+        region=plan.region.vertices, cap_points=plan.caps.points, cap_normals=plan.caps.normals,
+        cap_radii=plan.caps.radii, cap_priority=plan.caps.priority,
+        spacing_points=plan.spacing.points, spacing_radii=plan.spacing.radii,
+    )  # fmt: skip
+    boxes = [plan.tiling.box(tile) for tile in range(len(plan.tiling))]
+    write_json(
+        folder / LIST_NAME,
+        {
+            "version": VERSION,
+            "region": plan.region.name,
+            "origin": origin,
+            "seed": plan.seed,
+            "radius": plan.spacing.nominal,
+            "limited": plan.spacing.limited,
+            "notes": list(plan.notes),
+            "edge_length": plan.edge_length,
+            "target": plan.target,
+            "share": plan.share,
+            "sightings": plan.sightings,
+            "ball": plan.ball,
+            "area": plan.area,
+            "gaussians": plan.surface.gaussians,
+            "pivots": plan.surface.pivots,
+            "splits": plan.tiling.to_json(),
+            "tiles": [[_finite(low), _finite(high)] for low, high in boxes],
+        },
+    )
+
+
+def _finite(corner: np.ndarray) -> list[float | None]:
+    return [float(x) if np.isfinite(x) else None for x in corner]
+
+
+def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
+    """Read a plan and its origin.
+
+    Raises
+    ------
+    ParseError
+        The list is not of this version, or broken.
+    """
+    path = folder / LIST_NAME
+    try:
+        values = read_json(path)
+        if values["version"] != VERSION:
+            raise ParseError(path, "version", "is not known.", "Mesh the region again.")
+        with np.load(folder / "plan.npz", allow_pickle=False) as arrays:
+            plan = TilePlan(
+                Region(str(values["region"]), arrays["region"]),
+                CandidateSurface(
+                    arrays["vertices"], arrays["faces"], int(values["gaussians"]),
+                    int(values["pivots"]),
+                ),
+                float(values["area"]),
+                Spacing(
+                    arrays["spacing_points"], arrays["spacing_radii"], float(values["radius"]),
+                    float(values["limited"]),
+                ),
+                Tiling.from_json(values["splits"]),
+                arrays["fillers"],
+                float(values["ball"]),
+                Caps(
+                    arrays["cap_points"], arrays["cap_normals"], arrays["cap_radii"],
+                    arrays["cap_priority"],
+                ),
+                int(values["seed"]),
+                tuple(str(note) for note in values["notes"]),
+                float(values["edge_length"]),
+                int(values["target"]),
+                float(values["share"]),
+                int(values["sightings"]),
+            )  # fmt: skip
+        return plan, dict(values["origin"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ParseError(path, "whole file", f"{error}.", "Mesh the region again.") from None
+
+
+def save_points(path: Path, cloud: SurfacePoints) -> None:
+    """Write the points of a tile."""
+    _save(path, **_of_cloud(cloud))
+
+
+def load_points(path: Path) -> SurfacePoints:
+    """Read the points of a tile."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return _cloud_of(arrays)
+
+
+def save_gathered(path: Path, everything: AllPoints) -> None:
+    """Write the points of all tiles."""
+    _save(path, shifted=everything.shifted, inner=everything.inner, **_of_cloud(everything.cloud))
+
+
+def load_gathered(path: Path) -> AllPoints:
+    """Read the points of all tiles."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return AllPoints(_cloud_of(arrays), arrays["shifted"], arrays["inner"])
+
+
+def save_faces(path: Path, part: TileFaces) -> None:
+    """Write the faces of a tile."""
+    _save(
+        path, faces=part.faces, border=part.border, solid=part.solid,
+        figures=np.array(json.dumps(part.figures)),
+    )  # fmt: skip
+
+
+def load_faces(path: Path) -> TileFaces:
+    """Read the faces of a tile."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return TileFaces(
+            arrays["faces"], arrays["border"], arrays["solid"], json.loads(str(arrays["figures"]))
+        )
+
+
+def _of_cloud(cloud: SurfacePoints) -> dict[str, np.ndarray]:
+    return {
+        "points": cloud.points,
+        "normals": cloud.normals,
+        "kind": cloud.kind,
+        "radius": np.array(cloud.radius),
+        "radii": cloud.radii,
+        "notes": np.array(json.dumps(cloud.notes)),
+        "figures": np.array(json.dumps(cloud.figures)),
+    }
+
+
+def _cloud_of(arrays: Any) -> SurfacePoints:
+    return SurfacePoints(
+        arrays["points"], arrays["normals"], arrays["kind"], arrays["radii"],
+        float(arrays["radius"]), tuple(json.loads(str(arrays["notes"]))),
+        json.loads(str(arrays["figures"])),
+    )  # fmt: skip
+
+
+def _save(path: Path, **arrays: np.ndarray) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Labels of the tetrahedra of one tile, and its part of the faces between inside and outside.
+
+Each tetrahedron inside the region belongs to the tile of its corner with the smallest number. All
+tiles know it as the same one (:mod:`.fillers`), and only its owner says whether it is solid. So
+the faces of all tiles together bound a set of whole tetrahedra of one triangulation: they are
+closed, whatever the labels are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...errors import MeshingError
+from ...progress import Progress
+from ..classification import classify, on_one_sheet
+from ..delaunay import delaunay, far_points
+from ..extraction import OUTWARD_FACES, tetrahedron_neighbours
+from .plan import Field, TilePlan
+from .tile_points import AllPoints
+
+CONTEXT_RADII = 4.0
+"""Tetrahedra of others this close are labelled as well, so that the own ones have neighbours."""
+
+
+@dataclass(frozen=True)
+class TileFaces:
+    """What a tile adds to the mesh; corners are numbers of the points of the whole region."""
+
+    faces: np.ndarray
+    """(f, 3) int64: between two tetrahedra of the tile, outward."""
+    border: np.ndarray
+    """(b, 3) int64: faces of the tile's tetrahedra towards others, outward of the tile's."""
+    solid: np.ndarray
+    """(b,) bool: whether the tile's tetrahedron at that face is inside."""
+    figures: dict[str, Any]
+
+
+def tile_faces(
+    field: Field, plan: TilePlan, everything: AllPoints, tile: int, progress: Progress
+) -> TileFaces:
+    """Connect the points in and around a tile, label its tetrahedra, return its faces."""
+    numbers = np.flatnonzero(plan.tiling.within(tile, everything.shifted, plan.halo))
+    own = plan.tiling.owner(everything.cloud.points[numbers]) == tile
+    if not (own & everything.inner[numbers]).any():
+        return _nothing()
+    seed = int(np.random.default_rng([plan.seed, tile, 2]).integers(2**31))
+    numbers, tetrahedra = local_tetrahedra(plan, everything, tile, seed, progress.span(0.0, 0.2))
+    # Beyond the tile's surroundings they may be others than those of the whole.
+    near = np.zeros(len(numbers) + 8, np.bool_)
+    near[: len(numbers)] = plan.tiling.within(
+        tile, everything.cloud.points[numbers], CONTEXT_RADII * plan.radius
+    )
+    tetrahedra = tetrahedra[near[tetrahedra].any(1)]
+    neighbours = tetrahedron_neighbours(tetrahedra)
+    inner = np.append(everything.inner[numbers], np.zeros(8, np.bool_))
+    outer = ~inner[tetrahedra].all(1)
+    # Numbers of the region's points rise with the local ones.
+    first = tetrahedra.min(1)
+    owned = ~outer & np.append(own, np.zeros(8, np.bool_))[first]
+    # Only outer tetrahedra have far corners, and nobody asks where those are.
+    points = np.concatenate([everything.cloud.points[numbers], np.zeros((8, 3))])
+    labels = classify(
+        points,
+        tetrahedra,
+        neighbours,
+        outer,
+        on_one_sheet(
+            points,
+            tetrahedra,
+            everything.cloud.normals[numbers],
+            outer,
+            everything.cloud.radii[numbers],
+        ),
+        lambda where: field.vacancy.vacancy(where).filled,
+        np.random.default_rng([plan.seed, tile, 3]),
+        progress.span(0.2, 1.0),
+    )
+    inside = labels.inside
+    known = np.where(neighbours >= 0, owned[neighbours], False)  # (m, 4)
+    theirs = np.where(neighbours >= 0, inside[neighbours], False)
+    tetrahedron, corner = np.nonzero((owned & inside)[:, None] & known & ~theirs)
+    faces = numbers[tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]]
+    tetrahedron, corner = np.nonzero(owned[:, None] & ~known)
+    border = numbers[tetrahedra[tetrahedron[:, None], OUTWARD_FACES[corner]]]
+    figures = {
+        "tetrahedra": int(owned.sum()),
+        "interior_samples": int(labels.samples[owned].sum()),
+        "relabelled_tetrahedra": labels.flipped,
+        "undecided_tetrahedra": labels.undecided,
+    }
+    return TileFaces(faces, border, inside[tetrahedron], figures)
+
+
+def local_tetrahedra(
+    plan: TilePlan, everything: AllPoints, tile: int, seed: int, progress: Progress
+) -> tuple[np.ndarray, np.ndarray]:
+    """Connect the points in and around a tile.
+
+    Tetrahedra with a corner in the tile and one in the region are those of the whole.
+
+    Returns
+    -------
+    numbers : (n,) int64
+        Of the points, increasing.
+    tetrahedra : (m, 4) int64
+        Indices into ``numbers``; n and more are points far away.
+    """
+    numbers = np.flatnonzero(plan.tiling.within(tile, everything.shifted, plan.halo))
+    shifted = everything.shifted[numbers]
+    shifted = np.concatenate([shifted, far_points(shifted, seed)])
+    tetrahedra = delaunay(shifted, seed=seed, progress=progress, jitter_share=0.0)
+    return numbers, tetrahedra
+
+
+def circumradii(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Return the radii of the circumscribed balls, (m,)."""
+    base = points[tetrahedra[:, 0]]
+    edges = points[tetrahedra[:, 1:]] - base[:, None]  # (m, 3, 3)
+    offsets = np.linalg.solve(2.0 * edges, (edges**2).sum(2)[:, :, None])[:, :, 0]
+    return np.asarray(np.linalg.norm(offsets, axis=1))
+
+
+def _nothing() -> TileFaces:
+    none = np.zeros((0, 3), np.int64)
+    return TileFaces(none, none, np.zeros(0, np.bool_), {})
+
+
+def joined_faces(parts: list[TileFaces]) -> np.ndarray:
+    """Return the faces of all tiles, (f, 3) int64.
+
+    A border face that two tiles name lies between their tetrahedra; one that a single tile names
+    has the region's outside behind it.
+
+    Raises
+    ------
+    MeshingError
+        Two tiles have connected the points near their border differently.
+    """
+    border = np.concatenate([part.border for part in parts])
+    solid = np.concatenate([part.solid for part in parts])
+    low = np.sort(border, 1)
+    order = np.lexsort((low[:, 2], low[:, 1], low[:, 0]))
+    same = (low[order[1:]] == low[order[:-1]]).all(1)
+    first, second = order[:-1][same], order[1:][same]
+    turned = _parity(border[first]) != _parity(border[second])
+    if (same[1:] & same[:-1]).any() or not turned.all():
+        raise MeshingError(
+            "Tiles do not agree on their border.", "Use another seed or number of tiles."
+        )
+    covered = np.zeros(len(border), np.bool_)
+    covered[first], covered[second] = solid[second], solid[first]
+    return np.concatenate([*(part.faces for part in parts), border[solid & ~covered]])
+
+
+def _parity(faces: np.ndarray) -> np.ndarray:
+    """(f,) bool: whether the corners run like their sorted numbers, up to a rotation."""
+    a, b, c = faces.T
+    return (a < b) ^ (b < c) ^ (c < a)

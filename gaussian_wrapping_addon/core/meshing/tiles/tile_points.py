@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Surface points of one tile, and the points of all tiles brought together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...progress import Progress
+from ..resolution import Request
+from ..sampling import EDGE_PER_RADIUS, thin
+from ..surface_points import (
+    KIND_CAP,
+    KIND_JUMP,
+    PRIORITY_SURFACE,
+    SurfacePoints,
+    SurfaceSampler,
+)
+from .fillers import CLEAR_CAP_RADII, CLEAR_RADII, clear_of
+from .plan import JITTER_SHARE, Field, TilePlan
+
+KIND_FILLER = 4
+"""A filler that ended between inside and outside, where the field is undecided in depth."""
+
+MARGIN_RADII = 4.0
+"""Candidates this many of the largest radii beyond a tile may move into it."""
+
+PIECE_RADII = 8.0
+"""Triangles of the candidate surface that reach beyond are cut until edges are this short."""
+MAX_CUTS = 24
+
+
+def tile_points(field: Field, plan: TilePlan, tile: int, progress: Progress) -> SurfacePoints:
+    """Return the points that end up in a tile, thinned among themselves.
+
+    The same for any number of threads and on any machine of the same kind.
+    """
+    low, high = plan.tiling.box(tile)
+    margin = MARGIN_RADII * plan.radius
+    vertices, faces = pieces_in_box(
+        plan.surface.vertices, plan.surface.faces, low - margin, high + margin,
+        PIECE_RADII * plan.radius,
+    )  # fmt: skip
+    inside = plan.region.contains(vertices[faces].mean(1), margin)
+    faces = faces[inside]
+    if len(faces) == 0:
+        return no_points(plan)
+    surface = replace(plan.surface, vertices=vertices, faces=faces)
+    sampler = SurfaceSampler(field.vacancy, field.vectors, plan.region, surface, field.threads)
+    if sampler.area <= 0.0:
+        return no_points(plan)
+    rng = np.random.default_rng([plan.seed, tile, 0])
+    return sampler.sample(
+        Request(0.0, 0), rng, progress, spacing=plan.spacing,
+        owned=lambda where: plan.tiling.owner(where) == tile,
+    )  # fmt: skip
+
+
+def no_points(plan: TilePlan) -> SurfacePoints:
+    """Return the points of a tile without surface."""
+    none = np.zeros((0, 3))
+    return SurfacePoints(
+        none, none, np.zeros(0, np.uint8), np.zeros(0), plan.spacing.nominal, (), {}
+    )
+
+
+def pieces_in_box(
+    vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray, length: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a soup of triangles that covers the part of a surface in a box, and little more.
+
+    Triangles across the border are halved along their longest edge until it is shorter than
+    ``length``; pieces outside are left out.
+    """
+    corners = vertices[faces]  # (f, 3, 3)
+    for _ in range(MAX_CUTS):
+        lowest, highest = corners.min(1), corners.max(1)
+        corners = corners[((highest >= low) & (lowest <= high)).all(1)]
+        edges = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=2)  # (f, 3)
+        whole = ((corners >= low[None, None]) & (corners <= high[None, None])).all((1, 2))
+        cut = np.flatnonzero(~whole & (edges.max(1) > length))
+        if len(cut) == 0:
+            break
+        longest = edges[cut].argmax(1)
+        rows = np.arange(len(cut))
+        a, b, c = (corners[cut][rows, (longest + k) % 3] for k in range(3))
+        middle = (a + b) / 2
+        first, second = np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)
+        corners = np.concatenate([np.delete(corners, cut, 0), first, second])
+    return corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class AllPoints:
+    """The points of the whole region: few bytes each, held by every worker."""
+
+    cloud: SurfacePoints
+    """Surface points, caps, and fillers (normal 0, ``KIND_FILLER``)."""
+    shifted: np.ndarray
+    """(n, 3) float64: where they are while connectivity is decided."""
+    inner: np.ndarray
+    """(n,) bool: not a filler beyond the region."""
+
+
+def gather(plan: TilePlan, parts: list[SurfacePoints]) -> AllPoints:
+    """Thin the points of all tiles together with the caps, and let fillers give way.
+
+    Parameters
+    ----------
+    parts : list of SurfacePoints
+        In the order of the tiles.
+    """
+    rng = np.random.default_rng([plan.seed, len(plan.tiling), 1])
+    caps = plan.caps
+    points = np.concatenate([caps.points, *(part.points for part in parts)])
+    normals = np.concatenate([caps.normals, *(part.normals for part in parts)])
+    radii = np.concatenate([caps.radii, *(part.radii for part in parts)])
+    kind = np.full(len(points), KIND_CAP, np.uint8)
+    kind[len(caps.points) :] = np.concatenate([part.kind for part in parts])
+    # As within a tile: jumps last among surface points.
+    priority = PRIORITY_SURFACE + 0.5 * (rng.random(len(points)) + (kind == KIND_JUMP))
+    priority[: len(caps.points)] = caps.priority
+    kept = thin(points, normals, radii, priority)
+    points, normals, radii, kind = points[kept], normals[kept], radii[kept], kind[kept]
+    is_cap = kind == KIND_CAP
+    free = clear_of(plan.fillers, points[~is_cap], CLEAR_RADII * radii[~is_cap])
+    free &= clear_of(plan.fillers, points[is_cap], CLEAR_CAP_RADII * radii[is_cap])
+    fillers = plan.fillers[free]
+    figures = {
+        "surface_points": int((~is_cap).sum()),
+        "cap_points": int(is_cap.sum()),
+        "fillers": len(fillers),
+        "limited_by_photos_share": plan.spacing.limited,
+        "shortest_spacing_scene": EDGE_PER_RADIUS * float(radii.min(initial=np.inf)),
+        "longest_spacing_scene": EDGE_PER_RADIUS * float(radii.max(initial=0.0)),
+    }
+    for name in ("candidates", "dropped_candidates", "jump_points", "projection_evaluations"):
+        figures[name] = sum(part.figures.get(name, 0) for part in parts)
+    inner = np.concatenate([np.ones(len(points), np.bool_), plan.region.distance(fillers) < 0])
+    cloud = SurfacePoints(
+        np.concatenate([points, fillers]),
+        np.concatenate([normals, np.zeros_like(fillers)]),
+        np.concatenate([kind, np.full(len(fillers), KIND_FILLER, np.uint8)]),
+        np.concatenate([radii, np.full(len(fillers), np.inf)]),
+        plan.spacing.nominal,
+        plan.notes,
+        figures,
+    )
+    shift = JITTER_SHARE * plan.region.diagonal * rng.uniform(-1.0, 1.0, cloud.points.shape)
+    return AllPoints(cloud, cloud.points + shift, inner)

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The steps of a tiled mesh: plan, points of each tile, all points, faces of each tile, join."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...dataset.camera import Camera
+from ...errors import MeshingError
+from ...field.sightings import Sightings
+from ...gaussians.model import GaussianArrays
+from ...progress import Progress
+from ...settings import MeshingSettings
+from ..candidate_surface import candidate_surface
+from ..convex_region import Region
+from ..primal_adaptive import counts, distance_to_level, finished, selected
+from ..resolution import checked_request
+from ..surface_mesh import SurfaceMesh
+from .plan import Field, TilePlan, make_plan
+from .tile_faces import TileFaces, joined_faces, tile_faces
+from .tile_points import KIND_FILLER, AllPoints, gather, tile_points
+
+_logger = logging.getLogger(__name__)
+
+
+def plan_tiles(
+    field: Field,
+    arrays: GaussianArrays,
+    cameras: Sequence[Camera],
+    region: Region,
+    settings: MeshingSettings,
+    progress: Progress,
+    *,
+    tiles: int,
+    seed: int,
+    edge_length_scene: float = 0.0,
+    sightings: Sightings | None = None,
+) -> TilePlan:
+    """Find the region's candidate surface and cut it into tiles.
+
+    Parameters
+    ----------
+    tiles : int
+        0 makes as many as the request needs.
+
+    Raises
+    ------
+    MeshingError
+        The region holds no surface.
+    UsageError, ResourceError
+        The request makes no sense, or needs more points than the cap.
+    """
+    request = checked_request(edge_length_scene, settings.points, region)
+    surface = candidate_surface(
+        arrays, region, field.vacancy.is_empty, 0.5 * request.edge_length, seed,
+        progress.span(0.0, 0.6), sightings,
+    )  # fmt: skip
+    plan = make_plan(
+        field, region, surface, request, progress.span(0.6, 1.0), tiles=tiles, seed=seed,
+        cameras=cameras, adaptive=settings.spacing == "adaptive",
+        sightings=0 if sightings is None else len(sightings),
+    )  # fmt: skip
+    _logger.info("Region %s is meshed in %d tiles", region.name, len(plan.tiling))
+    return plan
+
+
+def join_tiles(
+    field: Field,
+    plan: TilePlan,
+    everything: AllPoints,
+    parts: list[TileFaces],
+    settings: MeshingSettings,
+    progress: Progress,
+) -> SurfaceMesh:
+    """Join the faces of all tiles into one closed 2-manifold, and keep the vertices that it needs.
+
+    The joined surface is held whole: memory is in proportion to it, not to a tile, but the
+    tetrahedra, many times larger, are never there at once.
+
+    Parameters
+    ----------
+    parts : list of TileFaces
+        In the order of the tiles.
+
+    Raises
+    ------
+    MeshingError
+        The region holds no solid, or tiles do not fit together.
+    """
+    faces = joined_faces(parts)
+    progress.update(0.1, f"joining {len(plan.tiling)} tiles")
+    cloud = everything.cloud
+    vertices, faces, kind, figures = finished(
+        cloud.points, faces, cloud, plan.region, settings, progress
+    )
+    figures["dense_vertices"] = len(vertices)
+    progress.update(0.95, f"choosing from {len(vertices)} vertices")
+    vertices, faces, kind = selected(vertices, faces, kind, plan.target, plan.share, plan.region)
+    figures |= counts(kind)
+    sums = ("tetrahedra", "interior_samples", "relabelled_tetrahedra", "undecided_tetrahedra")
+    provenance: dict[str, Any] = {
+        "method": "primal adaptive meshing",
+        "region": plan.region.name,
+        "tiles": len(plan.tiling),
+        "edge_length_scene": plan.edge_length,
+        "gaussians_in_region": plan.surface.gaussians,
+        "pivots": plan.surface.pivots,
+        "sightings": plan.sightings,
+        "candidate_area": plan.area,
+        "spacing": settings.spacing,
+        "notes": list(plan.notes),
+        "seed": plan.seed,
+        **cloud.figures,
+        **{name: sum(part.figures.get(name, 0) for part in parts) for name in sums},
+        **figures,
+        "vertices_of_fillers": int((kind == KIND_FILLER).sum()),
+        **distance_to_level(field.vacancy, vertices, kind),
+    }
+    progress.update(1.0, f"{len(faces)} faces")
+    _logger.info("Meshed region %s: %d faces", plan.region.name, len(faces))
+    return SurfaceMesh(vertices, faces.astype(np.int32), None, provenance)
+
+
+def mesh_in_tiles(
+    vacancy: Any,
+    vectors: Any,
+    arrays: GaussianArrays,
+    cameras: Sequence[Camera],
+    region: Region,
+    settings: MeshingSettings,
+    progress: Progress,
+    *,
+    tiles: int,
+    seed: int,
+    threads: int,
+    edge_length_scene: float = 0.0,
+    sightings: Sightings | None = None,
+) -> SurfaceMesh:
+    """Mesh a region tile by tile in this process alone; see :func:`~..primal_adaptive.mesh_region`.
+
+    The mesh is one closed 2-manifold. Of another number of tiles it differs as of another seed.
+    """
+    if len(cameras) == 0:
+        raise MeshingError("There are no cameras to look from.", "Check the scene.")
+    field = Field(vacancy, vectors, threads)
+    plan = plan_tiles(
+        field, arrays, cameras, region, settings, progress.span(0.0, 0.3), tiles=tiles, seed=seed,
+        edge_length_scene=edge_length_scene, sightings=sightings,
+    )  # fmt: skip
+    count = len(plan.tiling)
+    sampling, labelling = progress.span(0.3, 0.6), progress.span(0.6, 0.9)
+    points = [
+        tile_points(field, plan, tile, sampling.span(tile / count, (tile + 1) / count))
+        for tile in range(count)
+    ]
+    everything = gather(plan, points)
+    parts = [
+        tile_faces(field, plan, everything, tile, labelling.span(tile / count, (tile + 1) / count))
+        for tile in range(count)
+    ]
+    return join_tiles(field, plan, everything, parts, settings, progress.span(0.9, 1.0))
