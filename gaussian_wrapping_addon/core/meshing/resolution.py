@@ -125,6 +125,16 @@ class Dense:
     """The same, of the dense mesh: where the region cuts the solid, its boundary has some too."""
 
 
+def dense_points(stay: float) -> float:
+    """Return how many points a mesh has from which so many are selected."""
+    return max(min(DENSE_FACTOR * stay, DENSE_POINTS), LEAST_DENSE_FACTOR * stay)
+
+
+def stay_of_dense(points: float) -> float:
+    """Return how many stay, at most, of a mesh of so many points: the inverse of the above."""
+    return points / (LEAST_DENSE_FACTOR if points >= DENSE_POINTS else DENSE_FACTOR)
+
+
 def dense_request(request: Request, area: float, region: Region) -> Dense:
     """Tell how dense a mesh to make, and how many of its vertices to keep, for a request.
 
@@ -136,7 +146,7 @@ def dense_request(request: Request, area: float, region: Region) -> Dense:
     expected = POINTS_PER_SQUARE * area / thinning_radius(request, area, region) ** 2
     share = VERTICES_PER_UNIFORM if request.edge_length > 0 else 1.0
     target = max(MIN_VERTICES, round(share * expected))
-    dense = max(min(DENSE_FACTOR * target, DENSE_POINTS), LEAST_DENSE_FACTOR * target)
+    dense = dense_points(target)
     if request.edge_length > 0:
         check_expected(dense, request)
         edge = request.edge_length * math.sqrt(expected / dense)

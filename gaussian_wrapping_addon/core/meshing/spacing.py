@@ -38,6 +38,11 @@ def footprints(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     return np.where(np.isfinite(finest), finest, 0.0)
 
 
+def resolved_edges(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the shortest edge that the photos resolve at each point, (n,); 0 where none looks."""
+    return EDGE_PER_PIXEL * footprints(points, cameras)
+
+
 @dataclass(frozen=True)
 class Spacing:
     """Local thinning radii, known at some points of the surface."""
@@ -82,7 +87,7 @@ def footprint_spacing(points: np.ndarray, cameras: Sequence[Camera], radius: flo
         Thinning radius of the nominal edge length.
     """
     edge = EDGE_PER_RADIUS * radius
-    resolved = np.minimum(EDGE_PER_PIXEL * footprints(points, cameras), LONGEST_SHARE * edge)
+    resolved = np.minimum(resolved_edges(points, cameras), LONGEST_SHARE * edge)
     limited = float(np.mean(resolved > edge)) if len(points) else 0.0
     if limited == 0.0:
         return Spacing.uniform(radius)
