@@ -27,6 +27,7 @@ _logger = logging.getLogger("gaussian_wrapping")
 POLL_S = 0.2
 LINE_EVERY_S = 5.0
 CANCEL_WAIT_S = 12.0
+MAX_WAIT_S = 7 * 86400.0
 
 
 def main(arguments: list[str]) -> int:
@@ -85,9 +86,16 @@ def _parser() -> ArgumentParser:
     )
     resume.set_defaults(run=_resume)
 
+    mesh_estimate = commands.add_parser(
+        "estimate-mesh", help="triangles, time and memory of a region's mesh, before it is made"
+    )
+    mesh_estimate.add_argument("--region", default="auto", metavar="auto|all|REGION.json")
+    mesh_estimate.set_defaults(run=_estimate_mesh)
+
     for command in (wrap, mesh):
-        command.add_argument("--out", type=Path, required=True, metavar="DIR")
         command.add_argument("--region", nargs="+", action="extend", metavar="auto|all|REGION.json")
+    for command in (wrap, mesh, mesh_estimate):
+        command.add_argument("--out", type=Path, required=True, metavar="DIR")
         size = command.add_mutually_exclusive_group()
         size.add_argument("--edge-length", type=float, default=0.0, help="world units of the input")
         size.add_argument("--points", type=int, default=0, help="number of surface points")
@@ -96,13 +104,29 @@ def _parser() -> ArgumentParser:
         command.add_argument(
             "--spacing", choices=SPACINGS, default="adaptive", help="of the mesh's vertices"
         )
+        command.add_argument(
+            "--tiles", default="auto", metavar="auto|off|N",
+            help="parts that a large region is meshed in, so that memory stays bounded",
+        )  # fmt: skip
+    for command in (wrap, mesh):
         command.add_argument("--texture-size", default="auto", metavar="auto|N")
         command.add_argument(
             "--export", default="glb", help=f"comma separated, of {','.join(EXPORT_FORMATS)}"
         )
-    mesh.add_argument("--threads", type=int, default=0, help="0 uses every core")
+    for command in (mesh, mesh_estimate):
+        command.add_argument("--threads", type=int, default=0, help="0 uses every core")
     for command in (wrap, mesh, more, resume):
         command.add_argument("--no-blend", action="store_true", help="needs no bpy")
+
+    tiles = commands.add_parser(
+        "work-tiles", help="help a job that meshes in tiles, from another process or machine"
+    )
+    tiles.add_argument("out", type=Path, metavar="DIR", help="job folder of that job")
+    tiles.add_argument("--threads", type=int, default=0, help="0 uses every core")
+    tiles.add_argument(
+        "--wait", type=float, default=0.0, metavar="S", help="seconds to wait for tiles, at most"
+    )
+    tiles.set_defaults(run=_work_tiles)
 
     _add_evaluate(commands.add_parser("evaluate", help="a mesh or a job against a ground truth"))
 
@@ -223,6 +247,45 @@ def _mesh(options: Namespace) -> int:
     return _follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 
 
+def _estimate_mesh(options: Namespace) -> int:
+    from .core.jobs.client import worker_python
+    from .core.jobs.evaluate import run_in_worker
+    from .core.settings import JobSettings, MeshingSettings, to_json
+
+    meshing = MeshingSettings(
+        edge_length=options.edge_length, points=options.points, spacing=options.spacing,
+        tiles=options.tiles,
+    )  # fmt: skip
+    JobSettings(meshing=meshing, threads=options.threads).validated()
+    region = options.region
+    request = {
+        "out": str(options.out.resolve()),
+        "region": region if region in ("auto", "all") else str(Path(region).resolve()),
+        "meshing": to_json(meshing),
+        "threads": options.threads,
+    }
+    return run_in_worker(
+        request, python=worker_python(), module="jobs.mesh_estimate", what="estimate"
+    )
+
+
+def _work_tiles(options: Namespace) -> int:
+    from .core.errors import UsageError
+    from .core.jobs.client import worker_python
+    from .core.jobs.evaluate import run_in_worker
+
+    if not 0 <= options.threads <= 1024 or not 0 <= options.wait <= MAX_WAIT_S:
+        raise UsageError(
+            "--threads or --wait is out of range.", f"Wait from 0 to {MAX_WAIT_S:.0f} seconds."
+        )
+    request = {
+        "out": str(options.out.resolve()), "threads": options.threads, "wait_s": options.wait,
+    }  # fmt: skip
+    return run_in_worker(
+        request, python=worker_python(), module="jobs.tile_worker", what="work on tiles"
+    )
+
+
 def _resume(options: Namespace) -> int:
     from .core.jobs.client import JobClient, worker_python
     from .core.jobs.job_file import read_job
@@ -261,6 +324,7 @@ def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
             edge_length=options.edge_length,
             points=options.points,
             spacing=options.spacing,
+            tiles=options.tiles,
             **method_settings(options),
             **clean_up_settings(options),
         ),

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .errors import UsageError
+from .limits import MAX_TILES
 
 PRESETS = ("draft", "standard", "fine")
 DECISIONS = ("auto", "on", "off")
@@ -125,6 +126,9 @@ class MeshingSettings:
     spacing: str = "adaptive"
     """``"adaptive"``: vertices where the shape needs them, no denser than the photos resolve;
     ``"uniform"``: the same edge length everywhere."""
+    tiles: str = "auto"
+    """Parts that the region is meshed in, so that memory stays bounded: a number; ``"auto"``: as
+    many as the request needs; ``"off"``: the whole at once."""
     method: str = "pam"
     """``"pam"``: primal adaptive meshing; ``"pivots"``: marching tetrahedra on pivots, as fine as
     the Gaussians lie: edge length, number of points do not apply."""
@@ -250,6 +254,11 @@ class JobSettings:
                 self.meshing.spacing in SPACINGS,
                 _one_of(SPACINGS),
             ),
+            (
+                "meshing.tiles",
+                self.meshing.tiles in ("auto", "off") or _is_count(self.meshing.tiles, MAX_TILES),
+                f"auto, off, or from 1 to {MAX_TILES}",
+            ),
             ("meshing.points", 0 <= self.meshing.points <= 5_000_000, "from 0 to 5000000"),
             ("meshing.method", self.meshing.method in MESH_METHODS, _one_of(MESH_METHODS)),
             (
@@ -281,6 +290,10 @@ class JobSettings:
             if not good:
                 raise UsageError(f"Setting {name} is out of range.", f"Give {wanted}.")
         return self
+
+
+def _is_count(text: str, most: int) -> bool:
+    return text.isascii() and text.isdigit() and len(text) < 10 and 1 <= int(text) <= most
 
 
 def _one_of(choices: tuple[str, ...]) -> str:

@@ -196,6 +196,36 @@ def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str
     assert np.median(distance) < 0.03
 
 
+def test_a_region_is_estimated_and_meshed_in_tiles_with_help(
+    wrapped: tuple[BallScene, Path, str],
+) -> None:
+    scene, root, _ = wrapped
+    box = write_box(root / "tiled.json", scene, 1.3, (0, 0, 0.35))
+    asked = ("--out", str(root / "out"), "--region", str(box), "--points", "3000", "--tiles", "3")
+    estimate = batch("estimate-mesh", *asked)
+    assert estimate.returncode == 0, estimate.stdout + estimate.stderr
+    low, high = re.search(r"triangles: ([\d ]+) to ([\d ]+)\n", estimate.stdout).groups()
+    assert "it would be meshed in tiles" in estimate.stdout
+    with subprocess.Popen(
+        [sys.executable, str(BATCH), "work-tiles", str(root / "out"), "--wait", "200"],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    ) as helper:  # fmt: skip
+        done = batch("mesh", *asked, "--texture-size", "256", "--no-blend")
+        assert done.returncode == 0, done.stdout + done.stderr
+        said, _ = helper.communicate(timeout=240)
+    assert helper.returncode == 0, said
+    assert re.search(r"\d+ parts done here", said)
+    region = json.loads((root / "out" / "result" / "report.json").read_text())["regions"]["tiled"]
+    assert region["provenance"]["tiles"] == 3
+    assert region["check"]["defects"] == []
+    assert region["estimate"]["tiled"] is True
+    mesh = world_mesh(root, "tiled")
+    assert mesh.is_watertight
+    assert int(low.replace(" ", "")) < len(mesh.faces) < int(high.replace(" ", ""))
+    assert region["provenance"]["dense_vertices"] > 4 * len(mesh.vertices)
+    assert not list((root / "out" / "stages").glob("mesh-tiled-*/tiles*"))
+
+
 def test_a_killed_training_resumes_to_the_same_gaussians(
     wrapped: tuple[BallScene, Path, str], tmp_path: Path
 ) -> None:

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``estimate-mesh`` of the command line: what a region's mesh will take, from a finished training.
+
+Runs in the worker's Python. Speaks as :mod:`~.evaluate` does: one JSON object a line on stdout.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+from ..errors import EXIT_DONE, UsageError, WrapError
+from ..files import read_json
+from ..helper_process import emit
+from ..parallel import default_threads
+from ..progress import Progress
+from ..settings import MeshingSettings, from_json
+from .evaluate import end_with
+from .job_file import AUTOMATIC_REGIONS
+from .job_folder import JobFolder
+from .region_meshing import expected_mesh, free_bytes
+from .stages import read_done
+
+MOST_VIEWS = 24
+"""Photos whose cameras look for the surface: more cover little more of it."""
+MOST_SIGHTINGS = 60_000
+
+
+def main(arguments: list[str]) -> int:
+    """Estimate ``arguments = [{"out", "region", "meshing", "threads"} as JSON]``."""
+    # Not the caller's own id: where Python is started through a launcher, that is the parent.
+    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
+    request = json.loads(arguments[0])
+    try:
+        lines = _lines(request)
+    except WrapError as error:
+        emit(error=error.message, hint=error.hint)
+        return error.exit_code
+    for line in lines:
+        emit(line=line)
+    return EXIT_DONE
+
+
+def _newest(stages: Path, name: str) -> Path:
+    """Return the stage that was finished last."""
+    done = [(values["finished_unix_s"], path) for path in sorted(stages.glob(f"{name}-*"))
+            if (values := read_done(path)) is not None]  # fmt: skip
+    if not done:
+        raise UsageError(
+            f"{stages.parent} holds no finished training.", "Run wrap, or resume it, first."
+        )
+    return max(done)[1]
+
+
+def _lines(request: dict[str, Any]) -> list[str]:
+    from ..dataset.scene_file import load_saved_scene
+    from ..field.sightings import find_sightings
+    from ..field.vacancy import VacancyField
+    from ..gaussians.gaussian_file import load_gaussians
+    from ..meshing.region import automatic_region, parse_region, whole_region
+
+    folder = JobFolder(Path(request["out"]))
+    meshing = from_json(MeshingSettings, request["meshing"], "meshing")
+    threads = int(request["threads"]) or default_threads()
+    scene = load_saved_scene(_newest(folder.stages, "cameras"))
+    gaussians = load_gaussians(_newest(folder.stages, "train") / "gaussians.npz")
+    arrays = gaussians.arrays()
+    if request["region"] not in AUTOMATIC_REGIONS:
+        path = Path(request["region"])
+        world_region = parse_region(read_json(path), path)
+        region = world_region.transformed(scene.world_from_scene.inverse())
+    else:
+        automatic = request["region"] == "auto"
+        region = automatic_region(scene) if automatic else whole_region(scene, arrays)
+    cameras = scene.cameras[:: max(1, -(-len(scene.cameras) // MOST_VIEWS))]
+    sightings = find_sightings(
+        gaussians, cameras, lambda points: region.contains(points, 0.0), Progress(),
+        most=MOST_SIGHTINGS, threads=threads,
+    )  # fmt: skip
+    if len(sightings) == 0:
+        return ["the cameras see no surface in this region"]
+    expected = expected_mesh(
+        VacancyField(arrays, scene.cameras, threads=threads), scene.cameras, region, meshing,
+        meshing.edge_length / scene.world_from_scene.scale, sightings,
+    )  # fmt: skip
+    memory_bytes = free_bytes(folder.root, threads)
+    tiled = meshing.tiles != "off" and (meshing.tiles != "auto" or expected.tiles_for(memory_bytes))
+    expected.refuse(memory_bytes, tiled=tiled)
+    how = "it would be meshed in tiles" if tiled else "it would be meshed whole"
+    return [*expected.lines(), how]

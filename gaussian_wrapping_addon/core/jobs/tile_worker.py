@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``work-tiles`` of the command line: helps a job that meshes a region in tiles.
+
+Runs in the worker's Python, on this machine or on another one that sees the same job folder. Speaks
+as :mod:`~.evaluate` does: one JSON object a line on stdout.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from pathlib import Path
+
+from ..errors import EXIT_DONE, UsageError, WrapError
+from ..helper_process import emit
+from ..parallel import default_threads
+from ..progress import Progress
+from .evaluate import end_with
+from .job_folder import JobFolder
+from .region_meshing import open_lists, work_on_list
+
+POLL_S = 0.5
+
+
+def main(arguments: list[str]) -> int:
+    """Work for ``arguments = [{"out": folder, "threads": n, "wait_s": s} as JSON]``."""
+    # Not the caller's own id: where Python is started through a launcher, that is the parent.
+    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
+    request = json.loads(arguments[0])
+    try:
+        done = help_with_tiles(
+            JobFolder(Path(request["out"])), int(request["threads"]), float(request["wait_s"])
+        )
+    except WrapError as error:
+        emit(error=error.message, hint=error.hint)
+        return error.exit_code
+    emit(line=f"{done} parts done here")
+    return EXIT_DONE
+
+
+def help_with_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
+    """Work on every open tile list of a job; return how many parts were done here.
+
+    Parameters
+    ----------
+    wait_s : float
+        How long to wait for a list, at most.
+
+    Raises
+    ------
+    UsageError
+        There is no job, or no list to work on.
+    """
+    if not folder.is_job():
+        raise UsageError(f"{folder.root} is no job folder.", "Give the --out of a job.")
+    until_s = time.monotonic() + wait_s
+    progress = Progress("mesh", None, folder.cancel_path.exists)
+    while not (lists := open_lists(folder.stages)):
+        progress.check()
+        if time.monotonic() >= until_s:
+            raise UsageError(
+                f"{folder.root} has no tiles to work on.",
+                "Start mesh --tiles N there first, or give --wait.",
+            )
+        time.sleep(POLL_S)
+    done: list[str] = []
+    for path in lists:
+        try:
+            work_on_list(folder.stages, path, progress, done, threads=threads or default_threads())
+        except (WrapError, OSError):
+            # The job has joined the tiles and removed their files while we looked.
+            if path in open_lists(folder.stages):
+                raise
+    return len(done)
