@@ -151,7 +151,7 @@ def mesh_in_tiles_here(
     tiles : int
         0 makes as many as the request needs.
     origin : dict
-        With which other processes find Gaussians and cameras.
+        With which other processes make the same field (:func:`tiles_origin`).
     """
     from ..meshing.tiles.store import (
         LIST_NAME,

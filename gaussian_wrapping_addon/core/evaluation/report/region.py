@@ -109,6 +109,7 @@ def _mesh(region: dict[str, Any]) -> list[str]:
         ("Residual, largest", _residual(provenance, "max")),
         *_cleaned(provenance),
         ("Time", duration(seconds.get("mesh"))),
+        *_expected(part(region, "estimate")),
     ]
     lines = table(("mesh", "figure"), rows, "lr")
     vertices = measured(statistics.get("vertices"))
@@ -163,6 +164,18 @@ def _cleaned(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     if target := measured(provenance.get("target_faces")):
         rows.append(("Decimated", f"from {number(before)} faces, {number(target)} asked for"))
     return rows
+
+
+def _expected(estimate: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return what was said before the mesh was made; nothing of reports that had no estimate."""
+    few, many = (measured(estimate.get(f"points_{end}")) for end in ("low", "high"))
+    soon, late = (measured(estimate.get(f"seconds_{end}")) for end in ("low", "high"))
+    if few is None or many is None or soon is None or late is None:
+        return []
+    return [
+        ("Faces, as estimated", f"{number(2 * few)} to {number(2 * many, 'faces')}"),
+        ("Time, as estimated", f"{duration(soon)} to {duration(late)}"),
+    ]
 
 
 def _residual(provenance: dict[str, Any], which: str) -> str:
