@@ -134,6 +134,7 @@ def start_mesh(
             edge_length=edge_length,
             points=properties.points if properties.resolution == "POINTS" else 0,
             method=properties.method.lower(),
+            spacing=properties.spacing.lower(),
             pivots=int(properties.pivots),
             boundary=properties.boundary.lower(),
             unseen=properties.unseen.lower(),

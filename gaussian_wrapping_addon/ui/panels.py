@@ -192,6 +192,8 @@ class GWRAP_PT_mesh_advanced(_Panel, bpy.types.Panel):
         column.prop(properties, "method")
         if properties.method == "PIVOTS":
             column.prop(properties, "pivots")
+        else:
+            column.prop(properties, "spacing")
         column.prop(properties, "boundary")
         column.prop(properties, "unseen")
 

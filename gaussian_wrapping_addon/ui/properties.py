@@ -34,6 +34,10 @@ _METHODS: Final = (
     ("PAM", "Adaptive", "Primal adaptive meshing: at the chosen resolution"),
     ("PIVOTS", "Pivots", "Marching tetrahedra on the Gaussians' pivots: as fine as they lie"),
 )
+_SPACINGS: Final = (
+    ("ADAPTIVE", "Adaptive", "Vertices where the shape needs them: as true with half as many"),
+    ("UNIFORM", "Uniform", "Vertices evenly spread: even triangles"),
+)
 _PIVOTS: Final = (
     ("2", "2", "Centre and outer pivot"),
     ("3", "3", "Outer pivots on both sides"),
@@ -109,6 +113,9 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     )
     method: EnumProperty(  # type: ignore[valid-type]
         name="Method", description="How the mesh is made", items=_METHODS, default="PAM"
+    )
+    spacing: EnumProperty(  # type: ignore[valid-type]
+        name="Spacing", description="Where vertices stand", items=_SPACINGS, default="ADAPTIVE"
     )
     pivots: EnumProperty(  # type: ignore[valid-type]
         name="Pivots", description="Points of each Gaussian", items=_PIVOTS, default="2"

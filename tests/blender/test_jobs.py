@@ -221,6 +221,7 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     properties.decimate, properties.target_faces, properties.smooth_steps = True, 1234, 2
     properties.method, properties.pivots = "PIVOTS", "9"
     properties.boundary, properties.unseen = "OPEN", "OCCUPIED"
+    properties.spacing = "UNIFORM"
     select(region)
     region.name = "Front Door"
     assert "Mesh Region" in draw(panels.GWRAP_PT_mesh).texts
@@ -232,6 +233,7 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     assert (job.settings.meshing.target_faces, job.settings.meshing.smooth_steps) == (1234, 2)
     meshing = job.settings.meshing
     assert (meshing.method, meshing.pivots) == ("pivots", 9)
+    assert meshing.spacing == "uniform"
     assert (meshing.boundary, meshing.unseen) == ("open", "occupied")
     ((_, body),) = job.region_bodies.items()
     expected = WORLD_FROM_SCENE.points(BOX_SCENE)

@@ -91,11 +91,12 @@ def test_mesh_panel_shows_what_decides(resolution: str, shown: set[str]) -> None
 
 
 @pytest.mark.parametrize("method", ["PAM", "PIVOTS"])
-def test_advanced_panel_asks_for_pivots_only_where_they_count(method: str) -> None:
+def test_advanced_panel_asks_for_what_counts_by_the_method(method: str) -> None:
     bpy.context.scene.gwrap.method = method
     log = draw(panels.GWRAP_PT_mesh_advanced).log
     properties = {a[1] for name, a, _ in log if name == "prop"}
-    assert properties == {"method", "boundary", "unseen"} | ({"pivots"} & {method.lower()})
+    own = {"PAM": "spacing", "PIVOTS": "pivots"}[method]
+    assert properties == {"method", "boundary", "unseen", own}
 
 
 @pytest.mark.parametrize("decimate", [False, True])
