@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.training.multi_view_kernels import KEPT, SKIPPED
+from gaussian_wrapping_addon.core.training.multi_view_kernels import KEPT, MAX_RISE, SKIPPED
 from gaussian_wrapping_addon.core.training.pixel_choice import NO_MASK
 
 from .plane_scene import (
@@ -41,7 +41,7 @@ def compare(  # type: ignore[no-untyped-def]  # four arrays
 ):
     noise = np.zeros(len(pixels))
     pair = pair_of(view, pixels, threads)
-    return pair.compare(noise, grey, other_grey, mask, other_mask, squared)
+    return pair.compare(noise, grey, other_grey, mask, other_mask, squared, 1, MAX_RISE)
 
 
 def test_true_plane_shows_both_photos_the_same() -> None:
