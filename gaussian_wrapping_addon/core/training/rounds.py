@@ -175,9 +175,15 @@ class Rounds:
         return True
 
     def _try_harmonics(self, state: TrainingState) -> None:
-        """Raise the degree where enough of the surface gains by it."""
+        """Raise the degree where enough of the surface gains by it.
+
+        One that was refused is not tried again: three trials cost a short training a seventh of its
+        time, and the later they are, the more of what changes with the view has gone into shapes.
+        """
         degree = state.degree + 1
-        if degree > self.settings.sh_degree:
+        known = state.needs.get("harmonics")
+        refused = known is not None and known.figures.get("degree_tried") == degree
+        if degree > self.settings.sh_degree or refused:
             return
         found = harmonics_need(
             state.adam.gaussians().detached(),

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -363,6 +364,26 @@ def test_every_decision_is_written_down_and_can_be_overridden(tmp_path: Path) ->
         assert result.exposure_fitted == (word == "on")
         lengths = np.linalg.norm(result.gaussians.normals().numpy(), axis=1)
         assert (lengths.max() > 0) == (word == "on")
+
+
+@pytest.mark.parametrize(("accepts", "wanted"), [(False, [1]), (True, [1, 2])])
+def test_a_refused_degree_is_not_tried_again(
+    accepts: bool, wanted: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, photos = sphere_scene(views=9, size_px=24)
+    tried: list[int] = []
+    trial = rounds.harmonics_need
+
+    def counted(gaussians: Any, views: Any, held_out: Any, degree: int, **more: Any) -> Any:
+        tried.append(degree)
+        found = trial(gaussians, views, held_out, degree, **more)
+        sh = np.zeros((len(gaussians), (degree + 1) ** 2, 3), np.float32)
+        return dataclasses.replace(found, coefficients=sh if accepts else None)
+
+    monkeypatch.setattr(rounds, "harmonics_need", counted)
+    settings = dataclasses.replace(SETTINGS, sh_degree=2)
+    train(scene, photos, settings, tmp_path, Progress(), threads=1)
+    assert tried == wanted
 
 
 def test_masks_can_mean_that_nothing_is_there(tmp_path: Path) -> None:
