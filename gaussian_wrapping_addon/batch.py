@@ -99,8 +99,6 @@ def _parser() -> ArgumentParser:
         size = command.add_mutually_exclusive_group()
         size.add_argument("--edge-length", type=float, default=0.0, help="world units of the input")
         size.add_argument("--points", type=int, default=0, help="number of surface points")
-        add_method_options(command)
-        add_clean_up_options(command)
         command.add_argument(
             "--spacing", choices=SPACINGS, default="adaptive", help="of the mesh's vertices"
         )
@@ -109,6 +107,8 @@ def _parser() -> ArgumentParser:
             help="parts that a large region is meshed in, so that memory stays bounded",
         )  # fmt: skip
     for command in (wrap, mesh):
+        add_method_options(command)
+        add_clean_up_options(command)
         command.add_argument("--texture-size", default="auto", metavar="auto|N")
         command.add_argument(
             "--export", default="glb", help=f"comma separated, of {','.join(EXPORT_FORMATS)}"

@@ -12,7 +12,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from ..errors import EXIT_DONE, UsageError, WrapError
+from ..errors import EXIT_DONE, MeshingError, UsageError, WrapError
 from ..files import read_json
 from ..helper_process import emit
 from ..parallel import default_threads
@@ -81,7 +81,10 @@ def _lines(request: dict[str, Any]) -> list[str]:
         most=MOST_SIGHTINGS, threads=threads,
     )  # fmt: skip
     if len(sightings) == 0:
-        return ["the cameras see no surface in this region"]
+        raise MeshingError(
+            f"The cameras see no surface in region {region.name!r}.",
+            "Draw the region around something that was photographed.",
+        )
     expected = expected_mesh(
         VacancyField(arrays, scene.cameras, threads=threads), scene.cameras, region, meshing,
         meshing.edge_length / scene.world_from_scene.scale, sightings,

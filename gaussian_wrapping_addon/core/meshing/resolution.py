@@ -71,9 +71,9 @@ def checked_request(edge_length: float, points: int, region: Region) -> Request:
     if 0 < edge_length < FINEST_SHARE * region.diagonal:
         factor = FINEST_SHARE * region.diagonal / edge_length
         raise ResourceError(
-            f"Edges of a {region.diagonal / edge_length:.0e}th of region {region.name!r} cannot be "
-            "made.", f"Use edges at least {factor:.0e} times longer, or a smaller region.",
-        )  # fmt: skip
+            f"Region {region.name!r} is {region.diagonal / edge_length:.2g} edges long: too many.",
+            f"Use edges at least {math.ceil(factor)} times longer, or a smaller region.",
+        )
     coarsest = COARSEST_SHARE * region.diagonal
     if edge_length > coarsest:
         share = f"1/{1 / COARSEST_SHARE:.0f} of the region's diagonal"
