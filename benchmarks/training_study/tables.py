@@ -5,6 +5,7 @@ figure.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -150,15 +151,14 @@ def pairs(runs: Sequence[Measured], part: str) -> list[tuple[Measured, Measured]
 def comparison(auto: Measured, everything: Measured) -> Row:
     """Return one row of :func:`needs_table`."""
     a, b = auto.result, everything.result
+    saved = 100 * (1 - a.processor_s("train") / b.processor_s("train"))
     row: Row = {
         "scene": auto.case.run.scene,
         "preset": auto.case.run.preset,
         "decided s": f"{a.wall_s:.0f}",
         "everything s": f"{b.wall_s:.0f}",
         "time saved %": f"{100 * (1 - a.wall_s / b.wall_s):.0f}",
-        "processor saved, training %": (
-            f"{100 * (1 - a.processor_s('train') / b.processor_s('train')):.0f}"
-        ),
+        "processor saved, training %": f"{saved:.0f}" if math.isfinite(saved) else "not recorded",
         "Gaussians": a.scores["gaussians"]["count"],
         "of everything": b.scores["gaussians"]["count"],
     }
