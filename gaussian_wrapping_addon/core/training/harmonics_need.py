@@ -42,7 +42,8 @@ of a matte room count."""
 NEEDED_SHARE = 0.055
 """Share of the well-seen surface from which a degree is needed. Of scenes trained without harmonics
 for 600 iterations at 288 pixels, 40 photos, one with a glossy thing shows 0.080, matte ones 0.000
-(spokes) to 0.012 (a room), and a matte one with the exposures that training had found 0.038 (in a later run 0.063: too many)."""
+(spokes) to 0.012 (a room), and a matte one with the exposures that training had found 0.038 (in a
+later run 0.063: too many)."""
 
 SEEN_PX = 0.05
 SEEN_PHOTOS = 8
