@@ -15,8 +15,12 @@ from .cache import ALL_KINDS, REPOSITORY, ensure_scene
 from .catalogue import KINDS, scene_kind
 from .contact_sheet import write_contact_sheet
 from .looking_in import CUP_INSIDE, build_cup_inside
+from .torus_and_plate import TORUS, build_torus
 
 SHEET = REPOSITORY / "docs" / "images" / "scenes.jpg"
+
+_OWN = {CUP_INSIDE.name: build_cup_inside, TORUS.name: build_torus}
+"""What builds the scenes that have modules of their own."""
 
 
 def _arguments(given: list[str]) -> argparse.Namespace:
@@ -43,8 +47,8 @@ def main(given: list[str] | None = None) -> int:
     try:
         if options.build_into is not None:
             size = BuildSize(options.photos, options.test_views, options.width, options.height)
-            if options.name == CUP_INSIDE.name:
-                build_cup_inside(size, options.build_into)
+            if options.name in _OWN:
+                _OWN[options.name](size, options.build_into)
             else:
                 build_scene(scene_kind(options.name), size, options.build_into, options.base)
             return 0

@@ -20,6 +20,7 @@ from .build import BuildSize
 from .catalogue import KINDS, MESHES, SceneKind, scene_kind
 from .looking_in import CUP_INSIDE
 from .rendering import require_bpy
+from .torus_and_plate import TORUS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 CACHE = REPOSITORY / ".cache" / "scenes"
@@ -27,10 +28,14 @@ CACHE = REPOSITORY / ".cache" / "scenes"
 _DECIDES_NOTHING = {"__init__.py", "__main__.py", "cache.py", "contact_sheet.py"}
 """Files of this package that have no influence on a scene folder's content."""
 
-_OF_ONE_SCENE = {CUP_INSIDE.name: "looking_in.py"}
-"""Files of this package that have an influence on one scene only."""
+_OF_SOME_SCENES = {
+    "looking_in.py": {CUP_INSIDE.name},
+    "torus_and_plate.py": {TORUS.name},
+    "matte_thing.py": {CUP_INSIDE.name, TORUS.name},
+}
+"""Files of this package that have an influence on these scenes only."""
 
-ALL_KINDS = {**KINDS, CUP_INSIDE.name: CUP_INSIDE}
+ALL_KINDS = {**KINDS, CUP_INSIDE.name: CUP_INSIDE, TORUS.name: TORUS}
 """Every scene that can be rendered."""
 
 _LAST_WORDS = 1500
@@ -49,7 +54,7 @@ def kind_named(name: str) -> SceneKind:
 
 def deciding_sources(name: str) -> list[Path]:
     """Return the files of this package that a scene folder's content depends on."""
-    others = {file for scene, file in _OF_ONE_SCENE.items() if scene != name}
+    others = {file for file, scenes in _OF_SOME_SCENES.items() if name not in scenes}
     ignored = _DECIDES_NOTHING | others
     return sorted(p for p in Path(__file__).parent.glob("*.py") if p.name not in ignored)
 

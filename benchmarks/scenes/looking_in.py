@@ -14,11 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 
-from .build import BuildSize, _write_data
+from .build import BuildSize
 from .catalogue import SceneContent, SceneKind, scene_content, scene_kind
-from .rendering import render_photos, require_bpy
+from .matte_thing import build_matte_thing
 from .viewpoints import PRINCIPAL_POINT, around_thing, look_at
 
 CUP_INSIDE = SceneKind(
@@ -33,9 +32,6 @@ STEEP_DEGREES = (55.0, 70.0)
 
 STEEP_FOCAL_SHARE = 0.92
 """Of the width, as that of the rings."""
-
-WALL_DENSITY_AT_640 = 140.0
-"""Detail of the studio's walls, as of all single things."""
 
 
 def cup_inside_content(photos: int, tests: int, size: tuple[int, int]) -> SceneContent:
@@ -86,15 +82,4 @@ def build_cup_inside(size: BuildSize, folder: Path) -> None:
         bpy, trimesh or embreex is missing.
     """
     content = cup_inside_content(size.photos, size.test_views, (size.width, size.height))
-    images, tests = folder / "images", folder / "test" / "images"
-    images.mkdir(parents=True)
-    tests.mkdir(parents=True)
-    paths = [images / camera.name for camera in content.cameras]
-    paths += [tests / camera.name for camera in content.test_cameras]
-    render_photos(
-        content.parts, [*content.cameras, *content.test_cameras], paths, content.light,
-        samples=CUP_INSIDE.samples, glossy_bounces=0, wall_shadows=False,
-        wall_density=WALL_DENSITY_AT_640 * size.width / 640,
-    )  # fmt: skip
-    facts: dict[str, object] = {"bpy": require_bpy().app.version_string}
-    _write_data(CUP_INSIDE, CUP_INSIDE.seed, content, size, Similarity(), facts, folder)
+    build_matte_thing(CUP_INSIDE, content, size, folder)

@@ -26,9 +26,18 @@ from benchmarks.scenes.geometry import joined, open_edges, signed_volume
 from benchmarks.scenes.ground_truth import truth_samples
 from benchmarks.scenes.looking_in import CUP_INSIDE, build_cup_inside, cup_inside_content
 from benchmarks.scenes.rendering import Light, render_photos
+from benchmarks.scenes.torus_and_plate import (
+    PLATE_HEIGHT,
+    PLATE_SHARE,
+    PLATE_WIDTH,
+    RING_RADIUS,
+    TUBE_RADIUS,
+    torus_content,
+)  # fmt: skip
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.load import load_scene
 from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.meshing.mesh_check import check_mesh
 from gaussian_wrapping_addon.core.meshing.region import read_region
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.texture.depth_buffer import depth_buffer
@@ -273,6 +282,21 @@ def test_the_inside_of_the_cup_is_photographed() -> None:
     np.testing.assert_array_equal(inside.crop.vertices, cup.crop.vertices)
 
 
+def test_torus_and_plate_are_what_they_say() -> None:
+    content = torus_content(12, 4, (64, 48))
+    vertices, faces = content.truth
+    checked = check_mesh(vertices, faces)
+    assert checked.good
+    assert sorted(part.euler for part in checked.parts) == [0, 2]
+    ring, tube = RING_RADIUS, TUBE_RADIUS
+    parts = sorted(part.volume for part in checked.parts)
+    assert parts[1] == pytest.approx(2 * np.pi**2 * ring * tube**2, rel=2e-3)
+    plate = PLATE_WIDTH * PLATE_HEIGHT * PLATE_SHARE * content.region.diagonal
+    assert parts[0] == pytest.approx(plate, rel=1e-9)
+    assert content.crop.contains(vertices, 0.0).all()
+    assert content.region.contains(content.crop.vertices, 0.0).all()
+
+
 def test_a_scene_of_its_own_module_is_built_like_the_others(
     tmp_path: Path, folders: dict[str, Path]
 ) -> None:
@@ -289,7 +313,8 @@ def test_a_scene_of_its_own_module_is_built_like_the_others(
 
 def test_sources_of_one_scene_do_not_make_others_stale() -> None:
     own = {name: {path.name for path in deciding_sources(name)} for name in ALL_KINDS}
-    assert own["cup_inside"] - own["cup"] == {"looking_in.py"}
+    assert own["cup_inside"] - own["cup"] == {"looking_in.py", "matte_thing.py"}
+    assert own["torus"] - own["cup"] == {"torus_and_plate.py", "matte_thing.py"}
     assert own["cup"] < own["cup_inside"]
     assert {"build.py", "catalogue.py", "viewpoints.py"} <= own["cup"]
 
