@@ -11,12 +11,22 @@ from ..speed_error.tables import Row, table_of
 from ..tables import Table
 from ..training_study.acceptance import Check
 from .carry_out import Made, Outcome
-from .plan import ADAPTIVE, FUSION, LABELS, LARGE_POINTS, LARGE_SCENE, METHODS, PAM, UNIFORM
+from .plan import (
+    ADAPTIVE,
+    FUSION,
+    LABELS,
+    LARGE_POINTS,
+    LARGE_SCENE,
+    METHODS,
+    PAM,
+    SPACING_SCENES,
+    UNIFORM,
+)
 
 LEVEL_P99, LEVEL_MEDIAN = 0.02, 0.002
-VERTEX_SHARE, SPACING_SCENES = 0.5, ("spot", "wheel", "room")
+VERTEX_SHARE = 0.5
 VACANCY_S, LARGE_S, LARGE_GB = 12.0, 120.0, 3.0
-TOPOLOGY_SCENES = ("fence", "wheel")
+TOPOLOGY_SCENES = ("torus", "spot", "fence", "wheel")
 OTHER_LARGE_SHARE = 0.8
 """Vertices that a mesh of "200k" has to have at least, of those."""
 
