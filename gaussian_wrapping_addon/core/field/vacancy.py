@@ -128,6 +128,8 @@ class VacancyField:
         self.threads = threads or default_threads()
         self.unseen: Unseen = unseen
         self.near_z = near_z
+        self.device = "cpu"
+        """Where vacancy is evaluated, as torch names it."""
         self.region_bounds: np.ndarray | None = None
         if region_bounds is not None:
             bounds = np.asarray(region_bounds, np.float64)

@@ -18,6 +18,7 @@ PARTS = (
     "raster.cu",
     "isosurface.cu",
     "raster_backward.cu",
+    "vacancy.cu",
 )
 
 KERNELS = (
@@ -34,6 +35,8 @@ KERNELS = (
     "backward_tiles_absolute",
     "backward_tiles_depth_absolute",
     "sum_pairs",
+    "locate_points",
+    "transmittance_tiles",
 )
 """Names of the text's entry points."""
 
@@ -65,6 +68,9 @@ _SINGLE = {
     "SOLVER_LEVEL_FAR": 0.05,
     "SOLVER_FLAT": 0.02,
     "SOLVER_LEAST_SLOPE": 1e-12,
+    # As in core/field/vacancy_kernels.py.
+    "FACTOR_MIN": 1e-7,
+    "TRANSMITTANCE_LOST": 1e-4,
 }
 _DOUBLE = {
     "ALPHA_MIN_WIDE": tolerances.ALPHA_MIN,
