@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Vacancy of a million points from fifty cameras: seconds, and error against the definition.
 
-``python -m benchmarks.meshing_parts.vacancy_scale``
+``python -m benchmarks.meshing_parts.vacancy_scale``, with ``--device cuda`` on a GPU
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks.workload import DISTANCE, surface_gaussians
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.field.brute_force import brute_force_vacancy
+from gaussian_wrapping_addon.core.field.cuda_vacancy import CudaVacancyField
 from gaussian_wrapping_addon.core.field.vacancy import SETTLED, VacancyField
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from gaussian_wrapping_addon.core.parallel import default_threads
@@ -40,6 +41,7 @@ class VacancyScale:
     cameras: int
     points: int
     threads: int
+    device: str
     prepare_s: float
     """Projecting and binning the Gaussians for all cameras, once for all later queries."""
     prepare_cpu_s: float
@@ -107,6 +109,7 @@ def measure(
     *,
     sample: int = 60,
     threads: int = 0,
+    device: str = "cpu",
 ) -> VacancyScale:
     """Time the vacancy of points near and off a surface, and compare a sample with its definition.
 
@@ -118,21 +121,23 @@ def measure(
         Points for the definition (about 0.02 s each at 50 000 Gaussians, times the cameras).
     threads : int
         0 uses every core.
+    device : str
+        ``"cuda"`` evaluates on torch's GPU; the processor still prepares the cameras.
     """
     threads = threads or default_threads()
     arrays = surface_gaussians(gaussians, sh_degree=0).arrays()
     views = cameras_around(cameras)
     asked = query_points(arrays, points)
     # Compiles, and shows both programs a task of the same kind.
-    warm = VacancyField(arrays, views[:1], threads=threads)
+    warm = _field(arrays, views[:1], threads, device)
     warm.vacancy(asked[:1000])
     warm.is_empty(asked[:1000])
 
-    field = VacancyField(arrays, views, threads=threads)
+    field = _field(arrays, views, threads, device)
     prepare_s, prepare_cpu_s, _ = _timed(field.prepare)
     values_s, values_cpu_s, result = _timed(lambda: field.vacancy(asked))
     # A field of its own: its order of cameras must not come from the values.
-    signs = VacancyField(arrays, views, threads=threads)
+    signs = _field(arrays, views, threads, device)
     signs.prepare()
     sign_s, sign_cpu_s, empty = _timed(lambda: signs.is_empty(asked))
 
@@ -147,6 +152,7 @@ def measure(
         cameras=cameras,
         points=points,
         threads=threads,
+        device=field.device,
         prepare_s=prepare_s,
         prepare_cpu_s=prepare_cpu_s,
         values_s=values_s,
@@ -160,6 +166,14 @@ def measure(
         error_max=float(error.max()) if len(error) else 0.0,
         same_side_share=float((empty[rows] == (exact > 0.5)).mean()) if len(rows) else 1.0,
     )
+
+
+def _field(
+    arrays: GaussianArrays, views: Sequence[Camera], threads: int, device: str
+) -> VacancyField:
+    if device == "cpu":
+        return VacancyField(arrays, views, threads=threads)
+    return CudaVacancyField(arrays, views, threads=threads, device=device)
 
 
 def _timed(work: Callable[[], object]) -> tuple[float, float, object]:
@@ -176,6 +190,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--points", type=int, default=1_000_000)
     parser.add_argument("--sample", type=int, default=60)
     parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--device", default="cpu", help="cpu, or cuda")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     figures = measure(
@@ -184,6 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.points,
         sample=options.sample,
         threads=options.threads,
+        device=options.device,
     )
     values = ", ".join(
         f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}"

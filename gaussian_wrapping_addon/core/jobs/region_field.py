@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+import logging
+from typing import TYPE_CHECKING, Any
+
+from ..errors import DeviceError
 
 if TYPE_CHECKING:
     from ..dataset.scene import Scene
@@ -11,6 +14,8 @@ if TYPE_CHECKING:
     from ..gaussians.model import GaussianArrays
     from ..meshing.convex_region import Region
     from ..settings import MeshingSettings, TrainingSettings
+
+_logger = logging.getLogger(__name__)
 
 
 def region_field(
@@ -21,6 +26,7 @@ def region_field(
     meshing: MeshingSettings,
     *,
     threads: int,
+    device: str = "cpu",
 ) -> VacancyField:
     """Return the field in and around a region; it knows nothing beyond the mesher's halo.
 
@@ -32,6 +38,9 @@ def region_field(
         ``mask_mode`` and the size of the photos that masks are read at.
     meshing : MeshingSettings
         ``unseen`` is read.
+    device : str
+        Where the Gaussians were trained, as torch names it. On a GPU the field runs there too;
+        where its kernels cannot, it runs on the processor, and the log says why.
 
     Raises
     ------
@@ -39,25 +48,33 @@ def region_field(
         A mask does not fit its photo.
     """
     from ..dataset.photos import PhotoStore
-    from ..field.photo_masks import MaskMode
-    from ..field.vacancy import Unseen, VacancyField
+    from ..field.vacancy import VacancyField
     from ..meshing.candidate_surface import halo_bounds
 
     photos = PhotoStore(scene, training.max_image_px)
-    return VacancyField(
-        arrays,
-        scene.cameras,
-        threads=threads,
-        unseen=cast(Unseen, meshing.unseen),
-        region_bounds=halo_bounds(region),
-        masks=[photos.mask(index) for index in range(len(photos))],
-        mask_mode=cast(MaskMode, training.mask_mode),
-    )
+    options: dict[str, Any] = {
+        "threads": threads,
+        "unseen": meshing.unseen,
+        "region_bounds": halo_bounds(region),
+        "masks": [photos.mask(index) for index in range(len(photos))],
+        "mask_mode": training.mask_mode,
+    }
+    if device.startswith("cuda"):
+        from ..field.cuda_vacancy import CudaVacancyField
+
+        try:
+            return CudaVacancyField(arrays, scene.cameras, device=device, **options)
+        except DeviceError as error:
+            _logger.warning(
+                "Vacancy is evaluated on the processor, not on the GPU: %s", error.message
+            )
+    return VacancyField(arrays, scene.cameras, **options)
 
 
 def field_figures(field: VacancyField) -> dict[str, Any]:
     """Return what the report tells of a field that was used: how much no camera saw."""
     return {
+        "field_device": field.device,
         "unseen": field.unseen,
         "field_evaluations": field.evaluations,
         "unseen_evaluations": field.unseen_evaluations,

@@ -234,11 +234,13 @@ def work_on_list(
         raise MeshingError("The tile list names no stages of this job.", "Mesh the region again.")
     cameras, training = (place for place in places if place is not None)
     scene = load_saved_scene(cameras)
-    arrays = load_gaussians(training / "gaussians.npz").arrays()
+    gaussians = load_gaussians(training / "gaussians.npz")
+    arrays = gaussians.arrays()
     settings = from_json(JobSettings, origin.get("settings"), "settings").validated()
     vacancy = region_field(
-        scene, arrays, plan.region, settings.training, settings.meshing, threads=threads
-    )
+        scene, arrays, plan.region, settings.training, settings.meshing, threads=threads,
+        device=str(gaussians.means.device),
+    )  # fmt: skip
     field = Field(vacancy, VectorField(arrays, threads=threads), threads)
     tasks = tile_tasks(folder, plan, field)
     work_through(tasks, Claims(folder / CLAIMS), progress, done_here=done_here)

@@ -228,8 +228,9 @@ def _run_meshing(
             world_region = parse_region(body, Path(request))
             region = world_region.transformed(scene.world_from_scene.inverse())
         vacancy = region_field(
-            scene, arrays, region, job.settings.training, meshing, threads=threads
-        )
+            scene, arrays, region, job.settings.training, meshing, threads=threads,
+            device=str(gaussians.means.device),
+        )  # fmt: skip
         sightings = find_sightings(
             gaussians, scene.cameras, lambda points: region.contains(points, 0.0),
             progress.span(0.0, 0.15), threads=threads,

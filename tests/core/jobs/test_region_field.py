@@ -12,6 +12,7 @@ from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.field import cuda_vacancy
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.jobs.region_field import field_figures, region_field
 from gaussian_wrapping_addon.core.meshing.candidate_surface import halo_bounds
@@ -72,7 +73,8 @@ def test_unseen_space_is_what_the_settings_say_and_is_counted(tmp_path: Path) ->
         behind = 2 * field.cameras[0].center - far[:1]
         assert field.is_empty(behind).tolist() == [unseen == "empty"]
         assert field_figures(field) == {
-            "unseen": unseen, "field_evaluations": 1, "unseen_evaluations": 1,
+            "field_device": "cpu", "unseen": unseen, "field_evaluations": 1,
+            "unseen_evaluations": 1,
         }  # fmt: skip
 
 
@@ -84,6 +86,47 @@ def test_bounds_change_nothing_in_and_around_the_region(tmp_path: Path) -> None:
     points = np.random.default_rng(1).uniform(low, high, (500, 3))
     whole = VacancyField(arrays, scene.cameras, threads=1)
     assert np.array_equal(field.is_empty(points), whole.is_empty(points))
+
+
+def test_without_a_usable_gpu_the_log_says_why_and_the_report_where(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = scene_with_masks(tmp_path, slice(None))
+    monkeypatch.setattr(cuda_vacancy, "cuda_available", lambda: (False, "The driver is too old."))
+    fields = [
+        region_field(
+            scene, shell_arrays(0.9), cube(1.5), TrainingSettings(), MeshingSettings(), threads=1,
+            device=device,
+        )
+        for device in ("cpu", "cuda:1")
+    ]  # fmt: skip
+    assert [type(field) for field in fields] == [VacancyField, VacancyField]
+    assert [field_figures(field)["field_device"] for field in fields] == ["cpu", "cpu"]
+    assert caplog.messages == [
+        "Vacancy is evaluated on the processor, not on the GPU: The driver is too old."
+    ]
+
+
+def test_gaussians_on_a_gpu_get_its_field_with_the_same_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, arrays = scene_with_masks(tmp_path, slice(0, 40)), shell_arrays(0.9)
+    given = {}
+
+    class OnGpu(VacancyField):
+        def __init__(self, arrays, cameras, *, device, **options):  # type: ignore[no-untyped-def]
+            super().__init__(arrays, cameras, **options)
+            given.update(options)
+            self.device = device
+
+    monkeypatch.setattr(cuda_vacancy, "CudaVacancyField", OnGpu)
+    settings = TrainingSettings(mask_mode="background"), MeshingSettings(unseen="occupied")
+    field = region_field(scene, arrays, cube(1.5), *settings, threads=1, device="cuda:1")
+    assert isinstance(field, OnGpu)
+    assert field_figures(field)["field_device"] == "cuda:1"
+    assert (given["mask_mode"], given["unseen"]) == ("background", "occupied")
+    assert len(given["masks"]) == 6
+    assert np.array_equal(given["region_bounds"], halo_bounds(cube(1.5)))
 
 
 class WatchedField(ShapeField):
