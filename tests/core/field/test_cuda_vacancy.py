@@ -327,6 +327,26 @@ def test_the_same_bits_in_any_order_of_threads(emulator_library: Path) -> None:
     np.testing.assert_array_equal(one.camera, two.camera)
 
 
+def test_a_point_is_done_with_at_the_first_camera_that_settles_it(emulator_library: Path) -> None:
+    launched = []
+
+    class Counting(EmulatedKernels):
+        def _run(self, name, blocks, parameters):  # type: ignore[no-untyped-def]
+            launched.append(name)
+            super()._run(name, blocks, parameters)
+
+    field = CudaVacancyField(
+        make_arrays(np.zeros(3), 0.1, 0.9), cameras_around(4), device="cpu", threads=1,
+        kernels=Counting(emulator_library), device_cache_bytes=1 << 30,
+    )  # fmt: skip
+    free = np.array([[0.0, 0.0, 0.6], [0.1, 0.5, 0.0], [0.6, 0.1, 0.1]])
+    assert field.is_empty(free).all()
+    assert launched.count("transmittance_tiles") == 1
+    launched.clear()
+    assert field.is_empty(np.concatenate([free, np.zeros((1, 3))])).tolist() == [True] * 3 + [False]
+    assert launched.count("transmittance_tiles") == 4
+
+
 def test_the_hardwares_approximations_stay_within_tolerance(emulator_library: Path) -> None:
     # exp and quotients disturbed by their documented bounds, signs mixed.
     arrays, cameras = random_arrays(300), cameras_around(4)
