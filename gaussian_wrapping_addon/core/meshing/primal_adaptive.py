@@ -59,8 +59,8 @@ def mesh_region(
     """Mesh the surface ``vacancy = 0.5`` inside a region; the boundary closes the solid.
 
     With adaptive spacing a denser mesh is made, and of its vertices those stay that the shape needs
-    (:mod:`.vertex_selection`). Points that no camera sees count as empty. With neither an edge
-    length nor a number of points the mesh gets 40 to 50 thousand faces.
+    (:mod:`.vertex_selection`). What stands where no camera looks, ``vacancy`` says. With neither an
+    edge length nor a number of points the mesh gets 40 to 50 thousand faces.
 
     Parameters
     ----------
@@ -75,7 +75,9 @@ def mesh_region(
     region : Region
         Scene frame.
     settings : MeshingSettings
-        ``points`` and ``min_component_share`` are read; the edge length is passed in scene units.
+        ``points``, ``spacing`` and ``min_component_share`` are read; the edge length is passed in
+        scene units. Smoothing, fewer faces and an open boundary are steps of their own, on the
+        finished mesh; ``unseen`` is the field's.
     seed : int
         The same seed gives the same mesh, for any number of threads.
     edge_length_scene : float
