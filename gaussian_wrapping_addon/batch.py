@@ -32,12 +32,16 @@ MAX_WAIT_S = 7 * 86400.0
 
 def main(arguments: list[str]) -> int:
     """Run one command and return the exit code (0, 1, 2, 3, 4, 5: see the README)."""
-    from .core.errors import EXIT_OTHER, WrapError
+    from .batch_options import in_words_of_options
+    from .core.errors import EXIT_OTHER, SettingError, WrapError
 
     _log_to_terminal()
     try:
         options = _parser().parse_args(arguments)
         return int(options.run(options))
+    except SettingError as error:
+        _logger.error("error: %s", in_words_of_options(error))
+        return error.exit_code
     except WrapError as error:
         _logger.error("error: %s", error)
         return error.exit_code
@@ -273,11 +277,11 @@ def _work_tiles(options: Namespace) -> int:
     from .core.errors import UsageError
     from .core.jobs.client import worker_python
     from .core.jobs.evaluate import run_in_worker
+    from .core.settings import JobSettings
 
-    if not 0 <= options.threads <= 1024 or not 0 <= options.wait <= MAX_WAIT_S:
-        raise UsageError(
-            "--threads or --wait is out of range.", f"Wait from 0 to {MAX_WAIT_S:.0f} seconds."
-        )
+    JobSettings(threads=options.threads).validated()
+    if not 0 <= options.wait <= MAX_WAIT_S:
+        raise UsageError("--wait is out of range.", f"Give from 0 to {MAX_WAIT_S:.0f} seconds.")
     request = {
         "out": str(options.out.resolve()), "threads": options.threads, "wait_s": options.wait,
     }  # fmt: skip
@@ -335,7 +339,9 @@ def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
 def _evaluate(options: Namespace) -> int:
     from .core.jobs.client import worker_python
     from .core.jobs.evaluate import run_in_worker
+    from .core.settings import JobSettings
 
+    JobSettings(seed=options.seed, threads=options.threads).validated()
     protocols = options.protocols
     request = {
         "mesh": str(options.mesh),

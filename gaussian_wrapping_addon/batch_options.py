@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options of the command line that become training settings, of ``wrap`` and ``estimate``."""
+"""Options of the command line that become settings, and by which of them a setting is given."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .core.errors import SettingError
     from .core.settings import JobSettings
 
 NEEDS = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size")
@@ -158,3 +159,39 @@ def training_settings(options: Namespace) -> JobSettings:
         start_splat="" if options.start_splat is None else str(options.start_splat),
         training=replace(settings.training, **changes),
     )
+
+
+_OTHERS = {
+    "preset": "--preset",
+    "seed": "--seed",
+    "threads": "--threads",
+    "regions": "--region",
+    "export": "--export",
+    "meshing.edge_length": "--edge-length",
+    "meshing.points": "--points",
+    "meshing.spacing": "--spacing",
+    "meshing.tiles": "--tiles",
+    "texture.size_px": "--texture-size",
+    "training.mask_mode": "--mask-mode",
+    "training.extra_iterations": "--iterations",
+}
+"""Options by the setting that they give, besides those of the tables above."""
+
+
+def option_of(setting: str) -> str:
+    """Return the option that gives a setting (its path), ``""`` where there is none."""
+    options = {
+        **_OTHERS,
+        **{f"training.{name}": option for option, name, *_ in _NUMBERS},
+        **{f"training.{name}": "--" + name.replace("_", "-") for name in NEEDS},
+        **{f"meshing.{name}": option for option, name, *_ in _MESHING},
+        **{f"meshing.{name}": f"--{name}" for name in _CHOICES},
+    }
+    return options.get(setting, "")
+
+
+def in_words_of_options(error: SettingError) -> SettingError:
+    """Return the same error, naming the option where a setting is named."""
+    from .core.errors import SettingError
+
+    return SettingError(error.setting, error.wanted, called=option_of(error.setting))

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.batch import _parser, _region_settings
-from gaussian_wrapping_addon.batch_options import NEEDS, training_settings
+from gaussian_wrapping_addon.batch_options import NEEDS, option_of, training_settings
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.settings import (
     PRESETS,
@@ -106,18 +106,44 @@ def test_every_need_is_a_setting() -> None:
     assert set(NEEDS) <= names
 
 
+def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
+    """Each path that an option is known for exists, and each option exists."""
+    paths = {
+        path
+        for part, values in {**to_json(JobSettings()), "": to_json(JobSettings())}.items()
+        for path in ([f"{part}.{n}".strip(".") for n in values] if isinstance(values, dict) else ())
+    }
+    known = {path: option for path in paths if (option := option_of(path))}
+    wrap = set(_parser()._subparsers._group_actions[0].choices["wrap"]._option_string_actions)
+    assert set(known.values()) <= wrap
+    assert wrap - set(known.values()) == {
+        "-h", "--help", "--needs", "--start-splat", "--out", "--no-blend",
+    }  # fmt: skip
+    for name in ("preset", "meshing.min_component_share", "training.holdout_every"):
+        assert name in known
+    assert option_of("training.lambda_dssim") == ""
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
         (["wrap", "photos", "--out", "o", "--start-splat", "no.ply", "--no-blend"], 3, "no.ply"),
-        (["wrap", "photos", "--out", "o", "--sh-degree", "4", "--no-blend"], 2, "sh_degree"),
-        (["wrap", "photos", "--out", "o", "--faces", "3", "--no-blend"], 2, "target_faces"),
-        (["wrap", "photos", "--out", "o", "--smooth", "-1", "--no-blend"], 2, "smooth_steps"),
+        (["wrap", "photos", "--out", "o", "--sh-degree", "4", "--no-blend"], 2, "--sh-degree is"),
+        (["wrap", "photos", "--out", "o", "--faces", "3", "--no-blend"], 2, "--faces is"),
+        (["wrap", "photos", "--out", "o", "--smooth", "-1", "--no-blend"], 2, "--smooth is"),
+        (["wrap", "photos", "--out", "o", "--min-part", "7", "--no-blend"], 2, "--min-part is"),
+        (["wrap", "photos", "--out", "o", "--tiles", "x", "--no-blend"], 2, "--tiles is"),
+        (["wrap", "photos", "--out", "o", "--texture-size", "7"], 2, "--texture-size is"),
+        (["estimate-mesh", "--out", "photos", "--threads", "-1"], 2, "--threads is out of range. "),
+        (["work-tiles", "photos", "--threads", "2000"], 2, "--threads is out of range. Give from"),
+        (["work-tiles", "photos", "--wait", "-1"], 2, "--wait is out of range. Give from 0 to"),
+        (["work-tiles", "photos", "--wait", "nan"], 2, "--wait is out of range. Give from 0 to"),
+        (["evaluate", "m.ply", "--truth", "photos", "--threads", "-1"], 2, "--threads is"),
         (["wrap", "photos", "--out", "o", "--pivots", "4", "--no-blend"], 2, "--pivots"),
         (["more", "--out", "photos", "--iterations", "10", "--no-blend"], 2, "job.json"),
         (["more", "--out", "photos", "--no-blend"], 2, "--iterations"),
         (["estimate", "missing"], 3, "missing"),
-        (["estimate", "photos", "--iterations", "0"], 2, "iterations"),
+        (["estimate", "photos", "--iterations", "0"], 2, "--iterations is out of range. Give from"),
         (["resume", "photos", "--max-gaussians", "2000", "--no-blend"], 2, "job.json"),
     ],
 )

@@ -41,6 +41,23 @@ class UsageError(WrapError):
     exit_code = EXIT_USAGE
 
 
+class SettingError(UsageError):
+    """A setting out of range; who knows by which option it was given may name that instead.
+
+    Parameters
+    ----------
+    setting : str
+        Path in the job's settings, such as ``"meshing.tiles"``.
+    wanted : str
+        What may be given.
+    """
+
+    def __init__(self, setting: str, wanted: str, *, called: str = "") -> None:
+        super().__init__(f"{called or f'Setting {setting}'} is out of range.", f"Give {wanted}.")
+        self.setting = setting
+        self.wanted = wanted
+
+
 class DatasetError(WrapError):
     """The photos or camera poses cannot be used as they are."""
 

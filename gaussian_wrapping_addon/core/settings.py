@@ -9,7 +9,7 @@ import typing
 from dataclasses import dataclass, field
 from typing import Any
 
-from .errors import UsageError
+from .errors import SettingError, UsageError
 from .limits import MAX_TILES
 
 PRESETS = ("draft", "standard", "fine")
@@ -175,7 +175,7 @@ class JobSettings:
     texture: TextureSettings = field(default_factory=TextureSettings)
 
     def validated(self) -> JobSettings:
-        """Return self, or raise :class:`UsageError` naming the first setting out of range."""
+        """Return self, or raise :class:`SettingError` naming the first setting out of range."""
         checks = (
             ("preset", self.preset in PRESETS, f"one of {', '.join(PRESETS)}"),
             ("threads", 0 <= self.threads <= 1024, "from 0 to 1024"),
@@ -288,7 +288,7 @@ class JobSettings:
         )
         for name, good, wanted in checks:
             if not good:
-                raise UsageError(f"Setting {name} is out of range.", f"Give {wanted}.")
+                raise SettingError(name, wanted)
         return self
 
 
