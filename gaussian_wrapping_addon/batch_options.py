@@ -90,7 +90,7 @@ _MESHING: tuple[tuple[str, str, type, str, str], ...] = (
         "min_component_share",
         float,
         "SHARE",
-        "parts smaller than this share of the largest one's area are removed; 0 keeps all",
+        "remove parts of less area than this share of the largest, but no long ones; 0 for none",
     ),
 )
 

@@ -140,7 +140,8 @@ class MeshingSettings:
     unseen: str = "empty"
     """What stands where no camera looks: nothing (``"empty"``), or something (``"occupied"``)."""
     min_component_share: float = 0.01
-    """Solids smaller than this share of the largest (by area) are removed and counted."""
+    """Parts smaller than this share of the largest by area, and shorter than three times this share
+    of the longest, are removed and counted."""
     target_faces: int = 0
     """The mesh is decimated to this number of faces; 0 leaves all."""
     smooth_steps: int = 0

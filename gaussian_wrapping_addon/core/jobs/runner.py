@@ -25,7 +25,7 @@ from .stages import Stage, run_stage, source_fingerprint, stage_key
 _logger = logging.getLogger(__name__)
 
 # Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
-STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 6, "texture": 4}
+STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 7, "texture": 4}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 6.14, "texture": 0.12, "export": 0.02}
@@ -252,7 +252,7 @@ def _run_meshing(
         mesh = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
         open_at = region if meshing.boundary == "open" else None
         if open_at is not None:
-            mesh = opened(mesh, open_at)
+            mesh = opened(mesh, open_at, meshing.min_component_share)
         mesh.provenance.update(field_figures(vacancy))
         if not np.isfinite(mesh.vertices).all():
             raise MeshingError(

@@ -56,6 +56,11 @@ class Floaters:
     removed_area_share: float
     """Area of all removed parts, of the total."""
 
+    @property
+    def removed(self) -> int:
+        """All removed parts: of open ones the volume tells no solid from a cavity."""
+        return self.removed_solids + self.removed_cavities
+
 
 LONG_FACTOR = 3.0
 """A part this many times longer than its share of the area allows is no floater: a piece of wire
@@ -72,7 +77,7 @@ def extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: in
 
 
 def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> Floaters:
-    """Remove closed parts that are small: in area and in length.
+    """Remove parts that are small: in area and in length.
 
     The area is below ``min_share`` of the largest part's, and the length below
     :data:`LONG_FACTOR` times that share of the longest part's. Small cavities go as well, which

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..errors import MeshingError
 from .cap_planes import ON_PLANE_SHARE, cap_planes
-from .components import compacted
+from .components import compacted, without_floaters
 from .convex_region import Region
 from .repair import APART_SHARE, half_edges
 from .sampling import triangle_normals
@@ -24,11 +24,12 @@ ALONG_COSINE = 0.9
 """With such a vertex a face belongs to a cap only if it still faces out of the region."""
 
 
-def opened(mesh: SurfaceMesh, region: Region) -> SurfaceMesh:
+def opened(mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0) -> SurfaceMesh:
     """Return the mesh without the faces that close it at the region's boundary.
 
     What stays is consistently oriented and manifold, with boundary edges on the region's planes
-    alone. ``provenance`` counts the faces left out.
+    alone. A solid may fall into pieces by that; small ones are removed as floaters are.
+    ``provenance`` counts the faces left out, the pieces removed, and the parts that stay.
 
     Parameters
     ----------
@@ -36,6 +37,8 @@ def opened(mesh: SurfaceMesh, region: Region) -> SurfaceMesh:
         Closed 2-manifold, made in ``region``.
     region : Region
         Same frame.
+    min_component_share : float
+        As for :func:`~.components.without_floaters`; 0 keeps every piece.
 
     Raises
     ------
@@ -58,12 +61,16 @@ def opened(mesh: SurfaceMesh, region: Region) -> SurfaceMesh:
             "Draw the region around a surface, or keep the boundary closed.",
         )
     split, source = split_fans(stays)
-    vertices, split, used = compacted(vertices[source], split)
+    pieces = without_floaters(vertices[source], split, min_component_share)
+    vertices, split, used = compacted(vertices[source], pieces.faces)
     colors = None if mesh.colors is None else mesh.colors[source[used]]
     rim = (cap_planes(vertices, region).planes >= 0).any(1)
     counted = {
         "boundary": "open",
         "cap_faces_left_out": int(on_cap.sum()),
+        "components": pieces.kept,
+        "removed_open_pieces": pieces.removed,
+        "removed_open_area_share": pieces.removed_area_share,
         "vertices_on_region_boundary": int(rim.sum()),
     }
     return replace(

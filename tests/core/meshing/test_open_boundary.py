@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.core.meshing.region import Region
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import MeshingSettings
-from tests.core.meshing.closed_shapes import ball, slab
+from tests.core.meshing.closed_shapes import ball, joined, slab
 from tests.core.meshing.meshing_scenes import ShapeField, cube, gaussians_on, sphere, torus
 
 TURNED = Rotation.from_euler("xyz", [0.3, 0.7, 1.1]).as_matrix()
@@ -64,6 +64,33 @@ def test_a_plate_through_the_region_falls_into_two_sheets() -> None:
     check = check_mesh(mesh.vertices, mesh.faces, region)
     assert check.defects() == []
     assert [part.euler for part in check.parts] == [1, 1]
+
+
+def test_small_pieces_left_by_opening_go_as_floaters_do() -> None:
+    body, small = slab((2, 2, 2), 0.5), slab((0.05, 0.05, 0.05), 0.1)
+    flat, long = slab((0.05, 0.05, 0.05), 0.1), slab((0.01, 0.5, 0.01), 0.1)
+    vertices, faces = joined(
+        body,
+        (small[0] + [3, 0, 1.95], small[1]),  # within the region, but for a face
+        (flat[0] + [0, 3, 1.95], flat[1]),
+        (long[0] + [-3, 0, 1.99], long[1]),  # small in area alone
+    )
+    region = Region.box("r", np.full(3, -9.0), np.array([9.0, 9.0, 2.0]))
+    whole = opened(mesh_from(vertices, faces), region)
+    assert len(check_mesh(whole.vertices, whole.faces, region).parts) == 4
+    assert whole.provenance["removed_open_pieces"] == 0
+    mesh = opened(mesh_from(vertices, faces), region, 0.01)
+    check = check_mesh(mesh.vertices, mesh.faces, region)
+    assert check.defects() == []
+    assert len(check.parts) == mesh.provenance["components"] == 2
+    assert mesh.provenance["removed_open_pieces"] == 2
+    areas = 5 * 0.01  # of each that goes; the others have 5 faces left as well
+    total = 5 * 16 + 2 * areas + 0.02 * 1 * 3 + 2 * 0.02**2
+    assert mesh.provenance["removed_open_area_share"] == pytest.approx(2 * areas / total)
+    assert mesh.vertices[:, 0].min() < -2.9
+    assert mesh.vertices[:, :2].max() <= 2.0
+    # Whatever is asked for, the largest piece stays.
+    assert len(opened(mesh_from(vertices, faces), region, 1.0).faces) == len(body[1]) * 5 // 6
 
 
 def test_a_region_inside_of_the_solid_leaves_nothing() -> None:

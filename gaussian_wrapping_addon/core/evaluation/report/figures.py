@@ -82,6 +82,7 @@ _COUNTS = frozenset(
         "photos_undistorted", "photos_used", "photos_with_focal_length", "pivots",
         "pivots_each", "points", "points_high", "points_in_model", "points_low",
         "projection_evaluations", "relabelled_tetrahedra", "removed_cavities",
+        "removed_open_pieces",
         "removed_solids", "sightings", "smooth_steps", "split_edges", "split_vertices",
         "surface_points", "target_faces", "tetrahedra", "texels_filled",
         "texels_overlapping", "texels_seen", "texels_seen_at_outlines_only", "texels_used",

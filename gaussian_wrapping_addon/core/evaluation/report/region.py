@@ -151,7 +151,12 @@ def _removed(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     text = f"{plural(int(solids), 'floater')}, {hollows}"
     if solids or cavities:
         text += f": {percent(provenance.get('removed_area_share'))} of the area"
-    return [("Removed for their size", text)]
+    rows = [("Removed for their size", text)]
+    if pieces := measured(provenance.get("removed_open_pieces")):
+        share = percent(provenance.get("removed_open_area_share"))
+        text = f"{plural(int(pieces), 'small piece')}: {share} of the area"
+        rows.append(("Removed after opening at the region", text))
+    return rows
 
 
 def _cleaned(provenance: dict[str, Any]) -> list[tuple[str, str]]:

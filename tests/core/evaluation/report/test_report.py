@@ -238,13 +238,14 @@ def test_defects_of_the_last_check_are_told_and_what_was_cleaned_up(tmp_path: Pa
     region["check"] = {"good": False, "defects": ["edges have one face only: 4"]}
     region["provenance"].update(
         removed_solids=2, removed_cavities=1, removed_area_share=0.03, faces_before_clean_up=9000,
-        target_faces=196, smooth_steps=3,
+        target_faces=196, smooth_steps=3, removed_open_pieces=2, removed_open_area_share=0.01,
     )  # fmt: skip
     _, text = write(tmp_path, None, {REGION: region})
     told = section(text, f"## Region {escaped(REGION)}")
     for name, figure in (
         ("Check of closedness and manifold", "edges have one face only: 4"),
         ("Removed for their size", "2 floaters, 1 small cavity: 3.0 % of the area"),
+        ("Removed after opening at the region", "2 small pieces: 1.0 % of the area"),
         ("Smoothed", "3 steps"),
         ("Decimated", "from 9,000 faces, 196 asked for"),
     ):
