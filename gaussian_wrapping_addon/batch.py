@@ -407,7 +407,9 @@ def _require_bpy(job: JobFile, options: Namespace) -> None:
 def _follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     """Show progress until the worker ends; then write the Blender files."""
     from .core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
+    from .core.jobs.blend_file import shown_result
 
+    before = shown_result(client.folder.result)  # the worker writes it last
     shown_s, shown, interrupted_s = 0.0, ("", ""), 0.0
     while True:
         try:
@@ -443,14 +445,23 @@ def _follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     if status.state != "DONE":
         _logger.error("error: %s %s", status.error, status.hint)
         return status.exit_code or EXIT_OTHER
-    return _finish(client.folder.result, job, options) or EXIT_DONE
+    return _finish(client.folder.result, before, job, options) or EXIT_DONE
 
 
-def _finish(result: Path, job: JobFile, options: Namespace) -> int:
-    if not options.no_blend:
+def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Namespace) -> int:
+    """Write the Blender files; one that shows the result ``before`` does not stay."""
+    from .core.jobs.blend_file import NAME, set_aside_stale
+
+    if options.no_blend:
+        set_aside_stale(result, before)
+    else:
         from .ops.scene_objects import write_blend
 
-        write_blend(result, result / "scene.blend")
+        try:
+            write_blend(result, result / NAME)
+        except BaseException:
+            set_aside_stale(result, before)
+            raise
     if "usd" in job.settings.export:
         from .ops.scene_objects import export_usd
 

@@ -157,12 +157,16 @@ def test_another_region_and_resolution_needs_no_training(
     scene, root, _ = wrapped
     box = write_box(root / "cap.json", scene, 0.6, (0, 0, 1.0))
     before = {p: p.stat().st_mtime_ns for p in (root / "out" / "stages").glob("train-*/*")}
+    blend = root / "out" / "result" / "scene.blend"
+    blend.write_bytes(b"shows the ball alone")
     done = batch(
         "mesh", "--out", str(root / "out"), "--region", str(box),
         "--edge-length", str(0.04 * SCALE), "--texture-size", "256", "--no-blend",
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((root / "out" / "result" / "report.json").read_text())
+    assert not blend.exists(), "a file that shows another result"
+    assert "scene.blend showed the result before this one" in done.stdout
     reused = {s["name"]: s["reused"] for s in report["stages"]}
     assert reused["cameras"]
     assert reused["train"]
