@@ -36,6 +36,9 @@ STALE_S = 60.0
 from the first look, as clocks of machines differ."""
 POLL_S = 1.0
 
+_WORKER = "worker"
+"""Ending of an empty file for each process that has done a part."""
+
 
 @dataclass(frozen=True)
 class Task:
@@ -56,11 +59,20 @@ class Claims:
         self._folder = folder
         self._stale_s = stale_s
         self._seen: dict[str, tuple[Any, float]] = {}
+        self._worker = uuid.uuid4().hex
         folder.mkdir(exist_ok=True)
 
     def path(self, name: str) -> Path:
         """Return the file of a claim."""
         return self._folder / f"{name}.json"
+
+    def note_work(self) -> None:
+        """Say that this process has done a part."""
+        (self._folder / f"{self._worker}.{_WORKER}").touch()
+
+    def workers(self) -> int:
+        """Return how many processes have done a part; one that was started anew counts again."""
+        return sum(1 for _ in self._folder.glob(f"*.{_WORKER}"))
 
     @contextmanager
     def taken(self, name: str) -> Iterator[bool]:
@@ -189,6 +201,7 @@ def work_through(
                     continue
                 task.run(progress.span(finished / len(tasks), (finished + 1) / len(tasks)))
                 mine.append(task.name)
+                claims.note_work()
                 worked = True
                 break
         if not worked:

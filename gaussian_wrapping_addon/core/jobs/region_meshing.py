@@ -176,10 +176,13 @@ def mesh_in_tiles_here(
             origin,
         )  # fmt: skip
     plan, _ = load_plan(folder)
-    work_through(tile_tasks(folder, plan, field), Claims(folder / CLAIMS), progress.span(0.2, 0.9))
+    claims = Claims(folder / CLAIMS)
+    work_through(tile_tasks(folder, plan, field), claims, progress.span(0.2, 0.9))
     parts = [load_faces(faces_path(folder, tile)) for tile in range(len(plan.tiling))]
     everything = load_gathered(gathered_path(folder))
-    return join_tiles(field, plan, everything, parts, meshing, progress.span(0.9, 1.0))
+    mesh = join_tiles(field, plan, everything, parts, meshing, progress.span(0.9, 1.0))
+    mesh.provenance["tile_processes"] = claims.workers()
+    return mesh
 
 
 def tiles_origin(cameras: Path, training: Path, settings: JobSettings) -> dict[str, Any]:

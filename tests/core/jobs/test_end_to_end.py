@@ -218,9 +218,12 @@ def test_a_region_is_estimated_and_meshed_in_tiles_with_help(
         assert done.returncode == 0, done.stdout + done.stderr
         said, _ = helper.communicate(timeout=240)
     assert helper.returncode == 0, said
-    assert re.search(r"\d+ parts done here", said)
+    helped = int(re.search(r"(\d+) parts done here", said).group(1)) > 0
     region = json.loads((root / "out" / "result" / "report.json").read_text())["regions"]["tiled"]
     assert region["provenance"]["tiles"] == 3
+    assert region["provenance"]["tile_processes"] == 1 + helped
+    text = (root / "out" / "result" / "report.md").read_text(encoding="utf-8")
+    assert f"3 tiles, by {'2 processes' if helped else '1 process'}" in text
     assert region["check"]["defects"] == []
     assert region["estimate"]["tiled"] is True
     mesh = world_mesh(root, "tiled")

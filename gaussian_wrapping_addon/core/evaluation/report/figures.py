@@ -86,7 +86,8 @@ _COUNTS = frozenset(
         "removed_solids", "sightings", "smooth_steps", "split_edges", "split_vertices",
         "surface_points", "target_faces", "tetrahedra", "texels_filled",
         "texels_overlapping", "texels_seen", "texels_seen_at_outlines_only", "texels_used",
-        "threads", "undecided_tetrahedra", "unseen_evaluations", "unused_vertices",
+        "threads", "tile_processes", "undecided_tetrahedra", "unseen_evaluations",
+        "unused_vertices",
         "vertices", "vertices_at_end_of_sight", "vertices_moved_apart",
         "vertices_on_region_boundary", "vertices_on_surface", "views", "wrap_rounds",
     )

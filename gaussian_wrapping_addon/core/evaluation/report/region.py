@@ -99,6 +99,7 @@ def _mesh(region: dict[str, Any]) -> list[str]:
         ("Check of closedness and manifold", _checked(part(region, "check"))),
         ("Separate parts", plural(statistics.get("components"), "part")),
         *_removed(provenance),
+        *_made(provenance),
         ("Size (x, y, z)", extent),
         ("Surface area", number(world.get("area"), "square world units")),
         ("Edge length, mean", number(world.get("edge_mean"), "world units")),
@@ -167,7 +168,26 @@ def _cleaned(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     if steps := measured(provenance.get("smooth_steps")):
         rows.append(("Smoothed", plural(int(steps), "step")))
     if target := measured(provenance.get("target_faces")):
-        rows.append(("Decimated", f"from {number(before)} faces, {number(target)} asked for"))
+        rows.append(("Faces before decimation", number(before, "faces")))
+        rows.append(("Faces asked for", number(target, "faces")))
+    return rows
+
+
+def _made(provenance: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return in how many tiles the mesh was made, and how much of the space nobody has seen."""
+    rows = []
+    if tiles := measured(provenance.get("tiles")):
+        text = plural(int(tiles), "tile")
+        if processes := measured(provenance.get("tile_processes")):
+            text += f", by {plural(int(processes), 'process', 'processes')}"
+        rows.append(("Made in", text))
+    asked = measured(provenance.get("field_evaluations"))
+    unseen = measured(provenance.get("unseen_evaluations"))
+    if asked and unseen is not None:
+        text = f"{percent(unseen / asked)} of the points asked for"
+        if provenance.get("unseen") in ("empty", "occupied"):
+            text += f", taken as {provenance['unseen']}"
+        rows.append(("Seen by no camera", text))
     return rows
 
 

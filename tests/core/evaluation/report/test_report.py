@@ -247,7 +247,8 @@ def test_defects_of_the_last_check_are_told_and_what_was_cleaned_up(tmp_path: Pa
         ("Removed for their size", "2 floaters, 1 small cavity: 3.0 % of the area"),
         ("Removed after opening at the region", "2 small pieces: 1.0 % of the area"),
         ("Smoothed", "3 steps"),
-        ("Decimated", "from 9,000 faces, 196 asked for"),
+        ("Faces before decimation", "9,000 faces"),
+        ("Faces asked for", "196 faces"),
     ):
         assert row(told, name) == figure
     assert "edges have one face only: 4" in section(text, "## Warnings")
@@ -255,6 +256,24 @@ def test_defects_of_the_last_check_are_told_and_what_was_cleaned_up(tmp_path: Pa
     found = collect_warnings({"regions": {REGION: region}})
     assert not [w for w in found if "check of the finished mesh" in w.text]
     assert "| no defect |" in write(tmp_path, None, {REGION: region})[1]
+
+
+def test_tiles_processes_and_what_no_camera_saw_are_told(tmp_path: Path) -> None:
+    region = full_region()
+    region["provenance"].update(
+        tiles=3, tile_processes=2, field_evaluations=4000, unseen_evaluations=50, unseen="occupied"
+    )
+    told = section(write(tmp_path, None, {REGION: region})[1], f"## Region {escaped(REGION)}")
+    assert row(told, "Made in") == "3 tiles, by 2 processes"
+    assert row(told, "Seen by no camera") == "1.2 % of the points asked for, taken as occupied"
+    region["provenance"].update(tiles=1, tile_processes=1, unseen_evaluations=0, unseen="empty")
+    told = section(write(tmp_path, None, {REGION: region})[1], f"## Region {escaped(REGION)}")
+    assert row(told, "Made in") == "1 tile, by 1 process"
+    assert row(told, "Seen by no camera") == "0.0 % of the points asked for, taken as empty"
+    told = section(write(tmp_path)[1], f"## Region {escaped(REGION)}")
+    assert "Made in" not in told
+    assert "Seen by no camera" not in told
+    assert "before decimation" not in told
 
 
 def test_pictures_are_linked_exactly_where_they_are(tmp_path: Path) -> None:
