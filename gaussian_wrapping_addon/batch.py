@@ -211,12 +211,12 @@ def _wrap(options: Namespace) -> int:
 
 def _more(options: Namespace) -> int:
     from .core.jobs.client import JobClient, worker_python
-    from .core.jobs.job_file import read_job
+    from .core.jobs.earlier_job import finished_job
     from .core.jobs.job_folder import JobFolder
     from .core.jobs.more import job_with_more
 
     folder = JobFolder(options.out.resolve())
-    job = job_with_more(folder, read_job(folder.job_path), options.iterations)
+    job = job_with_more(folder, finished_job(folder), options.iterations)
     _require_bpy(job, options)
     return _follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 
@@ -236,12 +236,13 @@ def _estimate(options: Namespace) -> int:
 def _mesh(options: Namespace) -> int:
     from .core.errors import UsageError
     from .core.jobs.client import JobClient, worker_python
-    from .core.jobs.job_file import make_job, read_job
+    from .core.jobs.earlier_job import finished_job
+    from .core.jobs.job_file import make_job
     from .core.jobs.job_folder import JobFolder
     from .core.jobs.stages import read_done
 
     folder = JobFolder(options.out.resolve())
-    earlier = read_job(folder.job_path)
+    earlier = finished_job(folder)
     if not any(read_done(path) for path in folder.stages.glob("train-*")):
         raise UsageError(
             f"{options.out} holds no finished training.", "Run wrap, or resume it, first."
@@ -304,7 +305,7 @@ def _resume(options: Namespace) -> int:
         job.settings.training, max_gaussians=options.max_gaussians, extra_iterations=0
     )
     settings = replace(job.settings, training=training).validated()
-    job = replace(job, command="wrap" if job.command == "more" else job.command, settings=settings)
+    job = replace(job, command="wrap", settings=settings)
     return _follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 
 
@@ -444,6 +445,8 @@ def _follow(client: JobClient, job: JobFile, options: Namespace) -> int:
         return EXIT_CANCELLED
     if status.state != "DONE":
         _logger.error("error: %s %s", status.error, status.hint)
+        if client.folder.read_status().state == "DONE":
+            _logger.info("the job and its result are as they were before: %s", client.folder.root)
         return status.exit_code or EXIT_OTHER
     return _finish(client.folder.result, before, job, options) or EXIT_DONE
 

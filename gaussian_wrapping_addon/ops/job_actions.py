@@ -11,7 +11,8 @@ import numpy as np
 
 from ..core.errors import UsageError
 from ..core.jobs.client import JobClient, worker_python
-from ..core.jobs.job_file import make_job, read_job
+from ..core.jobs.earlier_job import finished_job
+from ..core.jobs.job_file import make_job
 from ..core.jobs.job_folder import JobFolder
 from ..core.jobs.more import job_with_more
 from ..core.jobs.stages import read_done
@@ -116,7 +117,7 @@ def start_mesh(
     folder = job_folder_of(frame)
     _require_training(folder)
     _refuse_running(folder)
-    earlier = read_job(JobFolder(folder).job_path)
+    earlier = finished_job(JobFolder(folder))
     edge_length = _edge_length_world(scene, regions, frame)
     requests = []
     for region in regions:
@@ -172,7 +173,7 @@ def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerCh
     """
     folder = job_folder_of(frame)
     _refuse_running(folder)
-    earlier = read_job(JobFolder(folder).job_path)
+    earlier = finished_job(JobFolder(folder))
     job = job_with_more(JobFolder(folder), earlier, scene.gwrap.training.more_iterations)
     job = replace(job, settings=replace(job.settings, threads=choice.threads))
     client = JobClient.start(

@@ -15,6 +15,7 @@ from typing import Any
 
 from ..errors import ParseError, UsageError, WorkerError
 from ..helper_process import child_command, child_environment, kill_group
+from .earlier_job import keep_finished
 from .job_file import JobFile, read_job, write_job
 from .job_folder import JobFolder, JobStatus, process_alive
 from .smaller import killed_hint
@@ -42,6 +43,7 @@ class JobClient:
     def __init__(self, folder: JobFolder, process: subprocess.Popen[bytes] | None) -> None:
         self.folder = folder
         self._process = process
+        self._seen_at_work = process is not None
 
     @classmethod
     def start(
@@ -74,6 +76,7 @@ class JobClient:
         target.create()
         if target.locked():
             raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
+        keep_finished(target, job)
         write_job(target.job_path, job)
         return cls._launch(target, python, keep_running)
 
@@ -119,7 +122,18 @@ class JobClient:
         return cls(target, None)
 
     def poll(self) -> JobStatus:
-        """Return the job's status; cheap enough for a timer."""
+        """Return the job's status; cheap enough for a timer.
+
+        A job that is finished as before, but could not be meshed again, has failed for those who
+        saw it at work, and is done for all others.
+        """
+        status = self._poll()
+        self._seen_at_work = self._seen_at_work or status.active
+        if self._seen_at_work and status.state == "DONE" and status.error:
+            return replace(status, state="FAILED")
+        return status
+
+    def _poll(self) -> JobStatus:
         code = None if self._process is None else self._process.poll()
         # Read after the process was looked at: its last status may be its last deed.
         status = self.folder.read_status()

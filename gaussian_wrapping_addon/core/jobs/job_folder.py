@@ -31,6 +31,7 @@ class JobStatus:
     message: str = ""
     seconds_left: float | None = None
     error: str = ""
+    """Why it failed; of a job that is DONE, why it could not be meshed again."""
     hint: str = ""
     exit_code: int | None = None
     pid: int = 0

@@ -10,12 +10,13 @@ import signal
 import sys
 import threading
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import FrameType
 
 from ..errors import EXIT_DONE, EXIT_OTHER, EXIT_RESOURCES, Cancelled, WrapError
 from ..progress import ProgressEvent
+from .earlier_job import forget_finished, put_back
 from .job_file import read_job
 from .job_folder import JobFolder, JobStatus, process_start_ticks
 from .training_stage import COMPILING
@@ -119,6 +120,15 @@ def parent_to_watch(caller: str) -> int:
     return os.getppid() if int(caller) else 0
 
 
+def _put_back(folder: JobFolder) -> JobStatus | None:
+    """Make the folder what it was before a mesh that has failed; that is told all the same."""
+    try:
+        return put_back(folder)
+    except OSError:
+        _logger.exception("the earlier job cannot be put back")
+        return None
+
+
 def main(arguments: list[str]) -> int:
     """Run the job of ``arguments = [folder, caller's pid or 0]``; return the exit code.
 
@@ -170,7 +180,13 @@ def main(arguments: list[str]) -> int:
         code, state, error, hint = EXIT_DONE, "DONE", "", ""
     reporter.end()
     result = str(folder.result) if folder.result.is_dir() else ""
+    if state == "DONE":
+        forget_finished(folder)
+    earlier = _put_back(folder) if state == "FAILED" else None
     full = {"fraction": 1.0, "seconds_left": 0.0, "message": ""} if state == "DONE" else {}
-    reporter.write(state=state, error=error, hint=hint, exit_code=code, result=result, **full)
+    last = {**full, "state": state, "result": result}
+    if earlier is not None:
+        last = {k: v for k, v in asdict(earlier).items() if k != "heartbeat_s"}
+    reporter.write(**{**last, "error": error, "hint": hint, "exit_code": code})
     folder.unlock()
     return code

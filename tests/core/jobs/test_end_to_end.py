@@ -180,6 +180,25 @@ def test_another_region_and_resolution_needs_no_training(
     assert 0.02 < np.median(edges) < 0.08
 
 
+def test_a_region_without_surface_leaves_the_finished_job_as_it_was(
+    wrapped: tuple[BallScene, Path, str],
+) -> None:
+    scene, root, _ = wrapped
+    folder = JobFolder(root / "out")
+    box = write_box(root / "nothing.json", scene, 0.2, (0, 0, 3.0))
+    before = folder.job_path.read_bytes(), sorted(folder.stages.iterdir())
+    shown = {p: p.read_bytes() for p in folder.result.rglob("*") if p.is_file()}
+    done = batch("mesh", "--out", str(folder.root), "--region", str(box), "--no-blend")
+    assert done.returncode == 3, done.stdout + done.stderr
+    assert "nothing" in done.stdout
+    assert "the job and its result are as they were before" in done.stdout
+    assert (folder.job_path.read_bytes(), sorted(folder.stages.iterdir())) == before
+    assert folder.read_status().state == "DONE"
+    assert {p: p.read_bytes() for p in folder.result.rglob("*") if p.is_file()} == shown
+    again = batch("resume", str(folder.root), "--no-blend")
+    assert again.returncode == 0, again.stdout + again.stderr
+
+
 def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str]) -> None:
     scene, root, _ = wrapped
     box = write_box(root / "open.json", scene, 0.6, (0, 0, 1.0))
