@@ -62,8 +62,13 @@ class _Parser(ArgumentParser):
 
 
 def _parser() -> ArgumentParser:
-    from .batch_options import add_clean_up_options, add_method_options, add_training_options
-    from .core.settings import EXPORT_FORMATS, SPACINGS
+    from .batch_options import (
+        add_boundary_options,
+        add_clean_up_options,
+        add_method_options,
+        add_training_options,
+    )
+    from .core.settings import EXPORT_FORMATS
 
     parser = _Parser(prog="batch.py", description="Photos in, a textured mesh out.")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
@@ -100,18 +105,9 @@ def _parser() -> ArgumentParser:
         command.add_argument("--region", nargs="+", action="extend", metavar="auto|all|REGION.json")
     for command in (wrap, mesh, mesh_estimate):
         command.add_argument("--out", type=Path, required=True, metavar="DIR")
-        size = command.add_mutually_exclusive_group()
-        size.add_argument("--edge-length", type=float, default=0.0, help="world units of the input")
-        size.add_argument("--points", type=int, default=0, help="number of surface points")
-        command.add_argument(
-            "--spacing", choices=SPACINGS, default="adaptive", help="of the mesh's vertices"
-        )
-        command.add_argument(
-            "--tiles", default="auto", metavar="auto|off|N",
-            help="parts that a large region is meshed in, so that memory stays bounded",
-        )  # fmt: skip
-    for command in (wrap, mesh):
         add_method_options(command)
+    for command in (wrap, mesh):
+        add_boundary_options(command)
         add_clean_up_options(command)
         command.add_argument("--texture-size", default="auto", metavar="auto|N")
         command.add_argument(
@@ -253,14 +249,12 @@ def _mesh(options: Namespace) -> int:
 
 
 def _estimate_mesh(options: Namespace) -> int:
+    from .batch_options import method_settings
     from .core.jobs.client import worker_python
     from .core.jobs.evaluate import run_in_worker
     from .core.settings import JobSettings, MeshingSettings, to_json
 
-    meshing = MeshingSettings(
-        edge_length=options.edge_length, points=options.points, spacing=options.spacing,
-        tiles=options.tiles,
-    )  # fmt: skip
+    meshing = MeshingSettings(**method_settings(options))
     JobSettings(meshing=meshing, threads=options.threads).validated()
     region = options.region
     request = {
@@ -311,7 +305,7 @@ def _resume(options: Namespace) -> int:
 
 def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
     """Put the options that ``wrap`` and ``mesh`` share into the settings."""
-    from .batch_options import clean_up_settings, method_settings
+    from .batch_options import boundary_settings, clean_up_settings, method_settings
     from .core.errors import UsageError
 
     size = options.texture_size
@@ -326,11 +320,8 @@ def _region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
         export=tuple(dict.fromkeys(f for f in options.export.split(",") if f)),
         meshing=replace(
             settings.meshing,
-            edge_length=options.edge_length,
-            points=options.points,
-            spacing=options.spacing,
-            tiles=options.tiles,
             **method_settings(options),
+            **boundary_settings(options),
             **clean_up_settings(options),
         ),
         texture=replace(settings.texture, size_px=0 if size == "auto" else int(size)),

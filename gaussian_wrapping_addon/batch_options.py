@@ -95,29 +95,82 @@ _MESHING: tuple[tuple[str, str, type, str, str], ...] = (
 )
 
 
-# Options of ``wrap`` and ``mesh`` that choose one word or number: their help.
-_CHOICES = {
+# Options of meshing that choose one word or number: their help.
+_METHOD = {
     "method": "primal adaptive meshing, or marching tetrahedra on the Gaussians' pivots",
-    "pivots": "of each Gaussian, where --method pivots",
+    "pivots": "of each Gaussian, with --method pivots (default: 2)",
+    "spacing": "of the mesh's vertices (default: adaptive)",
+}
+_CHOICES = {
     "boundary": "of the region where it cuts a solid: faces close it there, or it stays open",
     "unseen": "what stands where no camera looks: nothing, or something",
 }
 
 
 def add_method_options(parser: ArgumentParser) -> None:
-    """Add how a mesh is made, of which field, and how it ends at the region's boundary."""
-    from .core.settings import BOUNDARIES, MESH_METHODS, PIVOT_COUNTS, UNSEEN, MeshingSettings
+    """Add how a mesh is made, and how finely."""
+    from .core.settings import MESH_METHODS, PIVOT_COUNTS, SPACINGS
 
-    of_option = zip(_CHOICES, (MESH_METHODS, PIVOT_COUNTS, BOUNDARIES, UNSEEN), strict=True)
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--edge-length", type=float, metavar="X", help="world units of the input")
+    size.add_argument("--points", type=int, metavar="N", help="number of surface points")
+    of_option = zip(_METHOD, (MESH_METHODS, PIVOT_COUNTS, SPACINGS), strict=True)
     for name, choices in of_option:
+        parser.add_argument(f"--{name}", type=type(choices[0]), choices=choices, help=_METHOD[name])
+    parser.add_argument(
+        "--tiles",
+        metavar="auto|off|N",
+        help="parts that a large region is meshed in, so that memory stays bounded (default: auto)",
+    )
+
+
+def add_boundary_options(parser: ArgumentParser) -> None:
+    """Add of which field a mesh is made, and how it ends at the region's boundary."""
+    from .core.settings import BOUNDARIES, UNSEEN, MeshingSettings
+
+    for name, choices in zip(_CHOICES, (BOUNDARIES, UNSEEN), strict=True):
         default = getattr(MeshingSettings(), name)
-        parser.add_argument(
-            f"--{name}", type=type(default), choices=choices, default=default, help=_CHOICES[name]
-        )
+        parser.add_argument(f"--{name}", choices=choices, default=default, help=_CHOICES[name])
 
 
 def method_settings(options: Namespace) -> dict[str, Any]:
-    """Return the meshing settings that :func:`add_method_options` was given."""
+    """Return the meshing settings that :func:`add_method_options` was given.
+
+    What was not given has its default, not that of an earlier mesh.
+
+    Raises
+    ------
+    UsageError
+        An option is given that the method does not heed.
+    """
+    from .core.errors import UsageError
+    from .core.settings import MeshingSettings
+
+    default = MeshingSettings()
+    names = (*_METHOD, "edge_length", "points", "tiles")
+    given = {name: value for name in names if (value := getattr(options, name)) is not None}
+    method = given.get("method", default.method)
+    if method == "pivots":
+        # An edge length or number of 0 asks for none, and these words for what pivots do anyway.
+        idle = {"edge_length": (0.0,), "points": (0,), "tiles": ("auto", "off")}
+        for name in ("edge_length", "points", "spacing", "tiles"):
+            if name in given and given[name] not in idle.get(name, ()):
+                option = "--" + name.replace("_", "-")
+                raise UsageError(
+                    f"{option} {given[name]} does not go with --method pivots, which is as fine "
+                    "as the Gaussians lie and makes the mesh whole.",
+                    f"Leave one of the two out; --method pam heeds {option}.",
+                )
+    elif "pivots" in given:
+        raise UsageError(
+            f"--pivots {given['pivots']} does not go with --method {method}.",
+            "Add --method pivots, or leave --pivots out.",
+        )
+    return {name: given.get(name, getattr(default, name)) for name in names}
+
+
+def boundary_settings(options: Namespace) -> dict[str, Any]:
+    """Return the meshing settings that :func:`add_boundary_options` was given."""
     return {name: getattr(options, name) for name in _CHOICES}
 
 
@@ -169,7 +222,6 @@ _OTHERS = {
     "export": "--export",
     "meshing.edge_length": "--edge-length",
     "meshing.points": "--points",
-    "meshing.spacing": "--spacing",
     "meshing.tiles": "--tiles",
     "texture.size_px": "--texture-size",
     "training.mask_mode": "--mask-mode",
@@ -185,7 +237,7 @@ def option_of(setting: str) -> str:
         **{f"training.{name}": option for option, name, *_ in _NUMBERS},
         **{f"training.{name}": "--" + name.replace("_", "-") for name in NEEDS},
         **{f"meshing.{name}": option for option, name, *_ in _MESHING},
-        **{f"meshing.{name}": f"--{name}" for name in _CHOICES},
+        **{f"meshing.{name}": f"--{name}" for name in (*_METHOD, *_CHOICES)},
     }
     return options.get(setting, "")
 

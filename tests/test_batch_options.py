@@ -12,7 +12,12 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.batch import _parser, _region_settings
-from gaussian_wrapping_addon.batch_options import NEEDS, option_of, training_settings
+from gaussian_wrapping_addon.batch_options import (
+    NEEDS,
+    method_settings,
+    option_of,
+    training_settings,
+)
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.settings import (
     PRESETS,
@@ -72,11 +77,43 @@ def test_clean_up_options_become_meshing_settings(command: str) -> None:
     assert meshing("--method", "pivots", "--pivots", "9") == MeshingSettings(
         method="pivots", pivots=9
     )
+    assert meshing("--spacing", "uniform", "--points", "50", "--tiles", "3") == MeshingSettings(
+        spacing="uniform", points=50, tiles="3"
+    )
+    assert meshing("--edge-length", "0.5") == MeshingSettings(edge_length=0.5)
     assert meshing("--boundary", "open") == MeshingSettings(boundary="open")
     assert meshing("--unseen", "occupied") == MeshingSettings(unseen="occupied")
     assert meshing("--faces", "5000") == MeshingSettings(target_faces=5000)
     assert meshing("--smooth", "3") == MeshingSettings(smooth_steps=3)
     assert meshing("--min-part", "0.2") == MeshingSettings(min_component_share=0.2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--method", "pivots", "--points", "50"), ("--points 50", "--method pivots")),
+        (("--method", "pivots", "--edge-length", "0.1"), ("--edge-length 0.1", "--method pivots")),
+        (("--method", "pivots", "--spacing", "uniform"), ("--spacing uniform", "--method pivots")),
+        (("--method", "pivots", "--tiles", "4"), ("--tiles 4", "--method pivots")),
+        (("--pivots", "9"), ("--pivots 9", "--method pam")),
+        (("--method", "pam", "--pivots", "2"), ("--pivots 2", "--method pam")),
+    ],
+)
+@pytest.mark.parametrize("command", ["wrap photos", "mesh", "estimate-mesh"])
+def test_options_that_the_method_does_not_heed_are_refused(
+    command: str, arguments: tuple[str, ...], words: tuple[str, str]
+) -> None:
+    options = _parser().parse_args([*command.split(), "--out", "o", *arguments])
+    with pytest.raises(UsageError) as refused:
+        method_settings(options)
+    assert all(word in refused.value.message for word in words)
+    assert refused.value.hint
+
+
+def test_words_that_ask_a_method_for_nothing_else_go_with_it() -> None:
+    asked = ["mesh", "--out", "o", "--method", "pivots", "--points", "0", "--tiles", "off"]
+    settings = MeshingSettings(**method_settings(_parser().parse_args(asked)))
+    assert settings == MeshingSettings(method="pivots", tiles="off")
 
 
 @pytest.mark.parametrize(("word", "wanted"), [("auto", "auto"), ("all", "on"), ("none", "off")])

@@ -21,7 +21,7 @@ from ..settings import MeshingSettings, from_json
 from .evaluate import end_with
 from .job_file import AUTOMATIC_REGIONS
 from .job_folder import JobFolder
-from .region_meshing import expected_mesh, free_bytes
+from .region_meshing import expected_by_pivots, expected_mesh, free_bytes
 from .stages import read_done
 
 MOST_VIEWS = 24
@@ -85,11 +85,16 @@ def _lines(request: dict[str, Any]) -> list[str]:
             f"The cameras see no surface in region {region.name!r}.",
             "Draw the region around something that was photographed.",
         )
+    vacancy = VacancyField(arrays, scene.cameras, threads=threads)
+    memory_bytes = free_bytes(folder.root, threads)
+    if meshing.method == "pivots":
+        by_pivots = expected_by_pivots(vacancy, arrays, region, meshing, sightings)
+        by_pivots.refuse(memory_bytes)
+        return by_pivots.lines()
     expected = expected_mesh(
-        VacancyField(arrays, scene.cameras, threads=threads), scene.cameras, region, meshing,
+        vacancy, scene.cameras, region, meshing,
         meshing.edge_length / scene.world_from_scene.scale, sightings,
     )  # fmt: skip
-    memory_bytes = free_bytes(folder.root, threads)
     tiled = meshing.tiles != "off" and (meshing.tiles != "auto" or expected.tiles_for(memory_bytes))
     expected.refuse(memory_bytes, tiled=tiled)
     how = "it would be meshed in tiles" if tiled else "it would be meshed whole"

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ..gaussians.model import GaussianArrays
     from ..meshing.convex_region import Region
     from ..meshing.estimate import MeshEstimate
+    from ..meshing.pivot_estimate import PivotEstimate
     from ..meshing.surface_mesh import SurfaceMesh
     from ..meshing.tiles.plan import Field
 
@@ -93,6 +94,50 @@ def mesh_in_stage(
             threads=threads, edge_length_scene=edge_length_scene, sightings=sightings,
         )  # fmt: skip
     return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": tiled}
+
+
+def mesh_by_pivots_in_stage(
+    stage_folder: Path,
+    vacancy: VacancyField,
+    arrays: GaussianArrays,
+    cameras: Sequence[Camera],
+    region: Region,
+    meshing: MeshingSettings,
+    progress: Progress,
+    *,
+    seed: int,
+    threads: int,
+    sightings: Sightings,
+) -> tuple[SurfaceMesh, dict[str, Any]]:
+    """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
+    from ..meshing.pivot_meshing import mesh_by_pivots
+
+    expected = expected_by_pivots(vacancy, arrays, region, meshing, sightings)
+    for line in expected.lines():
+        _logger.info("region %s, estimated %s", region.name, line)
+    memory_bytes = free_bytes(stage_folder, threads)
+    expected.refuse(memory_bytes)
+    mesh = mesh_by_pivots(
+        vacancy, arrays, cameras, region, meshing, progress, seed=seed, sightings=sightings
+    )
+    return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": False}
+
+
+def expected_by_pivots(
+    vacancy: VacancyField,
+    arrays: GaussianArrays,
+    region: Region,
+    meshing: MeshingSettings,
+    sightings: Sightings,
+) -> PivotEstimate:
+    """Estimate the mesh of a region by pivots from the Gaussians and sightings in it."""
+    from ..meshing.estimate import evaluation_seconds
+    from ..meshing.pivot_estimate import estimate_pivots
+
+    return estimate_pivots(
+        arrays, region, meshing.pivots, len(sightings),
+        evaluation_s=evaluation_seconds(vacancy, sightings.points),
+    )  # fmt: skip
 
 
 def expected_mesh(

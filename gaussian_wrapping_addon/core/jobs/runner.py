@@ -211,11 +211,15 @@ def _run_meshing(
         from ..meshing.mesh_check import check_mesh
         from ..meshing.mesh_file import save_mesh
         from ..meshing.open_boundary import opened
-        from ..meshing.pivot_meshing import mesh_by_pivots
         from ..meshing.region import automatic_region, parse_region, whole_region, write_region
         from ..meshing.statistics import mesh_statistics
         from .region_field import field_figures, region_field
-        from .region_meshing import mesh_in_stage, remove_tiles, tiles_origin
+        from .region_meshing import (
+            mesh_by_pivots_in_stage,
+            mesh_in_stage,
+            remove_tiles,
+            tiles_origin,
+        )
 
         scene = load_saved_scene(cameras.folder)
         gaussians = load_gaussians(trained.folder / "gaussians.npz")
@@ -235,11 +239,11 @@ def _run_meshing(
             gaussians, scene.cameras, lambda points: region.contains(points, 0.0),
             progress.span(0.0, 0.15), threads=threads,
         )  # fmt: skip
-        expected: dict[str, Any] = {}
         if meshing.method == "pivots":
-            mesh = mesh_by_pivots(
-                vacancy, arrays, scene.cameras, region, meshing, progress.span(0.15, 0.9),
-                seed=job.settings.seed, sightings=sightings,
+            mesh, expected = mesh_by_pivots_in_stage(
+                stage_folder, vacancy, arrays, scene.cameras, region, meshing,
+                progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
+                sightings=sightings,
             )  # fmt: skip
         else:
             mesh, expected = mesh_in_stage(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -122,19 +122,40 @@ def pivot_cloud(
     MeshingError
         No Gaussian reaches the region.
     """
+    own = own_points(arrays, region, seed, pivots_of)
+    if sightings is None:
+        return own
+    points = np.concatenate(bracket_pairs(sightings, is_empty))
+    return replace(own, points=np.concatenate([own.points, _in_halo(points, region)]))
+
+
+def own_points(
+    arrays: GaussianArrays,
+    region: Region,
+    seed: int,
+    pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray],
+) -> PivotCloud:
+    """Collect pivots and probes alone, in and around a region; asks no field.
+
+    Raises
+    ------
+    MeshingError
+        No Gaussian reaches the region.
+    """
     margin = MARGIN_SHARE * region.diagonal
     index = reaching(arrays, region, margin)
     if len(index) == 0:
         raise MeshingError(f"No Gaussian reaches region {region.name!r}.", NO_SURFACE_HINT)
     chosen = representative(arrays, index, MAX_PIVOT_GAUSSIANS)
     pivots = pivots_of(arrays, chosen)
-    parts = [pivots[region.distance(pivots) <= HALO_SHARE * region.diagonal]]
-    parts.append(_probes(region, margin, seed))
-    if sightings is not None:
-        parts.extend(bracket_pairs(sightings, is_empty))
-    points = np.concatenate(parts)
+    near = pivots[region.distance(pivots) <= HALO_SHARE * region.diagonal]
+    points = np.concatenate([near, _probes(region, margin, seed)])
+    return PivotCloud(_in_halo(points, region), len(index), len(chosen))
+
+
+def _in_halo(points: np.ndarray, region: Region) -> np.ndarray:
     low, high = halo_bounds(region)
-    return PivotCloud(points[((points >= low) & (points <= high)).all(1)], len(index), len(chosen))
+    return points[((points >= low) & (points <= high)).all(1)]
 
 
 def halo_bounds(region: Region) -> np.ndarray:

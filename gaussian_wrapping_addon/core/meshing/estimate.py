@@ -99,7 +99,7 @@ class MeshEstimate:
         gigabytes = [f"{size / 2**30:.1f}" for size in sizes]
         unit, share = ("s", 1.0) if high < 90 else ("min", 60.0)
         return [
-            f"triangles: {_round(2 * self.points_low)} to {_round(2 * self.points_high)}",
+            f"triangles: {rounded(2 * self.points_low)} to {rounded(2 * self.points_high)}",
             f"time: {max(1, round(low / share))} to {max(1, round(high / share))} {unit}",
             f"memory: {gigabytes[0]} to {gigabytes[1]} GB whole, from {gigabytes[2]} GB in tiles",
         ]
@@ -118,8 +118,8 @@ class MeshEstimate:
         """
         if self.by_edge and self.dense_low > limits.MAX_MESH_POINTS:
             raise ResourceError(
-                f"This mesh needs at least {_round(self.dense_low)} points; "
-                f"{_round(limits.MAX_MESH_POINTS)} is the most.",
+                f"This mesh needs at least {rounded(self.dense_low)} points; "
+                f"{rounded(limits.MAX_MESH_POINTS)} is the most.",
                 f"{self._coarser(limits.MAX_MESH_POINTS)}, or a smaller region.",
             )
         needed = self.tiled_memory_bytes if tiled else self.memory_low_bytes
@@ -145,7 +145,7 @@ class MeshEstimate:
         stay = stay_of_dense(dense) if self.adaptive else dense
         before = stay_of_dense(self.dense_low) if self.adaptive else float(self.dense_low)
         factor = math.ceil(105.0 * math.sqrt(before / max(stay, 1.0))) / 100.0
-        return f"Use edges {factor:.2f} times longer (about {_round(int(stay))} points)"
+        return f"Use edges {factor:.2f} times longer (about {rounded(int(stay))} points)"
 
 
 def _tile_bytes(points: float) -> float:
@@ -153,7 +153,7 @@ def _tile_bytes(points: float) -> float:
     return SURROUNDINGS * points * POINT_BYTES
 
 
-def _round(number: int) -> str:
+def rounded(number: int) -> str:
     """Return a number with two digits that count."""
     digits = max(0, len(str(max(number, 1))) - 2)
     return f"{round(number, -digits):_}".replace("_", " ")

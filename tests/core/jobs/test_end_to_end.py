@@ -202,6 +202,17 @@ def test_a_region_without_surface_leaves_the_finished_job_as_it_was(
 def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str]) -> None:
     scene, root, _ = wrapped
     box = write_box(root / "open.json", scene, 0.6, (0, 0, 1.0))
+    estimate = batch(
+        "estimate-mesh", "--out", str(root / "out"), "--region", str(box), "--method", "pivots",
+        "--pivots", "3",
+    )  # fmt: skip
+    assert estimate.returncode == 0, estimate.stdout + estimate.stderr
+    ranges = {
+        name: tuple(int(word.replace(" ", "")) for word in (low, high))
+        for name, low, high in re.findall(
+            r"(t\w+es|t\w+dra): ([\d ]+) to ([\d ]+)", estimate.stdout
+        )
+    }
     done = batch(
         "mesh", "--out", str(root / "out"), "--region", str(box), "--method", "pivots",
         "--pivots", "3", "--boundary", "open", "--texture-size", "256", "--no-blend",
@@ -209,6 +220,11 @@ def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((root / "out" / "result" / "report.json").read_text())
     figures = report["regions"]["open"]
+    tetrahedra = figures["provenance"]["tetrahedra"]
+    assert ranges["tetrahedra"][0] < tetrahedra < ranges["tetrahedra"][1]
+    assert ranges["triangles"][0] < figures["statistics"]["faces"] < ranges["triangles"][1]
+    assert figures["estimate"]["tetrahedra_low"] < tetrahedra
+    assert figures["estimate"]["tetrahedra_high"] > tetrahedra
     assert figures["check"]["good"], figures["check"]["defects"]
     assert figures["check"]["open_at_region"] == figures["statistics"]["boundary_edges"] > 10
     assert figures["provenance"]["field_evaluations"] > figures["provenance"]["unseen_evaluations"]
