@@ -11,13 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.batch import _parser, _region_settings
-from gaussian_wrapping_addon.batch_options import (
-    NEEDS,
-    method_settings,
-    option_of,
-    training_settings,
-)
+from gaussian_wrapping_addon.command_line.meshing_options import method_settings, region_settings
+from gaussian_wrapping_addon.command_line.option_names import option_of
+from gaussian_wrapping_addon.command_line.parser import build_parser
+from gaussian_wrapping_addon.command_line.training_options import NEEDS, training_settings
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.settings import (
     PRESETS,
@@ -31,7 +28,9 @@ BATCH = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon" / "batch
 
 
 def settings_of(*arguments: str) -> JobSettings:
-    return training_settings(_parser().parse_args(["wrap", "photos", "--out", "o", *arguments]))
+    return training_settings(
+        build_parser().parse_args(["wrap", "photos", "--out", "o", *arguments])
+    )
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -69,9 +68,9 @@ def test_an_option_changes_its_setting_alone(
 @pytest.mark.parametrize("command", ["wrap photos", "mesh"])
 def test_clean_up_options_become_meshing_settings(command: str) -> None:
     def meshing(*arguments: str) -> MeshingSettings:
-        options = _parser().parse_args([*command.split(), "--out", "o", *arguments])
+        options = build_parser().parse_args([*command.split(), "--out", "o", *arguments])
         earlier = replace(preset("draft"), meshing=MeshingSettings(target_faces=77, smooth_steps=7))
-        return _region_settings(earlier, options).meshing
+        return region_settings(earlier, options).meshing
 
     assert meshing() == MeshingSettings(), "what an earlier mesh was given does not stay"
     assert meshing("--method", "pivots", "--pivots", "9") == MeshingSettings(
@@ -103,7 +102,7 @@ def test_clean_up_options_become_meshing_settings(command: str) -> None:
 def test_options_that_the_method_does_not_heed_are_refused(
     command: str, arguments: tuple[str, ...], words: tuple[str, str]
 ) -> None:
-    options = _parser().parse_args([*command.split(), "--out", "o", *arguments])
+    options = build_parser().parse_args([*command.split(), "--out", "o", *arguments])
     with pytest.raises(UsageError) as refused:
         method_settings(options)
     assert all(word in refused.value.message for word in words)
@@ -112,7 +111,7 @@ def test_options_that_the_method_does_not_heed_are_refused(
 
 def test_words_that_ask_a_method_for_nothing_else_go_with_it() -> None:
     asked = ["mesh", "--out", "o", "--method", "pivots", "--points", "0", "--tiles", "off"]
-    settings = MeshingSettings(**method_settings(_parser().parse_args(asked)))
+    settings = MeshingSettings(**method_settings(build_parser().parse_args(asked)))
     assert settings == MeshingSettings(method="pivots", tiles="off")
 
 
@@ -151,7 +150,7 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
         for path in ([f"{part}.{n}".strip(".") for n in values] if isinstance(values, dict) else ())
     }
     known = {path: option for path in paths if (option := option_of(path))}
-    wrap = set(_parser()._subparsers._group_actions[0].choices["wrap"]._option_string_actions)
+    wrap = set(build_parser()._subparsers._group_actions[0].choices["wrap"]._option_string_actions)
     assert set(known.values()) <= wrap
     assert wrap - set(known.values()) == {
         "-h", "--help", "--needs", "--start-splat", "--out", "--no-blend",
@@ -194,3 +193,19 @@ def test_bad_command_lines_end_with_words(
     said = done.stdout.decode()
     assert (done.returncode, words in said, done.stderr) == (code, True, b""), said
     assert not (tmp_path / "o").exists()
+
+
+def test_it_runs_as_a_script_of_blender(tmp_path: Path) -> None:
+    """As ``blender --background -P batch.py -- check photos``: Blender's own options are left."""
+    (tmp_path / "photos").mkdir()
+    line = ["blender", "--background", "-P", str(BATCH), "--", "check", "photos"]
+    script = (
+        f"import runpy, sys\nsys.argv = {line!r}\n"
+        f"runpy.run_path({str(BATCH)!r}, run_name='__main__')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-I", "-c", script], cwd=tmp_path, capture_output=True, check=False
+    )
+    assert done.returncode == 3, done
+    assert b"error: " in done.stdout
+    assert done.stderr == b""

@@ -17,6 +17,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon import batch
+from gaussian_wrapping_addon.command_line.parser import build_parser
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.evaluation.command import (
@@ -205,7 +206,7 @@ def test_a_launcher_between_caller_and_child_does_not_end_it(tmp_path: Path) -> 
     launcher.write_text(f'#!/bin/sh\n"{sys.executable}" "$@"\nexit $?\n')
     launcher.chmod(0o755)
     out = tmp_path / "scores.json"
-    options = batch._parser().parse_args(
+    options = build_parser().parse_args(
         ["evaluate", str(mesh), "--truth", str(mesh), "--samples", "1000", "--out", str(out)]
     )
     with pytest.MonkeyPatch.context() as patch:
@@ -215,12 +216,12 @@ def test_a_launcher_between_caller_and_child_does_not_end_it(tmp_path: Path) -> 
 
 
 def test_options_explain_themselves() -> None:
-    commands = next(a for a in batch._parser()._actions if isinstance(a.choices, dict))
+    commands = next(a for a in build_parser()._actions if isinstance(a.choices, dict))
     for action in commands.choices["evaluate"]._actions:
         assert action.help, action.dest
     for text in ("a", "1,b", "nan", "1,inf"):
         with pytest.raises(UsageError, match="give numbers separated by commas"):
-            batch._parser().parse_args(["evaluate", "m", "--truth", "t", "--thresholds", text])
+            build_parser().parse_args(["evaluate", "m", "--truth", "t", "--thresholds", text])
 
 
 def test_no_protocol_is_refused(tmp_path: Path) -> None:

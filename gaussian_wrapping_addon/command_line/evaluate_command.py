@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``evaluate``: a mesh or a job against a ground truth."""
+
+from __future__ import annotations
+
+import math
+from argparse import ArgumentTypeError, Namespace
+from pathlib import Path
+
+from .common import Commands, add_threads
+
+
+def add_evaluate(commands: Commands) -> None:
+    """Add ``evaluate``."""
+    parser = commands.add_parser("evaluate", help="a mesh or a job against a ground truth")
+    parser.add_argument(
+        "mesh", type=Path, metavar="MESH_OR_JOB", help="PLY, OBJ, GLB, STL or OFF; or a job folder"
+    )
+    parser.add_argument(
+        "--truth", type=Path, required=True, metavar="PATH", help="mesh, cloud, scene or data set"
+    )
+    parser.add_argument(
+        "--layout",
+        choices=("auto", "scene", "mesh", "tanks", "dtu"),
+        default="auto",
+        help="of the truth; auto tells it by the files there",
+    )
+    parser.add_argument("--scan", type=int, help="number of the DTU scan")
+    parser.add_argument("--region", help="of the job, where it has several")
+    parser.add_argument("--cameras", type=Path, help="cameras of a mesh file: COLMAP, transforms")
+    parser.add_argument(
+        "--thresholds", type=_floats, help="shares of the truth's diagonal, comma separated"
+    )
+    parser.add_argument("--distances", type=_floats, help="lengths instead, comma separated")
+    parser.add_argument(
+        "--align",
+        choices=("none", "cameras", "icp"),
+        help="how the mesh is placed on the truth first: as it is, by cameras of equal names, by "
+        "nearest points (default: none; tanks icp, dtu cameras)",
+    )
+    parser.add_argument("--protocols", help="comma separated, of uniform,scan,legacy")
+    parser.add_argument("--samples", type=int, help="points drawn on the mesh (uniform protocol)")
+    parser.add_argument("--seed", type=int, default=0, help="of these points")
+    add_threads(parser)
+    parser.add_argument("--out", type=Path, metavar="FILE.json", help="all figures, for programs")
+    parser.set_defaults(run=_evaluate)
+
+
+def _floats(text: str) -> list[float]:
+    try:
+        values = [float(word) for word in text.split(",") if word]
+    except ValueError:
+        values = [math.nan]
+    if not all(math.isfinite(value) for value in values):
+        raise ArgumentTypeError(f"{text!r}: give numbers separated by commas")
+    return values
+
+
+def _evaluate(options: Namespace) -> int:
+    from ..core.jobs.client import worker_python
+    from ..core.jobs.evaluate import run_in_worker
+    from ..core.settings import JobSettings
+
+    JobSettings(seed=options.seed, threads=options.threads).validated()
+    protocols = options.protocols
+    request = {
+        "mesh": str(options.mesh),
+        "truth": str(options.truth),
+        "layout": options.layout,
+        "scan": options.scan,
+        "region": options.region,
+        "cameras": None if options.cameras is None else str(options.cameras),
+        "shares": options.thresholds,
+        "distances": options.distances,
+        "align": options.align,
+        "protocols": None if protocols is None else [p for p in protocols.split(",") if p],
+        "samples": options.samples,
+        "seed": options.seed,
+        "threads": options.threads,
+        "out": None if options.out is None else str(options.out),
+    }
+    return run_in_worker(request, python=worker_python())

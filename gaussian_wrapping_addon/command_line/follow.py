@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A job from its start to its files, as the command line shows it."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import time
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..core.jobs.client import JobClient
+    from ..core.jobs.job_file import JobFile
+
+_logger = logging.getLogger("gaussian_wrapping")
+
+POLL_S = 0.2
+LINE_EVERY_S = 5.0
+CANCEL_WAIT_S = 12.0
+
+
+def has_bpy() -> bool:
+    """Tell whether this Python can write Blender files."""
+    return importlib.util.find_spec("bpy") is not None
+
+
+def require_bpy(job: JobFile, options: Namespace) -> None:
+    """Refuse before the start what could not be finished without bpy."""
+    from ..core.errors import UsageError
+
+    wants = "usd" in job.settings.export or not options.no_blend
+    if wants and not has_bpy():
+        raise UsageError(
+            "Writing scene.blend or USD needs bpy, which this Python does not have.",
+            "Add --no-blend (and leave usd out), run it in Blender, or pip install bpy.",
+        )
+
+
+def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
+    """Show progress until the worker ends; then write the Blender files. Return the exit code."""
+    from ..core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
+    from ..core.jobs.blend_file import shown_result
+
+    before = shown_result(client.folder.result)  # the worker writes it last
+    shown_s, shown, interrupted_s = 0.0, ("", ""), 0.0
+    while True:
+        try:
+            status = client.poll()
+            now_s = time.monotonic()
+            news = (status.stage, status.message)
+            due = status.stage != shown[0] or now_s - shown_s > LINE_EVERY_S
+            if status.stage and due and news != shown:
+                shown_s, shown = now_s, news
+                left = (
+                    "" if status.seconds_left is None else f" · {_span(status.seconds_left)} left"
+                )
+                _logger.info(
+                    "[%5.1f %%] %-7s %s%s",
+                    100 * status.fraction,
+                    status.stage,
+                    status.message,
+                    left,
+                )
+            if not status.active:
+                break
+            if interrupted_s and now_s - interrupted_s > CANCEL_WAIT_S:
+                client.kill()
+                return EXIT_CANCELLED
+            time.sleep(POLL_S)
+        except KeyboardInterrupt:
+            _logger.info("cancelling; the job can be resumed")
+            client.cancel()
+            interrupted_s = time.monotonic()
+    if status.state == "CANCELLED":
+        _logger.info("cancelled; continue with: resume %s", client.folder.root)
+        return EXIT_CANCELLED
+    if status.state != "DONE":
+        _logger.error("error: %s %s", status.error, status.hint)
+        if client.folder.read_status().state == "DONE":
+            _logger.info("the job and its result are as they were before: %s", client.folder.root)
+        return status.exit_code or EXIT_OTHER
+    return _finish(client.folder.result, before, job, options) or EXIT_DONE
+
+
+def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Namespace) -> int:
+    """Write the Blender files; one that shows the result ``before`` does not stay."""
+    from ..core.jobs.blend_file import NAME, set_aside_stale
+
+    if options.no_blend:
+        set_aside_stale(result, before)
+    else:
+        from ..ops.scene_objects import write_blend
+
+        try:
+            write_blend(result, result / NAME)
+        except BaseException:
+            set_aside_stale(result, before)
+            raise
+    if "usd" in job.settings.export:
+        from ..ops.scene_objects import export_usd
+
+        export_usd(result)
+    from ..core.evaluation.report.report import headline
+    from ..core.files import read_json
+
+    _logger.info("results: %s", result)
+    for line in headline(read_json(result / "report.json")):
+        _logger.info("  %s", line)
+    return 0
+
+
+def _span(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"

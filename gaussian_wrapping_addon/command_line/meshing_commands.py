@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``mesh``, ``estimate-mesh`` and ``work-tiles``: regions of a finished training."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from pathlib import Path
+
+from .common import Commands, add_no_blend, add_out, add_threads
+from .follow import follow, require_bpy
+from .meshing_options import (
+    add_method_options,
+    add_region_options,
+    method_settings,
+    region_settings,
+)
+
+MAX_WAIT_S = 7 * 86400.0
+
+
+def add_mesh(commands: Commands) -> None:
+    """Add ``mesh``."""
+    parser = commands.add_parser(
+        "mesh", help="another region or resolution, from a finished training"
+    )
+    add_out(parser)
+    add_method_options(parser)
+    add_region_options(parser)
+    add_threads(parser)
+    add_no_blend(parser)
+    parser.set_defaults(run=_mesh)
+
+
+def _mesh(options: Namespace) -> int:
+    from ..core.errors import UsageError
+    from ..core.jobs.client import JobClient, worker_python
+    from ..core.jobs.earlier_job import finished_job
+    from ..core.jobs.job_file import make_job
+    from ..core.jobs.job_folder import JobFolder
+    from ..core.jobs.stages import read_done
+
+    folder = JobFolder(options.out.resolve())
+    earlier = finished_job(folder)
+    if not any(read_done(path) for path in folder.stages.glob("train-*")):
+        raise UsageError(
+            f"{options.out} holds no finished training.", "Run wrap, or resume it, first."
+        )
+    job = make_job("mesh", Path(earlier.source), region_settings(earlier.settings, options))
+    require_bpy(job, options)
+    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+
+
+def add_estimate_mesh(commands: Commands) -> None:
+    """Add ``estimate-mesh``."""
+    parser = commands.add_parser(
+        "estimate-mesh", help="triangles, time and memory of a region's mesh, before it is made"
+    )
+    parser.add_argument("--region", default="auto", metavar="auto|all|REGION.json")
+    add_out(parser)
+    add_method_options(parser)
+    add_threads(parser)
+    parser.set_defaults(run=_estimate_mesh)
+
+
+def _estimate_mesh(options: Namespace) -> int:
+    from ..core.jobs.client import worker_python
+    from ..core.jobs.evaluate import run_in_worker
+    from ..core.settings import JobSettings, MeshingSettings, to_json
+
+    meshing = MeshingSettings(**method_settings(options))
+    JobSettings(meshing=meshing, threads=options.threads).validated()
+    region = options.region
+    request = {
+        "out": str(options.out.resolve()),
+        "region": region if region in ("auto", "all") else str(Path(region).resolve()),
+        "meshing": to_json(meshing),
+        "threads": options.threads,
+    }
+    return run_in_worker(
+        request, python=worker_python(), module="jobs.mesh_estimate", what="estimate"
+    )
+
+
+def add_work_tiles(commands: Commands) -> None:
+    """Add ``work-tiles``."""
+    parser = commands.add_parser(
+        "work-tiles", help="help a job that meshes in tiles, from another process or machine"
+    )
+    parser.add_argument("out", type=Path, metavar="DIR", help="job folder of that job")
+    add_threads(parser)
+    parser.add_argument(
+        "--wait", type=float, default=0.0, metavar="S", help="seconds to wait for tiles, at most"
+    )
+    parser.set_defaults(run=_work_tiles)
+
+
+def _work_tiles(options: Namespace) -> int:
+    from ..core.errors import UsageError
+    from ..core.jobs.client import worker_python
+    from ..core.jobs.evaluate import run_in_worker
+    from ..core.settings import JobSettings
+
+    JobSettings(threads=options.threads).validated()
+    if not 0 <= options.wait <= MAX_WAIT_S:
+        raise UsageError("--wait is out of range.", f"Give from 0 to {MAX_WAIT_S:.0f} seconds.")
+    request = {
+        "out": str(options.out.resolve()), "threads": options.threads, "wait_s": options.wait,
+    }  # fmt: skip
+    return run_in_worker(
+        request, python=worker_python(), module="jobs.tile_worker", what="work on tiles"
+    )

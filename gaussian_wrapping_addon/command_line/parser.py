@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The parser of the command line: every command, each from its own file."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+from typing import NoReturn
+
+from .check_commands import add_check, add_doctor
+from .evaluate_command import add_evaluate
+from .meshing_commands import add_estimate_mesh, add_mesh, add_work_tiles
+from .training_commands import add_estimate, add_more, add_resume, add_wrap
+
+_COMMANDS = (
+    add_wrap,
+    add_mesh,
+    add_more,
+    add_resume,
+    add_estimate_mesh,
+    add_work_tiles,
+    add_evaluate,
+    add_estimate,
+    add_check,
+    add_doctor,
+)
+"""In the order of the help."""
+
+
+class Parser(ArgumentParser):
+    """Raises our usage error instead of leaving the process, so that Blender ends in order."""
+
+    def error(self, message: str) -> NoReturn:
+        from ..core.errors import UsageError
+
+        raise UsageError(
+            f"{message}.", f"Usage: {self.format_usage().split('usage: ')[-1].strip()}"
+        )
+
+
+def build_parser() -> Parser:
+    """Return a parser whose options have ``run``: the command, given the options."""
+    parser = Parser(prog="batch.py", description="Photos in, a textured mesh out.")
+    commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
+    for add in _COMMANDS:
+        add(commands)
+    return parser

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``wrap``, ``more``, ``resume`` and ``estimate``: jobs that train."""
+
+from __future__ import annotations
+
+import logging
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+from .common import Commands, add_no_blend, add_out
+from .follow import follow, require_bpy
+from .meshing_options import add_method_options, add_region_options, region_settings
+from .training_options import add_training_options, training_settings
+
+_logger = logging.getLogger("gaussian_wrapping")
+
+
+def add_wrap(commands: Commands) -> None:
+    """Add ``wrap``."""
+    parser = commands.add_parser(
+        "wrap", help="photos, a COLMAP project or a transforms.json -> mesh"
+    )
+    parser.add_argument("input", type=Path)
+    add_training_options(parser)
+    add_out(parser)
+    add_method_options(parser)
+    add_region_options(parser)
+    add_no_blend(parser)
+    parser.set_defaults(run=_wrap)
+
+
+def _wrap(options: Namespace) -> int:
+    from ..core.dataset.check import check_input
+    from ..core.errors import DatasetError
+    from ..core.jobs.client import JobClient, worker_python
+    from ..core.jobs.job_file import make_job
+
+    settings = training_settings(options)
+    job = make_job("wrap", options.input, region_settings(settings, options))
+    require_bpy(job, options)
+    for finding in check_input(options.input):
+        if finding.severity == "error":
+            raise DatasetError(finding.message, finding.hint)
+        if finding.severity == "warning":
+            _logger.warning("warning: %s %s", finding.message, finding.hint)
+    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+
+
+def add_more(commands: Commands) -> None:
+    """Add ``more``."""
+    parser = commands.add_parser("more", help="train a finished job further, and mesh it again")
+    add_out(parser)
+    parser.add_argument("--iterations", type=int, required=True, metavar="N", help="to be added")
+    add_no_blend(parser)
+    parser.set_defaults(run=_more)
+
+
+def _more(options: Namespace) -> int:
+    from ..core.jobs.client import JobClient, worker_python
+    from ..core.jobs.earlier_job import finished_job
+    from ..core.jobs.job_folder import JobFolder
+    from ..core.jobs.more import job_with_more
+
+    folder = JobFolder(options.out.resolve())
+    job = job_with_more(folder, finished_job(folder), options.iterations)
+    require_bpy(job, options)
+    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+
+
+def add_resume(commands: Commands) -> None:
+    """Add ``resume``."""
+    parser = commands.add_parser("resume", help="continue a job that was stopped")
+    parser.add_argument("out", type=Path, metavar="DIR")
+    parser.add_argument(
+        "--max-gaussians", type=int, metavar="N", help="train anew with another cap"
+    )
+    add_no_blend(parser)
+    parser.set_defaults(run=_resume)
+
+
+def _resume(options: Namespace) -> int:
+    from ..core.jobs.client import JobClient, worker_python
+    from ..core.jobs.job_file import read_job
+    from ..core.jobs.job_folder import JobFolder
+
+    job = read_job(JobFolder(options.out.resolve()).job_path)
+    require_bpy(job, options)
+    if options.max_gaussians is None:
+        return follow(JobClient.resume(options.out, python=worker_python()), job, options)
+    # A training with another cap starts anew: there is nothing that it could add to.
+    training = replace(
+        job.settings.training, max_gaussians=options.max_gaussians, extra_iterations=0
+    )
+    settings = replace(job.settings, training=training).validated()
+    job = replace(job, command="wrap", settings=settings)
+    return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
+
+
+def add_estimate(commands: Commands) -> None:
+    """Add ``estimate``."""
+    parser = commands.add_parser("estimate", help="time, memory and disk of a training, before")
+    parser.add_argument("input", type=Path)
+    add_training_options(parser)
+    parser.set_defaults(run=_estimate)
+
+
+def _estimate(options: Namespace) -> int:
+    from ..core.jobs.client import worker_python
+    from ..core.jobs.evaluate import run_in_worker
+    from ..core.jobs.job_file import make_job
+
+    job = make_job("wrap", options.input, training_settings(options))
+    return run_in_worker(
+        job.to_json(), python=worker_python(), module="jobs.estimate", what="estimate"
+    )
