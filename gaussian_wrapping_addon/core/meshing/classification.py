@@ -3,18 +3,15 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from .. import tolerances
+from ..compiled import kernel
 from ..progress import Progress
-
-_logger = logging.getLogger(__name__)
+from .minimum_cut import minimum_cut
 
 Vacancy = Callable[[np.ndarray], np.ndarray]
 """Maps (n, 3) points to (n,) vacancy."""
@@ -45,8 +42,9 @@ DATA_WEIGHT = 1.0
 """Cost of a label against the vote, in units of the tetrahedron's own mean face area."""
 CAPACITY_STEPS = 4096.0
 """Integer steps of the median face area in the minimum cut."""
-MAX_CUT_NODES = 400_000
-SWEEPS = 8
+LARGEST_CAPACITY = 2**27
+"""In the same steps, 32 768 median areas: larger faces count as that. Flow one way can double what
+the other way may carry, which must fit into 32 bits."""
 
 POINTS_PER_CHUNK = 1 << 19
 
@@ -126,7 +124,7 @@ def classify(
     progress.update(0.85, "smoothing labels")
     free = flat | (np.abs(mean - tolerances.ISO_LEVEL) < FIXED_MARGIN) & ~outer
     areas = face_areas(points, tetrahedra)
-    smooth = regularised(inside, mean, free, neighbours, areas)
+    smooth = regularised(inside, mean, free, neighbours, areas, progress.span(0.9, 1.0))
     progress.update(1.0, "smoothing labels")
     flipped = int((smooth != inside).sum())
     return Classification(smooth, mean, samples, int(free.sum()), flipped)
@@ -216,6 +214,7 @@ def regularised(
     free: np.ndarray,
     neighbours: np.ndarray,
     areas: np.ndarray,
+    progress: Progress | None = None,
 ) -> np.ndarray:
     """Choose the labels of ``free`` tetrahedra by a minimum cut.
 
@@ -230,66 +229,37 @@ def regularised(
     nodes = np.flatnonzero(free)
     if len(nodes) == 0:
         return inside.copy()
-    own = np.full(len(free), -1, np.int64)
+    own = np.full(len(free), -1, np.int32)
     own[nodes] = np.arange(len(nodes))
-    links, weight = neighbours[nodes], areas[nodes]  # (k, 4)
-    known = links >= 0
-    theirs = np.where(known, own[links], -1)
-    fixed_inside = known & (theirs < 0) & inside[links]
-    fixed_outside = (theirs < 0) & ~fixed_inside
-    confidence = DATA_WEIGHT * 2 * np.abs(vacancy[nodes] - tolerances.ISO_LEVEL) * weight.mean(1)
-    votes_inside = inside[nodes]
-    to_inside = (weight * fixed_inside).sum(1) + np.where(votes_inside, confidence, 0.0)
-    to_outside = (weight * fixed_outside).sum(1) + np.where(votes_inside, 0.0, confidence)
+    # Only the difference of what pulls a tetrahedron to either side matters.
+    links = np.empty((len(nodes), 4), np.int32)
+    capacity, pull = np.empty((len(nodes), 4), np.int32), np.empty(len(nodes), np.int64)
+    confidence = DATA_WEIGHT * 2 * np.abs(vacancy[nodes] - tolerances.ISO_LEVEL)
+    steps = CAPACITY_STEPS / max(float(np.median(areas[nodes])), 1e-300)
+    _cut_kernel(
+        nodes, own, inside, confidence, neighbours, areas, steps, float(LARGEST_CAPACITY), links,
+        capacity, pull,
+    )  # fmt: skip
     result = inside.copy()
-    if len(nodes) <= MAX_CUT_NODES:
-        result[nodes] = _minimum_cut(theirs, weight, to_inside, to_outside)
-    else:
-        _logger.warning("%d undecided tetrahedra: smoothing by sweeps", len(nodes))
-        result[nodes] = _sweeps(votes_inside, theirs, weight, to_inside, to_outside)
+    result[nodes] = minimum_cut(links, capacity, pull, progress)
     return result
 
 
-def _minimum_cut(
-    links: np.ndarray, weight: np.ndarray, to_inside: np.ndarray, to_outside: np.ndarray
-) -> np.ndarray:
-    """Return which nodes end on the inside of the cheapest cut, (k,) bool."""
-    count = len(links)
-    source, sink = count, count + 1
-    row, column = np.nonzero(links >= 0)
-    # What both terminals give cancels; only the difference flows.
-    excess = to_inside - to_outside
-    strong, weak = np.flatnonzero(excess > 0), np.flatnonzero(excess < 0)
-    begins = np.concatenate([row, np.full(len(strong), source), weak])
-    ends = np.concatenate([links[row, column], strong, np.full(len(weak), sink)])
-    values = np.concatenate([weight[row, column], excess[strong], -excess[weak]])
-    unit = np.median(weight) / CAPACITY_STEPS
-    limit = np.iinfo(np.int32).max // 64  # sums of flows at a node must fit as well
-    capacity = np.minimum(np.rint(values / max(unit, 1e-300)), limit).astype(np.int32)
-    graph = csr_matrix((capacity, (begins, ends)), shape=(count + 2, count + 2))
-    flow = maximum_flow(graph, source, sink).flow
-    residual = graph - flow
-    residual.data[residual.data < 0] = 0
-    residual.eliminate_zeros()
-    reached = breadth_first_order(residual, source, return_predecessors=False)
-    result = np.zeros(count + 2, np.bool_)
-    result[reached] = True
-    return result[:count]
-
-
-def _sweeps(
-    start: np.ndarray,
-    links: np.ndarray,
-    weight: np.ndarray,
-    to_inside: np.ndarray,
-    to_outside: np.ndarray,
-) -> np.ndarray:
-    """Relax labels by weighted majority; alternate halves, so that neighbours do not chase."""
-    label = start.copy()
-    half = np.arange(len(label)) % 2 == 0
-    for sweep in range(2 * SWEEPS):
-        mine = np.where(links >= 0, np.where(label[links], 1.0, -1.0), 0.0)  # (k, 4)
-        balance = (mine * weight).sum(1) + to_inside - to_outside
-        change = ((balance > 0) != label) & (balance != 0) & (half == (sweep % 2 == 0))
-        label = label ^ change
-    return label
+@kernel(fast=False)
+def _cut_kernel(  # type: ignore[no-untyped-def]
+    nodes, own, inside, confidence, neighbours, areas, steps, limit, links, capacity, pull
+):
+    """Number the undecided, and round what links and pulls them to integers."""
+    for row in range(len(nodes)):
+        i = nodes[row]
+        mean = 0.0
+        for k in range(4):
+            mean += areas[i, k] / 4.0
+        towards = confidence[row] * mean if inside[i] else -confidence[row] * mean
+        for k in range(4):
+            j = neighbours[i, k]
+            links[row, k] = own[j] if j >= 0 else -1
+            capacity[row, k] = np.int32(np.rint(min(areas[i, k] * steps, limit)))
+            if links[row, k] < 0:
+                towards += areas[i, k] if j >= 0 and inside[j] else -areas[i, k]
+        pull[row] = np.int64(np.rint(min(max(towards * steps, -4.0 * limit), 4.0 * limit)))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gaussian_wrapping_addon.core.meshing.classification import _sweeps, regularised
+from gaussian_wrapping_addon.core.meshing.classification import regularised
 from gaussian_wrapping_addon.core.meshing.pivots import (
     directional_sigma,
     nine_pivots,
@@ -162,11 +162,3 @@ def test_minimum_cut_is_the_best_of_all_labels(seed: int) -> None:
         label[:10] = bits
         energies.append(energy(label, start, vacancy, links, areas))
     assert energy(best, start, vacancy, links, areas) == pytest.approx(min(energies), abs=2e-2)
-
-
-def test_sweeps_remove_a_lonely_label() -> None:
-    links = np.array([[1, 2, 3, -1], [0, -1, -1, -1], [0, -1, -1, -1], [0, -1, -1, -1]])
-    start = np.array([True, False, False, False])
-    outside = np.array([0.0, 1, 1, 1])
-    label = _sweeps(start, links, np.ones((4, 4)), np.zeros(4), outside)
-    assert not label.any()

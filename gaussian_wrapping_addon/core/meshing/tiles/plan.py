@@ -23,8 +23,8 @@ from .fillers import CLEAR_CAP_RADII, CLEAR_RADII, lattice, lattice_side
 from .tiling import Tiling, cut_evenly
 
 TILE_POINTS = 75_000
-"""Surface points of a tile, at most, where the number of tiles is automatic: its undecided
-tetrahedra, 4 to 5 a point, are few enough for the minimum cut (classification.MAX_CUT_NODES)."""
+"""Surface points of a tile, at most, where the number of tiles is automatic: memory stays small
+beside that of the field, and a machine with several cores gets enough tiles to share out."""
 
 WHOLE_POINTS = 400_000
 """Regions with no more surface points are meshed whole, where memory allows it."""
