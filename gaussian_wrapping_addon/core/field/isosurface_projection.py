@@ -19,7 +19,7 @@ from .vector_field import MIN_SLOPE, VectorFieldResult
 TOLERANCE = 0.01
 """Points no further than this from 0.5 are on the surface: about the error that dropped tails of
 Gaussians leave in the field."""
-AIM = 0.005
+AIM = 0.002
 """Points move on until they are this close, where the field is smooth enough. On trained scenes the
 median is then below 0.001, for a tenth more evaluations than with 0.01 (median 0.002)."""
 MAX_ROUNDS = 40
