@@ -21,6 +21,7 @@ from .components import compacted, without_floaters
 from .convex_region import Region
 from .degenerate import remove_degenerate
 from .delaunay import delaunay, far_points
+from .edge_flips import flip_edges
 from .extraction import boundary_faces, tetrahedron_neighbours
 from .level_error import level_errors
 from .repair import split_nonmanifold
@@ -241,6 +242,8 @@ def selected(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Keep the vertices that the shape needs, of a closed 2-manifold, and their kinds.
 
+    Edges between those that stay run where they keep closest to the given mesh.
+
     Parameters
     ----------
     target : int
@@ -249,9 +252,12 @@ def selected(
         Share that stays where that is more; with 1, as for uniform spacing, all do.
     """
     target = max(target, round(share * len(vertices)))
-    faces = select_vertices(vertices, faces, target, LONGEST_EDGE_SHARE * region.diagonal)
-    vertices, faces, chosen = compacted(vertices, faces)
-    return vertices, faces, kind[chosen]
+    if len(vertices) <= target:
+        return vertices, faces, kind
+    longest = LONGEST_EDGE_SHARE * region.diagonal
+    coarse = select_vertices(vertices, faces, target, longest)
+    kept, coarse, chosen = compacted(vertices, coarse)
+    return kept, flip_edges(kept, coarse, vertices, faces, longest), kind[chosen]
 
 
 def counts(kind: np.ndarray) -> dict[str, int]:
