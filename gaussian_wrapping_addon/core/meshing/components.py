@@ -65,6 +65,8 @@ class Floaters:
 LONG_FACTOR = 3.0
 """A part this many times longer than its share of the area allows is no floater: a piece of wire
 has little area and may be all that is left of it."""
+LONG_FACES = 30
+"""With fewer faces a long part is a sliver between a few vertices, not a piece of anything."""
 
 
 def extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: int) -> np.ndarray:
@@ -80,14 +82,16 @@ def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) 
     """Remove parts that are small: in area and in length.
 
     The area is below ``min_share`` of the largest part's, and the length below
-    :data:`LONG_FACTOR` times that share of the longest part's. Small cavities go as well, which
+    :data:`LONG_FACTOR` times that share of the longest part's, or it has fewer than
+    :data:`LONG_FACES` faces. Small cavities go as well, which
     fills them. A cavity whose solid goes is small itself.
     """
     count, part = face_components(len(vertices), faces)
     volume, area = volumes_and_areas(vertices, faces, part, count)
     length = extents(vertices, faces, part, count)
     keep = area >= min_share * area.max(initial=0.0)
-    keep |= length >= LONG_FACTOR * min_share * length.max(initial=0.0)
+    long = length >= LONG_FACTOR * min_share * length.max(initial=0.0)
+    keep |= long & (np.bincount(part, minlength=count) >= LONG_FACES)
     removed = float(area[~keep].sum() / max(area.sum(), 1e-300))
     return Floaters(
         faces[keep[part]],

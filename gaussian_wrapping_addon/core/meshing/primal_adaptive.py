@@ -19,13 +19,14 @@ from .candidate_surface import candidate_surface
 from .classification import classify, on_one_sheet
 from .components import compacted, without_floaters
 from .convex_region import Region
-from .degenerate import remove_degenerate
+from .degenerate import edge_lengths, remove_degenerate
 from .delaunay import delaunay, far_points
 from .edge_flips import flip_edges
 from .extraction import boundary_faces, tetrahedron_neighbours
 from .level_error import level_errors
 from .repair import split_nonmanifold
 from .resolution import Dense, checked_request, dense_request, nominal_edge
+from .small_handles import without_small_handles
 from .surface_mesh import SurfaceMesh
 from .surface_points import KIND_CAP, KIND_JUMP, KIND_SURFACE, SurfacePoints, SurfaceSampler
 from .vertex_selection import select_vertices
@@ -117,7 +118,8 @@ def mesh_region(
     vertices, faces, kind, figures = _connect(cloud, vacancy, region, settings, seed, rng, progress)
     figures["dense_vertices"] = len(vertices)
     vertices, faces, kind = selected(vertices, faces, kind, wanted.target, wanted.share, region)
-    figures |= counts(kind)
+    vertices, faces, kind, handles = tidied(vertices, faces, kind)
+    figures |= handles | counts(kind)
     provenance = {
         "method": "primal adaptive meshing",
         "region": region.name,
@@ -258,6 +260,17 @@ def selected(
     coarse = select_vertices(vertices, faces, target, longest)
     kept, coarse, chosen = compacted(vertices, coarse)
     return kept, flip_edges(kept, coarse, vertices, faces, longest), kind[chosen]
+
+
+def tidied(
+    vertices: np.ndarray, faces: np.ndarray, kind: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, int]]:
+    """Close handles that are smaller than the edges of the mesh resolve, of a closed 2-manifold."""
+    edge_length = float(np.median(edge_lengths(vertices, faces)))
+    closed = without_small_handles(vertices, faces, edge_length)
+    vertices, faces, chosen = compacted(vertices, closed.faces)
+    figures = {"small_handles_closed": closed.closed, "small_handles_left": closed.left}
+    return vertices, faces, kind[chosen], figures
 
 
 def counts(kind: np.ndarray) -> dict[str, int]:

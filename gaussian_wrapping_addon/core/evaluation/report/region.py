@@ -157,6 +157,8 @@ def _removed(provenance: dict[str, Any]) -> list[tuple[str, str]]:
         share = percent(provenance.get("removed_open_area_share"))
         text = f"{plural(int(pieces), 'small piece')}: {share} of the area"
         rows.append(("Removed after opening at the region", text))
+    if handles := measured(provenance.get("small_handles_closed")):
+        rows.append(("Handles closed, smaller than the edges resolve", f"{int(handles)}"))
     return rows
 
 

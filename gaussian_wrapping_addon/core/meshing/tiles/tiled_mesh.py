@@ -17,7 +17,7 @@ from ...progress import Progress
 from ...settings import MeshingSettings
 from ..candidate_surface import candidate_surface
 from ..convex_region import Region
-from ..primal_adaptive import counts, distance_to_level, finished, selected
+from ..primal_adaptive import counts, distance_to_level, finished, selected, tidied
 from ..resolution import checked_request
 from ..surface_mesh import SurfaceMesh
 from .plan import Field, TilePlan, make_plan
@@ -100,7 +100,8 @@ def join_tiles(
     figures["dense_vertices"] = len(vertices)
     progress.update(0.95, f"choosing from {len(vertices)} vertices")
     vertices, faces, kind = selected(vertices, faces, kind, plan.target, plan.share, plan.region)
-    figures |= counts(kind)
+    vertices, faces, kind, handles = tidied(vertices, faces, kind)
+    figures |= handles | counts(kind)
     sums = ("tetrahedra", "interior_samples", "relabelled_tetrahedra", "undecided_tetrahedra")
     provenance: dict[str, Any] = {
         "method": "primal adaptive meshing",
