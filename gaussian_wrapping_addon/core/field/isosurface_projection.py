@@ -22,7 +22,8 @@ Gaussians leave in the field."""
 AIM = 0.002
 """Points move on until they are this close, where the field is smooth enough. Those that a bracket
 brings there end anywhere below it, so it bounds the median of any scene. On trained scenes the
-median is 0.0003 to 0.0004, for an eighth more evaluations than with 0.005 (0.0009 to 0.0012)."""
+median is 0.0003 to 0.0004, for an eighth to a sixth more evaluations than with 0.005 (0.0009 to
+0.0012)."""
 MAX_ROUNDS = 40
 MAX_TRAVEL_SIGMAS = 16.0
 MAX_HALVINGS = 1

@@ -182,7 +182,7 @@ def test_a_piece_of_wire_is_no_floater() -> None:
 def test_a_long_sliver_is_a_floater() -> None:
     """Four long faces are not a wire, however long they are."""
     vertices, faces = cubes((0, 0, 0), (1, 0, 0))
-    sliver = np.array([[20.0, 0, 0], [28, 0, 0], [24, 0.01, 0], [24, 0, 0.01]])
+    sliver = np.array([[20.0, 0, 0], [28, 0, 0], [24, 0.002, 0], [24, 0, 0.002]])
     corners = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     both = np.concatenate([vertices, sliver]), np.concatenate([faces, corners + len(vertices)])
     assert mesh_statistics(as_mesh(*both)).closed
