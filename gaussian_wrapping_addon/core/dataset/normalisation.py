@@ -26,6 +26,8 @@ _CLEAR = 0.2
 """Largest share of the smallest eigenvalue in the middle one: the plane is clear of the noise."""
 _FLAT = 0.05
 """Thickness over width of a camera path that counts as plane."""
+MEAN_UP = "mean camera up"
+"""The rule of :func:`up_direction` where nothing better than the mean was found."""
 _AGREE = np.cos(np.radians(50.0))
 """Directions further from the cameras' mean up than this are not the up direction."""
 
@@ -138,7 +140,7 @@ def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray
         flat = values[0] < _FLAT**2 * values[1] and values[1] > _SPREAD * values[2]
         if flat and abs(normal @ guess) > _AGREE:
             return _signed(normal, guess), "plane camera path"
-    return guess, "mean camera up"
+    return guess, MEAN_UP
 
 
 def _robust_mean(directions: np.ndarray) -> np.ndarray:

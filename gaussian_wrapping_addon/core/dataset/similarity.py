@@ -35,6 +35,14 @@ class Similarity:
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
+    def after(self, first: Similarity) -> Similarity:
+        """Return the transform that applies ``first``, then this one."""
+        return Similarity(
+            self.scale * first.scale,
+            self.rotation @ first.rotation,
+            self.points(first.translation[None])[0],
+        )
+
     def matrix(self) -> np.ndarray:
         """Return the (4, 4) float64 matrix."""
         matrix = np.eye(4)
