@@ -24,9 +24,15 @@ from .region_geometry import (
 
 
 def matrix_of(thing: bpy.types.Object) -> np.ndarray:
-    """Return the (4, 4) float64 world matrix of an object as it stands now."""
+    """Return the (4, 4) float64 world matrix of an object as it stands now, hidden or not."""
     evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    return np.array(evaluated.matrix_world, np.float64)
+    if evaluated.is_evaluated:
+        return np.array(evaluated.matrix_world, np.float64)
+    # Blender does not update what is disabled in viewports: its matrix_world may be an old one.
+    matrix = np.array(thing.matrix_basis, np.float64)
+    if thing.parent is not None:
+        matrix = matrix_of(thing.parent) @ np.array(thing.matrix_parent_inverse) @ matrix
+    return matrix
 
 
 def transformed(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -80,6 +80,21 @@ def test_box_in_world_coordinates(
     assert same_set(region_from_object(box), expected)
 
 
+def test_a_hidden_box_moves_with_its_frame(result: ImportedResult) -> None:
+    """Blender leaves the matrix_world of disabled objects as it was."""
+    box = result.regions[0]
+    expected = region_from_object(box)
+    for hide in (lambda: setattr(box, "hide_viewport", True),
+                 lambda: setattr(result.collection, "hide_viewport", True)):  # fmt: skip
+        hide()
+        bpy.context.view_layer.update()
+        result.frame.location = (10, -4, 2)
+        result.frame.rotation_euler = (0.1, 0.7, 0.3)
+        result.frame.scale = (0.37,) * 3
+        bpy.context.view_layer.update()
+        assert same_set(region_from_object(box), expected)
+
+
 def test_box_without_a_result_is_in_blenders_world() -> None:
     bpy.ops.gwrap.add_region_box(around="CURSOR")
     box = bpy.context.view_layer.objects.active
