@@ -10,11 +10,14 @@ from typing import Any, Final
 import bpy
 
 from .ops import (
+    camera_operators,
     doctor,
     import_operators,
     job_operators,
     job_timer,
     live_preview,
+    placement,
+    placement_operators,
     region_operators,
     report_operators,
     training_estimate,
@@ -25,6 +28,7 @@ from .ui import (
     preferences,
     properties,
     report_panel,
+    scene_panel,
     training_panel,
     training_properties,
 )
@@ -38,17 +42,23 @@ CLASSES: Final[tuple[type, ...]] = (
     *job_operators.CLASSES,
     *region_operators.CLASSES,
     *import_operators.CLASSES,
+    *camera_operators.CLASSES,
+    *placement_operators.CLASSES,
     *report_operators.CLASSES,
     *training_operators.CLASSES,
     *panels.CLASSES,
     *training_panel.CLASSES,
     *report_panel.CLASSES,
+    *scene_panel.CLASSES,
 )
 
 HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (
     ("load_post", job_timer.after_load),
+    ("load_post", placement.after_load),
     ("undo_post", job_timer.after_undo),
     ("redo_post", job_timer.after_undo),
+    ("undo_post", placement.after_undo),
+    ("redo_post", placement.after_undo),
 )
 
 

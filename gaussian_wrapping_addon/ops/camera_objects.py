@@ -3,14 +3,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import bpy
 import numpy as np
 from mathutils import Matrix
 
 from ..core.dataset.camera import Camera
-from . import tags
+from ..core.errors import DatasetError
+from . import known_jobs, tags
 
 SENSOR_MM = 36.0
+CLIP_START, CLIP_END = 0.01, 1000.0
+"""In scene units: the cameras of a scene stand within 5 of its middle."""
+PHOTO_ALPHA = 0.7
+"""Opacity of the photo behind the mesh, so that the viewport's grid stays visible."""
 
 # Ours looks along +z with y down, Blender's along -z with y up (conventions.md C.6).
 _CAM_FROM_BLENDER_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -48,7 +55,7 @@ def create_camera(
     """
     data = bpy.data.cameras.new(camera.name)
     set_projection(data, camera)
-    data.clip_start, data.clip_end = 0.01, 1000.0
+    data.clip_start, data.clip_end = CLIP_START, CLIP_END
     data.display_size = display_size
     thing = bpy.data.objects.new(camera.name, data)
     thing.matrix_basis = Matrix(camera_matrix(camera).tolist())
@@ -70,3 +77,49 @@ def look_through(scene: bpy.types.Scene, thing: bpy.types.Object) -> None:
     render.resolution_percentage = 100
     render.pixel_aspect_x, render.pixel_aspect_y = thing[tags.PIXEL_ASPECT]
     scene.camera = thing
+
+
+def scale_display(thing: bpy.types.Object, scale: float) -> None:
+    """Bring clipping and frustum of a camera in proportion to a scene of this scale.
+
+    Blender frees a camera's matrix of its scale: neither of the two follows the parent's.
+    """
+    known = thing.get(tags.DISPLAY_SCALE, 1.0)
+    ratio = scale / (known if isinstance(known, float) and known > 0.0 else 1.0)
+    data = thing.data
+    data.clip_start *= ratio
+    data.clip_end *= ratio
+    data.display_size *= ratio
+    thing[tags.DISPLAY_SCALE] = scale
+
+
+def cameras_under(frame: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the photo cameras of a result in the order of their photos' paths."""
+    found = [c for c in frame.children if tags.kind_of(c) == "camera" and tags.RESOLUTION in c]
+    return sorted(found, key=lambda c: str(c.get(tags.PHOTO, "")))
+
+
+def show_photo(thing: bpy.types.Object) -> None:
+    """Show a camera's photo behind what it sees; the file is read when it is drawn, not packed.
+
+    Raises
+    ------
+    DatasetError
+        The photo is not there.
+    """
+    path = Path(str(thing.get(tags.PHOTO, "")))
+    hint = "Put it back, or look through the camera without it."
+    if known_jobs.is_remote(path) or not path.is_file():
+        raise DatasetError(f"The photo {path} is not there.", hint)
+    try:
+        image = bpy.data.images.load(str(path), check_existing=True)
+    except RuntimeError as error:
+        raise DatasetError(f"The photo {path} cannot be read: {error}.", hint) from None
+    data = thing.data
+    background = data.background_images[0] if data.background_images else None
+    if background is None:
+        background = data.background_images.new()
+        background.alpha = PHOTO_ALPHA
+    background.frame_method = "STRETCH"  # the frame has the photo's shape
+    background.image = image
+    data.show_background_images = True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators around results: import, open the report, shading, photo cameras."""
+"""Operators around results: import, open the report, shading."""
 
 from pathlib import Path
 from typing import Final
@@ -9,8 +9,7 @@ from bpy.props import EnumProperty, StringProperty
 
 from ..core.errors import UsageError
 from . import known_jobs, materials, tags
-from .camera_objects import look_through
-from .reporting import NeedsObjectMode, ReportsErrors
+from .reporting import NeedsObjectMode, NeedsResult, ReportsErrors
 from .scene_objects import import_result
 
 
@@ -42,18 +41,7 @@ class GWRAP_OT_import_result(NeedsObjectMode, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class _NeedsResult:
-    """Mixin: the operator is about the scene's current result."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if tags.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene holds no result")  # type: ignore[attr-defined]
-            return False
-        return True
-
-
-class GWRAP_OT_open_report(_NeedsResult, ReportsErrors, bpy.types.Operator):
+class GWRAP_OT_open_report(NeedsResult, ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.open_report"
     bl_label = "Open Report Folder"
     bl_description = "Show the folder with report.md, the meshes and the textures"
@@ -74,7 +62,7 @@ class GWRAP_OT_open_report(_NeedsResult, ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_set_shading(_NeedsResult, bpy.types.Operator):
+class GWRAP_OT_set_shading(NeedsResult, bpy.types.Operator):
     bl_idname = "gwrap.set_shading"
     bl_label = "Set Shading"
     bl_description = "Show the photo texture lit by the scene's lights, or as photographed"
@@ -107,42 +95,8 @@ def materials_of(frame: bpy.types.Object | None) -> list[bpy.types.Material]:
     return list(dict.fromkeys(found))
 
 
-class GWRAP_OT_view_photo(ReportsErrors, bpy.types.Operator):
-    bl_idname = "gwrap.view_photo"
-    bl_label = "View Through Photo"
-    bl_description = "Look through the active photo camera, with its photo behind the mesh"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if tags.kind_of(context.view_layer.objects.active) != "camera":
-            cls.poll_message_set("Select one of the photo cameras")
-            return False
-        return True
-
-    def work(self, context: bpy.types.Context) -> set[str]:
-        thing = context.view_layer.objects.active
-        look_through(context.scene, thing)
-        path = Path(str(thing.get(tags.PHOTO, "")))
-        if known_jobs.is_remote(path) or not path.is_file():
-            self.report({"WARNING"}, f"The photo {path} is not there")
-        else:
-            data = thing.data
-            if not data.background_images:
-                data.background_images.new()
-            background = data.background_images[0]
-            background.image = bpy.data.images.load(str(path), check_existing=True)
-            background.alpha = 0.7
-            data.show_background_images = True
-        for area in context.screen.areas if context.screen else ():
-            if area.type == "VIEW_3D":
-                area.spaces.active.region_3d.view_perspective = "CAMERA"
-        return {"FINISHED"}
-
-
 CLASSES: Final = (
     GWRAP_OT_import_result,
     GWRAP_OT_open_report,
     GWRAP_OT_set_shading,
-    GWRAP_OT_view_photo,
 )

@@ -8,6 +8,7 @@ import logging
 import bpy
 
 from ..core.errors import WrapError
+from . import tags
 
 _logger = logging.getLogger(__name__)
 
@@ -40,5 +41,17 @@ class NeedsObjectMode(ReportsErrors):
         """Tell whether the operator can run; Blender calls this."""
         if context.mode != "OBJECT":
             cls.poll_message_set("Leave the current mode first")  # type: ignore[attr-defined]
+            return False
+        return True
+
+
+class NeedsResult:
+    """Mixin: the operator is about the scene's current result."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run; Blender calls this."""
+        if tags.current_frame(context.scene, context.view_layer.objects.active) is None:
+            cls.poll_message_set("The scene holds no result")  # type: ignore[attr-defined]
             return False
         return True

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,11 +14,14 @@ import numpy as np
 
 from ..core import limits
 from ..core.dataset.camera import Camera
+from ..core.dataset.placement_file import FILE_NAME, read_placement
 from ..core.dataset.similarity import Similarity
 from ..core.errors import DatasetError, ParseError
 from ..core.files import read_json
 from .region_geometry import vertices_of_region
 from .report_data import figures_of_report
+
+_logger = logging.getLogger(__name__)
 
 # An import of this size already takes minutes; a larger claim is a broken or hostile file.
 MAX_MESH_BYTES = 4 * 2**30
@@ -55,6 +59,8 @@ class ResultFiles:
     regions: tuple[RegionResult, ...]
     figures: dict[str, Any] = field(default_factory=dict)
     """The figures of the report that the panel shows; empty without a report."""
+    placement: Similarity | None = None
+    """``blender_from_scene`` where the scene was placed before."""
 
 
 def read_result(folder: Path) -> ResultFiles:
@@ -81,6 +87,12 @@ def read_result(folder: Path) -> ResultFiles:
         raise DatasetError(f"{folder} holds no mesh.", "Mesh a region first.")
     report_path = folder / "report.json"
     report = read_json(report_path) if report_path.is_file() else {}
+    placement_path = folder / FILE_NAME
+    placement = None
+    if placement_path.is_file():
+        placement = read_placement(placement_path, world_from_scene)
+        if placement is None:
+            _logger.warning("%s is for other cameras: not used", placement_path)
     return ResultFiles(
         folder,
         cameras,
@@ -89,6 +101,7 @@ def read_result(folder: Path) -> ResultFiles:
         hashlib.sha256(scene_path.read_bytes()).hexdigest()[:16],
         regions,
         figures_of_report(report),
+        placement,
     )
 
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from ..core.errors import UsageError
 from . import tags
-from .camera_objects import create_camera, look_through
+from .camera_objects import create_camera, look_through, scale_display
 from .materials import create_material, load_texture
+from .placement import restore, scale_of
 from .region_objects import create_region
 from .result_files import RegionResult, ResultFiles, read_result
 
@@ -34,7 +35,7 @@ class ImportedResult:
 
     collection: bpy.types.Collection
     frame: bpy.types.Object
-    """The parent empty; its matrix is ``blender_from_scene``."""
+    """The parent empty; its matrix is ``blender_from_scene`` (``placement.py``)."""
     meshes: tuple[bpy.types.Object, ...]
     cameras: tuple[bpy.types.Object, ...]
     regions: tuple[bpy.types.Object, ...]
@@ -43,9 +44,10 @@ class ImportedResult:
 def import_result(folder: Path, scene: bpy.types.Scene) -> ImportedResult:
     """Build, or bring up to date, the objects of a result folder.
 
-    A result that was imported before is found again by its folder; then meshes whose file has
-    changed get the new geometry, what is missing is added, and everything else, such as the
-    transforms, modifiers and materials of the user, stays.
+    A result that was placed before (``placement.json``) is placed so again. One that was imported
+    before is found again by its folder; then meshes whose file has changed get the new geometry,
+    what is missing is added, and everything else, such as the transforms, modifiers and materials
+    of the user, stays.
 
     Parameters
     ----------
@@ -60,12 +62,17 @@ def import_result(folder: Path, scene: bpy.types.Scene) -> ImportedResult:
         The folder does not hold a sound result; nothing has been changed then.
     """
     files = read_result(folder)
-    frame = _find_frame(files) or _create_frame(files)
+    frame = _find_frame(files)
+    new = frame is None
+    if frame is None:
+        frame = _create_frame(files)
     frame[tags.RESULT] = str(files.folder)
     frame[tags.FINGERPRINT] = files.fingerprint
     frame[tags.WORLD_FROM_SCENE] = json.dumps(files.world_from_scene.to_json())
     frame[tags.FIGURES] = json.dumps(files.figures)
     collection = _collection_of(frame, files, scene)
+    if new and files.placement is not None:
+        restore(frame, files.placement)
     children = [c for c in bpy.data.objects if c.parent == frame and c.library is None]
     meshes, regions = [], []
     for region in files.regions:
@@ -197,6 +204,7 @@ def _update_cameras(
 ) -> tuple[bpy.types.Object, ...]:
     known = {c.get(tags.PHOTO): c for c in children if tags.kind_of(c) == "camera"}
     folder = cameras_of(collection)
+    scale = scale_of(frame)
     cameras = []
     for camera, photo in files.cameras:
         thing = known.get(photo)
@@ -207,6 +215,7 @@ def _update_cameras(
                 collection.children.link(folder)
             thing = create_camera(camera, photo, _CAMERA_SIZE_SHARE * files.radius, folder)
             thing.parent = frame
+            scale_display(thing, scale)
         cameras.append(thing)
     return tuple(cameras)
 

@@ -13,12 +13,14 @@ from ..core.dataset.similarity import Similarity
 from ..core.errors import UsageError
 
 KIND = "gwrap_kind"
-"""``"frame"`` (the parent empty), ``"mesh"``, ``"camera"`` or ``"region"``."""
+"""``"frame"`` (the parent empty), ``"mesh"``, ``"camera"``, ``"region"`` or ``"point"``."""
 RESULT = "gwrap_result"
 """On the frame: the result folder; ``//`` means beside the .blend file."""
 FINGERPRINT = "gwrap_fingerprint"
 WORLD_FROM_SCENE = "gwrap_world_from_scene"
 """On the frame: the similarity as JSON text, in float64, which object matrices are not."""
+PLACEMENT = "gwrap_blender_from_scene"
+"""On the frame: the similarity of its matrix as JSON text, in float64, once it has been placed."""
 FIGURES = "gwrap_figures"
 """On the frame: figures of the report as JSON text (``report_data.py``)."""
 REGION = "gwrap_region"
@@ -28,6 +30,8 @@ STAMP = "gwrap_stamp"
 PHOTO = "gwrap_photo"
 RESOLUTION = "gwrap_resolution_px"
 PIXEL_ASPECT = "gwrap_pixel_aspect"
+DISPLAY_SCALE = "gwrap_display_scale"
+"""On photo cameras: the scale of the scene that clipping and frustum size are for."""
 
 
 def kind_of(thing: bpy.types.Object | None) -> str:

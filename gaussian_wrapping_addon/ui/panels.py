@@ -8,7 +8,6 @@ import bpy
 from ..ops import job_timer, tags
 from ..ops.import_operators import materials_of
 from ..ops.materials import shading_of
-from ..ops.scene_objects import cameras_of
 from .live_view import draw_live
 from .text import characters_of, progress_text, wrapped_label
 
@@ -215,13 +214,6 @@ class GWRAP_PT_result(_Panel, bpy.types.Panel):
                 for value, text in (("LIT", "Lit"), ("UNLIT", "Unlit")):
                     button = row.operator("gwrap.set_shading", text=text, depress=shading == value)
                     button.shading = value
-            cameras = cameras_of(frame.users_collection[0]) if frame.users_collection else None
-            if cameras is not None:
-                layout.prop(
-                    cameras, "hide_viewport", text="Show Photo Cameras", invert_checkbox=True
-                )
-            if tags.kind_of(active) == "camera":
-                layout.operator("gwrap.view_photo", icon="CAMERA_DATA")
         column = layout.column(align=True)
         column.operator("gwrap.open_report", icon="FILE_FOLDER")
         column.operator("gwrap.import_result", icon="IMPORT")

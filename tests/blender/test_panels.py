@@ -13,7 +13,7 @@ from gaussian_wrapping_addon.core.jobs.doctor import Diagnosis
 from gaussian_wrapping_addon.core.jobs.job_folder import STATES, JobStatus
 from gaussian_wrapping_addon.ops import doctor, job_timer, tags
 from gaussian_wrapping_addon.ops.scene_objects import import_result
-from gaussian_wrapping_addon.ui import panels, preferences, report_panel
+from gaussian_wrapping_addon.ui import panels, preferences, report_panel, scene_panel
 from gaussian_wrapping_addon.ui.text import progress_text, time_span
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.synthetic_result import write_result
@@ -42,7 +42,7 @@ def show(status: JobStatus, command: str = "WRAP") -> None:
     job_timer.watch(scene, Path("/tmp/gwrap-none"), FakeClient(status), imports=False)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("panel", [*panels.CLASSES, *report_panel.CLASSES])
+@pytest.mark.parametrize("panel", [*panels.CLASSES, *report_panel.CLASSES, *scene_panel.CLASSES])
 def test_every_panel_draws_in_an_empty_file(panel: type) -> None:
     layout = draw(panel)
     assert layout.log
@@ -107,15 +107,35 @@ def test_mesh_panel_asks_for_faces_only_where_they_are_limited(decimate: bool) -
 
 
 def test_region_and_result_panels_with_a_result(tmp_path: Path) -> None:
-    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
+    import_result(write_result(tmp_path / "job"), bpy.context.scene)
     bpy.context.view_layer.update()
     assert "auto region" in draw(panels.GWRAP_PT_region).texts
     layout = draw(panels.GWRAP_PT_result)
-    assert "Show Photo Cameras" in layout.texts
     assert layout.operators.count("gwrap.set_shading") == 2
-    assert "gwrap.view_photo" not in layout.operators
-    bpy.context.view_layer.objects.active = imported.cameras[0]
-    assert "gwrap.view_photo" in draw(panels.GWRAP_PT_result).operators
+
+
+def test_scene_tools_with_a_result(tmp_path: Path) -> None:
+    assert draw(scene_panel.GWRAP_PT_scene_tools).operators == []
+    imported = import_result(write_result(tmp_path / "job"), bpy.context.scene)
+    bpy.context.view_layer.update()
+    layout = draw(scene_panel.GWRAP_PT_scene_tools)
+    assert "Show Photo Cameras" in layout.texts
+    assert "Scale 1" in layout.texts
+    assert layout.operators == [
+        "gwrap.view_photo", "gwrap.view_photo", "gwrap.view_photo", "gwrap.add_point",
+        "gwrap.set_scale", "gwrap.set_ground", "gwrap.auto_ground", "gwrap.set_origin",
+        "gwrap.keep_placement", "gwrap.reset_placement",
+    ]  # fmt: skip
+    for x in (0.0, 0.25):
+        bpy.context.scene.cursor.location = (x, 0, 0)
+        bpy.ops.gwrap.add_point()
+    assert "2 points selected, 25 cm apart" in draw(scene_panel.GWRAP_PT_scene_tools).texts
+    imported.frame.scale = (1, 2, 1)
+    bpy.context.view_layer.update()
+    assert "scaled differently" in draw(scene_panel.GWRAP_PT_scene_tools).texts
+    bpy.context.view_layer.objects.active = imported.meshes[0]
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert "Select vertices" in draw(scene_panel.GWRAP_PT_scene_tools).texts
 
 
 @pytest.mark.parametrize(
@@ -126,7 +146,7 @@ def test_result_panel_survives_edited_properties(tmp_path: Path, text: str) -> N
     imported.frame[tags.FIGURES] = text
     imported.frame[tags.RESULT] = 5
     imported.meshes[0].data.materials.clear()
-    for panel in (*panels.CLASSES, *report_panel.CLASSES):
+    for panel in (*panels.CLASSES, *report_panel.CLASSES, *scene_panel.CLASSES):
         draw(panel)
 
 
