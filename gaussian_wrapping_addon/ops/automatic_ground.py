@@ -39,8 +39,7 @@ def automatic_plane(frame: bpy.types.Object) -> tuple[Plane, str]:
     """Find the ground of a result, and tell how.
 
     Up comes from the cameras. The ground is the main level plane of the meshes; where none is
-    clear, it goes through the lowest corner of the regions the meshes were made of, or else
-    through the lowest vertex.
+    clear, it goes through their lowest point; without meshes, through the regions' lowest corner.
 
     Raises
     ------
@@ -57,14 +56,11 @@ def automatic_plane(frame: bpy.types.Object) -> tuple[Plane, str]:
     plane = main_plane(corners.mean(1), normals, 0.5 * length, up)
     if plane is not None:
         return plane, f"Up by {rule}, ground by the main plane"
-    regions = [
-        hull_in_blender(c)[0]
-        for c in frame.children
-        if tags.kind_of(c) == "region" and c.get(tags.REGION)
-    ]
-    points, what = np.concatenate([np.zeros((0, 3)), *regions]), "lowest corner of the regions"
+    # A mesh that the region cuts off below ends at the region's lowest face.
+    points, what = corners.reshape(-1, 3), "lowest point of the meshes"
     if len(points) == 0:
-        points, what = corners.reshape(-1, 3), "lowest vertex"
+        regions = [hull_in_blender(c)[0] for c in frame.children if tags.kind_of(c) == "region"]
+        points, what = np.concatenate([np.zeros((0, 3)), *regions]), "lowest corner of the regions"
     if len(points) == 0:
         raise UsageError(
             "The result has neither mesh nor region to find the ground by.",

@@ -141,7 +141,7 @@ class GWRAP_OT_auto_ground(_Tool, bpy.types.Operator):
     bl_label = "Auto Ground"
     bl_description = (
         "Find up from how the cameras were held, and the ground from the main level plane of the "
-        "meshes; where none is clear, from the lowest corner of the regions"
+        "meshes; where none is clear, from their lowest point"
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 

@@ -69,9 +69,7 @@ def error_px(thing: bpy.types.Object, camera: Camera, placement: Similarity) -> 
 @pytest.mark.parametrize("camera", SHAPES, ids=lambda c: c.name)
 def test_projection_to_a_hundredth_of_a_pixel(camera: Camera) -> None:
     thing = create_camera(camera, "", 0.1, bpy.context.scene.collection)
-    # A tele of 60000 pixels focal length asks more of float32 matrices than they hold.
-    limit_px = 0.01 if camera.fx < 10000 else 0.1
-    assert error_px(thing, camera, Similarity()) < limit_px
+    assert error_px(thing, camera, Similarity()) < 0.01
     assert bpy.context.scene.render.resolution_x == camera.width
     assert bpy.context.scene.render.resolution_y == camera.height
 

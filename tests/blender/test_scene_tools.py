@@ -18,7 +18,12 @@ from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import ParseError
 from gaussian_wrapping_addon.ops import job_actions, known_jobs, placement, tags
 from gaussian_wrapping_addon.ops.region_objects import matrix_of, region_from_object, transformed
-from gaussian_wrapping_addon.ops.scene_objects import ImportedResult, import_result
+from gaussian_wrapping_addon.ops.scene_objects import (
+    ImportedResult,
+    export_usd,
+    import_result,
+    write_blend,
+)
 from tests.blender.synthetic_result import (
     WORLD_FROM_SCENE,
     rotation_about,
@@ -203,16 +208,27 @@ def test_origin_at_the_cursor(result: ImportedResult) -> None:
 
 
 def test_auto_ground_rights_what_was_tilted(result: ImportedResult) -> None:
-    """No level plane is clear on a cube: the ground is the region's lowest corner."""
+    """No level plane is clear on a cube: it comes to stand on the ground."""
     tilt(result)
     assert bpy.ops.gwrap.auto_ground() == {"FINISHED"}
     up = matrix_of(result.frame)[:3, 2]
     assert up / np.linalg.norm(up) == pytest.approx([0, 0, 1], abs=1e-5)
-    box = transformed(matrix_of(result.regions[0]), np.array([[0.0, 0.0, -1.0]]))
-    assert box[0, 2] == pytest.approx(0.0, abs=1e-5)
+    assert min(in_blender(result, v)[2] for v in range(8)) == pytest.approx(0.0, abs=1e-5)
     again = placement.placement_of(result.frame)
     assert bpy.ops.gwrap.auto_ground() == {"FINISHED"}
     assert same_matrix(result.frame, again)
+
+
+def test_auto_ground_without_meshes_takes_the_region(result: ImportedResult) -> None:
+    bpy.data.objects.remove(result.meshes[0])
+    bpy.context.view_layer.objects.active = result.frame
+    tilt(result)
+    assert bpy.ops.gwrap.auto_ground() == {"FINISHED"}
+    box = transformed(matrix_of(result.regions[0]), np.array([[0.0, 0.0, -1.0]]))
+    assert box[0, 2] == pytest.approx(0.0, abs=1e-5)
+    bpy.data.objects.remove(result.regions[0])
+    with pytest.raises(RuntimeError, match="neither mesh nor region"):
+        bpy.ops.gwrap.auto_ground()
 
 
 def test_auto_ground_finds_the_floor_of_a_mesh(result: ImportedResult) -> None:
@@ -438,6 +454,20 @@ def test_regions_and_later_meshes_live_under_the_same_transform(
     assert transformed(matrix_of(fine), local[None]) == pytest.approx(
         placed.points(local[None]), abs=1e-5
     )
+
+
+def test_blend_and_usd_of_a_placed_result_are_placed(job: Path, result: ImportedResult) -> None:
+    pick_vertices(result.meshes[0], [0, 4])
+    bpy.ops.gwrap.set_scale(distance=0.5)
+    write_blend(job / "result", job / "result" / "scene.blend")
+    (mesh,) = [o for o in bpy.data.objects if tags.kind_of(o) == "mesh"]
+    assert list(mesh.matrix_world.to_scale()) == pytest.approx([0.5] * 3)
+    (path,) = export_usd(job / "result")
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    bpy.ops.wm.usd_import(filepath=str(path))
+    bpy.context.view_layer.update()
+    (mesh,) = [o for o in bpy.data.objects if o.type == "MESH"]
+    assert list(mesh.dimensions) == pytest.approx([0.5] * 3, rel=1e-5)
 
 
 def test_an_edge_length_is_one_of_the_placed_scene(result: ImportedResult) -> None:

@@ -13,7 +13,7 @@ degrees at most where it is off at all."""
 BAND_SHARE = 0.02
 """Height, as a share of the surface's extent, within which faces lie on one plane."""
 CLEAR_SHARE = 0.4
-"""Share of the level, upward-facing area that the plane must hold."""
+"""Share of the level, upward-facing area, without the topmost, that the plane must hold."""
 LOW_SHARE = 0.4
 """The plane must lie in this lowest share of the heights: tops of things are level as well."""
 _ROUNDS = 4
@@ -50,6 +50,9 @@ def main_plane(
         return None
     floor, ceiling = float(heights.min()), float(heights.max())
     limit = floor + LOW_SHARE * (ceiling - floor)
+    level &= heights < ceiling - band  # a region that cuts things off closes them by a level top
+    if not level.any():
+        return None
     points, weights, low = centers[level] - middle, areas[level], heights[level] < limit
     start = _fullest_band(heights[level][low], weights[low], band)
     if start is None:

@@ -61,6 +61,12 @@ def test_a_rough_ground_is_found_within_its_noise() -> None:
     assert plane.normal[2] > np.cos(np.radians(0.5))
 
 
+def test_the_cap_of_a_region_that_cuts_through_does_not_count() -> None:
+    plane = main_plane(*together(table(), sheet(1.4, 6.0, (0, 0, 1))), UP)
+    assert plane is not None
+    assert abs(plane.point[2]) < 1e-3
+
+
 def cube() -> Faces:
     faces = sheet(0.5, 0.5, (0, 0, 1))
     return together(faces, (-faces[0], -faces[1], faces[2]))
