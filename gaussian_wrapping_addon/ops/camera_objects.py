@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import bpy
@@ -10,12 +11,15 @@ import numpy as np
 from mathutils import Matrix
 
 from ..core.dataset.camera import Camera
-from ..core.errors import DatasetError
+from ..core.errors import DatasetError, UsageError
+from ..core.files import resolve_inside
 from . import known_jobs, tags
 
 SENSOR_MM = 36.0
 CLIP_START, CLIP_END = 0.01, 1000.0
 """In scene units: the cameras of a scene stand within 5 of its middle."""
+STAGES = "stages"
+"""Folder of a job that holds what it made, undistorted photos among it."""
 PHOTO_ALPHA = 0.7
 """Opacity of the photo behind the mesh, so that the viewport's grid stays visible."""
 
@@ -99,6 +103,20 @@ def cameras_under(frame: bpy.types.Object) -> list[bpy.types.Object]:
     return sorted(found, key=lambda c: str(c.get(tags.PHOTO, "")))
 
 
+def photo_of(thing: bpy.types.Object) -> Path:
+    """Return the path of a camera's photo; in a job folder that was moved, where it is now."""
+    path = Path(str(thing.get(tags.PHOTO, "")))
+    frame = tags.frame_of(thing)
+    if frame is None or known_jobs.is_remote(path) or path.is_file() or STAGES not in path.parts:
+        return path
+    # Photos that had to be straightened lie in a stage of the job.
+    last = len(path.parts) - 1 - path.parts[::-1].index(STAGES)
+    with contextlib.suppress(UsageError):
+        job = tags.result_folder(frame).resolve().parent
+        return resolve_inside(job, "/".join(path.parts[last:])) or path
+    return path
+
+
 def show_photo(thing: bpy.types.Object) -> None:
     """Show a camera's photo behind what it sees; the file is read when it is drawn, not packed.
 
@@ -107,7 +125,7 @@ def show_photo(thing: bpy.types.Object) -> None:
     DatasetError
         The photo is not there.
     """
-    path = Path(str(thing.get(tags.PHOTO, "")))
+    path = photo_of(thing)
     hint = "Put it back, or look through the camera without it."
     if known_jobs.is_remote(path) or not path.is_file():
         raise DatasetError(f"The photo {path} is not there.", hint)

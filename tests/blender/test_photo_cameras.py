@@ -13,6 +13,7 @@ from mathutils import Vector
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.ops import tags
 from gaussian_wrapping_addon.ops.camera_objects import (
     CLIP_END,
     CLIP_START,
@@ -142,6 +143,26 @@ def test_a_missing_photo_is_told_and_the_view_is_right(
     assert not lost.data.background_images
     text = capfd.readouterr()
     assert "is not there" in text.out + text.err
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_straightened_photo_is_found_in_a_job_that_was_moved(tmp_path: Path, moved: bool) -> None:
+    job = tmp_path / "stages" / "job"  # the name of a folder above must not mislead
+    folder = write_result(job)
+    imported = import_result(folder, bpy.context.scene)
+    thing = imported.cameras[0]
+    images = job / "stages" / "cameras-1" / "images"
+    images.mkdir(parents=True)
+    (images / "0.png").write_bytes(png_bytes(np.full((480, 640, 3), 9, np.uint8)))
+    thing[tags.PHOTO] = str(images / "0.png")
+    if moved:
+        job.rename(tmp_path / "elsewhere")
+        import_result(tmp_path / "elsewhere" / "result", bpy.context.scene)
+    bpy.context.view_layer.objects.active = thing
+    bpy.ops.gwrap.view_photo()
+    path = Path(thing.data.background_images[0].image.filepath)
+    home = tmp_path / "elsewhere" if moved else job
+    assert path == home / "stages" / "cameras-1" / "images" / "0.png"
 
 
 def test_without_cameras_the_next_step_is_named(result: ImportedResult) -> None:

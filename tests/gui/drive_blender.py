@@ -153,6 +153,7 @@ def steps() -> Iterator[float]:
     yield 0.8
     check(bpy.context.scene.camera == camera, "the view looks through the photo's camera")
     screenshot("6-camera")
+    yield from placing()
     if os.environ.get("GW_GUI_PREFERENCES"):
         press(bpy.ops.gwrap.check_worker)
         press(bpy.ops.screen.userpref_show, section="ADDONS")
@@ -160,6 +161,63 @@ def steps() -> Iterator[float]:
         yield 8.0
         screenshot("7-preferences")
     outcome["error"] = ""
+
+
+def frame() -> bpy.types.Object:
+    """Find the parent empty anew: undo replaces objects."""
+    return next(o for o in bpy.data.objects if o.get("gwrap_kind") == "frame")
+
+
+def execute(operator: Callable[..., set[str]], **properties: object) -> None:
+    """Run an operator as its dialog does when it is confirmed."""
+    window, area, region = view()
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        operator("EXEC_DEFAULT", True, **properties)
+
+
+def placing() -> Iterator[float]:
+    """Scale and ground; undo from Edit Mode takes the parent's transform back."""
+    mesh = next(o for o in bpy.data.objects if o.get("gwrap_kind") == "mesh")
+    bpy.context.view_layer.objects.active = mesh
+    press(bpy.ops.object.mode_set, mode="EDIT")
+    press(bpy.ops.mesh.select_all, action="SELECT")
+    yield 0.3
+    execute(bpy.ops.gwrap.set_ground)
+    check(bpy.context.mode == "OBJECT", "a tool leaves Edit Mode")
+    press(bpy.ops.gwrap.reset_placement)
+    for x in (0.0, 0.5):
+        bpy.context.scene.cursor.location = (x, 0.0, 0.0)
+        press(bpy.ops.gwrap.add_point)
+    execute(bpy.ops.gwrap.set_scale, distance=1.5)
+    yield 0.3
+    check(abs(frame().scale.x - 3.0) < 1e-5, "two points get their distance")
+    press(bpy.ops.ed.undo)
+    yield 0.3
+    check(abs(frame().scale.x - 1.0) < 1e-5, "undo takes the scale back")
+    press(bpy.ops.ed.redo)
+    yield 0.3
+    check(abs(frame().scale.x - 3.0) < 1e-5, "redo brings it again")
+
+    bpy.context.view_layer.objects.active = next(
+        o for o in bpy.data.objects if o.get("gwrap_kind") == "mesh"
+    )
+    press(bpy.ops.object.mode_set, mode="EDIT")
+    press(bpy.ops.mesh.select_all, action="SELECT")
+    yield 0.3
+    before = frame().matrix_world.copy()
+    execute(bpy.ops.gwrap.set_origin, target="POINTS")
+    bpy.context.scene.cursor.location = (1.0, 2.0, 3.0)
+    execute(bpy.ops.gwrap.set_origin, target="CURSOR")
+    yield 0.3
+    check(frame().matrix_world != before, "the origin is set from Edit Mode")
+    for _ in range(2):
+        press(bpy.ops.ed.undo)
+        yield 0.3
+    check(frame().matrix_world == before, "undo takes it back though it began in Edit Mode")
+    if bpy.context.mode != "OBJECT":
+        press(bpy.ops.object.mode_set, mode="OBJECT")
+    yield 0.3
+    screenshot("6-placed")
 
 
 def finish() -> None:
