@@ -103,6 +103,22 @@ def cameras_under(frame: bpy.types.Object) -> list[bpy.types.Object]:
     return sorted(found, key=lambda c: str(c.get(tags.PHOTO, "")))
 
 
+def bring_forward(frame: bpy.types.Object, thing: bpy.types.Object) -> None:
+    """Make one photo camera visible while the collection of all of them is hidden.
+
+    Blender draws the photo behind the view of a visible camera only: the camera joins the
+    collection of the result, and the one that was there before leaves it.
+    """
+    if not frame.users_collection:
+        return
+    collection = frame.users_collection[0]
+    for other in cameras_under(frame):
+        if other != thing and len(other.users_collection) > 1 and other in collection.objects[:]:
+            collection.objects.unlink(other)
+    if thing not in collection.objects[:]:
+        collection.objects.link(thing)
+
+
 def photo_of(thing: bpy.types.Object) -> Path:
     """Return the path of a camera's photo; in a job folder that was moved, where it is now."""
     path = Path(str(thing.get(tags.PHOTO, "")))

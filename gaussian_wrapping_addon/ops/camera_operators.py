@@ -8,7 +8,7 @@ from bpy.props import IntProperty
 
 from ..core.errors import DatasetError, UsageError
 from . import tags
-from .camera_objects import cameras_under, look_through, show_photo
+from .camera_objects import bring_forward, cameras_under, look_through, show_photo
 from .reporting import NeedsResult, ReportsErrors
 
 
@@ -28,7 +28,8 @@ class GWRAP_OT_view_photo(NeedsResult, ReportsErrors, bpy.types.Operator):
     )
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        thing = self._camera(context)
+        frame, thing = self._camera(context)
+        bring_forward(frame, thing)
         look_through(context.scene, thing)
         for area in context.screen.areas if context.screen else ():
             if area.type == "VIEW_3D":
@@ -39,18 +40,18 @@ class GWRAP_OT_view_photo(NeedsResult, ReportsErrors, bpy.types.Operator):
             self.report({"WARNING"}, str(error))
         return {"FINISHED"}
 
-    def _camera(self, context: bpy.types.Context) -> bpy.types.Object:
+    def _camera(self, context: bpy.types.Context) -> tuple[bpy.types.Object, bpy.types.Object]:
         active = context.view_layer.objects.active
         frame = tags.current_frame(context.scene, active)
         cameras = cameras_under(frame) if frame is not None else []
-        if not cameras:
+        if frame is None or not cameras:
             raise UsageError("The result has no photo cameras.", "Import the result again.")
         present = context.scene.camera
         if self.step == 0:
-            return next((c for c in (active, present) if c in cameras), cameras[0])
+            return frame, next((c for c in (active, present) if c in cameras), cameras[0])
         if present not in cameras:
-            return cameras[0 if self.step > 0 else -1]
-        return cameras[(cameras.index(present) + self.step) % len(cameras)]
+            return frame, cameras[0 if self.step > 0 else -1]
+        return frame, cameras[(cameras.index(present) + self.step) % len(cameras)]
 
 
 CLASSES: Final = (GWRAP_OT_view_photo,)

@@ -128,6 +128,11 @@ def test_photos_one_after_another(result: ImportedResult) -> None:
     assert seen == [*order, order[0]]
     bpy.ops.gwrap.view_photo(step=-1)
     assert bpy.context.scene.camera == order[-1]
+    bpy.context.view_layer.update()
+    assert [c for c in order if c.visible_get()] == [order[-1]], "a hidden one shows no photo"
+    assert all(len(c.users_collection) >= 1 for c in order)
+    import_result(tags.result_folder(result.frame), bpy.context.scene)
+    assert cameras_under(result.frame) == order
     bpy.ops.gwrap.view_photo()
     assert bpy.context.scene.camera == order[-1], "without a selected camera it stays"
 
