@@ -76,7 +76,7 @@ def make_mesh(trained: Trained, method: Method, *, threads: int, seed: int = 0) 
         vacancy, VectorField(arrays, threads=threads), arrays, cameras, region, settings,
         Progress(), seed=seed, threads=threads, sightings=sightings,
     )  # fmt: skip
-    return clean_up(mesh, region, settings, vacancy, Progress())
+    return clean_up(mesh, region, settings, vacancy, Progress()).mesh
 
 
 def cpu_seconds() -> float:

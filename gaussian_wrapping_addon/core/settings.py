@@ -15,6 +15,7 @@ from .limits import MAX_TILES
 PRESETS = ("draft", "standard", "fine")
 DECISIONS = ("auto", "on", "off")
 """Of what a scene may need: ``"auto"`` lets the photos decide (design.md 6)."""
+SWITCH = ("off", "on")
 
 MASK_MODES = ("ignore", "background")
 CORRELATIONS = ("signed", "squared")
@@ -23,6 +24,7 @@ MESH_METHODS = ("pam", "pivots")
 PIVOT_COUNTS = (2, 3, 9)
 BOUNDARIES = ("closed", "open")
 UNSEEN = ("empty", "occupied")
+MAX_LODS = 8
 EXPORT_FORMATS = ("glb", "obj", "ply", "usd")
 
 
@@ -156,6 +158,13 @@ class TextureSettings:
     """Side of the square texture; 0 chooses it from the photos' footprint."""
     gutter_px: int = 8
     """Texels around each chart of a texture of 4096; in proportion below, but 2 at least."""
+    normal_map: str = "auto"
+    """Whether the detail of the dense mesh is baked: ``"auto"`` where faces were taken away,
+    ``"on"`` always (flat where none were), or ``"off"``."""
+    ambient_occlusion: str = "off"
+    """``"on"`` bakes how open the dense mesh is to its surroundings."""
+    lods: int = 0
+    """Levels of detail below the mesh itself, each with a quarter of the faces."""
 
 
 @dataclass(frozen=True)
@@ -286,6 +295,13 @@ class JobSettings:
                 "0 (automatic) or from 64 to 8192",
             ),
             ("texture.gutter_px", 1 <= self.texture.gutter_px <= 64, "from 1 to 64"),
+            ("texture.normal_map", self.texture.normal_map in DECISIONS, _one_of(DECISIONS)),
+            (
+                "texture.ambient_occlusion",
+                self.texture.ambient_occlusion in SWITCH,
+                _one_of(SWITCH),
+            ),
+            ("texture.lods", 0 <= self.texture.lods <= MAX_LODS, f"from 0 to {MAX_LODS}"),
         )
         for name, good, wanted in checks:
             if not good:

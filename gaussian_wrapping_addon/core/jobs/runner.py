@@ -25,12 +25,15 @@ from .stages import Stage, run_stage, source_fingerprint, stage_key
 _logger = logging.getLogger(__name__)
 
 # Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
-STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 7, "texture": 4}
+STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 8, "texture": 5}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
 
 NAME_CHARACTERS = 40
+
+DENSE_MESH = "dense.npz"
+"""In a mesh stage whose mesh was decimated: the mesh before, for the texture stage's maps."""
 
 
 @dataclass(frozen=True)
@@ -253,10 +256,12 @@ def _run_meshing(
                 sightings=sightings,
                 origin=tiles_origin(cameras.folder, trained.folder, job.settings),
             )  # fmt: skip
-        mesh = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
+        mesh, dense = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
         open_at = region if meshing.boundary == "open" else None
         if open_at is not None:
             mesh = opened(mesh, open_at, meshing.min_component_share)
+            if dense is not None:
+                dense = opened(dense, open_at, meshing.min_component_share)
         mesh.provenance.update(field_figures(vacancy))
         if not np.isfinite(mesh.vertices).all():
             raise MeshingError(
@@ -264,6 +269,8 @@ def _run_meshing(
                 "Send the job folder's log.txt with a bug report.",
             )
         save_mesh(stage_folder / "mesh.npz", mesh)
+        if dense is not None:
+            save_mesh(stage_folder / DENSE_MESH, dense)
         remove_tiles(stage_folder)
         write_region(stage_folder / "region.json", region.transformed(scene.world_from_scene))
         progress.update(0.97, "measuring the mesh")
@@ -296,19 +303,37 @@ def _run_texture(
         from ..dataset.scene_file import load_saved_scene
         from ..evaluation.views.photo_comparison import compare_with_photos
         from ..evaluation.views.preview import write_preview
+        from ..files import read_json
         from ..limits import MAX_IMAGE_SIDE_PX
         from ..meshing.mesh_file import load_mesh
-        from ..texture.export import write_textured
+        from ..meshing.region import parse_region
+        from ..texture.export import file_offset, write_textured
+        from ..texture.levels import levels_of_detail
         from ..texture.texture_mesh import texture_mesh
 
         scene = load_saved_scene(cameras.folder)
         photos = PhotoStore(scene, MAX_IMAGE_SIDE_PX)
         mesh = load_mesh(meshed.folder / "mesh.npz")
+        dense_path = meshed.folder / DENSE_MESH
+        dense = load_mesh(dense_path) if dense_path.is_file() else None
+        coarse_from = 0.7 if texture.lods else 0.9
         textured = texture_mesh(
-            mesh, scene, photos, texture, stage_folder, progress.span(0.0, 0.9), threads=threads
-        )
+            mesh, scene, photos, texture, stage_folder, progress.span(0.0, coarse_from),
+            threads=threads, dense=dense,
+        )  # fmt: skip
+        region_path = meshed.folder / "region.json"
+        region = parse_region(read_json(region_path), region_path)
+        levels = levels_of_detail(
+            textured, dense, texture, stage_folder, progress.span(coarse_from, 0.9),
+            threads=threads, region=region.transformed(scene.world_from_scene.inverse()),
+        )  # fmt: skip
         formats = tuple(f for f in job.settings.export if f != "usd")
-        write_textured(textured, stage_folder / "files", formats, scene.world_from_scene)
+        offset = file_offset(scene.world_from_scene.points(mesh.vertices))
+        for number, level in enumerate([textured, *levels]):
+            folder = stage_folder / "files" / (f"lod{number}" if number else "")
+            write_textured(level, folder, formats, scene.world_from_scene, offset)
+        if levels:
+            textured.statistics["lods"] = [level.statistics for level in levels]
         progress.update(0.92, "comparing with photos")
         held_out = {figure["name"] for figure in trained.done["held_out"]}
         rendering = compare_with_photos(

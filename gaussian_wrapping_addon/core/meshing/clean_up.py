@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,13 +21,20 @@ from .surface_mesh import SurfaceMesh
 _logger = logging.getLogger(__name__)
 
 
+class CleanedUp(NamedTuple):
+    """A mesh as asked for, and the one with all its faces where some were taken away."""
+
+    mesh: SurfaceMesh
+    dense: SurfaceMesh | None
+
+
 def clean_up(
     mesh: SurfaceMesh,
     region: Region,
     settings: MeshingSettings,
     vacancy: Any,
     progress: Progress,
-) -> SurfaceMesh:
+) -> CleanedUp:
     """Smooth, then decimate, as the settings ask; without a request the mesh stays as it is.
 
     Both keep a closed 2-manifold closed and manifold, with its parts and their genus. Vertices then
@@ -44,14 +51,16 @@ def clean_up(
         Or anything with ``vacancy(points)``.
     """
     if settings.smooth_steps == 0 and not 0 < settings.target_faces < len(mesh.faces):
-        return _with_request(mesh, settings)
+        return CleanedUp(_with_request(mesh, settings), None)
     vertices, faces, colors = mesh.vertices, np.asarray(mesh.faces, np.int64), mesh.colors
     if settings.smooth_steps > 0:
         vertices = smooth(
             vertices, faces, settings.smooth_steps, progress.span(0.0, 0.4), region=region
         )
     notes = list(mesh.provenance.get("notes", []))
+    dense = None
     if 0 < settings.target_faces < len(faces):
+        dense = SurfaceMesh(vertices, np.asarray(mesh.faces, np.int32))
         result = decimate(
             vertices, faces, settings.target_faces, progress.span(0.4, 0.9), region=region
         )
@@ -78,7 +87,8 @@ def clean_up(
         "vertices_moved_apart": 0,
     }
     progress.update(1.0, f"{len(faces)} faces")
-    return SurfaceMesh(vertices, faces.astype(np.int32), colors, provenance)
+    cleaned = SurfaceMesh(vertices, faces.astype(np.int32), colors, provenance)
+    return CleanedUp(cleaned, dense if len(faces) < len(mesh.faces) else None)
 
 
 def _with_request(mesh: SurfaceMesh, settings: MeshingSettings) -> SurfaceMesh:

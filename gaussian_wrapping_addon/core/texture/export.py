@@ -85,7 +85,12 @@ def write_mesh_ply(
 
 
 def write_obj(
-    path: Path, vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, image_name: str
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    corner_uvs: np.ndarray,
+    image_name: str,
+    normal_name: str | None = None,
 ) -> None:
     """Write ``path`` and its ``.mtl`` beside it, which names an image in the same folder.
 
@@ -97,6 +102,8 @@ def write_obj(
         v upwards, as OBJ wants it.
     image_name : str
         Without spaces, which OBJ readers do not agree on.
+    normal_name : str, optional
+        A normal map, under the name of ``map_Bump``, by which Blender writes and reads them.
     """
     _check(vertices, faces)
     if any(c.isspace() for c in image_name + path.name):
@@ -111,6 +118,8 @@ def write_obj(
     text.write("usemtl albedo\n")
     np.savetxt(text, table, fmt="f %d/%d %d/%d %d/%d")
     material = f"newmtl albedo\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {image_name}\n"
+    if normal_name is not None:
+        material += f"map_Bump -bm 1 {normal_name}\n"
     with _writing(path):
         write_bytes(path.with_suffix(".mtl"), material.encode())
         write_bytes(path, text.getvalue().encode())
@@ -123,11 +132,12 @@ def write_glb(
     corner_uvs: np.ndarray,
     png: bytes,
     offset: np.ndarray,
+    **maps: bytes | None,
 ) -> None:
-    """Write a binary glTF with the image inside; see :func:`.glb.glb_bytes`."""
+    """Write a binary glTF with the images inside; see :func:`.glb.glb_bytes`."""
     _check(vertices, faces)
     with _writing(path):
-        write_bytes(path, glb_bytes(vertices, faces, corner_uvs, png, offset))
+        write_bytes(path, glb_bytes(vertices, faces, corner_uvs, png, offset, **maps))
 
 
 def write_textured(
@@ -135,8 +145,11 @@ def write_textured(
     folder: Path,
     formats: tuple[str, ...],
     world_from_scene: Similarity,
+    offset: np.ndarray | None = None,
 ) -> None:
     """Write ``mesh.npz``, ``albedo.png``, ``mesh.ply``, ``transform.json`` and the formats asked.
+
+    ``normal.png`` and ``occlusion.png`` stand beside them where the mesh has such maps.
 
     Parameters
     ----------
@@ -148,6 +161,9 @@ def write_textured(
         Among ``"glb"``, ``"obj"``, ``"ply"`` (always written).
     world_from_scene : Similarity
         Leads to the world frame of the input.
+    offset : (3,) float64, optional
+        What the files leave out, where several are to lie over each other; else
+        :func:`file_offset`.
 
     Raises
     ------
@@ -166,7 +182,11 @@ def write_textured(
     if not np.isfinite(textured.corner_uvs).all():
         raise MeshingError("The mesh has UVs that are not finite.", "Texture the region again.")
     world = world_from_scene.points(mesh.vertices)
-    offset = file_offset(world)
+    offset = file_offset(world) if offset is None else offset
+    maps = {
+        "normal": None if textured.normal_map is None else png_bytes(textured.normal_map),
+        "occlusion": None if textured.occlusion is None else png_bytes(textured.occlusion),
+    }
     png = png_bytes(textured.albedo)
     with _writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -179,6 +199,9 @@ def write_textured(
         )
         write_bytes(folder / "mesh.npz", stream.getvalue())
         write_bytes(folder / "albedo.png", png)
+        for name, data in maps.items():
+            if data is not None:
+                write_bytes(folder / f"{name}.png", data)
         write_json(
             folder / "transform.json",
             {
@@ -196,9 +219,25 @@ def write_textured(
     write_mesh_ply(folder / "mesh.ply", world, mesh.faces, vertex_colors(textured))
     local = world - offset
     if "obj" in formats:
-        write_obj(folder / "mesh.obj", local, mesh.faces, textured.corner_uvs, "albedo.png")
+        write_obj(
+            folder / "mesh.obj",
+            local,
+            mesh.faces,
+            textured.corner_uvs,
+            "albedo.png",
+            None if maps["normal"] is None else "normal.png",
+        )
     if "glb" in formats:
-        write_glb(folder / "mesh.glb", local, mesh.faces, textured.corner_uvs, png, offset)
+        write_glb(
+            folder / "mesh.glb",
+            local,
+            mesh.faces,
+            textured.corner_uvs,
+            png,
+            offset,
+            normal_png=maps["normal"],
+            occlusion_png=maps["occlusion"],
+        )
 
 
 def file_offset(world: np.ndarray) -> np.ndarray:
@@ -225,7 +264,7 @@ def vertex_colors(textured: TexturedMesh) -> np.ndarray:
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """Encode (h, w, 3) uint8 as PNG."""
+    """Encode (h, w, 3) or grey (h, w) uint8 as PNG."""
     from PIL import Image
 
     stream = io.BytesIO()

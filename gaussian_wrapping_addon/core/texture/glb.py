@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One textured mesh as binary glTF 2.0 (Y up, image embedded, shadeless)."""
+"""One textured mesh as binary glTF 2.0: Y up, images embedded."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .face_graph import vertex_normals
+from .tangent_frame import shading_normals
 
 _MAGIC = 0x46546C67
 _JSON_CHUNK = 0x4E4F534A
@@ -24,11 +24,16 @@ def glb_bytes(
     corner_uvs: np.ndarray,
     png: bytes,
     offset: np.ndarray,
+    *,
+    normal_png: bytes | None = None,
+    occlusion_png: bytes | None = None,
 ) -> bytes:
     """Build the file.
 
     Photos hold their own light, so the material is ``KHR_materials_unlit``, with an ordinary
-    rough material for readers that do not know it.
+    rough material for readers that do not know it. With a normal map or occlusion it is lit:
+    readers ignore both where a material is unlit. Normals are those that the map was baked for;
+    tangents are left to the reader, which glTF binds to MikkTSpace.
 
     Parameters
     ----------
@@ -41,6 +46,8 @@ def glb_bytes(
         The texture.
     offset : (3,) float64
         What was taken off the world coordinates; kept in the node's extras.
+    normal_png, occlusion_png : bytes, optional
+        Tangent-space normal map (+Y) and ambient occlusion (red channel), for the same UVs.
     """
     corner_vertex = np.asarray(faces, np.int64).ravel()
     uvs = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
@@ -51,21 +58,33 @@ def glb_bytes(
     _, first, index = np.unique(key, return_index=True, return_inverse=True)
     owner = corner_vertex[first]
     positions = _y_up(vertices)[owner].astype("<f4")
-    normals = _unit(_y_up(vertex_normals(vertices, faces)))[owner].astype("<f4")
+    normals = _y_up(shading_normals(vertices, faces))[owner].astype("<f4")
     coordinates = np.stack([uvs[first, 0], 1.0 - uvs[first, 1]], axis=1).astype("<f4")
     parts = [positions.tobytes(), normals.tobytes(), coordinates.tobytes()]
-    parts += [index.astype("<u4").tobytes(), png]
+    parts += [index.astype("<u4").tobytes()]
+    images = {"albedo": png, "normal": normal_png, "occlusion": occlusion_png}
+    pictures = {name: data for name, data in images.items() if data is not None}
+    targets = [
+        _ARRAY_BUFFER,
+        _ARRAY_BUFFER,
+        _ARRAY_BUFFER,
+        _INDEX_BUFFER,
+        *(None for _ in pictures),
+    ]
+    first_image = len(parts)
+    parts += pictures.values()
     views: list[dict[str, Any]] = []
     binary = bytearray()
-    targets = (_ARRAY_BUFFER, _ARRAY_BUFFER, _ARRAY_BUFFER, _INDEX_BUFFER, None)
     for part, target in zip(parts, targets, strict=True):
         view = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(part)}
         views.append(view if target is None else {**view, "target": target})
         binary += part + b"\0" * (-len(part) % 4)
     count = len(first)
+    material = _material(list(pictures))
+    is_unlit = "extensions" in material
     document = {
         "asset": {"version": "2.0", "generator": "Gaussian Wrapping for Blender"},
-        "extensionsUsed": ["KHR_materials_unlit"],
+        **({"extensionsUsed": ["KHR_materials_unlit"]} if is_unlit else {}),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [
@@ -83,20 +102,13 @@ def glb_bytes(
                 ],
             }
         ],
-        "materials": [
-            {
-                "name": "albedo",
-                "pbrMetallicRoughness": {
-                    "baseColorTexture": {"index": 0},
-                    "metallicFactor": 0.0,
-                    "roughnessFactor": 1.0,
-                },
-                "extensions": {"KHR_materials_unlit": {}},
-            }
-        ],
-        "textures": [{"source": 0, "sampler": 0}],
+        "materials": [material],
+        "textures": [{"source": k, "sampler": 0} for k in range(len(pictures))],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
-        "images": [{"name": "albedo", "mimeType": "image/png", "bufferView": 4}],
+        "images": [
+            {"name": name, "mimeType": "image/png", "bufferView": first_image + k}
+            for k, name in enumerate(pictures)
+        ],
         "accessors": [
             {
                 **_accessor(0, _FLOAT, count, "VEC3"),
@@ -124,14 +136,26 @@ def glb_bytes(
     )
 
 
+def _material(images: list[str]) -> dict[str, Any]:
+    """Return the material of images, named in the order of the textures."""
+    material: dict[str, Any] = {
+        "name": "albedo",
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": images.index("albedo")},
+            "metallicFactor": 0.0,
+            "roughnessFactor": 1.0,
+        },
+    }
+    for name in ("normal", "occlusion"):
+        if name in images:
+            material[f"{name}Texture"] = {"index": images.index(name)}
+    if images == ["albedo"]:
+        material["extensions"] = {"KHR_materials_unlit": {}}
+    return material
+
+
 def _y_up(values: np.ndarray) -> np.ndarray:
     return np.stack([values[:, 0], values[:, 2], -values[:, 1]], axis=1)
-
-
-def _unit(normals: np.ndarray) -> np.ndarray:
-    """glTF wants unit length everywhere: vertices without a normal get one."""
-    missing = np.linalg.norm(normals, axis=1) < 0.5
-    return np.where(missing[:, None], [0.0, 1.0, 0.0], normals)
 
 
 def _accessor(view: int, component: int, count: int, kind: str) -> dict[str, Any]:

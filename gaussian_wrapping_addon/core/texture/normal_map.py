@@ -14,6 +14,7 @@ from .atlas_raster import AtlasRaster
 from .dense_surface import BLOCK, BY_NEAREST, BY_RAY, NO_HIT, DenseSurface, Places, cage_distance
 from .fill import grow
 from .tangent_frame import TangentFrames, tangent_frames
+from .texel_points import texel_points
 
 FLAT = (128, 128, 255)
 """The colour of the light mesh's own normal: what is between charts."""
@@ -71,20 +72,14 @@ def bake_normal_map(
     for begin in range(0, len(texels), BLOCK):
         progress.update(begin / len(texels), "normal map: rays between the meshes")
         part = texels[begin : begin + BLOCK]
-        face = raster.face.ravel()[part]
-        bary = raster.bary.reshape(-1, 2)[part].astype(np.float64)
-        weights = np.concatenate([bary, 1.0 - bary.sum(axis=1, keepdims=True)], axis=1)
-        corners = np.asarray(light.faces)[face]  # (n, 3)
-        points = np.einsum("nc,ncx->nx", weights, np.asarray(light.vertices, float)[corners])
-        normal = np.einsum("nc,ncx->nx", weights, frames.normals[corners])
-        unit = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        places = dense.corresponding(points, unit, cage)
+        at = texel_points(light, raster, part, frames.normals)
+        places = dense.corresponding(at.points, at.normals, cage)
         counts += np.bincount(places.how, minlength=3)
         found = places.how != NO_HIT
-        wanted = unit.copy()
+        wanted = at.normals.copy()
         rows = Places(places.face[found], places.weights[found], places.how[found])
         wanted[found] = dense.normals(rows)
-        pixels[part] = encode(in_frame(wanted, normal, weights, face, frames))
+        pixels[part] = encode(in_frame(wanted, at.raw_normals, at.weights, at.face, frames))
     ring = np.where(raster.face >= 0, 0, -1).astype(np.int16)
     chart = np.where(raster.face >= 0, 0, -1).astype(np.int32)
     grow(image, ring, chart, gutter_px, inside=False)

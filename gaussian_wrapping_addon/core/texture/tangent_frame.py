@@ -3,7 +3,7 @@
 
 What reads the map must have the same frame, to the degree. Blender and glTF both name MikkTSpace
 (Mikkelsen, "Simulation of wrinkled surfaces revisited", 2008): each face's direction of growing u,
-averaged by corner angles over the faces that share a vertex, its UV and the UVs' orientation, in
+averaged by corner angles over neighbours that share a vertex, its UV and the UVs' orientation, in
 the plane of the vertex's normal. Normals and tangents are interpolated as they are, not to unit
 length, and the bitangent is ``sign * cross(normal, tangent)``.
 """
@@ -13,6 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 
 @dataclass(frozen=True)
@@ -86,11 +88,26 @@ def tangent_frames(
 
 
 def _groups(faces: np.ndarray, uvs: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """(3 f,) int64: one number for corners with the same vertex, UV and orientation."""
+    """(3 f,) int64: one number for corners that average their tangents.
+
+    They have the same vertex, UV and orientation, and their faces are joined by edges around the
+    vertex: pieces of a chart that touch in a point alone have tangents of their own.
+    """
     key = np.empty(faces.size, np.dtype([("vertex", "<i8"), ("uv", "<u8")]))
     key["vertex"] = 2 * faces.ravel() + np.repeat(signs > 0, 3)
     key["uv"] = np.ascontiguousarray(uvs.reshape(-1, 2)).view(np.uint64)[:, 0]
-    return np.unique(key, return_inverse=True)[1].ravel()
+    welded = np.unique(key, return_inverse=True)[1].ravel()
+    corner = np.arange(faces.size)
+    follower = corner - corner % 3 + (corner % 3 + 1) % 3
+    low = np.where(welded < welded[follower], corner, follower)
+    high = corner + follower - low
+    edge = welded[low] * (int(welded.max()) + 1) + welded[high]
+    order = np.argsort(edge, kind="stable")
+    same = np.flatnonzero(edge[order[1:]] == edge[order[:-1]])
+    one, other = order[same], order[same + 1]
+    rows, columns = np.r_[low[one], high[one]], np.r_[low[other], high[other]]
+    links = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (faces.size, faces.size))
+    return connected_components(links, directed=False)[1].astype(np.int64)
 
 
 def _flattened(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from ..progress import Progress
 from ..settings import TextureSettings
 from .atlas_raster import AtlasRaster, raster_atlas
 from .bake import Baked, Photos, bake
+from .detail import bake_detail, wants_normal_map
 from .face_graph import face_graph
 from .fill import (
     RING_TEXELS,
@@ -48,6 +49,7 @@ def texture_mesh(
     progress: Progress,
     *,
     threads: int,
+    dense: SurfaceMesh | None = None,
 ) -> TexturedMesh:
     """Unwrap a mesh and bake its texture from the photos (method.md 8).
 
@@ -67,6 +69,8 @@ def texture_mesh(
         Span of this step.
     threads : int
         Threads to use; the result does not depend on it.
+    dense : SurfaceMesh, optional
+        What the mesh was decimated from: its detail goes into the normal map.
 
     Raises
     ------
@@ -83,7 +87,10 @@ def texture_mesh(
         )
     graph = face_graph(mesh.vertices, mesh.faces)
     count = len(scene.views)
-    size_px = settings.size_px or automatic_size(graph, photos, count)
+    detail_points = 0
+    if dense is not None and wants_normal_map(settings, is_decimated=True):
+        detail_points = len(dense.vertices)
+    size_px = settings.size_px or automatic_size(graph, photos, count, detail_points)
     progress.update(0.0, f"unwrapping for {size_px} x {size_px} texels")
     gutter_px = gutter_for(size_px, settings.gutter_px)
     unwrapped = unwrap(
@@ -101,14 +108,21 @@ def texture_mesh(
         graph.normals,
         texel_size,
     )
-    baked = bake(points, surface, photos, count, progress.span(0.3, 0.9), threads=threads)
+    baked = bake(points, surface, photos, count, progress.span(0.3, 0.8), threads=threads)
+    detail = bake_detail(
+        mesh, unwrapped.corner_uvs, raster, dense, settings, progress.span(0.8, 0.9),
+        threads=threads,
+    )  # fmt: skip
     progress.update(0.9, "filling what no photo saw")
     albedo = _image(size_px, texels, points, surface, baked, raster, unwrapped, gutter_px)
     statistics = _statistics(size_px, settings, unwrapped, raster, points, baked, graph.areas)
+    statistics |= detail.statistics
     if statistics["texels_seen"] == 0:
         _logger.warning("no photo sees the mesh: its texture is plain grey")
     progress.update(1.0, f"texture: {100 * statistics['coverage']:.1f} % seen by photos")
-    return TexturedMesh(mesh, unwrapped.corner_uvs, albedo, statistics)
+    return TexturedMesh(
+        mesh, unwrapped.corner_uvs, albedo, statistics, detail.normal_map, detail.occlusion
+    )
 
 
 def check_mesh(mesh: SurfaceMesh) -> None:

@@ -16,6 +16,8 @@ SAMPLED_FACES = 2_000
 TEXELS_PER_FACE = 12
 """Many small charts need room for their faces, however little the photos show of each: with less,
 most faces of a wheel with 28 spokes had no texel at all."""
+TEXELS_PER_DETAIL_POINT = 2
+"""A normal map of one texel for each vertex of the dense mesh would lose half of its bends."""
 FULL_GUTTER_SIDE_PX = 4096
 MIN_GUTTER_PX = 2
 MIN_SIZE_PX = 256
@@ -26,12 +28,15 @@ ENOUGH = 0.8
 """A texture of this share of the photos' resolution is enough: the next size costs four times."""
 
 
-def automatic_size(graph: FaceGraph, photos: Photos, count: int, seed: int = 0) -> int:
+def automatic_size(
+    graph: FaceGraph, photos: Photos, count: int, detail_points: int = 0, seed: int = 0
+) -> int:
     """Return the side in pixels, a power of two from 256 to 4096.
 
     The footprint of a photo's pixel on the surface is ``z / focal``; each sampled face takes its
     best photo, and the surface their median (by area). Occlusion is not tested: a size needs no
-    more than the order. There is also room for :data:`TEXELS_PER_FACE`.
+    more than the order. There is also room for :data:`TEXELS_PER_FACE`,
+    and for :data:`TEXELS_PER_DETAIL_POINT` of the ``detail_points`` that a normal map shows.
     """
     area = float(graph.areas.sum())
     generator = np.random.default_rng(seed)
@@ -51,7 +56,8 @@ def automatic_size(graph: FaceGraph, photos: Photos, count: int, seed: int = 0) 
         return MIN_SIZE_PX
     footprint = float(np.median(best))
     wanted = ENOUGH * math.sqrt(area / EXPECTED_UTILISATION) / footprint
-    wanted = max(wanted, math.sqrt(TEXELS_PER_FACE * len(graph.areas) / EXPECTED_UTILISATION))
+    room = max(TEXELS_PER_FACE * len(graph.areas), TEXELS_PER_DETAIL_POINT * detail_points)
+    wanted = max(wanted, math.sqrt(room / EXPECTED_UTILISATION))
     exponent = math.ceil(math.log2(max(wanted, 1.0)))
     largest = min(MAX_AUTOMATIC_SIZE_PX, limits.MAX_TEXTURE_SIDE_PX)
     return int(min(max(2**exponent, MIN_SIZE_PX), largest))

@@ -22,3 +22,7 @@ class TexturedMesh:
     """(h, w, 3) uint8 sRGB; row 0 is the top of the image (v = 1)."""
     statistics: dict[str, Any] = field(default_factory=dict)
     """Coverage: texels used, seen, filled; number of charts, utilisation."""
+    normal_map: np.ndarray | None = None
+    """(h, w, 3) uint8 tangent-space normals, +Y, no sRGB; rows as in ``albedo``."""
+    occlusion: np.ndarray | None = None
+    """(k, k) uint8: 255 where nothing is near, 0 where nothing of the surroundings is seen."""

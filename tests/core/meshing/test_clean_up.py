@@ -37,7 +37,7 @@ def mesh() -> SurfaceMesh:
 
 
 def cleaned(mesh: SurfaceMesh, **changes: int) -> SurfaceMesh:
-    return clean_up(mesh, REGION, MeshingSettings(**changes), FIELD, Progress())
+    return clean_up(mesh, REGION, MeshingSettings(**changes), FIELD, Progress()).mesh
 
 
 def test_off_means_untouched(mesh: SurfaceMesh) -> None:
@@ -66,6 +66,23 @@ def test_what_was_asked_for_is_done_and_told(mesh: SurfaceMesh, steps: int, shar
     away = np.abs(FIELD.vacancy(result.vertices[~capped]).vacancy - 0.5)
     assert told["level_error_max"] == pytest.approx(away.max(), abs=1e-6)
     assert told["level_error_max"] > mesh.provenance["level_error_max"]
+
+
+def test_the_dense_mesh_is_kept_where_faces_went(mesh: SurfaceMesh) -> None:
+    def dense(**changes: int) -> SurfaceMesh | None:
+        return clean_up(mesh, REGION, MeshingSettings(**changes), FIELD, Progress()).dense
+
+    kept = dense(target_faces=500)
+    assert kept is not None
+    assert (kept.vertices == mesh.vertices).all()
+    assert (kept.faces == mesh.faces).all()
+    assert dense() is None
+    assert dense(smooth_steps=2) is None
+    assert dense(target_faces=10**6) is None
+    # Smoothing comes first: the light mesh is to look like the smooth one.
+    smooth = dense(target_faces=500, smooth_steps=2)
+    assert smooth is not None
+    assert (smooth.vertices == cleaned(mesh, smooth_steps=2).vertices).all()
 
 
 def test_more_faces_than_there_are_is_said(mesh: SurfaceMesh) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,65 @@ def test_glb_follows_the_container_format(files: Path) -> None:
     begin = normals["byteOffset"]
     values = np.frombuffer(binary[begin : begin + normals["byteLength"]], "<f4").reshape(-1, 3)
     assert np.abs(np.linalg.norm(values, axis=1) - 1).max() < 1e-5
+
+
+def read_glb(path: Path) -> tuple[dict, bytes]:
+    """The JSON and the binary part."""
+    data = path.read_bytes()
+    (size,) = struct.unpack("<I", data[12:16])
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def test_maps_are_written_beside_and_into_the_files(tmp_path: Path) -> None:
+    generator = np.random.default_rng(4)
+    normal_map = generator.integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    occlusion = generator.integers(0, 256, (16, 16), dtype=np.uint8)
+    textured = replace(cube(), normal_map=normal_map, occlusion=occlusion)
+    write_textured(textured, tmp_path, ("glb", "obj"), Similarity())
+    assert (np.asarray(Image.open(tmp_path / "normal.png")) == normal_map).all()
+    assert Image.open(tmp_path / "occlusion.png").mode == "L"
+    assert (np.asarray(Image.open(tmp_path / "occlusion.png")) == occlusion).all()
+    assert "map_Bump -bm 1 normal.png\n" in (tmp_path / "mesh.mtl").read_text()
+    document, binary = read_glb(tmp_path / "mesh.glb")
+    (material,) = document["materials"]
+    wanted = {
+        "baseColorTexture": textured.albedo,
+        "normalTexture": normal_map,
+        "occlusionTexture": np.repeat(occlusion[..., None], 3, axis=2),
+    }
+    for name, pixels in wanted.items():
+        place = {**material, **material["pbrMetallicRoughness"]}[name]["index"]
+        view = document["bufferViews"][
+            document["images"][document["textures"][place]["source"]]["bufferView"]
+        ]
+        assert view["byteOffset"] % 4 == 0
+        assert "target" not in view
+        png = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        assert (np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) == pixels).all()
+    # An unlit material would hide both.
+    assert "extensions" not in material
+    assert "extensionsUsed" not in document
+    read = trimesh.load(tmp_path / "mesh.glb", force="mesh", process=False)
+    assert (np.asarray(read.visual.material.normalTexture.convert("RGB")) == normal_map).all()
+
+
+def test_without_maps_files_are_unlit_and_without_links(files: Path) -> None:
+    document, _ = read_glb(files / "mesh.glb")
+    (material,) = document["materials"]
+    assert set(material) == {"name", "pbrMetallicRoughness", "extensions"}
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
+    assert len(document["textures"]) == len(document["images"]) == 1
+    assert "map_Bump" not in (files / "mesh.mtl").read_text()
+
+
+def test_levels_share_the_offset_that_they_are_given(tmp_path: Path) -> None:
+    offset = np.array([512_000.0, 4_123_000.0, 100.0])
+    write_textured(cube(), tmp_path, ("glb",), UTM, offset)
+    assert json.loads((tmp_path / "transform.json").read_text())["offset"] == offset.tolist()
+    document, _ = read_glb(tmp_path / "mesh.glb")
+    low = np.array(document["accessors"][0]["min"])
+    world = UTM.points(cube().mesh.vertices) - offset
+    assert low[[0, 1]] == pytest.approx(world.min(axis=0)[[0, 2]], rel=1e-6)
 
 
 def test_obj_read_by_trimesh_is_the_same_mesh_and_image(files: Path) -> None:

@@ -290,6 +290,39 @@ def test_the_automatic_size_follows_the_photos() -> None:
     assert automatic_size(graph, FakePhotos([], []), 0) == 256
 
 
+def test_the_automatic_size_has_room_for_the_detail() -> None:
+    mesh = sphere(2)
+    graph = face_graph(mesh.vertices, mesh.faces)
+    assert automatic_size(graph, photographed_from_afar(), 1) == 256
+    assert automatic_size(graph, photographed_from_afar(), 1, 200_000) == 1024
+
+
+def photographed_from_afar() -> FakePhotos:
+    return FakePhotos([look_at((0.0, -300.0, 0.0))], [])
+
+
+@pytest.mark.parametrize(
+    ("normal_map", "dense", "baked"),
+    [("auto", False, False), ("auto", True, True), ("on", False, True), ("off", True, False)],
+)
+def test_maps_are_baked_as_settings_ask(
+    tmp_path: Path, normal_map: str, dense: bool, baked: bool
+) -> None:
+    photos = photograph(ring(4, 3.5, 1.0), [(sphere_hit, waves)])
+    settings = TextureSettings(64, 2, normal_map=normal_map)
+    textured = texture_mesh(
+        sphere(2), scene_of(photos), photos, settings, tmp_path, Progress(), threads=2,
+        dense=sphere(4) if dense else None,
+    )  # fmt: skip
+    assert (textured.normal_map is not None) == baked
+    assert ("normal_map" in textured.statistics) == baked
+    assert textured.occlusion is None
+    if baked:
+        assert textured.normal_map.shape == textured.albedo.shape
+        told = textured.statistics["normal_map"]["dense_faces"]
+        assert told == (5120 if dense else 320)
+
+
 def test_photos_finer_than_the_texture_do_not_alias(tmp_path: Path) -> None:
     """A checker much finer than a texel must turn grey, not into noise."""
 
