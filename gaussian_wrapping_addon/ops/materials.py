@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 
 SHADINGS = ("LIT", "UNLIT")
+_NORMAL_IMAGE, _NORMAL = "Normal Texture", "Normal Map"
 _IMAGE, _LIT, _UNLIT, _OUTPUT = "Photo Texture", "Lit", "Unlit", "Output"
 
 # Photos carry their own light: a glossy guess on top of it would look wrong from most sides.
@@ -15,17 +16,22 @@ _ROUGHNESS = 0.9
 _SPECULAR = 0.1
 
 
-def load_texture(path: Path) -> bpy.types.Image:
-    """Load an image by path (not packed), or reload it where it is loaded already."""
+def load_texture(path: Path, colorspace: str = "sRGB") -> bpy.types.Image:
+    """Load an image by path (not packed), or reload it where it is loaded already.
+
+    Normal maps are no colours: their ``colorspace`` is ``"Non-Color"``.
+    """
     image = bpy.data.images.load(str(path), check_existing=True)
     if image.users:
         image.reload()
-    image.colorspace_settings.name = "sRGB"
+    image.colorspace_settings.name = colorspace
     return image
 
 
-def create_material(name: str, image: bpy.types.Image) -> bpy.types.Material:
-    """Make a material with both branches, linked as lit.
+def create_material(
+    name: str, image: bpy.types.Image, normal_map: bpy.types.Image | None = None
+) -> bpy.types.Material:
+    """Make a material with both branches, linked as lit; the lit one takes the normal map.
 
     Unlit is the pattern that the glTF exporter writes as ``KHR_materials_unlit``.
     """
@@ -58,7 +64,37 @@ def create_material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     links.new(lit.outputs[0], output.inputs["Surface"])
     # Workbench draws the texture of the active image node.
     nodes.active = texture
+    set_normal_map(material, normal_map)
     return material
+
+
+def set_normal_map(material: bpy.types.Material, image: bpy.types.Image | None) -> bool:
+    """Give the lit branch a normal map, or take it away; False where it is none of our materials.
+
+    The image goes through a Normal Map node, without which glTF exporters drop it.
+    """
+    tree = material.node_tree
+    if tree is None or _LIT not in tree.nodes:
+        return False
+    nodes, links = tree.nodes, tree.links
+    if image is None:
+        for name in (_NORMAL, _NORMAL_IMAGE):
+            if name in nodes:
+                nodes.remove(nodes[name])
+        return True
+    texture, normal = nodes.get(_NORMAL_IMAGE), nodes.get(_NORMAL)
+    if texture is None or normal is None:
+        set_normal_map(material, None)
+        active = nodes.active
+        texture = nodes.new("ShaderNodeTexImage")
+        texture.name, texture.location = _NORMAL_IMAGE, (-900, 500)
+        normal = nodes.new("ShaderNodeNormalMap")
+        normal.name, normal.location = _NORMAL, (-450, 500)
+        links.new(texture.outputs["Color"], normal.inputs["Color"])
+        links.new(normal.outputs["Normal"], nodes[_LIT].inputs["Normal"])
+        nodes.active = active  # Workbench draws the active image
+    texture.image = image
+    return True
 
 
 def set_shading(material: bpy.types.Material, shading: str) -> bool:

@@ -18,6 +18,7 @@ from ..core.dataset.placement_file import FILE_NAME, read_placement
 from ..core.dataset.similarity import Similarity
 from ..core.errors import DatasetError, ParseError
 from ..core.files import read_json
+from ..core.settings import MAX_LODS
 from .region_geometry import vertices_of_region
 from .report_data import figures_of_report
 
@@ -25,6 +26,20 @@ _logger = logging.getLogger(__name__)
 
 # An import of this size already takes minutes; a larger claim is a broken or hostile file.
 MAX_MESH_BYTES = 4 * 2**30
+
+
+@dataclass(frozen=True)
+class LevelResult:
+    """One level of detail below a region's mesh."""
+
+    vertices: np.ndarray
+    """(v, 3) float64, scene frame, finite."""
+    faces: np.ndarray
+    """(f, 3) int32, indices within range."""
+    corner_uvs: np.ndarray
+    """(f, 3, 2) float32, finite."""
+    albedo: Path
+    normal_map: Path | None
 
 
 @dataclass(frozen=True)
@@ -43,6 +58,9 @@ class RegionResult:
     """(n, 3) float64, world frame: corners of the region."""
     stamp: str
     """Changes when the mesh file changes."""
+    normal_map: Path | None = None
+    levels: tuple[LevelResult, ...] = ()
+    """Levels of detail 1, 2, ..."""
 
 
 @dataclass(frozen=True)
@@ -144,12 +162,24 @@ def _region(folder: Path) -> RegionResult:
     region_path = folder / "region.json"
     if not region_path.is_file():
         raise DatasetError(f"{folder} holds no region.json.", "Mesh the region again.")
-    albedo = folder / "albedo.png"
-    if not albedo.is_file():
-        raise DatasetError(f"{folder} holds no albedo.png.", "Mesh the region again.")
+    albedo, normal_map = _textures(folder)
     box = vertices_of_region(read_json(region_path), region_path)
     stamp = f"{state.st_size}:{state.st_mtime_ns}"
-    return RegionResult(folder.name, vertices, faces, corner_uvs, albedo, box, stamp)
+    levels = []
+    while (level := folder / f"lod{len(levels) + 1}" / "mesh.npz").is_file():
+        if len(levels) == MAX_LODS:
+            raise DatasetError(f"{folder} holds too many levels.", "Mesh the region again.")
+        levels.append(LevelResult(*_mesh(level), *_textures(level.parent)))
+    return RegionResult(
+        folder.name, vertices, faces, corner_uvs, albedo, box, stamp, normal_map, tuple(levels)
+    )
+
+
+def _textures(folder: Path) -> tuple[Path, Path | None]:
+    albedo, normal_map = folder / "albedo.png", folder / "normal.png"
+    if not albedo.is_file():
+        raise DatasetError(f"{folder} holds no albedo.png.", "Mesh the region again.")
+    return albedo, normal_map if normal_map.is_file() else None
 
 
 def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

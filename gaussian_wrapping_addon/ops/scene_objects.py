@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
-import numpy as np
 
 from ..core.errors import UsageError
 from . import tags
 from .camera_objects import create_camera, look_through, scale_display
-from .materials import create_material, load_texture
+from .level_objects import update_levels
+from .materials import create_material, load_texture, set_normal_map
+from .mesh_data import build_mesh
 from .placement import restore, scale_of
 from .region_objects import create_region
 from .result_files import RegionResult, ResultFiles, read_result
@@ -79,6 +80,10 @@ def import_result(folder: Path, scene: bpy.types.Scene) -> ImportedResult:
         meshes.append(_update_mesh(region, children, frame, collection))
         regions.append(_update_region(region, files, children, frame, collection))
     cameras = _update_cameras(files, children, frame, collection)
+    # Last: levels that are made anew leave dead entries among the children.
+    for region, mesh in zip(files.regions, meshes, strict=True):
+        levels = [c for c in frame.children if tags.kind_of(c) == "lod"]
+        update_levels(region, mesh, levels, collection)
     return ImportedResult(collection, frame, tuple(meshes), cameras, tuple(regions))
 
 
@@ -126,25 +131,6 @@ def _found(
     return next((c for c in children if tags.kind_of(c) == kind and c.get(key) == value), None)
 
 
-def build_mesh(region: RegionResult) -> bpy.types.Mesh:
-    """Make mesh data of a region's arrays: smooth shaded, one UV layer."""
-    mesh = bpy.data.meshes.new(region.name)
-    count = len(region.faces)
-    mesh.vertices.add(len(region.vertices))
-    mesh.vertices.foreach_set("co", region.vertices.astype(np.float32).ravel())
-    mesh.loops.add(3 * count)
-    mesh.loops.foreach_set("vertex_index", region.faces.ravel())
-    mesh.polygons.add(count)
-    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
-    mesh.polygons.foreach_set("use_smooth", np.ones(count, bool))
-    layer = mesh.uv_layers.new(name="UVMap", do_init=False)
-    layer.uv.foreach_set("vector", region.corner_uvs.ravel())
-    mesh.update(calc_edges=True)
-    if mesh.validate():
-        _logger.warning("mesh of region %s: broken faces were removed", region.name)
-    return mesh
-
-
 def _update_mesh(
     region: RegionResult,
     children: list[bpy.types.Object],
@@ -154,10 +140,11 @@ def _update_mesh(
     thing = _found(children, "mesh", tags.REGION, region.name)
     if thing is not None and thing.get(tags.STAMP) == region.stamp:
         return thing
-    mesh = build_mesh(region)
+    mesh = build_mesh(region.name, region.vertices, region.faces, region.corner_uvs)
     image = load_texture(region.albedo)
+    normal_map = load_texture(region.normal_map, "Non-Color") if region.normal_map else None
     if thing is None:
-        mesh.materials.append(create_material(region.name, image))
+        mesh.materials.append(create_material(region.name, image, normal_map))
         thing = bpy.data.objects.new(region.name, mesh)
         thing.parent = frame
         thing[tags.KIND] = "mesh"
@@ -167,6 +154,8 @@ def _update_mesh(
         old = thing.data
         for material in old.materials:
             mesh.materials.append(material)
+            if material is not None:
+                set_normal_map(material, normal_map)
         thing.data = mesh
         if old.users == 0:
             name = old.name

@@ -13,7 +13,8 @@ from ..core.dataset.similarity import Similarity
 from ..core.errors import UsageError
 
 KIND = "gwrap_kind"
-"""``"frame"`` (the parent empty), ``"mesh"``, ``"camera"``, ``"region"`` or ``"point"``."""
+"""``"frame"`` (the parent empty), ``"mesh"``, ``"lod"``, ``"camera"``, ``"region"`` or
+``"point"``."""
 RESULT = "gwrap_result"
 """On the frame: the result folder; ``//`` means beside the .blend file."""
 FINGERPRINT = "gwrap_fingerprint"
@@ -25,8 +26,10 @@ FIGURES = "gwrap_figures"
 """On the frame: figures of the report as JSON text (``report_data.py``)."""
 REGION = "gwrap_region"
 """On meshes and regions: the name of the region in the result folder."""
+LEVEL = "gwrap_level"
+"""On levels of detail: 1, 2, ..."""
 STAMP = "gwrap_stamp"
-"""On meshes: changes when the mesh file changes."""
+"""On meshes and levels of detail: changes when the mesh file changes."""
 PHOTO = "gwrap_photo"
 RESOLUTION = "gwrap_resolution_px"
 PIXEL_ASPECT = "gwrap_pixel_aspect"
