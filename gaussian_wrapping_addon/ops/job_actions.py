@@ -18,7 +18,7 @@ from ..core.jobs.more import job_with_more
 from ..core.jobs.stages import read_done
 from . import job_timer, tags
 from .region_objects import export_region, hull_in_blender, scene_from_blender
-from .training_choices import job_settings
+from .training_choices import job_settings, texture_choices
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def start_mesh(
             target_faces=properties.target_faces if properties.decimate else 0,
             smooth_steps=properties.smooth_steps,
         ),
-        texture=replace(earlier.settings.texture, size_px=int(properties.texture_size)),
+        texture=replace(earlier.settings.texture, **texture_choices(scene)),
     )
     job = make_job("mesh", Path(earlier.source), settings)
     names = [region_name(request, job.region_bodies[request]) for request in job.settings.regions]

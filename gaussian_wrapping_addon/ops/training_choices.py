@@ -34,8 +34,19 @@ def job_settings(scene: bpy.types.Scene, threads: int) -> JobSettings:
         settings,
         start_splat=_splat(choices.start_splat),
         training=replace(settings.training, **changes),
-        texture=replace(settings.texture, size_px=int(properties.texture_size)),
+        texture=replace(settings.texture, **texture_choices(scene)),
     )
+
+
+def texture_choices(scene: bpy.types.Scene) -> dict[str, object]:
+    """Return the texture settings that the panels of a scene ask for."""
+    properties = scene.gwrap
+    return {
+        "size_px": int(properties.texture_size),
+        "normal_map": properties.normal_map.lower(),
+        "ambient_occlusion": "on" if properties.ambient_occlusion else "off",
+        "lods": properties.lods,
+    }
 
 
 def _splat(stored: str) -> str:

@@ -195,6 +195,9 @@ class GWRAP_PT_mesh_advanced(_Panel, bpy.types.Panel):
             column.prop(properties, "spacing")
         column.prop(properties, "boundary")
         column.prop(properties, "unseen")
+        column.prop(properties, "normal_map")
+        column.prop(properties, "ambient_occlusion")
+        column.prop(properties, "lods")
 
 
 class GWRAP_PT_result(_Panel, bpy.types.Panel):

@@ -51,6 +51,11 @@ _UNSEEN: Final = (
     ("EMPTY", "Empty", "Nothing stands where no camera looks"),
     ("OCCUPIED", "Occupied", "Something stands there: closes the backs of things"),
 )
+_NORMAL_MAPS: Final = (
+    ("AUTO", "Automatic", "Where the faces are limited: what they no longer show"),
+    ("ON", "On", "Always; flat where no face was taken away"),
+    ("OFF", "Off", "No normal map"),
+)
 _TEXTURE_SIZES: Final = (
     ("0", "Automatic", "As many pixels as the photos hold"),
     ("1024", "1024", "1024 pixels each way"),
@@ -153,6 +158,24 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     )
     texture_size: EnumProperty(  # type: ignore[valid-type]
         name="Texture Size", description="Side of the texture", items=_TEXTURE_SIZES, default="0"
+    )
+    normal_map: EnumProperty(  # type: ignore[valid-type]
+        name="Normal Map",
+        description="Detail of the mesh before its faces were limited, as a texture",
+        items=_NORMAL_MAPS,
+        default="AUTO",
+    )
+    ambient_occlusion: BoolProperty(  # type: ignore[valid-type]
+        name="Ambient Occlusion",
+        description="Write how open the surface is as a texture, for glTF and game engines",
+        default=False,
+    )
+    lods: IntProperty(  # type: ignore[valid-type]
+        name="Levels of Detail",
+        description="Coarser meshes, each with a quarter of the faces of the one before",
+        default=0,
+        min=0,
+        max=8,
     )
     training: PointerProperty(type=GWRAP_PG_training)  # type: ignore[valid-type]
     job_folder: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]

@@ -16,6 +16,7 @@ from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
 from gaussian_wrapping_addon.core.texture.dense_surface import DenseSurface
+from gaussian_wrapping_addon.core.texture.glb import glb_bytes
 from gaussian_wrapping_addon.core.texture.normal_map import bake_normal_map
 from gaussian_wrapping_addon.core.texture.tangent_frame import tangent_frames
 from gaussian_wrapping_addon.core.texture.unwrap import unwrap
@@ -126,6 +127,18 @@ def test_5k_faces_with_a_normal_map_look_like_200k(tmp_path: Path) -> None:
         pictures[name] = rendered(thing, tmp_path)
     assert psnr(pictures["dense"], pictures["mapped"]) > WANTED_DB + 4.0
     assert psnr(pictures["dense"], pictures["plain"]) < WANTED_DB
+    # The same through a GLB file, with the normals and tangents of Blender's reader.
+    images = [(tmp_path / f"{kind}.png").read_bytes() for kind in ("albedo", "normal")]
+    data = glb_bytes(light.vertices, light.faces, uvs, images[0], np.zeros(3), normal_png=images[1])
+    (tmp_path / "light.glb").write_bytes(data)
+    before = set(bpy.data.objects)
+    bpy.ops.import_scene.gltf(filepath=str(tmp_path / "light.glb"))
+    (read,) = [o for o in set(bpy.data.objects) - before if o.type == "MESH"]
+    lit = next(n for n in read.data.materials[0].node_tree.nodes if n.type == "BSDF_PRINCIPLED")
+    ours = thing.data.materials[0].node_tree.nodes["Lit"]
+    for name in ("Roughness", "Specular IOR Level"):
+        lit.inputs[name].default_value = ours.inputs[name].default_value
+    assert psnr(pictures["dense"], rendered(read, tmp_path)) > WANTED_DB + 4.0
     # Unlit the map is not looked at.
     set_shading(thing.data.materials[0], "UNLIT")
     plain = rendered(thing, tmp_path)

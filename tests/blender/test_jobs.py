@@ -222,6 +222,7 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     properties.method, properties.pivots = "PIVOTS", "9"
     properties.boundary, properties.unseen = "OPEN", "OCCUPIED"
     properties.spacing = "UNIFORM"
+    properties.normal_map, properties.ambient_occlusion, properties.lods = "OFF", True, 3
     select(region)
     region.name = "Front Door"
     assert "Mesh Region" in draw(panels.GWRAP_PT_mesh).texts
@@ -234,6 +235,8 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     meshing = job.settings.meshing
     assert (meshing.method, meshing.pivots) == ("pivots", 9)
     assert meshing.spacing == "uniform"
+    texture = job.settings.texture
+    assert (texture.normal_map, texture.ambient_occlusion, texture.lods) == ("off", "on", 3)
     assert (meshing.boundary, meshing.unseen) == ("open", "occupied")
     ((_, body),) = job.region_bodies.items()
     expected = WORLD_FROM_SCENE.points(BOX_SCENE)

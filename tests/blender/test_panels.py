@@ -96,7 +96,8 @@ def test_advanced_panel_asks_for_what_counts_by_the_method(method: str) -> None:
     log = draw(panels.GWRAP_PT_mesh_advanced).log
     properties = {a[1] for name, a, _ in log if name == "prop"}
     own = {"PAM": "spacing", "PIVOTS": "pivots"}[method]
-    assert properties == {"method", "boundary", "unseen", own}
+    maps = {"normal_map", "ambient_occlusion", "lods"}
+    assert properties == {"method", "boundary", "unseen", own} | maps
 
 
 @pytest.mark.parametrize("decimate", [False, True])

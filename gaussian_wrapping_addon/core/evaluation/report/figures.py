@@ -79,7 +79,7 @@ _COUNTS = frozenset(
         "dropped_candidates",
         "faces", "faces_before_clean_up", "faces_without_texel", "field_evaluations",
         "frames", "gaussians", "gaussians_in_region", "holdout_every", "images_in_model",
-        "inconsistent_edges", "interior_samples", "iterations", "jump_points", "left_out",
+        "inconsistent_edges", "interior_samples", "iterations", "jump_points", "left_out", "lods",
         "max_gaussians", "nonmanifold_edges", "nonmanifold_vertices", "not_finite_vertices",
         "open_at_region", "open_edges", "part_count", "photos", "photos_placed",
         "photos_undistorted", "photos_used", "photos_with_focal_length", "pivots",
