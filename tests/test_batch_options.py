@@ -20,6 +20,7 @@ from gaussian_wrapping_addon.core.settings import (
     PRESETS,
     JobSettings,
     MeshingSettings,
+    TextureSettings,
     preset,
     to_json,
 )
@@ -115,6 +116,19 @@ def test_words_that_ask_a_method_for_nothing_else_go_with_it() -> None:
     assert settings == MeshingSettings(method="pivots", tiles="off")
 
 
+@pytest.mark.parametrize("command", ["wrap photos", "mesh"])
+def test_map_options_become_texture_settings(command: str) -> None:
+    def texture(*arguments: str) -> TextureSettings:
+        options = build_parser().parse_args([*command.split(), "--out", "o", *arguments])
+        earlier = replace(preset("draft"), texture=TextureSettings(normal_map="on", lods=5))
+        return region_settings(earlier, options).texture
+
+    assert texture() == TextureSettings(), "what an earlier mesh was given does not stay"
+    assert texture("--normal-map", "off") == TextureSettings(normal_map="off")
+    assert texture("--ambient-occlusion") == TextureSettings(ambient_occlusion="on")
+    assert texture("--lods", "3") == TextureSettings(lods=3)
+
+
 @pytest.mark.parametrize(("word", "wanted"), [("auto", "auto"), ("all", "on"), ("none", "off")])
 def test_needs_sets_all_five_and_a_single_option_wins(word: str, wanted: str) -> None:
     training = settings_of("--needs", word).training
@@ -175,6 +189,7 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
         (["work-tiles", "photos", "--wait", "-1"], 2, "--wait is out of range. Give from 0 to"),
         (["work-tiles", "photos", "--wait", "nan"], 2, "--wait is out of range. Give from 0 to"),
         (["evaluate", "m.ply", "--truth", "photos", "--threads", "-1"], 2, "--threads is"),
+        (["wrap", "photos", "--out", "o", "--lods", "9", "--no-blend"], 2, "--lods is"),
         (["wrap", "photos", "--out", "o", "--pivots", "4", "--no-blend"], 2, "--pivots"),
         (["more", "--out", "photos", "--iterations", "10", "--no-blend"], 2, "job.json"),
         (["more", "--out", "photos", "--no-blend"], 2, "--iterations"),

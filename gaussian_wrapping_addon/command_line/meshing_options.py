@@ -7,6 +7,8 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from .texture_options import add_texture_options, texture_settings
+
 if TYPE_CHECKING:
     from ..core.settings import JobSettings
 
@@ -130,6 +132,7 @@ def add_region_options(parser: ArgumentParser) -> None:
     add_boundary_options(parser)
     add_clean_up_options(parser)
     parser.add_argument("--texture-size", default="auto", metavar="auto|N")
+    add_texture_options(parser)
     parser.add_argument(
         "--export", default="glb", help=f"comma separated, of {','.join(EXPORT_FORMATS)}"
     )
@@ -155,5 +158,9 @@ def region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
             **boundary_settings(options),
             **clean_up_settings(options),
         ),
-        texture=replace(settings.texture, size_px=0 if size == "auto" else int(size)),
+        texture=replace(
+            settings.texture,
+            size_px=0 if size == "auto" else int(size),
+            **texture_settings(options),
+        ),
     )

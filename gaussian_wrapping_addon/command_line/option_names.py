@@ -21,6 +21,9 @@ _OTHERS = {
     "meshing.points": "--points",
     "meshing.tiles": "--tiles",
     "texture.size_px": "--texture-size",
+    "texture.normal_map": "--normal-map",
+    "texture.ambient_occlusion": "--ambient-occlusion",
+    "texture.lods": "--lods",
     "training.mask_mode": "--mask-mode",
     "training.extra_iterations": "--iterations",
 }

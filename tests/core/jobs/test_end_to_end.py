@@ -235,6 +235,50 @@ def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str
     assert np.median(distance) < 0.03
 
 
+def test_fewer_faces_get_a_normal_map_occlusion_and_levels(
+    wrapped: tuple[BallScene, Path, str],
+) -> None:
+    scene, root, _ = wrapped
+    box = write_box(root / "light.json", scene, 1.3, (0, 0, 0.35))
+    done = batch(
+        "mesh", "--out", str(root / "out"), "--region", str(box), "--points", "4000",
+        "--faces", "1600", "--lods", "2", "--ambient-occlusion", "--texture-size", "512",
+        "--export", "glb", "--no-blend",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    (stage,) = (root / "out" / "stages").glob("mesh-light-*")
+    with np.load(stage / "dense.npz", allow_pickle=False) as arrays:
+        dense_faces = len(arrays["faces"])
+    assert dense_faces > 4000
+    assert not list((root / "out" / "stages").glob("mesh-ball-*/dense.npz"))
+    result = root / "out" / "result"
+    report = json.loads((result / "report.json").read_text())
+    number = re.compile(r"[\d,]+(\.\d+)?(e[+-]\d+)?")
+    assert [row for row in figure_rows(report) if number.fullmatch(row[1]) and not row[2]] == []
+    figures = report["regions"]["light"]["texture"]
+    assert figures["normal_map"]["dense_faces"] == dense_faces
+    assert figures["normal_map"]["by_ray_share"] > 0.95
+    assert figures["ambient_occlusion"]["open_share"] > 0.5
+    assert [level["faces"] for level in figures["lods"]] == [400, 100]
+    assert not (result / "ball" / "normal.png").exists()
+    for folder, side in (("", 512), ("lod1", 256), ("lod2", 128)):
+        here = result / "light" / folder
+        assert Image.open(here / "albedo.png").size == (side, side)
+        assert Image.open(here / "normal.png").size == (side, side)
+        assert Image.open(here / "occlusion.png").mode == "L"
+        mesh = trimesh.load(here / "mesh.glb", force="mesh", process=False)
+        assert mesh.visual.material.normalTexture is not None
+        closed = trimesh.load(here / "mesh.ply", process=False)
+        assert closed.is_watertight
+        away = np.abs(np.linalg.norm((closed.vertices - scene.offset) / scene.scale, axis=1))
+        assert away.max() < 3.0
+    offsets = {
+        json.dumps(json.loads(path.read_text())["offset"])
+        for path in (result / "light").rglob("transform.json")
+    }
+    assert len(offsets) == 1
+
+
 def test_a_region_is_estimated_and_meshed_in_tiles_with_help(
     wrapped: tuple[BallScene, Path, str],
 ) -> None:
