@@ -14,8 +14,10 @@ from ..compiled import kernel, part
 from ..dataset.camera import Camera
 from ..parallel import even_bounds, run_chunks
 from ..progress import Progress
+from .evenness import solve_fields
 from .exposure import solve_gains
-from .photo_samples import PhotoView, SurfaceArrays, SurfacePoints, sample_photo
+from .fill import surface_positions
+from .photo_samples import LAST_RESORT_BELOW, PhotoView, SurfaceArrays, SurfacePoints, sample_photo
 from .sampling import pyramid
 from .visibility import photo_visibility
 
@@ -33,8 +35,9 @@ MEDIAN_POWER = 0.25
 """Weights of the median: so even that one leading view cannot outvote the others."""
 POINTS_PER_BLOCK = 12_000_000
 """Points held with their views at once (48 bytes each)."""
-EXPOSURE_POINTS = 8_000
-EXPOSURE_CELLS = 4_000_000
+EXPOSURE_POINTS = 24_000
+"""Some fifty in each cell of a photo's brightness field where a fifth of them is in the photo."""
+EXPOSURE_CELLS = 8_000_000
 """Bound on points x photos of the exposure step."""
 COARSE_LONG_SIDE_PX = 480
 
@@ -65,11 +68,16 @@ class Baked:
     """(n,) uint8 number of views blended, 0 where unseen."""
     clear: np.ndarray
     """(n,) bool: some view sees the point away from silhouettes, where two surfaces mix."""
+    sure: np.ndarray
+    """(n,) bool: some view sees the point neither grazing nor half hidden."""
     photos_used: int
     """Photos that gave at least a depth sample of the mesh."""
     gain_spread: float
     """Standard deviation of the log gains between photos."""
     gains_applied: bool
+    field_spread: float
+    """Standard deviation of the log brightness fields within photos."""
+    fields_applied: bool
     rejected_share: float
     """Share of kept views that were outliers."""
 
@@ -78,6 +86,16 @@ class Baked:
 class _Plan:
     index: int
     divisor: int
+
+
+@dataclass(frozen=True)
+class _Exposure:
+    factors: np.ndarray
+    """(photos, gh, gw, 3) float64 factors of each photo's brightness, on a grid over the photo."""
+    gain_spread: float
+    gains_applied: bool
+    field_spread: float
+    fields_applied: bool
 
 
 def bake(
@@ -106,13 +124,12 @@ def bake(
     image border. The best ``KEPT_VIEWS`` are kept; with three or more, those far from their
     median are dropped (method.md 8).
     """
-    plans, gains, spread = _exposure(
-        points, surface, photos, count, progress.span(0.0, 0.25), threads
-    )
+    plans, exposure = _exposure(points, surface, photos, count, progress.span(0.0, 0.25), threads)
     colors = np.zeros((len(points), 3), np.uint8)
     views = np.zeros(len(points), np.uint8)
     rejected = np.zeros(len(points), np.uint8)
     clearance = np.zeros(len(points), np.uint8)
+    sure = np.zeros(len(points), np.bool_)
     blocks = max(1, math.ceil(len(points) / POINTS_PER_BLOCK))
     bounds = np.linspace(0, len(points), blocks + 1).astype(int).tolist()
     steps = max(1, blocks * len(plans))
@@ -125,9 +142,17 @@ def bake(
             progress.update(fraction, f"texture: photo {step + 1} of {len(plans)}")
             view = _view(photos, plan.index, plan.divisor, surface, threads)
             sample_photo(
-                part, surface, view, gains[plan.index], weights, kept, clearance[begin:end], threads
+                part,
+                surface,
+                view,
+                exposure.factors[plan.index],
+                weights,
+                kept,
+                clearance[begin:end],
+                threads,
             )
         progress.update(0.25 + 0.7 * (block + 1) / blocks, "blending views")
+        sure[begin:end] = weights.max(axis=1) > LAST_RESORT_BELOW
         _blend_block(
             weights, kept, colors[begin:end], views[begin:end], rejected[begin:end], threads
         )
@@ -136,9 +161,12 @@ def bake(
         colors,
         views,
         clearance >= CLEAR_PX,
+        sure,
         len(plans),
-        spread,
-        bool((gains != 1.0).any()),
+        exposure.gain_spread,
+        exposure.gains_applied,
+        exposure.field_spread,
+        exposure.fields_applied,
         float(rejected.sum(dtype=np.int64)) / max(offered, 1),
     )
 
@@ -164,12 +192,14 @@ def _exposure(
     count: int,
     progress: Progress,
     threads: int,
-) -> tuple[list[_Plan], np.ndarray, float]:
+) -> tuple[list[_Plan], _Exposure]:
     """Look at every photo coarsely: which see the mesh, at what level, with what exposure."""
     wanted = max(1, min(EXPOSURE_POINTS, EXPOSURE_CELLS // max(count, 1), len(points)))
     part = points.part(np.linspace(0, len(points) - 1, wanted).astype(np.int64))
     colors = np.zeros((wanted, count, 3), np.uint8)
     valid = np.zeros((wanted, count), np.bool_)
+    places = np.zeros((wanted, count, 2), np.float32)
+    positions = surface_positions(part, surface)
     plans = []
     for index in range(count):
         progress.update(index / count, f"texture: looking at photo {index + 1} of {count}")
@@ -187,11 +217,19 @@ def _exposure(
         weights = np.zeros((wanted, 1), np.float32)
         one = np.zeros((wanted, 1, 3), np.uint8)
         unused = np.zeros(wanted, np.uint8)
-        sample_photo(part, surface, view, np.ones(3), weights, one, unused, threads)
-        valid[:, index] = weights[:, 0] > 0
+        sample_photo(part, surface, view, np.ones((1, 1, 3)), weights, one, unused, threads)
+        valid[:, index] = weights[:, 0] > LAST_RESORT_BELOW
         colors[:, index] = one[:, 0]
-    gains, spread = solve_gains(colors, valid)
-    return plans, gains, spread
+        places[:, index] = full.project(positions)[0] / [full.width, full.height]
+    gains, gain_spread = solve_gains(colors, valid)
+    fields, field_spread = solve_fields(colors, valid, places, gains)
+    return plans, _Exposure(
+        gains[:, None, None] * fields,
+        gain_spread,
+        bool((gains != 1.0).any()),
+        field_spread,
+        bool((fields != 1.0).any()),
+    )
 
 
 def _blend_block(
@@ -224,10 +262,13 @@ def _blend(
         count = 0
         best = 0.0
         for k in range(slots):
-            if weights[i, k] > 0.0:
+            best = max(best, float(weights[i, k]))
+        # Last resorts count only where there is nothing else.
+        least = LAST_RESORT_BELOW if best > LAST_RESORT_BELOW else 0.0
+        for k in range(slots):
+            if weights[i, k] > least:
                 order[count] = k
                 count += 1
-                best = max(best, float(weights[i, k]))
         if count == 0:
             continue
         for j in range(count):

@@ -13,10 +13,16 @@ from ..dataset.camera import Camera
 from ..parallel import even_bounds, run_chunks
 from .face_graph import vertex_normals
 from .sampling import Pyramid, trilinear
-from .visibility import PhotoVisibility, is_hidden
+from .visibility import PhotoVisibility, hidden_pixels
 
 MIN_COSINE = 0.2
-"""Views more grazing than 78 degrees are not used."""
+"""Views more grazing than 78 degrees are a last resort."""
+LAST_COSINE = 0.003
+"""More grazing still (89.8 degrees), not even the side is certain."""
+LAST_RESORT = 1e-20
+"""Factor of the weights of a last resort: far below any other, so both fit in one number."""
+LAST_RESORT_BELOW = 1e-15
+"""Weights below are of a last resort; the faintest other is (0.2 x 0.01 px)^2 x floors = 2e-9."""
 CLEAR_PX = 4.0
 """Views count in full from this distance to a silhouette, where pose errors mix two surfaces."""
 CLEAR_FLOOR = 0.02
@@ -85,7 +91,7 @@ def sample_photo(
     points: SurfacePoints,
     surface: SurfaceArrays,
     view: PhotoView,
-    gain: np.ndarray,
+    factors: np.ndarray,
     weights: np.ndarray,
     colors: np.ndarray,
     best_clearance: np.ndarray,
@@ -95,8 +101,8 @@ def sample_photo(
 
     Parameters
     ----------
-    gain : (3,) float64
-        Factors of the photo's channels.
+    factors : (gh, gw, 3) float64
+        What the photo's channels are multiplied by, on a grid whose outer nodes are the corners.
     weights : (n, k) float32
         Changed in place; 0 marks a free place.
     colors : (n, k, 3) uint8
@@ -127,7 +133,7 @@ def sample_photo(
             view.mask,
             view.image.pixels,
             view.image.levels,
-            gain,
+            factors,
             weights,
             colors,
             best_clearance,
@@ -160,7 +166,7 @@ def _sample(
     mask: Any,
     pixels: Any,
     levels: Any,
-    gain: Any,
+    factors: Any,
     weights: Any,
     colors: Any,
     best_clearance: Any,
@@ -168,6 +174,7 @@ def _sample(
     height, width = depth.shape
     has_mask = mask.shape[0] == height and mask.shape[1] == width
     kept = weights.shape[1]
+    grid_height, grid_width = factors.shape[0], factors.shape[1]
     for i in range(begin, end):
         face = point_face[i]
         l0, l1 = np.float64(point_bary[i, 0]), np.float64(point_bary[i, 1])
@@ -183,7 +190,7 @@ def _sample(
         y = pose[1, 0] * wx + pose[1, 1] * wy + pose[1, 2] * wz + pose[1, 3]
         u = intrinsics[0] * x / z + intrinsics[2]
         v = intrinsics[1] * y / z + intrinsics[3]
-        if not (u >= 0.5 and v >= 0.5 and u <= width - 0.5 and v <= height - 0.5):
+        if not (u >= 0.0 and v >= 0.0 and u < width and v < height):
             continue
         # Facing: the face itself gates, the smooth normal keeps noise out of the weight.
         fx, fy, fz = face_normals[face, 0], face_normals[face, 1], face_normals[face, 2]
@@ -192,7 +199,7 @@ def _sample(
         nz = pose[2, 0] * fx + pose[2, 1] * fy + pose[2, 2] * fz
         distance = np.sqrt(x * x + y * y + z * z)
         cosine = -(nx * x + ny * y + nz * z) / distance
-        if cosine < MIN_COSINE:
+        if cosine < LAST_COSINE:
             continue
         sx = l0 * corner_normals[a, 0] + l1 * corner_normals[b, 0] + l2 * corner_normals[c, 0]
         sy = l0 * corner_normals[a, 1] + l1 * corner_normals[b, 1] + l2 * corner_normals[c, 1]
@@ -209,6 +216,10 @@ def _sample(
         weight *= _fade(np.float64(clearance[iy, ix]), CLEAR_PX, CLEAR_FLOOR)
         border = min(min(u, width - u) / width, min(v, height - v) / height)
         weight *= _fade(border, BORDER_SHARE, BORDER_FLOOR)
+        # Half a pixel from the border a pixel may mix in what is beyond, where no depth is known.
+        outermost = min(min(u, width - u), min(v, height - v)) < 0.5
+        if cosine < MIN_COSINE or outermost:
+            weight *= LAST_RESORT
         # The worst of the kept views goes; a tie keeps the earlier photo.
         slot = 0
         for k in range(1, kept):
@@ -217,8 +228,13 @@ def _sample(
         if np.float32(weight) <= weights[i, slot]:
             continue
         plane = nx * x + ny * y + nz * z
-        if is_hidden(depth, u, v, intrinsics, nx, ny, nz, plane, z):
+        hidden = hidden_pixels(depth, u, v, intrinsics, nx, ny, nz, plane, z)
+        if hidden == 4:
             continue
+        if hidden > 0 and weight > LAST_RESORT_BELOW:
+            weight *= LAST_RESORT
+            if np.float32(weight) <= weights[i, slot]:
+                continue
         if has_mask:
             jx, jy = int(u - 0.5), int(v - 0.5)
             kx, ky = min(jx + 1, width - 1), min(jy + 1, height - 1)
@@ -227,7 +243,15 @@ def _sample(
         level = np.log2(max(intrinsics[0] * texel_size / z, 1.0))
         red, green, blue = trilinear(pixels, levels, level, u, v)
         weights[i, slot] = weight
-        best_clearance[i] = max(best_clearance[i], clearance[iy, ix])
-        colors[i, slot, 0] = int(min(red * gain[0], 255.0) + 0.5)
-        colors[i, slot, 1] = int(min(green * gain[1], 255.0) + 0.5)
-        colors[i, slot, 2] = int(min(blue * gain[2], 255.0) + 0.5)
+        if weight > LAST_RESORT_BELOW:
+            best_clearance[i] = max(best_clearance[i], clearance[iy, ix])
+        grid_x, grid_y = u / width * (grid_width - 1), v / height * (grid_height - 1)
+        gx0, gy0 = int(grid_x), int(grid_y)
+        gx1, gy1 = min(gx0 + 1, grid_width - 1), min(gy0 + 1, grid_height - 1)
+        tx, ty = grid_x - gx0, grid_y - gy0
+        for channel in range(3):
+            upper = (1.0 - tx) * factors[gy0, gx0, channel] + tx * factors[gy0, gx1, channel]
+            lower = (1.0 - tx) * factors[gy1, gx0, channel] + tx * factors[gy1, gx1, channel]
+            value = red if channel == 0 else green if channel == 1 else blue
+            value *= (1.0 - ty) * upper + ty * lower
+            colors[i, slot, channel] = int(min(value, 255.0) + 0.5)

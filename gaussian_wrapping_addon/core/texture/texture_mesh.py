@@ -40,6 +40,11 @@ OUTLINE_TEXELS = 8
 """Texels seen only at silhouettes take their neighbours' colour within this distance."""
 
 
+UNSURE_LEVELS = 15.0
+"""What only grazing or half hidden views show is taken while it is this near to what lies around,
+and not at all at twice this: on trained meshes such views are often of something before it."""
+
+
 def texture_mesh(
     mesh: SurfaceMesh,
     scene: Scene,
@@ -120,8 +125,10 @@ def texture_mesh(
     if statistics["texels_seen"] == 0:
         _logger.warning("no photo sees the mesh: its texture is plain grey")
     progress.update(1.0, f"texture: {100 * statistics['coverage']:.1f} % seen by photos")
+    views = np.zeros((size_px, size_px), np.uint8)
+    views.ravel()[texels] = baked.views
     return TexturedMesh(
-        mesh, unwrapped.corner_uvs, albedo, statistics, detail.normal_map, detail.occlusion
+        mesh, unwrapped.corner_uvs, albedo, statistics, detail.normal_map, detail.occlusion, views
     )
 
 
@@ -157,7 +164,7 @@ def _image(
     gutter_px: int,
 ) -> np.ndarray:
     """Put the colours into the image; fill unseen texels, gutters and the rest."""
-    seen = baked.views > 0
+    seen = baked.sure
     image = np.zeros((size_px, size_px, 3), np.uint8)
     pixels = image.reshape(-1, 3)
     pixels[texels] = baked.colors
@@ -186,6 +193,13 @@ def _image(
         share = np.where(number < 0, 1.0, number / (RING_TEXELS + 1.0))[:, None]
         near = pixels[unseen]
         pixels[unseen] = np.rint(near + share * (far - near)).astype(np.uint8)
+    unsure = np.flatnonzero((baked.views > 0) & ~seen)
+    around, shown = pixels[texels[unsure]].astype(np.float32), baked.colors[unsure]
+    off = np.abs(shown - around).max(axis=1, initial=0.0)
+    number = flat_ring[texels[unsure]].astype(np.float32)
+    away = np.where(number < 0, 1.0, number / (RING_TEXELS + 1.0))  # no step at the sure ones
+    share = (away * (2.0 - off / UNSURE_LEVELS).clip(0.0, 1.0))[:, None]
+    pixels[texels[unsure]] = np.rint(around + share * (shown - around)).astype(np.uint8)
     flat_ring[texels] = 0
     grow(image, ring, chart, gutter_px, inside=False)
     fill_background(image, ring >= 0)
@@ -219,7 +233,8 @@ def _statistics(
         "texels_used": used,
         "texels_seen": texels_seen,
         "texels_filled": used - texels_seen,
-        "texels_seen_at_outlines_only": int((seen & ~baked.clear).sum()),
+        "texels_seen_at_outlines_only": int((baked.sure & ~baked.clear).sum()),
+        "texels_seen_badly": int((seen & ~baked.sure).sum()),
         "texels_overlapping": raster.overlaps,
         "coverage": texels_seen / max(used, 1),
         "faces_seen_share": float(face_seen.sum()) / max(int(with_texel.sum()), 1),
@@ -232,4 +247,6 @@ def _statistics(
         "photos_used": baked.photos_used,
         "exposure_spread": baked.gain_spread,
         "exposure_corrected": baked.gains_applied,
+        "brightness_spread_within_photos": baked.field_spread,
+        "brightness_evened_within_photos": baked.fields_applied,
     }

@@ -26,3 +26,5 @@ class TexturedMesh:
     """(h, w, 3) uint8 tangent-space normals, +Y, no sRGB; rows as in ``albedo``."""
     occlusion: np.ndarray | None = None
     """(k, k) uint8: 255 where nothing is near, 0 where nothing of the surroundings is seen."""
+    views: np.ndarray | None = None
+    """(h, w) uint8 photos blended into each texel, 0 where unseen or between charts."""

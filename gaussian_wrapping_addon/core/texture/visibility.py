@@ -93,7 +93,7 @@ def _clearance(depth: Any, jump: float) -> np.ndarray:
 
 
 @inline
-def is_hidden(
+def hidden_pixels(
     depth: Any,
     x: float,
     y: float,
@@ -103,8 +103,8 @@ def is_hidden(
     nz: float,
     plane: float,
     z: float,
-) -> bool:
-    """Tell whether anything lies before the plane ``n . p = plane`` around a pixel position.
+) -> int:
+    """Count the pixels around a position (0 to 4) where something lies before ``n . p = plane``.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def is_hidden(
     tolerance = z * (BIAS_RELATIVE + BIAS_PX / min(intrinsics[0], intrinsics[1]))
     ix = int(np.floor(x - 0.5))
     iy = int(np.floor(y - 0.5))
-    hidden = False
+    hidden = 0
     for k in range(4):
         u = min(max(ix + (k & 1), 0), width - 1)
         v = min(max(iy + (k >> 1), 0), height - 1)
@@ -133,5 +133,5 @@ def is_hidden(
         # Behind the horizon of a grazing plane the point itself is the better guess.
         expected = expected if 0.0 < expected < 2.0 * z else z
         if depth[v, u] < expected - tolerance:
-            hidden = True
+            hidden += 1
     return hidden

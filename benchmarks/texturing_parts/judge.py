@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A baked texture against the true one: error, what should have been baked, jumps at borders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.face_graph import face_graph
+from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
+
+from ..scenes.visibility import RayScene
+from .photographed import Pattern
+
+SUBTEXELS = 4
+"""Samples of the true texture along each side of a texel."""
+EDGE_SAMPLES = 4
+TEXELS_APART = 0.5
+"""Distance from an edge to the samples on both of its sides."""
+
+
+@dataclass(frozen=True)
+class Seams:
+    """Differences between the two sides of edges, at one distance, levels of 255."""
+
+    across: float
+    """Mean over edges between charts."""
+    inside: float
+    """Mean over edges inside of charts."""
+    across_true: float
+    """The same of the true texture."""
+    inside_true: float
+    gap: float
+    """Mean difference of the two look-ups at the border itself, where one colour is right."""
+    error_inside: float
+    """Mean error of look-ups on edges inside of charts."""
+    error_across: float
+    """Mean error of look-ups on edges between charts."""
+
+
+def true_albedo(
+    textured: TexturedMesh, pattern: Pattern, subtexels: int = SUBTEXELS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the true texture, means over texels (h, w, 3), and where it is known (h, w)."""
+    size = len(textured.albedo)
+    fine = raster_atlas(textured.corner_uvs, size * subtexels, 2)
+    inside = fine.inside
+    points = _positions(textured.mesh, fine.face[inside], fine.bary[inside])
+    rows, columns = np.nonzero(inside)
+    texel = (rows // subtexels) * size + columns // subtexels
+    count = np.bincount(texel, minlength=size * size)
+    colors = pattern(points)
+    mean = np.stack([np.bincount(texel, colors[:, k], size * size) for k in range(3)], -1)
+    mean /= np.maximum(count, 1)[:, None]
+    # Texels at chart borders are judged where their centre is inside.
+    centre = raster_atlas(textured.corner_uvs, size, 2).inside
+    return mean.reshape(size, size, 3), centre & (count.reshape(size, size) > 0)
+
+
+def psnr(error: np.ndarray) -> float:
+    """Return the peak signal-to-noise ratio of differences of 8-bit colours, dB."""
+    return float(10.0 * np.log10(255.0**2 / max(float((error**2).mean()), 1e-12)))
+
+
+def photos_that_see(
+    textured: TexturedMesh, cameras: list[Camera], texels: np.ndarray
+) -> np.ndarray:
+    """Count by rays the photos that see each of the texels (flat places)."""
+    mesh = textured.mesh
+    raster = raster_atlas(textured.corner_uvs, len(textured.albedo), 2)
+    face = raster.face.ravel()[texels]
+    points = _positions(mesh, face, raster.bary.reshape(-1, 2)[texels])
+    normals = face_graph(mesh.vertices, mesh.faces).normals[face]
+    rays = RayScene(mesh.vertices, mesh.faces)
+    return sum(rays.sees(camera, points, normals).astype(int) for camera in cameras)
+
+
+def steps_between_texels(textured: TexturedMesh, texels_apart: int) -> float:
+    """Return the difference that one in a thousand pairs of seen texels so far apart exceeds.
+
+    Of a thing of one colour that photos show in different brightness, this is how visible the
+    borders are where the leading view changes.
+    """
+    size = len(textured.albedo)
+    assert textured.views is not None
+    good = raster_atlas(textured.corner_uvs, size, 2).inside & (textured.views > 0)
+    grey = textured.albedo.astype(np.float64).mean(axis=2)
+    steps = []
+    for image, usable in ((grey, good), (grey.T, good.T)):
+        step = image[texels_apart:] - image[:-texels_apart]
+        steps.append(step[usable[texels_apart:] & usable[:-texels_apart]])
+    return float(np.percentile(np.abs(np.concatenate(steps)), 99.9))
+
+
+def look_up(image: np.ndarray, uvs: np.ndarray) -> np.ndarray:
+    """Bilinear look-up of (n, 2) UVs, v upwards, as renderers do it."""
+    size = len(image)
+    x = (uvs[:, 0] * size - 0.5).clip(0, size - 1)
+    y = ((1.0 - uvs[:, 1]) * size - 0.5).clip(0, size - 1)
+    ix, iy = x.astype(int), y.astype(int)
+    jx, jy = np.minimum(ix + 1, size - 1), np.minimum(iy + 1, size - 1)
+    tx, ty = (x - ix)[:, None], (y - iy)[:, None]
+    pixels = image.astype(np.float64)
+    upper = pixels[iy, ix] * (1 - tx) + pixels[iy, jx] * tx
+    lower = pixels[jy, ix] * (1 - tx) + pixels[jy, jx] * tx
+    return upper * (1 - ty) + lower * ty
+
+
+def seams(textured: TexturedMesh, pattern: Pattern, seen: np.ndarray) -> Seams:
+    """Compare the jump over edges between charts with the jump over edges inside of charts.
+
+    Parameters
+    ----------
+    seen : (f,) bool
+        Faces to judge at.
+    """
+    mesh, uvs = textured.mesh, textured.corner_uvs.astype(np.float64)
+    graph = face_graph(mesh.vertices, mesh.faces)
+    face, corner = np.nonzero(graph.opposite >= 0)
+    half = 3 * face + corner
+    other = graph.opposite[face, corner]
+    once = (half < other) & seen[face] & seen[other // 3]
+    half, other = half[once], other[once]
+    uv_area = np.abs(_cross(uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0])).sum() / 2
+    texel = np.sqrt(graph.areas.sum() / uv_area) / len(textured.albedo)
+    here, there = [], []
+    steps = (np.arange(EDGE_SAMPLES) + 0.5) / EDGE_SAMPLES
+    for t in steps.tolist():
+        here.append(_beside(mesh, half, t, TEXELS_APART * texel))
+        there.append(_beside(mesh, other, 1.0 - t, TEXELS_APART * texel))
+    a, b = np.concatenate(here), np.concatenate(there)
+    half, other = np.tile(half, EDGE_SAMPLES), np.tile(other, EDGE_SAMPLES)
+    good = (a > 0).all(1) & (b > 0).all(1)
+    half, other, a, b = half[good], other[good], a[good], b[good]
+    fa, fb = half // 3, other // 3
+    # An edge is inside of a chart where both of its ends have the same UVs in both faces.
+    start, end = uvs[fa, half % 3], uvs[fa, (half % 3 + 1) % 3]
+    start_b, end_b = uvs[fb, (other % 3 + 1) % 3], uvs[fb, other % 3]
+    joined = (start == start_b).all(1) & (end == end_b).all(1)
+    color_a, color_b = (
+        look_up(textured.albedo, np.einsum("nk,nkd->nd", w, uvs[f])) for w, f in ((a, fa), (b, fb))
+    )
+    corners = mesh.vertices[mesh.faces]
+    true_a, true_b = (
+        pattern(np.einsum("nk,nkd->nd", w, corners[f])) for w, f in ((a, fa), (b, fb))
+    )
+    t = np.repeat(steps, len(good) // EDGE_SAMPLES)[good][:, None]
+    at_edge = look_up(textured.albedo, start * (1 - t) + end * t)
+    at_edge_b = look_up(textured.albedo, start_b * (1 - t) + end_b * t)
+    first = corners[fa, half % 3]
+    true_edge = pattern(first * (1 - t) + corners[fa, (half % 3 + 1) % 3] * t)
+    jump = np.abs(color_a - color_b).mean(1)
+    jump_true = np.abs(true_a - true_b).mean(1)
+    off = 0.5 * (np.abs(at_edge - true_edge) + np.abs(at_edge_b - true_edge)).mean(1)
+    return Seams(
+        float(jump[~joined].mean()),
+        float(jump[joined].mean()),
+        float(jump_true[~joined].mean()),
+        float(jump_true[joined].mean()),
+        float(np.abs(at_edge - at_edge_b).mean(1)[~joined].mean()),
+        float(off[joined].mean()),
+        float(off[~joined].mean()),
+    )
+
+
+def _positions(mesh: SurfaceMesh, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    first, second = bary[:, 0].astype(np.float64), bary[:, 1].astype(np.float64)
+    weights = np.stack([first, second, 1.0 - first - second], -1)
+    return np.einsum("nk,nkd->nd", weights, mesh.vertices[mesh.faces[face]])
+
+
+def _beside(mesh: SurfaceMesh, half: np.ndarray, t: float, distance: float) -> np.ndarray:
+    """Return (n, 3) barycentric weights of points beside edges, within the edges' faces."""
+    face, k = half // 3, half % 3
+    corners = mesh.vertices[mesh.faces[face]]
+    rows = np.arange(len(half))
+    a, b, c = corners[rows, k], corners[rows, (k + 1) % 3], corners[rows, (k + 2) % 3]
+    edge = b - a
+    length2 = np.maximum((edge**2).sum(1), 1e-30)
+    foot = ((c - a) * edge).sum(1) / length2
+    height = np.linalg.norm(c - a - foot[:, None] * edge, axis=1)
+    share = distance / np.maximum(height, 1e-30)
+    weights = np.empty((len(half), 3))
+    weights[rows, (k + 2) % 3] = share
+    weights[rows, (k + 1) % 3] = t - share * foot
+    weights[rows, k] = 1.0 - t - share * (1.0 - foot)
+    return weights
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
