@@ -28,6 +28,7 @@ from .fill import (
     surface_positions,
 )
 from .photo_samples import SurfaceArrays, SurfacePoints
+from .stretch import texture_stretch
 from .texture_size import automatic_size, gutter_for
 from .textured_mesh import TexturedMesh
 from .unwrap import Unwrap, unwrap
@@ -120,8 +121,14 @@ def texture_mesh(
     )  # fmt: skip
     progress.update(0.9, "filling what no photo saw")
     albedo = _image(size_px, texels, points, surface, baked, raster, unwrapped, gutter_px)
-    statistics = _statistics(size_px, settings, unwrapped, raster, points, baked, graph.areas)
-    statistics |= detail.statistics
+    stretch = texture_stretch(mesh.vertices, mesh.faces, unwrapped.corner_uvs)
+    statistics = {
+        **_statistics(size_px, settings, unwrapped, raster, points, baked, graph.areas),
+        "stretch_mean": stretch.mean,
+        "stretch_p95": stretch.p95,
+        "area_collapsed_share": stretch.collapsed_share,
+        **detail.statistics,
+    }
     if statistics["texels_seen"] == 0:
         _logger.warning("no photo sees the mesh: its texture is plain grey")
     progress.update(1.0, f"texture: {100 * statistics['coverage']:.1f} % seen by photos")

@@ -232,6 +232,8 @@ def _texture(region: dict[str, Any]) -> list[str]:
         ),
         ("Pieces (charts)", plural(texture.get("charts"), "chart")),
         ("Image used by the mesh", percent(texture.get("utilisation"))),
+        ("Stretch, mean over the surface (1 is even)", number(texture.get("stretch_mean"))),
+        ("Stretch that 95 % of the surface stay below", number(texture.get("stretch_p95"))),
         ("Time", duration(part(region, "seconds").get("texture"))),
     ]
     return table(("texture", "figure"), rows, "lr")

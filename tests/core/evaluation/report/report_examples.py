@@ -115,6 +115,8 @@ def full_region() -> dict[str, Any]:
             "size_automatic": True,
             "charts": 12,
             "utilisation": 0.5,
+            "stretch_mean": 1.07,
+            "stretch_p95": 1.31,
             "texels_used": 1000,
             "texels_overlapping": 2,
             "coverage": 0.25,
