@@ -25,6 +25,7 @@ PIVOT_COUNTS = (2, 3, 9)
 BOUNDARIES = ("closed", "open")
 UNSEEN = ("empty", "occupied")
 MAX_LODS = 8
+TEXTURE_SOURCES = ("photos", "gaussians")
 EXPORT_FORMATS = ("glb", "obj", "ply", "usd")
 
 
@@ -165,6 +166,9 @@ class TextureSettings:
     """``"on"`` bakes how open the dense mesh is to its surroundings."""
     lods: int = 0
     """Levels of detail below the mesh itself, each with a quarter of the faces."""
+    source: str = "photos"
+    """``"photos"``, or ``"gaussians"``: their colour without what changes with the direction,
+    rendered from the photos' cameras."""
 
 
 @dataclass(frozen=True)
@@ -302,6 +306,7 @@ class JobSettings:
                 _one_of(SWITCH),
             ),
             ("texture.lods", 0 <= self.texture.lods <= MAX_LODS, f"from 0 to {MAX_LODS}"),
+            ("texture.source", self.texture.source in TEXTURE_SOURCES, _one_of(TEXTURE_SOURCES)),
         )
         for name, good, wanted in checks:
             if not good:

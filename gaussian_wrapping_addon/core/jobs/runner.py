@@ -25,7 +25,7 @@ from .stages import Stage, run_stage, source_fingerprint, stage_key
 _logger = logging.getLogger(__name__)
 
 # Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
-STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 8, "texture": 5}
+STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 8, "texture": 6}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
@@ -307,6 +307,7 @@ def _run_texture(
         from ..limits import MAX_IMAGE_SIDE_PX
         from ..meshing.mesh_file import load_mesh
         from ..meshing.region import parse_region
+        from ..texture.bake import Photos
         from ..texture.export import file_offset, write_textured
         from ..texture.levels import levels_of_detail
         from ..texture.texture_mesh import texture_mesh
@@ -316,9 +317,16 @@ def _run_texture(
         mesh = load_mesh(meshed.folder / "mesh.npz")
         dense_path = meshed.folder / DENSE_MESH
         dense = load_mesh(dense_path) if dense_path.is_file() else None
+        source: Photos = photos
+        if texture.source == "gaussians":
+            from ..gaussians.gaussian_file import load_gaussians
+            from ..texture.gaussian_photos import GaussianPhotos
+
+            trained_file = trained.folder / "gaussians.npz"
+            source = GaussianPhotos(load_gaussians(trained_file), photos, threads=threads)
         coarse_from = 0.7 if texture.lods else 0.9
         textured = texture_mesh(
-            mesh, scene, photos, texture, stage_folder, progress.span(0.0, coarse_from),
+            mesh, scene, source, texture, stage_folder, progress.span(0.0, coarse_from),
             threads=threads, dense=dense,
         )  # fmt: skip
         region_path = meshed.folder / "region.json"
