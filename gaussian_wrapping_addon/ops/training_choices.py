@@ -43,6 +43,7 @@ def texture_choices(scene: bpy.types.Scene) -> dict[str, object]:
     properties = scene.gwrap
     return {
         "size_px": int(properties.texture_size),
+        "source": properties.texture_source.lower(),
         "normal_map": properties.normal_map.lower(),
         "ambient_occlusion": "on" if properties.ambient_occlusion else "off",
         "lods": properties.lods,

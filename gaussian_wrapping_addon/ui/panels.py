@@ -110,6 +110,7 @@ class GWRAP_PT_wrap(_Panel, bpy.types.Panel):
         column.enabled = not job_timer.is_running(properties.job_folder)
         column.prop(properties, "preset")
         column.prop(properties, "texture_size")
+        column.prop(properties, "texture_source")
         column.prop(properties, "output")
         if _draw_job(layout, context, "WRAP"):
             return

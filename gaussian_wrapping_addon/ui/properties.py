@@ -63,6 +63,14 @@ _TEXTURE_SIZES: Final = (
     ("4096", "4096", "4096 pixels each way"),
     ("8192", "8192", "8192 pixels each way"),
 )
+_TEXTURE_SOURCES: Final = (
+    ("PHOTOS", "Photos", "The photos' own pixels, blended: the finest detail"),
+    (
+        "GAUSSIANS",
+        "Gaussians",
+        "What the Gaussians have learned, without highlights and passers-by: even, but softer",
+    ),
+)
 
 
 class GWRAP_PG_finding(bpy.types.PropertyGroup):
@@ -176,6 +184,12 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
         default=0,
         min=0,
         max=8,
+    )
+    texture_source: EnumProperty(  # type: ignore[valid-type]
+        name="Texture From",
+        description="Where the colours of the texture come from",
+        items=_TEXTURE_SOURCES,
+        default="PHOTOS",
     )
     training: PointerProperty(type=GWRAP_PG_training)  # type: ignore[valid-type]
     job_folder: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]

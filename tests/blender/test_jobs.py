@@ -98,12 +98,14 @@ def test_wrap_scene_runs_and_imports(photos: Path, worker: object) -> None:
     properties = bpy.context.scene.gwrap
     properties.preset = "DRAFT"
     properties.texture_size = "2048"
+    properties.texture_source = "GAUSSIANS"
     start_wrap(photos)
     folder = photos.with_name(photos.name + "_wrap")
     assert Path(properties.output) == Path(properties.job_folder) == folder
     job = read_job(folder / "job.json")
     assert (job.command, job.source) == ("wrap", str(photos))
     assert (job.settings.preset, job.settings.texture.size_px) == ("draft", 2048)
+    assert job.settings.texture.source == "gaussians"
     assert job.settings.training.iterations == 1500
     wait_for("DONE")
     kinds = sorted(tags.kind_of(o) for o in bpy.context.scene.objects)

@@ -76,6 +76,7 @@ def test_a_first_wrap_can_be_started_at_one_glance() -> None:
     assert [a[1] for name, a, _ in layout.log if name == "prop"] == [
         "preset",
         "texture_size",
+        "texture_source",
         "output",
     ]
 
