@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Measure unwrap and bake: ``python -m benchmarks.texturing``.
+
+Photos of spot with a known texture are rendered by rays and baked back; then a mesh of 375 thousand
+faces is unwrapped and baked at 4096 x 4096 from 40 photos of 2 megapixels, in a process of its own.
+``texturing.md`` goes into ``docs/benchmarks``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import logging
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.settings import TextureSettings
+from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
+from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
+
+from .texturing_parts.judge import photos_that_see, psnr, seams, steps_between_texels, true_albedo
+from .texturing_parts.photographed import (
+    RenderedPhotos,
+    Unevenness,
+    cameras_around,
+    photograph,
+    spot,
+    uneven,
+)
+from .texturing_parts.solid_texture import SolidTexture
+
+_logger = logging.getLogger("benchmarks")
+
+OUT = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
+PHOTOS, WIDTH, HEIGHT, SUPERSAMPLING = 24, 640, 480, 3
+SIZES_PX = (512, 1024)
+GREY = 140.0
+PARTS = ("known", "uneven", "large")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=OUT, help="folder of the report")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument(
+        "--only", nargs="+", choices=PARTS, default=list(PARTS), help="only these parts"
+    )
+    options = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    only = " ".join(["--only", *options.only]) if len(options.only) < len(PARTS) else ""
+    command = f"python -m benchmarks.texturing {only}".strip()
+    lines = [
+        "# Unwrap and bake",
+        "",
+        f"`{command}`, {datetime.date.today().isoformat()}, {options.threads} threads.",
+    ]
+    parts = {"known": _known, "uneven": _uneven, "large": _large}
+    for name in options.only:
+        lines += ["", *parts[name](options.threads)]
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "texturing.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return 0
+
+
+def _baked(photos: RenderedPhotos, size_px: int, threads: int) -> TexturedMesh:
+    with tempfile.TemporaryDirectory() as folder:
+        return texture_mesh(
+            spot(), photos.scene(), photos, TextureSettings(size_px), Path(folder), Progress(),
+            threads=threads,
+        )  # fmt: skip
+
+
+def _known(threads: int) -> list[str]:
+    _logger.info("photos of the known texture")
+    pattern, cameras = SolidTexture(), cameras_around(PHOTOS, WIDTH, HEIGHT)
+    photos = photograph(spot(), pattern, cameras, SUPERSAMPLING)
+    lines = [
+        "## A known texture comes back",
+        "",
+        (
+            f"A checker over a picture with the spectrum of photos, on spot; {PHOTOS} photos of "
+            f"{WIDTH} x {HEIGHT}, {SUPERSAMPLING**2} rays a pixel, true cameras and true mesh. "
+            "PSNR of the baked texels against the mean of the true texture over each texel."
+        ),
+        "",
+        (
+            "| texture | texels that photos show | that 2 photos show | of these baked "
+            "| jump over chart borders : inside charts | gap at borders | stretch, mean "
+            "| texels used | overlaps |"
+        ),
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for size in SIZES_PX:
+        _logger.info("bake at %d", size)
+        textured = _baked(photos, size, threads)
+        truth, known = true_albedo(textured, pattern)
+        places = np.flatnonzero(known)
+        count = photos_that_see(textured, cameras, places)
+        error = (textured.albedo - truth).reshape(-1, 3)[places]
+        assert textured.views is not None
+        baked = textured.views.ravel()[places] > 0
+        owner = raster_atlas(textured.corner_uvs, size, threads).face.ravel()[places]
+        good = np.ones(len(textured.mesh.faces), bool)
+        good[owner[count < 3]] = False
+        found = seams(textured, pattern, good)
+        figures = textured.statistics
+        lines.append(
+            f"| {size} | {psnr(error[baked]):.2f} dB | {psnr(error[count >= 2]):.2f} dB "
+            f"| {100 * baked[count >= 2].mean():.2f} % "
+            f"| {found.across:.2f} : {found.inside:.2f} levels | {found.gap:.2f} levels "
+            f"| {figures['stretch_mean']:.3f} | {100 * figures['utilisation']:.0f} % "
+            f"| {figures['texels_overlapping']} |"
+        )
+    return lines
+
+
+def _grey(points: np.ndarray) -> np.ndarray:
+    return np.full((len(points), 3), GREY)
+
+
+def _uneven(threads: int) -> list[str]:
+    from gaussian_wrapping_addon.core.texture import bake
+
+    _logger.info("uneven photos")
+    lines = [
+        "## Brightness that differs within photos",
+        "",
+        (
+            "Photos with dark corners and gradients of 6 to 10 % either way, of a grey spot: the "
+            "step that one in a thousand pairs of texels four apart exceeds, at 512 x 512."
+        ),
+        "",
+        "| photos | brightness evened | not evened |",
+        "| --- | --- | --- |",
+    ]
+    cameras = cameras_around(PHOTOS, WIDTH, HEIGHT)
+    solve = bake.solve_fields
+    cases: tuple[tuple[str, Unevenness | None], ...] = (("even", None), ("uneven", uneven))
+    for name, unevenness in cases:
+        photos = photograph(spot(), _grey, cameras, 2, unevenness)
+        steps = []
+        for evened in (True, False):
+            if not evened:
+                bake.solve_fields = lambda c, v, p, g: (np.ones((v.shape[1], 1, 1, 3)), 0.0)
+            try:
+                steps.append(steps_between_texels(_baked(photos, 512, threads), 4))
+            finally:
+                bake.solve_fields = solve
+        lines.append(f"| {name} | {steps[0]:.1f} levels | {steps[1]:.1f} levels |")
+    return lines
+
+
+def _large(threads: int) -> list[str]:
+    _logger.info("a large mesh at 4096")
+    module = "benchmarks.texturing_parts.large_mesh"
+    done = subprocess.run(
+        [sys.executable, "-m", module, str(threads)], capture_output=True, text=True, check=True
+    )
+    figures = json.loads(done.stdout.splitlines()[-1])
+    return [
+        "## A large mesh",
+        "",
+        (
+            f"{figures['faces']:,} faces, 4096 x 4096 texels, {figures['photos']} photos of "
+            f"{figures['megapixels']:.1f} megapixels, a fresh process with compiled "
+            "kernels. Memory is that of both processes together."
+        ),
+        "",
+        "| time | processor time | most memory | unwrap | texels used | overlaps |",
+        "| --- | --- | --- | --- | --- | --- |",
+        (
+            f"| {figures['wall_s']:.0f} s | {figures['cpu_s']:.0f} s "
+            f"| {figures['peak_mib']:.0f} MiB "
+            f"| {figures['unwrap']}, {figures['charts']} charts "
+            f"| {100 * figures['utilisation']:.0f} % | {figures['overlaps']} |"
+        ),
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
