@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options that become texture settings besides the size: maps and levels of detail."""
+"""Options that become texture settings besides the size: source, maps and levels of detail."""
 
 from __future__ import annotations
 
@@ -8,10 +8,16 @@ from typing import Any
 
 
 def add_texture_options(parser: ArgumentParser) -> None:
-    """Add what a mesh is given besides its colours."""
-    from ..core.settings import DECISIONS, TextureSettings
+    """Add where colours come from, and what a mesh is given besides."""
+    from ..core.settings import DECISIONS, TEXTURE_SOURCES, TextureSettings
 
     default = TextureSettings()
+    parser.add_argument(
+        "--texture-source",
+        choices=TEXTURE_SOURCES,
+        default=default.source,
+        help="colours of the photos, or of the Gaussians without what changes with direction",
+    )
     parser.add_argument(
         "--normal-map",
         choices=DECISIONS,
@@ -33,6 +39,7 @@ def add_texture_options(parser: ArgumentParser) -> None:
 def texture_settings(options: Namespace) -> dict[str, Any]:
     """Return the texture settings that :func:`add_texture_options` was given."""
     return {
+        "source": options.texture_source,
         "normal_map": options.normal_map,
         "ambient_occlusion": "on" if options.ambient_occlusion else "off",
         "lods": options.lods,
