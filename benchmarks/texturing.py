@@ -2,8 +2,8 @@
 """Measure unwrap and bake: ``python -m benchmarks.texturing``.
 
 Photos of spot with a known texture are rendered by rays and baked back; then a mesh of 375 thousand
-faces is unwrapped and baked at 4096 x 4096 from 40 photos of 2 megapixels, in a process of its own.
-``texturing.md`` goes into ``docs/benchmarks``.
+faces is unwrapped and baked at 4096 x 4096 from 40 photos of 2 megapixels, in a process of its own. With ``--jobs`` finished jobs of real photos are textured
+without their held-out photos and compared with these. ``texturing.md`` goes into ``docs/benchmarks``.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
 
+from .texturing_parts.held_out import held_out_figures
 from .texturing_parts.judge import photos_that_see, psnr, seams, steps_between_texels, true_albedo
 from .texturing_parts.photographed import (
     RenderedPhotos,
@@ -43,18 +44,25 @@ OUT = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
 PHOTOS, WIDTH, HEIGHT, SUPERSAMPLING = 24, 640, 480, 3
 SIZES_PX = (512, 1024)
 GREY = 140.0
-PARTS = ("known", "uneven", "large")
+PARTS = ("known", "uneven", "large", "real")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=OUT, help="folder of the report")
+    parser.add_argument("--out", type=Path, help="folder of the report")
+    parser.add_argument(
+        "--jobs", type=Path, nargs="+", default=[], help="finished jobs of real photos"
+    )
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument(
         "--only", nargs="+", choices=PARTS, default=list(PARTS), help="only these parts"
     )
     options = parser.parse_args(arguments)
+    if len(options.only) < len(PARTS) and options.out is None:
+        parser.error("--only makes a part of the report: name its folder with --out")
+    out = options.out or OUT
+    out.mkdir(parents=True, exist_ok=True)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     only = " ".join(["--only", *options.only]) if len(options.only) < len(PARTS) else ""
     command = f"python -m benchmarks.texturing {only}".strip()
@@ -63,11 +71,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "",
         f"`{command}`, {datetime.date.today().isoformat()}, {options.threads} threads.",
     ]
-    parts = {"known": _known, "uneven": _uneven, "large": _large}
+    parts = {
+        "known": _known,
+        "uneven": _uneven,
+        "large": _large,
+        "real": lambda threads: _real(options.jobs, out, threads),
+    }
     for name in options.only:
         lines += ["", *parts[name](options.threads)]
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "texturing.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (out / "texturing.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return 0
 
 
@@ -184,6 +196,34 @@ def _large(threads: int) -> list[str]:
             f"| {100 * figures['utilisation']:.0f} % | {figures['overlaps']} |"
         ),
     ]
+
+
+def _real(jobs: Sequence[Path], out: Path, threads: int) -> list[str]:
+    lines = [
+        "## Real photos, held out",
+        "",
+        (
+            "Each mesh is textured without the photos that the training held out, and rendered from "
+            "their cameras. PSNR and SSIM of the pixels that the mesh covers; fitted: with one gain "
+            "a channel for each photo, as the exposure of a held-out photo is unknown. Pictures: "
+            "the photo of median PSNR left, the rendering right."
+        ),
+        "",
+        "| job | photos | held out | faces | texture | PSNR | fitted | SSIM | covered | overlaps |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    pictures = []
+    for job in jobs:
+        _logger.info("held-out photos of %s", job.name)
+        picture = out / f"texturing-{job.name}.jpg"
+        f = held_out_figures(job, picture, threads)
+        lines.append(
+            f"| {job.name} | {f['photos']} | {f['held_out']} | {f['faces']:,} "
+            f"| {f['texture']['size_px']} | {f['psnr']:.2f} dB | {f['fitted_psnr']:.2f} dB "
+            f"| {f['ssim']:.3f} | {100 * f['covered']:.0f} % | {f['texture']['texels_overlapping']} |"
+        )
+        pictures += ["", f"![{job.name}]({picture.name})"]
+    return lines + pictures if jobs else [*lines[:2], "No job was named with `--jobs`."]
 
 
 if __name__ == "__main__":

@@ -22,11 +22,9 @@ from gaussian_wrapping_addon.core.field.sightings import find_sightings
 from gaussian_wrapping_addon.core.field.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.meshing.candidate_surface import candidate_surface
 from gaussian_wrapping_addon.core.meshing.clean_up import clean_up
-from gaussian_wrapping_addon.core.meshing.components import compacted
 from gaussian_wrapping_addon.core.meshing.mesh_file import save_mesh
-from gaussian_wrapping_addon.core.meshing.pivots import nine_pivots, two_pivots
+from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.parallel import default_threads
@@ -37,9 +35,6 @@ from gaussian_wrapping_addon.core.settings import MeshingSettings
 from .fusion import fuse, require_open3d
 from .plan import FUSION, METHODS, PAM, TETRAHEDRA, Method
 from .trained import Trained, open_trained
-
-BRACKET_SHARE = 2e-4
-"""Of the diagonal: marching tetrahedra bisect their crossings to this."""
 
 MESH, MEASURED = "mesh.npz", "measured.json"
 
@@ -61,16 +56,14 @@ def make_mesh(trained: Trained, method: Method, *, threads: int, seed: int = 0) 
         return SurfaceMesh(vertices, faces.astype(np.int32))
     arrays, cameras, region = trained.gaussians.arrays(), trained.scene.cameras, trained.region
     vacancy = VacancyField(arrays, cameras, threads=threads)
-    if method.name == TETRAHEDRA:
-        surface = candidate_surface(
-            arrays, region, vacancy.is_empty, BRACKET_SHARE * region.diagonal, seed, Progress(),
-            pivots_of={2: two_pivots, 9: nine_pivots}[method.size],
-        )  # fmt: skip
-        vertices, faces, _ = compacted(surface.vertices, surface.faces)
-        return SurfaceMesh(vertices, faces.astype(np.int32))
     sightings = find_sightings(
         trained.gaussians, cameras, lambda p: region.contains(p, 0.0), Progress(), threads=threads
     )
+    if method.name == TETRAHEDRA:
+        settings = MeshingSettings(method="pivots", pivots=method.size)
+        return mesh_by_pivots(
+            vacancy, arrays, cameras, region, settings, Progress(), seed=seed, sightings=sightings
+        )
     settings = MeshingSettings(points=method.size, spacing=method.name)
     mesh = mesh_region(
         vacancy, VectorField(arrays, threads=threads), arrays, cameras, region, settings,

@@ -22,7 +22,7 @@ LAST_COSINE = 0.003
 LAST_RESORT = 1e-20
 """Factor of the weights of a last resort: far below any other, so both fit in one number."""
 LAST_RESORT_BELOW = 1e-15
-"""Weights below are of a last resort; the faintest other is (0.2 x 0.01 px)^2 x floors = 2e-9."""
+"""Weights below are of a last resort; the faintest other is (0.2 x 0.01 px)^2 x floors = 3e-11."""
 CLEAR_PX = 4.0
 """Views count in full from this distance to a silhouette, where pose errors mix two surfaces."""
 CLEAR_FLOOR = 0.02
@@ -30,6 +30,10 @@ CLEAR_FLOOR = 0.02
 BORDER_SHARE = 0.04
 """Weights fade over this share of the image side towards its border."""
 BORDER_FLOOR = 0.02
+CLIPPED_FROM, CLIPPED_RANGE = 254.0, 14.0
+"""Views fade over this range below white: a clipped pixel is a lower bound, which after another
+photo's exposure is a flat grey beside it. Highlights go where another view has none."""
+CLIPPED_FLOOR = 0.02
 MAX_USEFUL_PX = 1.5
 """A photo with more pixels a texel than this is no better."""
 
@@ -242,6 +246,10 @@ def _sample(
                 continue
         level = np.log2(max(intrinsics[0] * texel_size / z, 1.0))
         red, green, blue = trilinear(pixels, levels, level, u, v)
+        room = CLIPPED_FROM - max(red, max(green, blue))
+        weight *= _fade(room, CLIPPED_RANGE, CLIPPED_FLOOR)
+        if np.float32(weight) <= weights[i, slot]:
+            continue
         weights[i, slot] = weight
         if weight > LAST_RESORT_BELOW:
             best_clearance[i] = max(best_clearance[i], clearance[iy, ix])
