@@ -48,7 +48,7 @@ def remove_degenerate(
         A closed 2-manifold.
     region : Region, optional
         No vertex on its boundary is merged into one that lies on fewer of its planes, and no edge
-        of its own is flipped: caps stay on their planes.
+        of its own is flipped, but for one beside a third point of it: caps stay on their planes.
 
     Returns
     -------
@@ -225,5 +225,8 @@ def _improve(
             ):
                 return True
     a, b = corners[longest], corners[(longest + 1) % 3]
+    third = corners[(longest + 2) % 3]
     shared = planes.get(a, _NO_PLANES) & planes.get(b, _NO_PLANES)
-    return len(shared) < 2 and mesh.flip(a, b)
+    # Three points of the region's edge: the other two sides run along it in place of this one.
+    along = shared <= planes.get(third, _NO_PLANES)
+    return (len(shared) < 2 or along) and mesh.flip(a, b)

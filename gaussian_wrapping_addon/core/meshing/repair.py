@@ -11,9 +11,11 @@ from scipy.sparse.csgraph import connected_components
 
 from ..errors import MeshingError
 
-APART_SHARE = 0.02
+APART_SHARE = 0.005
 """Copies of a vertex move this share of the way to the middle of their own faces, so that the
-parts do not touch and programs that merge equal points do not join them again."""
+parts do not touch and programs that merge equal points do not join them again. With four times as
+much, coarse meshes of thin things left the isosurface: 99 % of a room's vertices were within 0.05
+of the level, not within 0.02."""
 
 MAX_PASSES = 20
 

@@ -11,6 +11,7 @@ from gaussian_wrapping_addon.core.meshing.components import without_floaters
 from gaussian_wrapping_addon.core.meshing.degenerate import narrow_faces, remove_degenerate
 from gaussian_wrapping_addon.core.meshing.delaunay import delaunay, far_points
 from gaussian_wrapping_addon.core.meshing.extraction import boundary_faces, tetrahedron_neighbours
+from gaussian_wrapping_addon.core.meshing.region import Region
 from gaussian_wrapping_addon.core.meshing.repair import Repaired, split_nonmanifold
 from gaussian_wrapping_addon.core.meshing.statistics import mesh_statistics
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
@@ -143,6 +144,38 @@ def test_flat_face_and_needle_are_removed() -> None:
     assert left == 0
     assert near not in fixed
     assert mesh_statistics(as_mesh(vertices, fixed)).volume == pytest.approx(1.0)
+
+
+def test_a_face_along_the_region_s_edge_is_flipped_away() -> None:
+    """Three points of the edge in one face: its long side is not an edge that has to stay."""
+    vertices, faces = cubes((0, 0, 0))
+    region = Region.box("r", np.zeros(3), np.ones(3))
+    begin, end, first, second = _an_edge_of_the_cube(vertices, faces)
+    middle = len(vertices)
+    vertices = np.concatenate([vertices, vertices[[begin, end]].mean(0)[None]])
+    tip = int(next(v for v in faces[second] if v not in (begin, end)))
+    divided = [[middle, begin, tip], [end, middle, tip], [end, begin, middle]]
+    flat = np.concatenate([np.delete(faces, second, 0), divided])
+    assert mesh_statistics(as_mesh(vertices, flat)).closed
+    kept, left = remove_degenerate(vertices, flat, 1e-3, region)
+    assert left == 0
+    assert_closed_manifold(as_mesh(vertices, kept))
+    assert middle in kept
+    assert mesh_statistics(as_mesh(vertices, kept)).volume == pytest.approx(1.0, rel=1e-12)
+    assert first != second
+
+
+def _an_edge_of_the_cube(vertices: np.ndarray, faces: np.ndarray) -> tuple[int, int, int, int]:
+    """Return begin and end of an edge of length 1, the face left of it, and the one beyond."""
+    sides = {
+        (int(a), int(b)): k
+        for k, f in enumerate(faces)
+        for a, b in zip(f, np.roll(f, -1), strict=False)
+    }
+    for (a, b), face in sides.items():
+        if np.linalg.norm(vertices[a] - vertices[b]) < 1.1:
+            return a, b, face, sides[b, a]
+    raise AssertionError
 
 
 def test_floaters_and_cavities_are_counted() -> None:
