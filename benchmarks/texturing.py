@@ -2,8 +2,9 @@
 """Measure unwrap and bake: ``python -m benchmarks.texturing``.
 
 Photos of spot with a known texture are rendered by rays and baked back; then a mesh of 375 thousand
-faces is unwrapped and baked at 4096 x 4096 from 40 photos of 2 megapixels, in a process of its own. With ``--jobs`` finished jobs of real photos are textured
-without their held-out photos and compared with these. ``texturing.md`` goes into ``docs/benchmarks``.
+faces is unwrapped and baked at 4096 x 4096 from 40 photos of 2 megapixels, in a process of its own.
+With ``--jobs`` finished jobs of real photos are textured without their held-out photos and compared
+with these. ``texturing.md`` and its pictures go into ``docs/benchmarks``.
 """
 
 from __future__ import annotations
@@ -203,10 +204,10 @@ def _real(jobs: Sequence[Path], out: Path, threads: int) -> list[str]:
         "## Real photos, held out",
         "",
         (
-            "Each mesh is textured without the photos that the training held out, and rendered from "
-            "their cameras. PSNR and SSIM of the pixels that the mesh covers; fitted: with one gain "
-            "a channel for each photo, as the exposure of a held-out photo is unknown. Pictures: "
-            "the photo of median PSNR left, the rendering right."
+            "Each mesh is textured without the photos that the training held out, and rendered "
+            "from their cameras. PSNR and SSIM of the pixels that the mesh covers; fitted: with "
+            "one gain a channel for each photo, as the exposure of a held-out photo is unknown. "
+            "Pictures: the photo of median PSNR left, the rendering right."
         ),
         "",
         "| job | photos | held out | faces | texture | PSNR | fitted | SSIM | covered | overlaps |",
@@ -220,7 +221,8 @@ def _real(jobs: Sequence[Path], out: Path, threads: int) -> list[str]:
         lines.append(
             f"| {job.name} | {f['photos']} | {f['held_out']} | {f['faces']:,} "
             f"| {f['texture']['size_px']} | {f['psnr']:.2f} dB | {f['fitted_psnr']:.2f} dB "
-            f"| {f['ssim']:.3f} | {100 * f['covered']:.0f} % | {f['texture']['texels_overlapping']} |"
+            f"| {f['ssim']:.3f} | {100 * f['covered']:.0f} % "
+            f"| {f['texture']['texels_overlapping']} |"
         )
         pictures += ["", f"![{job.name}]({picture.name})"]
     return lines + pictures if jobs else [*lines[:2], "No job was named with `--jobs`."]
