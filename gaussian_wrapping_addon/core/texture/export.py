@@ -22,8 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from ..dataset.similarity import Similarity
-from ..errors import MeshingError, ResourceError, UsageError
+from ..errors import ResourceError, UsageError
 from ..files import write_bytes, write_json
+from .file_checks import check_mesh
 from .glb import glb_bytes
 from .textured_mesh import TexturedMesh
 
@@ -54,7 +55,7 @@ def write_mesh_ply(
         The file cannot be written.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
-    _check(vertices, faces)
+    check_mesh(vertices, faces)
     fields = [(axis, "<f8") for axis in "xyz"]
     names = ["property double x", "property double y", "property double z"]
     if colors is not None:
@@ -105,7 +106,7 @@ def write_obj(
     normal_name : str, optional
         A normal map, under the name of ``map_Bump``, by which Blender writes and reads them.
     """
-    _check(vertices, faces)
+    check_mesh(vertices, faces, corner_uvs)
     if any(c.isspace() for c in image_name + path.name):
         raise UsageError(f"OBJ files cannot name {image_name!r}.", "Use a name without spaces.")
     uvs, corner = np.unique(corner_uvs.reshape(-1, 2), axis=0, return_inverse=True)
@@ -132,12 +133,19 @@ def write_glb(
     corner_uvs: np.ndarray,
     png: bytes,
     offset: np.ndarray,
-    **maps: bytes | None,
+    *,
+    normal_png: bytes | None = None,
+    occlusion_png: bytes | None = None,
+    shading: str = "auto",
 ) -> None:
     """Write a binary glTF with the images inside; see :func:`.glb.glb_bytes`."""
-    _check(vertices, faces)
+    check_mesh(vertices, faces, corner_uvs)
     with _writing(path):
-        write_bytes(path, glb_bytes(vertices, faces, corner_uvs, png, offset, **maps))
+        data = glb_bytes(
+            vertices, faces, corner_uvs, png, offset,
+            normal_png=normal_png, occlusion_png=occlusion_png, shading=shading,
+        )  # fmt: skip
+        write_bytes(path, data)
 
 
 def write_textured(
@@ -178,9 +186,7 @@ def write_textured(
     if unknown:
         raise UsageError(f"There is no export {unknown[0]!r} here.", f"Use {', '.join(FORMATS)}.")
     mesh = textured.mesh
-    _check(mesh.vertices, mesh.faces)
-    if not np.isfinite(textured.corner_uvs).all():
-        raise MeshingError("The mesh has UVs that are not finite.", "Texture the region again.")
+    check_mesh(mesh.vertices, mesh.faces, textured.corner_uvs)
     world = world_from_scene.points(mesh.vertices)
     offset = file_offset(world) if offset is None else offset
     maps = {
@@ -270,18 +276,6 @@ def png_bytes(image: np.ndarray) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(image).save(stream, format="PNG", compress_level=4)
     return stream.getvalue()
-
-
-def _check(vertices: np.ndarray, faces: np.ndarray) -> None:
-    if len(faces) == 0 or len(vertices) == 0:
-        raise MeshingError("The mesh to write has no faces.", "Choose a region with a surface.")
-    if not np.isfinite(vertices).all():
-        first = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise MeshingError(
-            f"Vertex {first} of the mesh to write is not finite.", "Mesh the region again."
-        )
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshingError("A face names a vertex that does not exist.", "Mesh the region again.")
 
 
 @contextlib.contextmanager

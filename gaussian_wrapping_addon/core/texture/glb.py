@@ -27,13 +27,15 @@ def glb_bytes(
     *,
     normal_png: bytes | None = None,
     occlusion_png: bytes | None = None,
+    shading: str = "auto",
 ) -> bytes:
     """Build the file.
 
     Photos hold their own light, so the material is ``KHR_materials_unlit``, with an ordinary
     rough material for readers that do not know it. With a normal map or occlusion it is lit:
     readers ignore both where a material is unlit. Normals are those that the map was baked for;
-    tangents are left to the reader, which glTF binds to MikkTSpace.
+    tangents are left to the reader, which glTF binds to MikkTSpace. Faces that name a vertex
+    twice are left out.
 
     Parameters
     ----------
@@ -48,7 +50,14 @@ def glb_bytes(
         What was taken off the world coordinates; kept in the node's extras.
     normal_png, occlusion_png : bytes, optional
         Tangent-space normal map (+Y) and ambient occlusion (red channel), for the same UVs.
+    shading : str
+        ``"lit"``, ``"unlit"`` (then without both maps), or ``"auto"``: as said above.
     """
+    if shading == "unlit":
+        normal_png = occlusion_png = None
+    corners = np.asarray(faces)
+    whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+    faces, corner_uvs = corners[whole], np.asarray(corner_uvs)[whole]
     corner_vertex = np.asarray(faces, np.int64).ravel()
     uvs = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
     # One glTF vertex for each pair of vertex and UV.
@@ -80,8 +89,8 @@ def glb_bytes(
         views.append(view if target is None else {**view, "target": target})
         binary += part + b"\0" * (-len(part) % 4)
     count = len(first)
-    material = _material(list(pictures))
-    is_unlit = "extensions" in material
+    is_unlit = shading == "unlit" or (shading == "auto" and list(pictures) == ["albedo"])
+    material = _material(list(pictures), is_unlit)
     document = {
         "asset": {"version": "2.0", "generator": "Gaussian Wrapping for Blender"},
         **({"extensionsUsed": ["KHR_materials_unlit"]} if is_unlit else {}),
@@ -136,7 +145,7 @@ def glb_bytes(
     )
 
 
-def _material(images: list[str]) -> dict[str, Any]:
+def _material(images: list[str], is_unlit: bool) -> dict[str, Any]:
     """Return the material of images, named in the order of the textures."""
     material: dict[str, Any] = {
         "name": "albedo",
@@ -149,7 +158,7 @@ def _material(images: list[str]) -> dict[str, Any]:
     for name in ("normal", "occlusion"):
         if name in images:
             material[f"{name}Texture"] = {"index": images.index(name)}
-    if images == ["albedo"]:
+    if is_unlit:
         material["extensions"] = {"KHR_materials_unlit": {}}
     return material
 

@@ -19,6 +19,7 @@ from gaussian_wrapping_addon.core.errors import MeshingError, ResourceError, Usa
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.texture.export import (
     file_offset,
+    write_glb,
     write_mesh_ply,
     write_obj,
     write_textured,
@@ -274,6 +275,18 @@ def test_nan_is_refused_by_each_writer(tmp_path: Path) -> None:
         write_mesh_ply(tmp_path / "m.ply", bad.mesh.vertices, bad.mesh.faces)
     with pytest.raises(MeshingError, match="Vertex 2"):
         write_obj(tmp_path / "m.obj", bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, "a.png")
+    path, png, zero = tmp_path / "m.glb", b"", np.zeros(3)
+    with pytest.raises(MeshingError, match="Vertex 2"):
+        write_glb(path, bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, png, zero)
+    bad = spoiled("nan uv")
+    with pytest.raises(MeshingError, match="Face 3"):
+        write_glb(path, bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, png, zero)
+    with pytest.raises(MeshingError, match="Face 3"):
+        write_obj(tmp_path / "m.obj", bad.mesh.vertices, bad.mesh.faces, bad.corner_uvs, "a.png")
+    # Finite, but not in single precision.
+    good = cube()
+    with pytest.raises(MeshingError, match="not finite"):
+        write_glb(path, good.mesh.vertices * 1e39, good.mesh.faces, good.corner_uvs, png, zero)
     assert list(tmp_path.iterdir()) == []
 
 
