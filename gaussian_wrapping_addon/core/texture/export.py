@@ -14,75 +14,21 @@ to ``transform.json`` and into the GLB's node.
 
 from __future__ import annotations
 
-import contextlib
 import io
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from ..dataset.file_frame import file_offset
 from ..dataset.similarity import Similarity
-from ..errors import ResourceError, UsageError
+from ..errors import UsageError
 from ..files import write_bytes, write_json
-from .file_checks import check_mesh
+from .file_checks import check_mesh, writing
 from .glb import glb_bytes
+from .mesh_ply import vertex_colors, write_mesh_ply
 from .textured_mesh import TexturedMesh
 
 FORMATS = ("glb", "obj", "ply")
-FAR_FROM_ORIGIN = 100.0
-"""Further than this many sizes from the origin, float32 rounding passes 1e-5 of the size."""
-
-
-def write_mesh_ply(
-    path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None = None
-) -> None:
-    """Write a binary little-endian PLY with double coordinates.
-
-    Parameters
-    ----------
-    path : Path
-        Its folder must exist.
-    vertices : (v, 3) float64
-        World coordinates; stored without loss.
-    faces : (f, 3) int32
-    colors : (v, 3) uint8 or None
-
-    Raises
-    ------
-    MeshingError
-        Not finite, no faces, or an index out of range.
-    ResourceError
-        The file cannot be written.
-    """
-    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
-    check_mesh(vertices, faces)
-    fields = [(axis, "<f8") for axis in "xyz"]
-    names = ["property double x", "property double y", "property double z"]
-    if colors is not None:
-        fields += [(channel, "u1") for channel in ("red", "green", "blue")]
-        names += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
-    rows = np.empty(len(vertices), np.dtype(fields))
-    for column, axis in enumerate("xyz"):
-        rows[axis] = vertices[:, column]
-    if colors is not None:
-        for column, channel in enumerate(("red", "green", "blue")):
-            rows[channel] = colors[:, column]
-    triangles = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", (3,))]))
-    triangles["count"] = 3
-    triangles["corners"] = faces
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *names,
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-        "",
-    ]
-    data = "\n".join(header).encode() + rows.tobytes() + triangles.tobytes()
-    with _writing(path):
-        write_bytes(path, data)
 
 
 def write_obj(
@@ -121,7 +67,7 @@ def write_obj(
     material = f"newmtl albedo\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {image_name}\n"
     if normal_name is not None:
         material += f"map_Bump -bm 1 {normal_name}\n"
-    with _writing(path):
+    with writing(path):
         write_bytes(path.with_suffix(".mtl"), material.encode())
         write_bytes(path, text.getvalue().encode())
 
@@ -140,7 +86,7 @@ def write_glb(
 ) -> None:
     """Write a binary glTF with the images inside; see :func:`.glb.glb_bytes`."""
     check_mesh(vertices, faces, corner_uvs)
-    with _writing(path):
+    with writing(path):
         data = glb_bytes(
             vertices, faces, corner_uvs, png, offset,
             normal_png=normal_png, occlusion_png=occlusion_png, shading=shading,
@@ -194,7 +140,7 @@ def write_textured(
         "occlusion": None if textured.occlusion is None else png_bytes(textured.occlusion),
     }
     png = png_bytes(textured.albedo)
-    with _writing(folder):
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         stream = io.BytesIO()
         np.savez(
@@ -222,7 +168,8 @@ def write_textured(
                 },
             },
         )
-    write_mesh_ply(folder / "mesh.ply", world, mesh.faces, vertex_colors(textured))
+    colors = vertex_colors(len(world), mesh.faces, textured.corner_uvs, textured.albedo)
+    write_mesh_ply(folder / "mesh.ply", world, mesh.faces, colors)
     local = world - offset
     if "obj" in formats:
         write_obj(
@@ -246,29 +193,6 @@ def write_textured(
         )
 
 
-def file_offset(world: np.ndarray) -> np.ndarray:
-    """Return the (3,) float64 offset that files leave out: 0, or whole units near the centre."""
-    low, high = world.min(axis=0), world.max(axis=0)
-    size = float((high - low).max())
-    centre = 0.5 * (low + high)
-    if np.abs(centre).max() <= FAR_FROM_ORIGIN * size:
-        return np.zeros(3)
-    return np.round(centre) if size > 1.0 else centre
-
-
-def vertex_colors(textured: TexturedMesh) -> np.ndarray:
-    """Return (v, 3) uint8 means of the texture at the corners of each vertex."""
-    size = textured.albedo.shape[0]
-    texels = np.asarray(textured.corner_uvs, np.float64).reshape(-1, 2) * size
-    column = np.floor(texels[:, 0]).clip(0, size - 1).astype(np.int64)
-    row = np.floor(size - texels[:, 1]).clip(0, size - 1).astype(np.int64)
-    values = textured.albedo[row, column].astype(np.float64)  # (3 f, 3)
-    corner = np.asarray(textured.mesh.faces).ravel()
-    count = np.bincount(corner, minlength=len(textured.mesh.vertices))
-    sums = [np.bincount(corner, values[:, c], len(count)) for c in range(3)]
-    return np.rint(np.stack(sums, axis=1) / np.maximum(count, 1)[:, None]).astype(np.uint8)
-
-
 def png_bytes(image: np.ndarray) -> bytes:
     """Encode (h, w, 3) or grey (h, w) uint8 as PNG."""
     from PIL import Image
@@ -276,14 +200,3 @@ def png_bytes(image: np.ndarray) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(image).save(stream, format="PNG", compress_level=4)
     return stream.getvalue()
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise ResourceError(
-            f"{path} cannot be written: {error.strerror or error}.",
-            "Check that the folder exists, is not read-only, and that the disk has room.",
-        ) from error

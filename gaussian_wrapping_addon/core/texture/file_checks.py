@@ -6,9 +6,13 @@ Those write a NaN without a word, and what reads the file then shows nothing or 
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
 import numpy as np
 
-from ..errors import MeshingError
+from ..errors import MeshingError, ResourceError
 
 SINGLE_MAX = float(np.finfo(np.float32).max)
 """Coordinates beyond become infinite in single precision, which most formats have."""
@@ -56,3 +60,15 @@ def check_mesh(
             f"Face {int(np.argmax(bad))} of {name} has UVs that are not finite.",
             "Texture the region again.",
         )
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what the system says of a path into our error."""
+    try:
+        yield
+    except OSError as error:
+        raise ResourceError(
+            f"{path} cannot be written: {error.strerror or error}.",
+            "Check that the folder exists, is not read-only, and that the disk has room.",
+        ) from error
