@@ -23,7 +23,7 @@ from ..ply_table import read_vertices
 from ..tolerances import QUATERNION_MIN_NORM
 from .initialisation import SH_C0
 from .model import OrientedGaussians
-from .splat_ply import MAX_LOG_SCALE, harmonics_of
+from .splat_ply import MAX_LOG_SCALE, MOST_OPAQUE_LOGIT, harmonics_of
 
 _logger = logging.getLogger(__name__)
 
@@ -36,9 +36,6 @@ discs of 1e8 : 1 that float32 cannot render."""
 
 THINNEST_AXIS = 1e-5
 """An axis is made at least this share of the longest one."""
-
-MOST_OPAQUE_LOGIT = 30.0
-"""Opacity logits are clamped to this and its negative: sigmoid is 1 or 0 to 13 digits."""
 
 _ACTIVATED_SHARE = 0.999
 """A file where this share of all opacities and scales could be activated values likely has them."""

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from ..dataset.similarity import Similarity
-from ..errors import ParseError
+from ..errors import MeshingError, ParseError
 from ..files import write_bytes
 from ..ply_table import read_ply_header, read_vertices
 from .model import OrientedGaussians
@@ -28,6 +28,9 @@ _logger = logging.getLogger(__name__)
 
 MAX_LOG_SCALE = 40.0
 """Scales beyond e^40 cannot be meant; such Gaussians are dropped."""
+
+MOST_OPAQUE_LOGIT = 30.0
+"""Opacity logits of viewers' files end here and at its negative: sigmoid is 1 or 0 to 13 digits."""
 
 _FRAME_COMMENT = "world_from_scene"
 _HINT = "Write the file again with this program."
@@ -55,13 +58,30 @@ def write_splat_ply(path: Path, gaussians: OrientedGaussians, world_from_scene: 
 
 
 def write_viewer_ply(path: Path, gaussians: OrientedGaussians) -> None:
-    """Write a file for splat viewers, scene frame: the filter is baked into scale and opacity."""
+    """Write a file for splat viewers: the filter is baked into scale and opacity.
+
+    Raises
+    ------
+    MeshingError
+        A Gaussian is not finite, also in single precision: viewers show nothing then, or crash.
+    """
     wide = OrientedGaussians(**{n: t.detach().cpu().double() for n, t in gaussians.tensors()})
     log_opacity = wide.log_opacities()
     # logit = log(a / (1 - a)), from log a without losing a close to 1
     logit = log_opacity - torch.log(-torch.expm1(log_opacity.clamp_max(-1e-12)))
+    logit = logit.clamp(-MOST_OPAQUE_LOGIT, MOST_OPAQUE_LOGIT)
     baked = wide.replaced(log_scales=torch.log(wide.scales()), opacity_logits=logit)
     arrays = {name: t.numpy() for name, t in baked.tensors()}
+    good = np.ones(len(arrays["means"]), np.bool_)
+    for name in ("means", "sh", "opacity_logits", "log_scales", "quats"):
+        with np.errstate(over="ignore"):
+            single = arrays[name].reshape(len(good), -1).astype(np.float32)
+        good &= np.isfinite(single).all(axis=1)
+    if not good.all():
+        raise MeshingError(
+            f"Gaussian {int(np.argmin(good))} of the splat to write is not finite.",
+            "Train the scene again.",
+        )
     _write(path, standard_names(arrays["sh"].shape[1]), _standard_columns(arrays), [])
 
 

@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``export`` of the command line: results as GLB, OBJ, PLY and splat, each with its sidecar.
+
+Runs in the worker's Python and needs no Blender (USD and FBX do: ``ops/export_objects.py``).
+Speaks as :mod:`~.evaluate` does: one JSON object a line on stdout.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import threading
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..dataset.file_frame import FileFrame, file_offset
+from ..dataset.placement_file import FILE_NAME, read_placement
+from ..dataset.similarity import Similarity
+from ..errors import EXIT_DONE, EXIT_OTHER, DatasetError, ParseError, UsageError, WrapError
+from ..files import read_json
+from ..helper_process import emit
+from .evaluate import end_with
+from .sidecar import write_sidecar
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+OWN_FORMATS = ("glb", "obj", "ply", "splat")
+"""Written here; the others need Blender."""
+BLENDER_FORMATS = ("usd", "fbx")
+SHADINGS = ("auto", "lit", "unlit")
+SPLAT_NAME = "gaussians.splat.ply"
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """What is to be written of a result."""
+
+    result: Path
+    """The result folder."""
+    out: Path
+    """Made where it is missing; files of the same names are replaced."""
+    formats: tuple[str, ...]
+    """Among :data:`OWN_FORMATS`."""
+    placed: bool = False
+    """Whether coordinates are those of the scene as placed in Blender, else the input's world."""
+    regions: tuple[str, ...] = ()
+    """Names; none for all."""
+    levels: bool = False
+    """Whether levels of detail are written too."""
+    shading: str = "auto"
+    """Of GLB: lit, unlit, or lit where there is a normal map or occlusion."""
+
+
+@dataclass(frozen=True)
+class StoredMesh:
+    """One mesh of a result folder."""
+
+    region: str
+    level: int
+    folder: Path
+    vertices: np.ndarray  # (v, 3) float64, scene frame
+    faces: np.ndarray  # (f, 3) int32
+    corner_uvs: np.ndarray  # (f, 3, 2) float32
+
+    @property
+    def stem(self) -> str:
+        """Name of its files: no spaces, which OBJ readers do not agree on."""
+        return file_stem(self.region, self.level)
+
+
+def file_stem(region: str, level: int) -> str:
+    """Return the name, without its ending, of the files of a region's level."""
+    clean = re.sub(r"[^\w.-]+", "_", region).strip("._") or "mesh"
+    return f"{clean}-lod{level}" if level else clean
+
+
+def result_of(folder: Path) -> Path:
+    """Return the result folder of a job folder, or of itself.
+
+    Raises
+    ------
+    DatasetError
+        There is none.
+    """
+    for path in (folder / "result", folder):
+        if (path / "scene.json").is_file():
+            return path.resolve()
+    raise DatasetError(f"{folder} holds no result.", "Give the folder of a finished job.")
+
+
+def frames_of(result: Path) -> tuple[Similarity, Similarity]:
+    """Return ``world_from_scene`` and ``blender_from_scene`` of a result.
+
+    Raises
+    ------
+    ParseError
+        ``scene.json`` or ``placement.json`` does not hold one.
+    """
+    path = result / "scene.json"
+    try:
+        world_from_scene = Similarity.from_json(read_json(path)["world_from_scene"])
+        if not (np.isfinite(world_from_scene.matrix()).all() and world_from_scene.scale > 0.0):
+            raise ValueError("a number is not finite")
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise ParseError(
+            path, "world_from_scene", f"not a transform ({error}).", "Run the job again."
+        ) from None
+    placement = result / FILE_NAME
+    found = read_placement(placement, world_from_scene) if placement.is_file() else None
+    return world_from_scene, found or Similarity()
+
+
+def export_files(request: ExportRequest) -> Iterator[Path]:
+    """Write every file of a request; yield each, whole, its sidecar beside it.
+
+    Raises
+    ------
+    UsageError
+        An unknown format, shading or region.
+    DatasetError, ParseError
+        The result is not whole.
+    MeshingError
+        A mesh or a Gaussian is not finite; nothing of it is written.
+    ResourceError
+        The folder cannot be written.
+    """
+    from ..texture.file_checks import writing
+
+    for name, known in (("formats", OWN_FORMATS), ("shading", SHADINGS)):
+        asked = getattr(request, name)
+        wrong = sorted({*([asked] if isinstance(asked, str) else asked)} - set(known))
+        if wrong:
+            raise UsageError(f"{wrong[0]!r} is not written here.", f"Use {', '.join(known)}.")
+    frames = frames_of(request.result)
+    with writing(request.out):
+        request.out.mkdir(parents=True, exist_ok=True)
+    wanted = [f for f in request.formats if f != "splat"]
+    if wanted:
+        for mesh in _meshes(request):
+            for name in wanted:
+                yield _write_mesh(request, mesh, name, *frames)
+    if "splat" in request.formats:
+        yield _write_splat(request, *frames)
+
+
+def _meshes(request: ExportRequest) -> Iterator[StoredMesh]:
+    known = sorted(path.parent.name for path in request.result.glob("*/mesh.npz"))
+    missing = sorted(set(request.regions) - set(known))
+    if missing or not known:
+        raise UsageError(
+            f"{request.result} holds no mesh {missing[0] if missing else ''}".rstrip() + ".",
+            f"Use {', '.join(known)}." if known else "Mesh a region first.",
+        )
+    for region in request.regions or known:
+        folder, level = request.result / region, 0
+        while (folder / "mesh.npz").is_file():
+            yield _read_mesh(region, level, folder)
+            level += 1
+            folder = request.result / region / f"lod{level}"
+            if not request.levels:
+                break
+
+
+def _read_mesh(region: str, level: int, folder: Path) -> StoredMesh:
+    from ..texture.file_checks import check_mesh
+
+    path = folder / "mesh.npz"
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            vertices, faces, corner_uvs = (
+                np.asarray(arrays[n], t)
+                for n, t in (("vertices", "f8"), ("faces", "i4"), ("corner_uvs", "f4"))
+            )
+        if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+            raise ValueError("not lists of triples")
+        if corner_uvs.shape != (len(faces), 3, 2):
+            raise ValueError("UVs are not those of the faces")
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ParseError(
+            path, "whole file", f"not a mesh file ({error}).", "Mesh the region again."
+        ) from None
+    mesh = StoredMesh(region, level, folder, vertices, faces, corner_uvs)
+    check_mesh(vertices, faces, corner_uvs, name=f"mesh {mesh.stem}")
+    return mesh
+
+
+def _write_mesh(
+    request: ExportRequest,
+    mesh: StoredMesh,
+    format: str,
+    world_from_scene: Similarity,
+    blender_from_scene: Similarity,
+) -> Path:
+    from ..texture.export import write_glb, write_obj
+    from ..texture.file_checks import writing
+    from ..texture.mesh_ply import vertex_colors, write_mesh_ply
+
+    target_from_scene = blender_from_scene if request.placed else world_from_scene
+    frame = FileFrame(format, target_from_scene)
+    if not request.placed and format != "ply":  # doubles need no offset
+        # That of the finest level, so that all levels lie over each other.
+        finest = mesh if mesh.level == 0 else _read_mesh(mesh.region, 0, mesh.folder.parent)
+        frame = FileFrame(
+            format, target_from_scene, file_offset(target_from_scene.points(finest.vertices))
+        )
+    local = frame.local(mesh.vertices)
+    path = request.out / f"{mesh.stem}.{format}"
+    textures: list[str] = []
+    shading = "lit"
+    if format == "ply":
+        albedo = np.asarray(_image(mesh.folder / "albedo.png"))
+        colors = vertex_colors(len(local), mesh.faces, mesh.corner_uvs, albedo)
+        write_mesh_ply(path, local, mesh.faces, colors)
+    elif format == "obj":
+        present = [n for n in ("albedo", "normal") if (mesh.folder / f"{n}.png").is_file()]
+        textures = [f"{mesh.stem}-{name}.png" for name in present]
+        with writing(request.out):
+            for name, target in zip(present, textures, strict=True):
+                _image(mesh.folder / f"{name}.png")
+                shutil.copyfile(mesh.folder / f"{name}.png", request.out / target)
+        write_obj(path, local @ frame.turn.T, mesh.faces, mesh.corner_uvs, *textures)
+    else:
+        maps = {
+            f"{name}_png": file.read_bytes()
+            for name in ("normal", "occlusion")
+            if (file := mesh.folder / f"{name}.png").is_file()
+        }
+        _image(mesh.folder / "albedo.png")
+        albedo_png = (mesh.folder / "albedo.png").read_bytes()
+        shading = request.shading
+        if shading == "auto":
+            shading = "lit" if maps else "unlit"
+        write_glb(
+            path, local, mesh.faces, mesh.corner_uvs, albedo_png, frame.offset,
+            normal_png=maps.get("normal_png"), occlusion_png=maps.get("occlusion_png"),
+            shading=shading,
+        )  # fmt: skip
+    contents = {
+        "region": mesh.region, "level": mesh.level, "shading": shading, "textures": textures,
+        "vertices": len(mesh.vertices), "faces": len(mesh.faces),
+    }  # fmt: skip
+    write_sidecar(
+        path, frame, world_from_scene, blender_from_scene,
+        placed=request.placed, result=request.result, contents=contents,
+    )  # fmt: skip
+    return path
+
+
+def _image(path: Path) -> Image:
+    """Read an RGB image, so that nothing broken is handed on."""
+    from PIL import Image
+
+    try:
+        return Image.open(path).convert("RGB")
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise ParseError(
+            path, "whole file", f"not an image ({error}).", "Mesh the region again."
+        ) from None
+
+
+def _write_splat(
+    request: ExportRequest, world_from_scene: Similarity, blender_from_scene: Similarity
+) -> Path:
+    from ..gaussians.splat_ply import read_splat_ply, write_viewer_ply
+    from ..texture.file_checks import writing
+    from ..training.splat_motion import move_gaussians
+
+    source = request.result / "gaussians.ply"
+    if not source.is_file():
+        raise DatasetError(f"{request.result} holds no gaussians.ply.", "Run the job again.")
+    found = read_splat_ply(source)
+    target_from_scene = blender_from_scene if request.placed else world_from_scene
+    offset = np.zeros(3)
+    if not request.placed:
+        offset = file_offset(target_from_scene.points(found.gaussians.means.double().numpy()))
+    frame = FileFrame("splat", target_from_scene, offset)
+    moved = move_gaussians(found.gaussians, frame.file_from_scene())
+    path = request.out / SPLAT_NAME
+    with writing(path):
+        write_viewer_ply(path, moved)
+    write_sidecar(
+        path, frame, world_from_scene, blender_from_scene,
+        placed=request.placed, result=request.result,
+        contents={"gaussians": len(moved), "dropped": found.dropped, "filter": "baked in"},
+    )  # fmt: skip
+    return path
+
+
+def main(arguments: list[str]) -> int:
+    """Export ``arguments = [the request as JSON]`` in this process; return the exit code."""
+    # Not the caller's own id: where Python is started through a launcher, that is the parent.
+    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
+    asked = json.loads(arguments[0])
+    try:
+        request = ExportRequest(
+            Path(asked["result"]), Path(asked["out"]), tuple(asked["formats"]), asked["placed"],
+            tuple(asked["regions"]), asked["levels"], asked["shading"],
+        )  # fmt: skip
+        for path in export_files(request):
+            emit(line=f"written: {path}")
+    except WrapError as error:
+        emit(error=error.message, hint=error.hint)
+        return error.exit_code
+    except ImportError as error:
+        emit(
+            error=f"The worker's Python lacks a package: {error}.",
+            hint="pip install -r requirements-worker.txt there.",
+        )
+        return EXIT_OTHER
+    except OSError as error:
+        emit(error=f"{error}.", hint="Check the path and its permissions.")
+        return EXIT_OTHER
+    return EXIT_DONE
