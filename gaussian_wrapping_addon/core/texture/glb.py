@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .tangent_frame import shading_normals
+from .tangent_frame import shading_normals, tangent_frames
 
 _MAGIC = 0x46546C67
 _JSON_CHUNK = 0x4E4F534A
@@ -34,8 +34,8 @@ def glb_bytes(
     Photos hold their own light, so the material is ``KHR_materials_unlit``, with an ordinary
     rough material for readers that do not know it. With a normal map or occlusion it is lit:
     readers ignore both where a material is unlit. Normals are those that the map was baked for;
-    tangents are left to the reader, which glTF binds to MikkTSpace. Faces that name a vertex
-    twice are left out.
+    tangents stand beside them where there is a normal map. Faces that name a vertex twice are
+    left out.
 
     Parameters
     ----------
@@ -60,26 +60,34 @@ def glb_bytes(
     faces, corner_uvs = corners[whole], np.asarray(corner_uvs)[whole]
     corner_vertex = np.asarray(faces, np.int64).ravel()
     uvs = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
-    # One glTF vertex for each pair of vertex and UV.
-    key = np.empty(len(uvs), np.dtype([("vertex", "<i8"), ("uv", "<u8")]))
+    tangents = np.zeros((len(uvs), 4), "<f4")
+    if normal_png is not None:
+        frames = tangent_frames(vertices, faces, corner_uvs)
+        tangents[:, :3] = _y_up(frames.tangents.reshape(-1, 3))
+        tangents[:, 3] = np.repeat(frames.signs, 3)
+    # One glTF vertex for each set of vertex, UV and tangent.
+    kinds = [("vertex", "<i8"), ("uv", "<u8"), ("tangent", "<u8", (2,))]
+    key = np.empty(len(uvs), np.dtype(kinds))
     key["vertex"] = corner_vertex
     key["uv"] = np.ascontiguousarray(uvs).view(np.uint64)[:, 0]
-    _, first, index = np.unique(key, return_index=True, return_inverse=True)
+    key["tangent"] = tangents.view(np.uint64)
+    _, first, index = np.unique(_bytes_of(key), return_index=True, return_inverse=True)
     owner = corner_vertex[first]
     positions = _y_up(vertices)[owner].astype("<f4")
     normals = _y_up(shading_normals(vertices, faces))[owner].astype("<f4")
     coordinates = np.stack([uvs[first, 0], 1.0 - uvs[first, 1]], axis=1).astype("<f4")
-    parts = [positions.tobytes(), normals.tobytes(), coordinates.tobytes()]
+    attributes = {
+        "POSITION": (positions, "VEC3"),
+        "NORMAL": (normals, "VEC3"),
+        "TEXCOORD_0": (coordinates, "VEC2"),
+    }
+    if normal_png is not None:
+        attributes["TANGENT"] = (tangents[first], "VEC4")
+    parts = [array.tobytes() for array, _ in attributes.values()]
     parts += [index.astype("<u4").tobytes()]
     images = {"albedo": png, "normal": normal_png, "occlusion": occlusion_png}
     pictures = {name: data for name, data in images.items() if data is not None}
-    targets = [
-        _ARRAY_BUFFER,
-        _ARRAY_BUFFER,
-        _ARRAY_BUFFER,
-        _INDEX_BUFFER,
-        *(None for _ in pictures),
-    ]
+    targets = [*(_ARRAY_BUFFER for _ in attributes), _INDEX_BUFFER, *(None for _ in pictures)]
     first_image = len(parts)
     parts += pictures.values()
     views: list[dict[str, Any]] = []
@@ -91,7 +99,7 @@ def glb_bytes(
     count = len(first)
     is_unlit = shading == "unlit" or (shading == "auto" and list(pictures) == ["albedo"])
     material = _material(list(pictures), is_unlit)
-    document = {
+    document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "Gaussian Wrapping for Blender"},
         **({"extensionsUsed": ["KHR_materials_unlit"]} if is_unlit else {}),
         "scene": 0,
@@ -104,8 +112,8 @@ def glb_bytes(
                 "name": "mesh",
                 "primitives": [
                     {
-                        "attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2},
-                        "indices": 3,
+                        "attributes": {name: k for k, name in enumerate(attributes)},
+                        "indices": len(attributes),
                         "material": 0,
                     }
                 ],
@@ -119,18 +127,14 @@ def glb_bytes(
             for k, name in enumerate(pictures)
         ],
         "accessors": [
-            {
-                **_accessor(0, _FLOAT, count, "VEC3"),
-                "min": positions.min(axis=0).tolist(),
-                "max": positions.max(axis=0).tolist(),
-            },
-            _accessor(1, _FLOAT, count, "VEC3"),
-            _accessor(2, _FLOAT, count, "VEC2"),
-            _accessor(3, _UINT32, len(index), "SCALAR"),
+            *(_accessor(k, _FLOAT, count, kind) for k, (_, kind) in enumerate(attributes.values())),
+            _accessor(len(attributes), _UINT32, len(index), "SCALAR"),
         ],
         "bufferViews": views,
         "buffers": [{"byteLength": len(binary)}],
     }
+    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    document["accessors"][0].update(bounds)
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     length = 12 + 8 + len(text) + 8 + len(binary)
@@ -161,6 +165,11 @@ def _material(images: list[str], is_unlit: bool) -> dict[str, Any]:
     if is_unlit:
         material["extensions"] = {"KHR_materials_unlit": {}}
     return material
+
+
+def _bytes_of(rows: np.ndarray) -> np.ndarray:
+    """View each row of a structured array as one sortable value."""
+    return rows.view(np.dtype((np.void, rows.dtype.itemsize)))
 
 
 def _y_up(values: np.ndarray) -> np.ndarray:
