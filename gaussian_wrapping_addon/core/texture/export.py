@@ -26,6 +26,8 @@ from ..files import write_bytes, write_json
 from .file_checks import check_mesh, writing
 from .glb import glb_bytes
 from .mesh_ply import vertex_colors, write_mesh_ply
+from .shading import OBJ_SHININESS, SPECULAR_LEVEL
+from .tangent_frame import shading_normals
 from .textured_mesh import TexturedMesh
 
 FORMATS = ("glb", "obj", "ply")
@@ -57,14 +59,19 @@ def write_obj(
         raise UsageError(f"OBJ files cannot name {image_name!r}.", "Use a name without spaces.")
     uvs, corner = np.unique(corner_uvs.reshape(-1, 2), axis=0, return_inverse=True)
     corner = corner.reshape(-1, 3) + 1
-    table = np.stack([faces + 1, corner], axis=2).reshape(-1, 6)
+    owner = np.asarray(faces) + 1
+    table = np.stack([owner, corner, owner], axis=2).reshape(-1, 9)
     text = io.StringIO()
     text.write(f"mtllib {path.stem}.mtl\no {path.stem}\n")
     np.savetxt(text, vertices, fmt="v %.9g %.9g %.9g")
     np.savetxt(text, uvs, fmt="vt %.7f %.7f")
+    # Without normals, readers show every face flat, and a normal map on faces that it is not for.
+    np.savetxt(text, shading_normals(vertices, faces), fmt="vn %.6f %.6f %.6f")
     text.write("usemtl albedo\n")
-    np.savetxt(text, table, fmt="f %d/%d %d/%d %d/%d")
-    material = f"newmtl albedo\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {image_name}\n"
+    np.savetxt(text, table, fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
+    shine = " ".join([str(SPECULAR_LEVEL)] * 3)
+    material = "newmtl albedo\n" + f"Ns {OBJ_SHININESS:.6g}\nKa 1 1 1\nKd 1 1 1\nKs {shine}\n"
+    material += f"Ni 1.5\nd 1\nillum 2\nmap_Kd {image_name}\n"
     if normal_name is not None:
         material += f"map_Bump -bm 1 {normal_name}\n"
     with writing(path):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .shading import ROUGHNESS, SPECULAR_LEVEL
 from .tangent_frame import shading_normals, tangent_frames
 
 _MAGIC = 0x46546C67
@@ -101,7 +102,7 @@ def glb_bytes(
     material = _material(list(pictures), is_unlit)
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "Gaussian Wrapping for Blender"},
-        **({"extensionsUsed": ["KHR_materials_unlit"]} if is_unlit else {}),
+        "extensionsUsed": list(material["extensions"]),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [
@@ -156,14 +157,14 @@ def _material(images: list[str], is_unlit: bool) -> dict[str, Any]:
         "pbrMetallicRoughness": {
             "baseColorTexture": {"index": images.index("albedo")},
             "metallicFactor": 0.0,
-            "roughnessFactor": 1.0,
+            "roughnessFactor": ROUGHNESS,
         },
     }
     for name in ("normal", "occlusion"):
         if name in images:
             material[f"{name}Texture"] = {"index": images.index(name)}
-    if is_unlit:
-        material["extensions"] = {"KHR_materials_unlit": {}}
+    extensions: dict[str, Any] = {"KHR_materials_specular": {"specularFactor": 2 * SPECULAR_LEVEL}}
+    material["extensions"] = {"KHR_materials_unlit": {}} if is_unlit else extensions
     return material
 
 

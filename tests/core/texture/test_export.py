@@ -149,8 +149,8 @@ def test_maps_are_written_beside_and_into_the_files(tmp_path: Path) -> None:
         png = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
         assert (np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) == pixels).all()
     # An unlit material would hide both.
-    assert "extensions" not in material
-    assert "extensionsUsed" not in document
+    assert list(material["extensions"]) == ["KHR_materials_specular"]
+    assert document["extensionsUsed"] == ["KHR_materials_specular"]
     read = trimesh.load(tmp_path / "mesh.glb", force="mesh", process=False)
     assert (np.asarray(read.visual.material.normalTexture.convert("RGB")) == normal_map).all()
 
