@@ -12,6 +12,7 @@ import bpy
 from .ops import (
     camera_operators,
     doctor,
+    export_operators,
     import_operators,
     job_operators,
     job_timer,
@@ -42,6 +43,7 @@ CLASSES: Final[tuple[type, ...]] = (
     *job_operators.CLASSES,
     *region_operators.CLASSES,
     *import_operators.CLASSES,
+    *export_operators.CLASSES,
     *camera_operators.CLASSES,
     *placement_operators.CLASSES,
     *report_operators.CLASSES,

@@ -83,12 +83,12 @@ class GWRAP_OT_set_shading(NeedsResult, bpy.types.Operator):
 
 
 def materials_of(frame: bpy.types.Object | None) -> list[bpy.types.Material]:
-    """Return our materials on the meshes of a result."""
+    """Return our materials on the meshes and levels of detail of a result."""
     children = frame.children if frame is not None else ()
     found = [
         slot.material
         for child in children
-        if tags.kind_of(child) == "mesh"
+        if tags.kind_of(child) in ("mesh", "lod")
         for slot in child.material_slots
         if materials.shading_of(slot.material) is not None
     ]

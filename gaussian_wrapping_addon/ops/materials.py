@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import bpy
 
+from ..core.texture.shading import ROUGHNESS, SPECULAR_LEVEL
+from . import tags
+
 SHADINGS = ("LIT", "UNLIT")
 _NORMAL_IMAGE, _NORMAL = "Normal Texture", "Normal Map"
 _IMAGE, _LIT, _UNLIT, _OUTPUT = "Photo Texture", "Lit", "Unlit", "Output"
-
-# Photos carry their own light: a glossy guess on top of it would look wrong from most sides.
-_ROUGHNESS = 0.9
-_SPECULAR = 0.1
 
 
 def load_texture(path: Path, colorspace: str = "sRGB") -> bpy.types.Image:
@@ -22,7 +22,11 @@ def load_texture(path: Path, colorspace: str = "sRGB") -> bpy.types.Image:
     Normal maps are no colours: their ``colorspace`` is ``"Non-Color"``.
     """
     image = bpy.data.images.load(str(path), check_existing=True)
-    if image.users:
+    if image.packed_file is not None:  # reloading would bring the packed one back
+        image.unpack(method="REMOVE")
+        image.reload()
+        image.pack()
+    elif image.users:
         image.reload()
     image.colorspace_settings.name = colorspace
     return image
@@ -44,8 +48,8 @@ def create_material(
     texture.name, texture.image, texture.location = _IMAGE, image, (-600, 200)
     lit = nodes.new("ShaderNodeBsdfPrincipled")
     lit.name, lit.location = _LIT, (-200, 400)
-    lit.inputs["Roughness"].default_value = _ROUGHNESS
-    lit.inputs["Specular IOR Level"].default_value = _SPECULAR
+    lit.inputs["Roughness"].default_value = ROUGHNESS
+    lit.inputs["Specular IOR Level"].default_value = SPECULAR_LEVEL
     links.new(texture.outputs["Color"], lit.inputs["Base Color"])
     emission = nodes.new("ShaderNodeEmission")
     emission.location = (-200, -300)
@@ -114,3 +118,58 @@ def shading_of(material: bpy.types.Material | None) -> str | None:
         return None
     links = tree.nodes[_OUTPUT].inputs["Surface"].links
     return "UNLIT" if links and links[0].from_node.name == _UNLIT else "LIT"
+
+
+def show_as_emission(material: bpy.types.Material) -> None:
+    """Turn one of our materials into a black Principled one that glows in the texture's colours.
+
+    For formats without unlit materials: what is left of ``Unlit`` there, without the texture lost.
+    """
+    tree = material.node_tree
+    lit, texture = tree.nodes[_LIT], tree.nodes[_IMAGE]
+    set_normal_map(material, None)
+    for link in list(lit.inputs["Base Color"].links):
+        tree.links.remove(link)
+    lit.inputs["Base Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+    lit.inputs["Specular IOR Level"].default_value = 0.0
+    lit.inputs["Emission Strength"].default_value = 1.0
+    tree.links.new(texture.outputs["Color"], lit.inputs["Emission Color"])
+    set_shading(material, "LIT")
+
+
+def fold_specular(material: bpy.types.Material) -> None:
+    """Say the reflectance of the lit branch by its index of refraction alone, as USD does.
+
+    Blender's reader of USD takes the level for 0.5, which leaves the reflectance
+    ((ior - 1) / (ior + 1))^2 as it is; twice the level is a factor of it.
+    """
+    inputs = material.node_tree.nodes[_LIT].inputs
+    level, index = inputs["Specular IOR Level"], inputs["IOR"]
+    root = (
+        abs(index.default_value - 1.0)
+        / (index.default_value + 1.0)
+        * math.sqrt(2.0 * min(max(level.default_value, 0.0), 0.5))
+    )
+    index.default_value, level.default_value = (1.0 + root) / (1.0 - root), 0.5
+
+
+def texture_of(material: bpy.types.Material | None) -> bpy.types.Image | None:
+    """Return the photo texture of one of our materials, else None."""
+    if shading_of(material) is None:
+        return None
+    node = material.node_tree.nodes.get(_IMAGE)
+    return None if node is None else node.image
+
+
+def images_of(frame: bpy.types.Object | None) -> list[bpy.types.Image]:
+    """Return the images in our materials on the meshes of a result, each once."""
+    found = [
+        node.image
+        for child in (frame.children_recursive if frame is not None else ())
+        if tags.kind_of(child) in ("mesh", "lod")
+        for slot in child.material_slots
+        if shading_of(slot.material) is not None
+        for node in slot.material.node_tree.nodes
+        if node.bl_idname == "ShaderNodeTexImage" and node.image is not None
+    ]
+    return list(dict.fromkeys(found))

@@ -223,7 +223,7 @@ def write_blend(result_folder: Path, path: Path) -> None:
         The folder does not hold a sound result.
     """
     path = path.resolve()
-    _start_empty("Writing a .blend file of a result")
+    start_empty("Writing a .blend file of a result")
     scene = bpy.context.scene
     imported = import_result(result_folder, scene)
     for thing in imported.regions:
@@ -257,7 +257,7 @@ def export_usd(result_folder: Path) -> list[Path]:
     paths : list of Path
         The files written.
     """
-    _start_empty("Writing USD")
+    start_empty("Writing USD")
     imported = import_result(result_folder, bpy.context.scene)
     options = {
         "selected_objects_only": True,
@@ -282,7 +282,8 @@ def export_usd(result_folder: Path) -> list[Path]:
     return paths
 
 
-def _start_empty(purpose: str) -> None:
+def start_empty(purpose: str) -> None:
+    """Close the open file without saving and begin an empty one; refuse where a person works."""
     if not bpy.app.background:
         raise UsageError(f"{purpose} would close the open file.", "Do it in background Blender.")
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)

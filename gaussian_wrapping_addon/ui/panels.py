@@ -7,7 +7,7 @@ import bpy
 
 from ..ops import job_timer, tags
 from ..ops.import_operators import materials_of
-from ..ops.materials import shading_of
+from ..ops.materials import images_of, shading_of
 from .live_view import draw_live
 from .text import characters_of, progress_text, wrapped_label
 
@@ -218,6 +218,14 @@ class GWRAP_PT_result(_Panel, bpy.types.Panel):
                 for value, text in (("LIT", "Lit"), ("UNLIT", "Unlit")):
                     button = row.operator("gwrap.set_shading", text=text, depress=shading == value)
                     button.shading = value
+            column = layout.column(align=True)
+            column.operator("gwrap.export_meshes", text="Export…", icon="EXPORT")
+            images = images_of(frame)
+            if images:
+                packed = all(image.packed_file is not None for image in images)
+                text = "Unpack Textures" if packed else "Pack Textures"
+                icon = "UGLYPACKAGE" if packed else "PACKAGE"
+                column.operator("gwrap.pack_images", text=text, icon=icon).pack = not packed
         column = layout.column(align=True)
         column.operator("gwrap.open_report", icon="FILE_FOLDER")
         column.operator("gwrap.import_result", icon="IMPORT")
