@@ -8,6 +8,7 @@ from typing import NoReturn
 
 from .check_commands import add_check, add_doctor
 from .evaluate_command import add_evaluate
+from .export_command import add_export
 from .meshing_commands import add_estimate_mesh, add_mesh, add_work_tiles
 from .training_commands import add_estimate, add_more, add_resume, add_wrap
 
@@ -18,6 +19,7 @@ _COMMANDS = (
     add_resume,
     add_estimate_mesh,
     add_work_tiles,
+    add_export,
     add_evaluate,
     add_estimate,
     add_check,

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``export``: results of a finished job as files for other programs."""
+
+from __future__ import annotations
+
+import logging
+from argparse import Namespace
+from pathlib import Path
+
+from .common import Commands
+from .follow import has_bpy
+
+_logger = logging.getLogger("gaussian_wrapping")
+
+
+def add_export(commands: Commands) -> None:
+    """Add ``export``."""
+    from ..core.jobs.export_files import BLENDER_FORMATS, OWN_FORMATS, SHADINGS
+
+    parser = commands.add_parser("export", help="meshes of a finished job for other programs")
+    parser.add_argument("job", type=Path, metavar="JOB", help="job folder, or its result folder")
+    parser.add_argument(
+        "--format",
+        default="glb",
+        help=f"comma separated, of {','.join((*OWN_FORMATS, *BLENDER_FORMATS))}; "
+        f"{' and '.join(BLENDER_FORMATS)} need bpy or Blender",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument(
+        "--placed",
+        action="store_true",
+        help="coordinates as placed in Blender, instead of the input's world",
+    )
+    parser.add_argument("--region", nargs="+", action="extend", metavar="NAME", default=[])
+    parser.add_argument("--lods", action="store_true", help="levels of detail too")
+    parser.add_argument(
+        "--shading",
+        choices=SHADINGS,
+        default="auto",
+        help="of the material; auto is lit, but for GLB without a normal map or occlusion",
+    )
+    parser.add_argument("--pack", action="store_true", help="textures into USD and FBX files")
+    parser.set_defaults(run=_export)
+
+
+def _export(options: Namespace) -> int:
+    from ..core.errors import UsageError
+    from ..core.jobs.client import worker_python
+    from ..core.jobs.evaluate import run_in_worker
+    from ..core.jobs.export_files import BLENDER_FORMATS, OWN_FORMATS, result_of
+
+    formats = list(dict.fromkeys(f for f in options.format.split(",") if f))
+    known = (*OWN_FORMATS, *BLENDER_FORMATS)
+    wrong = [f for f in formats if f not in known]
+    if wrong or not formats:
+        raise UsageError(
+            f"--format {options.format} names no format." if not formats
+            else f"--format {wrong[0]} is not known.",
+            f"Use {', '.join(known)}.",
+        )  # fmt: skip
+    by_blender = [f for f in formats if f in BLENDER_FORMATS]
+    if by_blender and not has_bpy():
+        # Before anything is written: half of what was asked for is easily taken for all.
+        raise UsageError(
+            f"Writing {by_blender[0].upper()} needs bpy, which this Python does not have.",
+            "Run blender --background -P batch.py -- export ..., pip install bpy, or leave it out.",
+        )
+    result, out = result_of(options.job), options.out.resolve()
+    own = [f for f in formats if f in OWN_FORMATS]
+    if own:
+        request = {
+            "result": str(result), "out": str(out), "formats": own, "placed": options.placed,
+            "regions": options.region, "levels": options.lods, "shading": options.shading,
+        }  # fmt: skip
+        code = run_in_worker(
+            request, python=worker_python(), module="jobs.export_files", what="export"
+        )
+        if code:
+            return code
+    if by_blender:
+        from ..ops.export_objects import ObjectExport
+        from ..ops.export_result import export_result
+
+        requests = [ObjectExport(f, out, options.placed, options.pack) for f in by_blender]
+        paths = export_result(
+            result, requests,
+            regions=tuple(options.region), levels=options.lods, shading=options.shading,
+        )  # fmt: skip
+        for path in paths:
+            _logger.info("written: %s", path)
+    return 0
