@@ -11,11 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from gaussian_wrapping_addon.command_line import export_command
 from gaussian_wrapping_addon.command_line.meshing_options import method_settings, region_settings
 from gaussian_wrapping_addon.command_line.option_names import option_of
 from gaussian_wrapping_addon.command_line.parser import build_parser
 from gaussian_wrapping_addon.command_line.training_options import NEEDS, training_settings
-from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
+from gaussian_wrapping_addon.core.jobs import evaluate
 from gaussian_wrapping_addon.core.settings import (
     PRESETS,
     JobSettings,
@@ -224,3 +226,40 @@ def test_it_runs_as_a_script_of_blender(tmp_path: Path) -> None:
     assert done.returncode == 3, done
     assert b"error: " in done.stdout
     assert done.stderr == b""
+
+
+def test_export_refuses_before_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parser, out = build_parser(), tmp_path / "out"
+    options = parser.parse_args(["export", str(tmp_path), "--out", str(out), "--format", "glb,usd"])
+    monkeypatch.setattr(export_command, "has_bpy", lambda: False)
+    with pytest.raises(UsageError, match="Writing USD needs bpy") as caught:
+        options.run(options)
+    assert "blender --background" in caught.value.hint
+    for text, wanted in (("glb,stl", "stl"), (",", "names no format")):
+        options.format = text
+        with pytest.raises(UsageError, match=wanted):
+            options.run(options)
+    options.format = "glb"
+    with pytest.raises(DatasetError, match="holds no result"):
+        options.run(options)
+    assert not out.exists()
+
+
+def test_export_asks_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "result").mkdir()
+    (tmp_path / "result" / "scene.json").write_text("{}")
+    asked = []
+    monkeypatch.setattr(
+        evaluate, "run_in_worker", lambda request, **how: asked.append((request, how)) or 3
+    )
+    command = ["export", str(tmp_path), "--out", str(tmp_path / "o"), "--format", "obj,splat,obj"]
+    command += ["--placed", "--lods", "--region", "a", "b", "--shading", "unlit"]
+    options = build_parser().parse_args(command)
+    assert options.run(options) == 3
+    ((request, how),) = asked
+    assert how["module"] == "jobs.export_files"
+    assert request == {
+        "result": str(tmp_path / "result"), "out": str(tmp_path / "o"),
+        "formats": ["obj", "splat"], "placed": True, "regions": ["a", "b"], "levels": True,
+        "shading": "unlit",
+    }  # fmt: skip

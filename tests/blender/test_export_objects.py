@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 from gaussian_wrapping_addon.core.dataset.placement_file import FILE_NAME, write_placement
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import MeshingError, UsageError
+from gaussian_wrapping_addon.core.jobs.export_files import ExportRequest, export_files
 from gaussian_wrapping_addon.core.jobs.sidecar import sidecar_path
 from gaussian_wrapping_addon.ops import export_objects as module
 from gaussian_wrapping_addon.ops.export_objects import FORMATS, ObjectExport, export_objects
@@ -158,6 +160,43 @@ def test_khronos_finds_nothing_in_glb_from_blender(
     assert problems(unlit) == []
     assert unlit["info"]["extensionsUsed"] == ["KHR_materials_unlit"]
     assert "KHR_materials_unlit" not in lit["info"]["extensionsUsed"]
+
+
+def gltf_tangents(path: Path) -> dict[tuple[float, ...], np.ndarray]:
+    """Of each vertex of a GLB, by its position and UV: (4,) tangent and sign."""
+    data = path.read_bytes()
+    (size,) = struct.unpack("<I", data[12:16])
+    document, binary = json.loads(data[20 : 20 + size]), data[28 + size :]
+    (primitive,) = document["meshes"][0]["primitives"]
+    rows = []
+    for name, width in (("POSITION", 3), ("TEXCOORD_0", 2), ("TANGENT", 4)):
+        accessor = document["accessors"][primitive["attributes"][name]]
+        view = document["bufferViews"][accessor["bufferView"]]
+        begin, count = view["byteOffset"], accessor["count"] * width
+        rows.append(np.frombuffer(binary, "<f4", count, begin).reshape(-1, width))
+    place = np.round(np.concatenate(rows[:2], axis=1).astype(np.float64), 4) + 0.0
+    return dict(zip(map(tuple, place.tolist()), rows[2], strict=True))
+
+
+def test_tangents_of_our_glb_are_those_of_blenders(
+    imported: ImportedResult, tmp_path: Path
+) -> None:
+    """The cube's UVs differ at every corner, half of them mirrored here: one tangent each."""
+    path = tmp_path / "job" / "result" / "auto" / "mesh.npz"
+    vertices, faces, uvs = cube_mesh()
+    uvs[::2, :, 0] = 1.0 - uvs[::2, :, 0]
+    np.savez(path, vertices=vertices, faces=faces, corner_uvs=uvs)
+    (thing,) = import_result(path.parents[1], bpy.context.scene).meshes
+    (blenders,) = export_objects(imported.frame, [thing], ObjectExport("glb", tmp_path / "b"))
+    request = ExportRequest(path.parents[1], tmp_path / "o", ("glb",), placed=True)
+    (ours,) = export_files(request)
+    wanted, found = gltf_tangents(blenders), gltf_tangents(ours)
+    assert found.keys() == wanted.keys()
+    assert len(found) == 36
+    assert {row[3] for row in found.values()} == {-1.0, 1.0}
+    for place, tangent in found.items():
+        assert tangent[3] == wanted[place][3]
+        assert np.abs(tangent - wanted[place]).max() < 1e-3
 
 
 def test_what_a_person_changed_is_exported(imported: ImportedResult, tmp_path: Path) -> None:
