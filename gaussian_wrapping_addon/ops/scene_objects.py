@@ -15,7 +15,7 @@ from ..core.errors import UsageError
 from . import tags
 from .camera_objects import create_camera, look_through, scale_display
 from .level_objects import update_levels
-from .materials import create_material, load_texture, set_normal_map
+from .materials import create_material, fold_specular, load_texture, set_normal_map
 from .mesh_data import build_mesh
 from .placement import restore, scale_of
 from .region_objects import create_region
@@ -270,6 +270,8 @@ def export_usd(result_folder: Path) -> list[Path]:
     paths = []
     bpy.context.view_layer.update()  # new objects cannot be selected before
     for mesh in imported.meshes:
+        for slot in mesh.material_slots:
+            fold_specular(slot.material)
         for thing in bpy.context.view_layer.objects:
             thing.select_set(thing == mesh)
         path = result_folder.resolve() / mesh[tags.REGION] / "mesh.usdc"
