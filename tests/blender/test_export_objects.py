@@ -20,6 +20,7 @@ from gaussian_wrapping_addon.core.jobs.export_files import ExportRequest, export
 from gaussian_wrapping_addon.core.jobs.sidecar import sidecar_path
 from gaussian_wrapping_addon.ops import export_objects as module
 from gaussian_wrapping_addon.ops.export_objects import FORMATS, ObjectExport, export_objects
+from gaussian_wrapping_addon.ops.export_result import export_result
 from gaussian_wrapping_addon.ops.materials import images_of, set_shading, shading_of
 from gaussian_wrapping_addon.ops.scene_objects import ImportedResult, import_result
 from tests.blender.synthetic_result import (
@@ -294,3 +295,26 @@ def test_the_operator(imported: ImportedResult, tmp_path: Path, addon: object) -
     with pytest.raises(RuntimeError, match="not finite"):
         bpy.ops.gwrap.export_meshes(directory=str(tmp_path / "bad"), scope="ALL")
     assert list((tmp_path / "bad").iterdir()) == []
+
+
+def test_a_result_folder_is_exported_in_the_background(tmp_path: Path) -> None:
+    result = write_result(tmp_path / "job", regions=("auto", "nose"))
+    write_detail(result / "auto", 1, with_normals=False)
+    write_placement(result / FILE_NAME, PLACEMENT, WORLD_FROM_SCENE)
+    out = tmp_path / "out"
+    requests = [ObjectExport("usd", out), ObjectExport("fbx", out, placed=False)]
+    paths = export_result(result, requests, levels=True, shading="unlit")
+    assert sorted(p.name for p in paths) == [
+        f"{stem}.{suffix}"
+        for stem in ("auto-lod1", "auto", "nose")
+        for suffix in ("fbx", "usdc")
+    ]  # fmt: skip
+    for path in paths:
+        values = sidecar(path)
+        assert values["shading"] == ("emission" if path.suffix == ".usdc" else "lit")
+        assert values["placed"] is (path.suffix == ".usdc")
+        assert values["blender_from_scene"] == PLACEMENT.to_json()
+    (path,) = export_result(result, [ObjectExport("obj", out)], regions=("nose",))
+    assert path.name == "nose.obj"
+    with pytest.raises(UsageError, match="no mesh mouth"):
+        export_result(result, requests, regions=("mouth",))
