@@ -71,7 +71,9 @@ def remove_degenerate(
             if mesh.faces[face] is not None:
                 changed |= _improve(mesh, vertices, face, short, planes)
         if not changed:
-            break
+            if short >= height * MAX_SHORT_HEIGHTS:
+                break
+            continue
         gone = np.array([f is None for f in mesh.faces])
         faces = faces.copy()
         faces[near[~gone]] = np.array([f for f in mesh.faces if f is not None]).reshape(-1, 3)

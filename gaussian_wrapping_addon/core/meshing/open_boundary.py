@@ -47,12 +47,17 @@ def opened(mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0) 
     """
     vertices, faces = mesh.vertices.copy(), np.asarray(mesh.faces, np.int64)
     on_cap = np.zeros(len(faces), np.bool_)
+    tolerance = ON_PLANE_SHARE * region.diagonal
+    on_any = (cap_planes(vertices, region).planes >= 0).any(1)  # (v,)
     for normal, offset in zip(*region.half_spaces, strict=True):
         distance = (vertices - region.center) @ normal - offset  # (v,)
-        cap = _cap_faces(vertices, faces, normal, distance, ON_PLANE_SHARE * region.diagonal)
+        cap = _cap_faces(vertices, faces, normal, distance, on_any, tolerance)
         # Repair may have moved a vertex of the rim: it goes back, so that the rim is on the plane.
+        # One that lies on another plane stays there: between planes of a round body it would leave.
         rim = np.unique(faces[cap])
+        rim = rim[~on_any[rim]]
         vertices[rim] -= distance[rim, None] * normal
+        vertices[rim] = _within(vertices[rim], region)
         on_cap |= cap
     stays = faces[~on_cap]
     if len(stays) == 0:
@@ -82,17 +87,37 @@ def opened(mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0) 
     )
 
 
+def _within(points: np.ndarray, region: Region) -> np.ndarray:
+    """Move points (n, 3) that lie just outside of a region onto the plane that they crossed."""
+    normals, offsets = region.half_spaces
+    points = points.copy()
+    for _ in range(len(normals)):
+        beyond = (points - region.center) @ normals.T - offsets  # (n, k)
+        worst = beyond.argmax(1)
+        out = beyond[np.arange(len(points)), worst]
+        left = out > ON_PLANE_SHARE * region.diagonal
+        if not left.any():
+            break
+        points[left] -= out[left, None] * normals[worst[left]]
+    return points
+
+
 def _cap_faces(
     vertices: np.ndarray,
     faces: np.ndarray,
     normal: np.ndarray,
     distance: np.ndarray,
+    on_any: np.ndarray,
     tolerance: float,
 ) -> np.ndarray:
-    """Tell which faces lie on one plane of the region, (f,) bool."""
+    """Tell which faces lie on one plane of the region, (f,) bool.
+
+    A face of which repair has moved a corner counts, unless other corners lie on other planes.
+    """
     exact = np.abs(distance) <= tolerance  # (v,)
     cap = exact[faces].all(1)
-    near = np.flatnonzero(exact[faces].any(1) & ~cap)
+    own = (exact | ~on_any)[faces].all(1)
+    near = np.flatnonzero(exact[faces].any(1) & ~cap & own)
     corners = vertices[faces[near]]  # (k, 3, 3)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
     unit, _ = triangle_normals(vertices, faces[near])

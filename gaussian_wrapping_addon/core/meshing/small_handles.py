@@ -9,11 +9,19 @@ from itertools import product
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from .components import face_components
 
 BOX_EDGES = (2.0, 3.0, 4.5)
 """Sides of the boxes in which handles are looked for, in edge lengths of the mesh, small ones
 first. Both loops of a handle, through it and around it, have to lie in one box: a tube is no handle
-there, nor is an opening that is wider than the box."""
+there, nor is an opening that is wider than the box. A handle of half of the last side is found
+wherever it lies, a larger one where a box happens to hold it."""
+
+MAX_MOVE_EDGES = 2.25
+"""A vertex that goes lies at most so many edge lengths from the disc that takes the patch's place,
+half of the largest box: more is a thing of its own, not noise of the surface."""
 
 MAX_LOOP = 60
 """A patch with more edges around it is left alone: its cover would not follow the surface."""
@@ -34,7 +42,8 @@ class Closed:
     closed: int
     """Handles that are gone."""
     left: int
-    """Small handles that could not be closed without cutting something else."""
+    """Small handles that could not be closed without cutting something else; there may be more that
+    no box happens to hold."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +74,14 @@ def without_small_handles(vertices: np.ndarray, faces: np.ndarray, edge_length: 
         Of the mesh that is wanted, scene units.
     """
     faces = np.asarray(faces, np.int64)
+    if _genus(len(vertices), faces) == 0:
+        return Closed(faces, 0, 0)
     closed = 0
     for share in BOX_EDGES:
         for _ in range(MAX_PASSES):
             found = 0
             for shift in product((0.0, 0.5), repeat=3):
-                faces, count = _one_grid(vertices, faces, share * edge_length, np.array(shift))
+                faces, count = _one_grid(vertices, faces, share, edge_length, np.array(shift))
                 found += count
             closed += found
             if found == 0:
@@ -82,36 +93,57 @@ def without_small_handles(vertices: np.ndarray, faces: np.ndarray, edge_length: 
     return Closed(faces, closed, left)
 
 
+def _genus(vertex_count: int, faces: np.ndarray) -> int:
+    """Return the genus of all parts of a closed 2-manifold together."""
+    parts, _ = face_components(vertex_count, faces)
+    euler = len(np.unique(faces)) - len(faces) // 2
+    return (2 * parts - euler) // 2
+
+
 def _one_grid(
-    vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.ndarray
+    vertices: np.ndarray, faces: np.ndarray, share: float, edge_length: float, shift: np.ndarray
 ) -> tuple[np.ndarray, int]:
     """Close the handles in the boxes of one grid; return the faces and the number of handles."""
-    patches = _patches(vertices, faces, side, shift)
+    patches = _patches(vertices, faces, share * edge_length, shift)
     chosen = np.flatnonzero((patches.handles > 0) & (patches.loops == 1))
     if len(chosen) == 0:
         return faces, 0
     count = len(vertices)
     keys = np.sort(_edge_keys(faces, count))
+    order = np.argsort(patches.of_face, kind="stable")
+    bounds = np.searchsorted(patches.of_face[order], np.stack([chosen, chosen + 1], axis=1))
     kept = np.ones(len(faces), np.bool_)
-    added: list[np.ndarray] = []
+    covers: list[np.ndarray] = []
+    covered: set[int] = set()
     closed = 0
-    for label in chosen.tolist():
-        rows = np.flatnonzero(patches.of_face == label)
+    for label, (first, last) in zip(chosen.tolist(), bounds.tolist(), strict=True):
+        rows = order[first:last]
         loop = _outline(faces[rows])
         if loop is None or len(loop) > MAX_LOOP:
             continue
         pairs = _keys(loop[:, None], loop[None, :], count)  # (n, n)
         taken = keys[np.minimum(np.searchsorted(keys, pairs), len(keys) - 1)] == pairs
         taken &= ~np.isin(pairs, _edge_keys(faces[rows], count))
-        for other in added:
-            taken |= np.isin(pairs, _edge_keys(other, count))
+        taken |= np.array([key in covered for key in pairs.ravel().tolist()]).reshape(pairs.shape)
         cover = _cover(vertices[loop], loop, taken)
         if cover is None:
             continue
+        gone = np.setdiff1d(faces[rows], loop)
+        if _farthest(vertices[gone], vertices[cover]) > MAX_MOVE_EDGES * edge_length:
+            continue
         kept[rows] = False
-        added.append(cover)
+        covers.append(cover)
+        covered.update(_edge_keys(cover, count).tolist())
         closed += int(patches.handles[label])
-    return np.concatenate([faces[kept], *added]), closed
+    return np.concatenate([faces[kept], *covers]), closed
+
+
+def _farthest(points: np.ndarray, triangles: np.ndarray) -> float:
+    """Return the largest distance of points (n, 3) to the middles and corners of (t, 3, 3)."""
+    if len(points) == 0:
+        return 0.0
+    near = np.concatenate([triangles.mean(1), triangles.reshape(-1, 3)])
+    return float(cKDTree(near).query(points)[0].max())
 
 
 def _patches(vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.ndarray) -> _Patches:

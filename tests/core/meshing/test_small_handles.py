@@ -115,6 +115,19 @@ def test_a_tiny_ring_becomes_a_lump() -> None:
     assert checked(vertices, closed.faces).parts[0].genus == 0
 
 
+def test_a_ring_around_a_wire_is_left() -> None:
+    """Closing it would cut off a ring that stands out: a thing of its own, not noise."""
+    cells = np.zeros((9, 9, 20), np.bool_)
+    cells[3:6, 4, :14] = True
+    ring = np.zeros((9, 9, 20), np.bool_)
+    ring[2:7, 4, 14:19] = True
+    ring[3:6, 4, 15:18] = False
+    vertices, faces = surface_of(cells | ring)
+    closed = without_small_handles(vertices, faces, 1.2)
+    assert closed.closed == 0
+    assert checked(vertices, closed.faces).parts[0].genus == 1
+
+
 def test_what_cannot_be_closed_is_left_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = surface_of(with_arch(block((16, 16, 4)), 6, 7, 4))
     monkeypatch.setattr(small_handles, "MAX_LOOP", 3)
