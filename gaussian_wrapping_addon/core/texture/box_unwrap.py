@@ -7,14 +7,13 @@ import numpy as np
 
 from ..meshing.surface_mesh import SurfaceMesh
 from ..progress import Progress
-from .atlas_raster import raster_atlas
+from .chart_overlaps import split_overlaps
 from .face_graph import FaceGraph, components
 
 SMOOTHING_ROUNDS = 8
 NEIGHBOUR_VOTE = 0.4
 MIN_COSINE = 0.15
 """A face may be projected along an axis that its normal leaves by up to 81 degrees."""
-MAX_SPLIT_ROUNDS = 8
 SCALE_STEPS = 24
 
 _AXES = np.repeat(np.eye(3), 2, axis=0) * np.array([[1.0], [-1.0]] * 3)
@@ -28,7 +27,6 @@ def box_unwrap(
     size_px: int,
     gutter_px: int,
     progress: Progress,
-    threads: int,
 ) -> tuple[np.ndarray, float]:
     """Unwrap by projection along six directions.
 
@@ -40,21 +38,15 @@ def box_unwrap(
         Texels kept between charts; less than asked for when there is no room.
     """
     axis = _axis_of_faces(graph)
-    layer = np.zeros(len(axis), np.int64)
     corners = mesh.vertices[mesh.faces]
     plane = np.array(_PLANES)[axis]  # (f, 2)
     flat = np.take_along_axis(corners, plane[:, None, :], axis=2)  # (f, 3, 2)
-    for split in range(MAX_SPLIT_ROUNDS):
-        progress.update(split / MAX_SPLIT_ROUNDS, "box projection")
-        group = axis + 6 * layer
-        other = np.where(graph.opposite >= 0, graph.opposite // 3, 0)
-        charts = components(graph, group[other] == group[:, None])
-        corner_uvs, gutter_left_px = _pack(flat, charts, size_px, gutter_px)
-        later = raster_atlas(corner_uvs, size_px, threads).later_faces
-        if not later.any():
-            break
-        layer[later] += 1
-    return corner_uvs, gutter_left_px
+    progress.update(0.2, "box projection")
+    other = np.where(graph.opposite >= 0, graph.opposite // 3, 0)
+    charts = components(graph, axis[other] == axis[:, None])
+    charts = split_overlaps(flat - corners.mean(axis=(0, 1))[plane][:, None, :], charts, graph)
+    progress.update(0.6, "box projection: packing")
+    return _pack(flat, charts, size_px, gutter_px)
 
 
 def _axis_of_faces(graph: FaceGraph) -> np.ndarray:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""UV unwrap: xatlas on chunks in a helper process, checked; a box projection to fall back on."""
+"""UV unwrap: charts and packing by xatlas, checked; a box projection to fall back on."""
 
 from __future__ import annotations
 
@@ -7,30 +7,22 @@ import logging
 import shutil
 import tempfile
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import DatasetError, ResourceError, WorkerError
-from ..helper_process import run_helper
 from ..meshing.surface_mesh import SurfaceMesh
 from ..progress import Progress
 from .atlas_raster import raster_atlas
 from .box_unwrap import box_unwrap
-from .chunks import split_into_chunks
+from .charts import find_charts, pack_charts
 from .face_graph import FaceGraph, face_graph, uv_charts
 
 _logger = logging.getLogger(__name__)
 
-HELPER_MODULE = "texture.unwrap_helper"
-HELPER_MEMORY_BYTES = 8 * 2**30
-DEADLINE_BASE_S = 60.0
-DEADLINE_PER_FACE_S = 1e-3
-"""Noisy meshes take about 1e-4 s a face and packing; ten times that is a hang."""
 FLAT_FACE_AREA = 1e-6
 """Faces of less than this share of the squared median edge are not given to xatlas."""
-MAX_OVERLAP_SHARE = 5e-4
 MAX_IGNORED_AREA_SHARE = 1e-3
 CHECK_SIZE_PX = 2048
 MAX_REASON = 200
@@ -90,7 +82,7 @@ def unwrap(
         reason = error.message[:MAX_REASON]
         _logger.warning("xatlas could not unwrap the mesh (%s): box projection instead", reason)
         corner_uvs, gutter_left_px = box_unwrap(
-            mesh, graph, size_px, gutter_px, progress.span(0.0, 0.9), threads
+            mesh, graph, size_px, gutter_px, progress.span(0.0, 0.9)
         )
         method = "box"
         problem = _problem(corner_uvs, graph, size_px, threads)
@@ -117,56 +109,31 @@ def _xatlas(
     progress: Progress,
     threads: int,
 ) -> tuple[np.ndarray, float]:
-    progress.update(0.0, "splitting the mesh for xatlas")
     corners = mesh.vertices[mesh.faces]
+    if not np.isfinite(corners).all():
+        raise DatasetError("Vertices of the mesh are not finite.")
     edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
     unit = float(np.median(edges[edges > 0]))
     solid = np.flatnonzero(graph.areas > FLAT_FACE_AREA * unit**2)
     if len(solid) == 0:
         raise DatasetError("No face of the mesh has an area.")
-    labels = split_into_chunks(graph)[solid]
-    order = np.argsort(labels, kind="stable")
-    face_bounds = np.concatenate([[0], np.cumsum(np.bincount(labels))])
-    face_bounds = np.unique(face_bounds)  # chunks of flat faces only are empty
-    ordered = solid[order]
     # xatlas has absolute tolerances: median edge 1, centre 0 suits them.
     scaled = (mesh.vertices - mesh.vertices.mean(axis=0)) / unit
-    vertices, local, vertex_bounds = [], [], [0]
-    for begin, end in pairwise(face_bounds.tolist()):
-        used, inverse = np.unique(mesh.faces[ordered[begin:end]], return_inverse=True)
-        vertices.append(scaled[used].astype(np.float32))
-        local.append(inverse.reshape(-1, 3).astype(np.uint32))
-        vertex_bounds.append(vertex_bounds[-1] + len(used))
+    faces = mesh.faces[solid]
     work_folder.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="unwrap-", dir=work_folder))
     try:
-        np.savez(
-            folder / "input.npz",
-            vertices=np.concatenate(vertices),
-            corners=np.concatenate(local),
-            vertex_bounds=np.array(vertex_bounds),
-            face_bounds=face_bounds,
-            size_px=size_px,
-            gutter_px=gutter_px,
+        charts = find_charts(scaled, faces, size_px, gutter_px, folder, progress.span(0.0, 0.7))
+        texture_uvs, gutter_left_px = pack_charts(
+            charts, size_px, gutter_px, folder, progress.span(0.7, 0.9)
         )
-        run_helper(
-            HELPER_MODULE,
-            folder,
-            progress.span(0.1, 0.9),
-            deadline_s=DEADLINE_BASE_S + DEADLINE_PER_FACE_S * len(solid),
-            memory_bytes=HELPER_MEMORY_BYTES,
-        )
-        with np.load(folder / "output.npz", allow_pickle=False) as output:
-            texels, side_px = output["corner_uvs"], int(output["side_px"])
-            gutter_left_px = float(output["padding_px"]) * size_px / side_px
     except (OSError, ValueError, KeyError) as error:
         raise WorkerError(f"xatlas left no usable result ({error}).") from None
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     progress.update(0.9, "checking the unwrap")
     corner_uvs = np.full((len(mesh.faces), 3, 2), np.nan, np.float32)
-    corner_uvs[ordered] = texels / side_px
-    corner_uvs[..., 1] = 1.0 - corner_uvs[..., 1]
+    corner_uvs[solid[charts.faces]] = texture_uvs
     _collapse_ignored(corner_uvs, mesh.faces, graph)
     problem = _problem(corner_uvs, graph, size_px, threads)
     if problem:
@@ -204,6 +171,6 @@ def _problem(corner_uvs: np.ndarray, graph: FaceGraph, size_px: int, threads: in
     used = int(raster.inside.sum())
     if used == 0:
         return "no texel is used"
-    if raster.overlaps > max(MAX_OVERLAP_SHARE * used, 2):
+    if raster.overlaps > 0:
         return f"{raster.overlaps} of {used} texels are used twice"
     return ""

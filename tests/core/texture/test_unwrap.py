@@ -13,10 +13,13 @@ import pytest
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.texture import charts as charts_module
 from gaussian_wrapping_addon.core.texture import unwrap as unwrap_module
 from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.chart_overlaps import conflicts
 from gaussian_wrapping_addon.core.texture.chunks import MAX_CHUNK_FACES, split_into_chunks
 from gaussian_wrapping_addon.core.texture.face_graph import components, face_graph
+from gaussian_wrapping_addon.core.texture.stretch import texture_stretch
 from gaussian_wrapping_addon.core.texture.unwrap import Unwrap, unwrap
 from tests.core.texture.texture_scenes import box, joined, sphere
 
@@ -55,6 +58,42 @@ def helix() -> SurfaceMesh:
     n = len(steps)
     faces = np.concatenate([np.stack([k, k + n, k + 1], 1), np.stack([k + n, k + n + 1, k + 1], 1)])
     return SurfaceMesh(np.concatenate([inner, outer]), faces.astype(np.int32))
+
+
+def noisy(mesh: SurfaceMesh, share: float) -> SurfaceMesh:
+    """Move vertices by a share of the median edge."""
+    edges = mesh.vertices[mesh.faces[:, 0]] - mesh.vertices[mesh.faces[:, 1]]
+    noise = np.random.default_rng(2).normal(size=mesh.vertices.shape)
+    step = share * np.median(np.linalg.norm(edges, axis=1))
+    return SurfaceMesh(mesh.vertices + step * noise, mesh.faces)
+
+
+def bowl(n: int) -> SurfaceMesh:
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    vertices = np.stack([x, y, 1.2 * (x**2 + y**2)], axis=-1).reshape(-1, 3)
+    k = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate([np.stack([k, k + 1, k + n + 1], 1), np.stack([k, k + n + 1, k + n], 1)])
+    return SurfaceMesh(vertices, faces.astype(np.int32))
+
+
+def wire(sides: int) -> SurfaceMesh:
+    """An open tube along a helix, of so many faces around."""
+    t = np.linspace(0, 4 * np.pi, 300)
+    centre = np.stack([np.cos(t), np.sin(t), 0.2 * t], axis=1)
+    along = np.gradient(centre, axis=0)
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    side = np.cross(along, [0, 0, 1])
+    side /= np.linalg.norm(side, axis=1)[:, None]
+    angles = np.arange(sides) * 2 * np.pi / sides
+    ring = (
+        np.cos(angles)[:, None] * side[:, None]
+        + np.sin(angles)[:, None] * np.cross(along, side)[:, None]
+    )
+    row = np.arange(len(t) - 1)[:, None] * sides
+    k, q = (row + np.arange(sides)).ravel(), (row + (np.arange(sides) + 1) % sides).ravel()
+    faces = np.concatenate([np.stack([k, q, q + sides], 1), np.stack([k, q + sides, k + sides], 1)])
+    vertices = (centre[:, None] + 0.02 * ring).reshape(-1, 3)
+    return SurfaceMesh(vertices, faces.astype(np.int32))
 
 
 MESHES = {
@@ -115,10 +154,54 @@ def test_uvs_are_finite_inside_and_without_overlap(
 ) -> None:
     mesh = MESHES[name]()
     if method == "box":
-        monkeypatch.setattr(unwrap_module, "HELPER_MODULE", "texture.no_such_helper")
+        monkeypatch.setattr(charts_module, "CHARTS_HELPER", "texture.no_such_helper")
     unwrapped = unwrap(mesh, 512, 4, tmp_path, Progress(), threads=2)
     assert unwrapped.method == method
     assert_usable(mesh, unwrapped, 512, 4)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 0.75])
+def test_folds_of_a_noisy_bowl_are_cut(noise: float, tmp_path: Path) -> None:
+    mesh = noisy(bowl(70), noise)
+    unwrapped = unwrap(mesh, 1024, 4, tmp_path, Progress(), threads=2)
+    assert unwrapped.method == "xatlas"
+    assert_usable(mesh, unwrapped, 1024, 4)
+    assert len(conflicts(unwrapped.corner_uvs, unwrapped.charts)) == 0
+
+
+def test_noise_does_not_shatter_the_surface(tmp_path: Path) -> None:
+    """Noise of 0.3 edges on the mesh itself made 4000 charts of these 20 000 faces."""
+    mesh = noisy(sphere(5), 0.3)
+    unwrapped = unwrap(mesh, 1024, 2, tmp_path, Progress(), threads=2)
+    assert unwrapped.method == "xatlas"
+    assert unwrapped.charts.max() + 1 < 400
+    assert raster_atlas(unwrapped.corner_uvs, 1024, 2).inside.mean() > 0.4
+    stretch = texture_stretch(mesh.vertices, mesh.faces, unwrapped.corner_uvs)
+    assert stretch.mean < 1.1
+    assert stretch.collapsed_share == 0.0
+
+
+@pytest.mark.parametrize("sides", [3, 4])
+def test_thin_wires_keep_their_tubes(sides: int, tmp_path: Path) -> None:
+    mesh = wire(sides)
+    unwrapped = unwrap(mesh, 1024, 2, tmp_path, Progress(), threads=2)
+    assert unwrapped.method == "xatlas"
+    assert_usable(mesh, unwrapped, 1024, 2)
+    stretch = texture_stretch(mesh.vertices, mesh.faces, unwrapped.corner_uvs)
+    assert stretch.mean < 1.1
+    assert stretch.collapsed_share == 0.0
+
+
+def test_a_mesh_that_is_not_finite_ends_in_words(tmp_path: Path) -> None:
+    mesh = sphere(2)
+    vertices = mesh.vertices.copy()
+    vertices[3] = np.inf
+    graph = face_graph(mesh.vertices, mesh.faces)
+    with pytest.raises(DatasetError, match="finite"):
+        unwrap_module._xatlas(
+            SurfaceMesh(vertices, mesh.faces), graph, 64, 2, tmp_path, Progress(), 1
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -137,7 +220,7 @@ def test_82k_faces_do_not_crash(tmp_path: Path) -> None:
 def test_a_failed_helper_is_said_and_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(unwrap_module, "HELPER_MODULE", "texture.no_such_helper")
+    monkeypatch.setattr(charts_module, "CHARTS_HELPER", "texture.no_such_helper")
     with caplog.at_level(logging.WARNING):
         unwrapped = unwrap(sphere(2), 256, 4, tmp_path, Progress())
     assert unwrapped.method == "box"
@@ -149,23 +232,23 @@ def test_a_failed_helper_is_said_and_replaced(
 def test_bad_answers_of_xatlas_are_refused(
     bad: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What the helper says is checked, not believed."""
+    """What the helpers say is checked, not believed."""
+    run = charts_module.run_helper
 
-    def helper(module: str, folder: Path, progress: Progress, **options: object) -> None:
-        if bad == "silent":
-            return
-        with np.load(folder / "input.npz", allow_pickle=False) as task:
-            count = len(task["corners"])
-        uvs = np.tile(np.array([[10, 10], [200, 10], [10, 200]], np.float32), (count, 1, 1))
-        if bad == "nan":
-            uvs[:] = np.nan
-        if bad == "outside":
-            uvs += 500
-        if bad == "missing":
-            uvs[count // 2 :] = np.nan
-        np.savez(folder / "output.npz", corner_uvs=uvs, side_px=256, padding_px=8, charts=1)
+    def helper(module: str, folder: Path, progress: Progress, **options: float) -> None:
+        with np.load(folder / "input.npz", allow_pickle=False) as arrays:
+            task = {name: arrays[name] for name in arrays.files}
+        if module == charts_module.CHARTS_HELPER and bad in ("nan", "missing"):
+            uvs = np.tile(np.eye(3, 2, dtype=np.float32), (len(task["corners"]), 1, 1))
+            uvs[0 if bad == "nan" else len(uvs) // 2 :] = np.nan
+            np.savez(folder / "output.npz", corner_uvs=uvs)
+        elif module == charts_module.PACK_HELPER and bad in ("overlap", "outside"):
+            points = task["points"] / task["points"].max() + (0.5 if bad == "outside" else 0.0)
+            np.savez(folder / "output.npz", points=points, gutter_px=4.0)
+        elif bad != "silent":
+            run(module, folder, progress, **options)
 
-    monkeypatch.setattr(unwrap_module, "run_helper", helper)
+    monkeypatch.setattr(charts_module, "run_helper", helper)
     mesh = box([0, 0, 0], [1, 1, 1], 2)
     unwrapped = unwrap(mesh, 256, 4, tmp_path, Progress())
     assert unwrapped.method == "box"
