@@ -12,7 +12,7 @@ from .face_graph import FaceGraph, components
 
 OVERLAP_DEPTH_SHARE = 1e-4
 """Two faces overlap when they cannot be moved apart by this share of the median edge of all. In
-textures in use that is a hundredth of a texel; rounding of UVs stays far below."""
+textures in use that is a hundredth of a texel; rounding of UVs stays below."""
 
 
 def signed_areas(flat: np.ndarray) -> np.ndarray:

@@ -12,7 +12,9 @@ from .chart_overlaps import conflicts, signed_areas
 SMOOTHING_STEPS = 2
 """More bring more charts again (the copy shrinks into folds), one leaves noise of 0.3 edges."""
 MAX_MOVE_SHARE = 0.5
-"""Of the mean length of a vertex's edges: a wire of three faces around keeps its tube."""
+"""Of the mean length of a vertex's edges."""
+MIN_AREA_SHARE = 0.03
+"""A face left with less of its area was crushed; xatlas hung on a wire of three faces around."""
 RELAXATIONS = 6
 """After six rounds the stretch of charts moves by less than 0.1 %."""
 MAX_ROUNDS_BACK = 30
@@ -49,7 +51,25 @@ def smoothed_copy(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         move[lonely] = 0.0
         far = np.linalg.norm(move, axis=1)
         points = start + move * np.minimum(1.0, limit / np.maximum(far, 1e-300))[:, None]
-    return np.asarray(points + centre)
+    return np.asarray(_without_crushed_faces(points, start, faces) + centre)
+
+
+def _without_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Put points back to their start where a face lost most of its area: wires keep their tubes."""
+    before = np.linalg.norm(_area_vectors(start, faces), axis=1)
+    points = points.copy()
+    while True:
+        crushed = np.linalg.norm(_area_vectors(points, faces), axis=1) < MIN_AREA_SHARE * before
+        back = np.unique(faces[crushed])
+        back = back[(points[back] != start[back]).any(axis=1)]
+        if len(back) == 0:
+            return points
+        points[back] = start[back]
+
+
+def _area_vectors(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    corners = points[faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

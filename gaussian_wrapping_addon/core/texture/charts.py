@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import WorkerError
+from ..errors import DatasetError, ResourceError, WorkerError
 from ..helper_process import run_helper
 from ..progress import Progress
-from .chart_boxes import chart_extents, scale_that_fits
+from .chart_boxes import chart_extents, packing_square, scale_that_fits
 from .chart_overlaps import signed_areas, split_overlaps
 from .chart_shapes import chart_points, even_density, flat_faces, relax, smoothed_copy
 from .chunks import split_into_chunks
@@ -25,11 +25,14 @@ _logger = logging.getLogger(__name__)
 CHARTS_HELPER = "texture.unwrap_helper"
 PACK_HELPER = "texture.pack_helper"
 HELPER_MEMORY_BYTES = 8 * 2**30
-DEADLINE_BASE_S = 60.0
+DEADLINE_BASE_S = 30.0
 DEADLINE_PER_FACE_S = 1e-3
 """Noisy meshes take about 1e-4 s a face and packing; ten times that is a hang."""
 MAX_MEAN_STRETCH = 1.1
 """Charts found on the smoothed copy that stay worse than this are found on the mesh itself too."""
+WORTH_SHATTERING = 1.2
+"""Texels for an edge by which the charts of the mesh itself must be better: there are many more,
+with a seam around each, and boxes flatter small charts."""
 MAX_LOST_SHARE = 1e-3
 """The same when more of the surface has no area in them."""
 
@@ -47,10 +50,12 @@ class Charts:
     stretch: Stretch
 
     def density(self, size_px: int, gutter_px: int) -> float:
-        """Return how many texels an edge gets, about, where they are spread worst."""
+        """Return how many texels an edge gets, about, on all but 5 % of the surface."""
         corners = np.arange(self.corner_uvs.size // 2).reshape(-1, 3)
         extents = chart_extents(self.corner_uvs.reshape(-1, 2), corners, self.labels)
-        return scale_that_fits(extents, size_px, gutter_px) / self.stretch.mean
+        side_px, padding_px = packing_square(size_px, gutter_px)
+        scale = scale_that_fits(extents, side_px, padding_px) * size_px / side_px
+        return scale / max(self.stretch.p95, 1.0)
 
 
 def find_charts(
@@ -85,9 +90,12 @@ def find_charts(
     WorkerError, DatasetError, ResourceError
         xatlas crashed, answered nonsense or took too long.
     """
-    first = _charts(
-        vertices, smoothed_copy(vertices, faces), faces, folder, progress.span(0.0, 0.6)
-    )
+    copy = smoothed_copy(vertices, faces)
+    try:
+        first = _charts(vertices, copy, faces, folder, progress.span(0.0, 0.6))
+    except (WorkerError, ResourceError, DatasetError) as error:
+        _logger.info("xatlas failed on the smoothed copy: %s", error.message)
+        return _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0))
     poor = first.stretch.mean > MAX_MEAN_STRETCH or first.stretch.collapsed_share > MAX_LOST_SHARE
     if not poor and len(first.faces) == len(faces):
         return first
@@ -96,7 +104,7 @@ def find_charts(
     _logger.debug("texels for an edge: %.2f, without smoothing %.2f", *density)
     lost = first.stretch.collapsed_share - second.stretch.collapsed_share
     lost += (len(second.faces) - len(first.faces)) / len(faces)
-    return second if lost > MAX_LOST_SHARE or density[1] > density[0] else first
+    return second if lost > MAX_LOST_SHARE or density[1] > WORTH_SHATTERING * density[0] else first
 
 
 def _charts(

@@ -11,10 +11,8 @@ import numpy as np
 
 from ..errors import DatasetError
 from ..helper_process import emit
-from .chart_boxes import chart_extents, scale_that_fits
+from .chart_boxes import chart_extents, packing_square, scale_that_fits
 
-MAX_PACKING_PX = 1024
-"""Packing costs by the texel: it is done on a smaller square, with gutters in proportion."""
 GROWTH = 1.1
 MAX_GROWTHS = 8
 SHRINKING = (0.94, 0.9, 0.85, 0.8, 0.7, 0.6)
@@ -38,8 +36,7 @@ def main(folder: Path) -> None:
     with np.load(folder / "input.npz", allow_pickle=False) as arrays:
         task = {name: arrays[name] for name in arrays.files}
     size_px = int(task["size_px"])
-    side_px = min(size_px, MAX_PACKING_PX)
-    padding_px = math.ceil(float(task["gutter_px"]) * side_px / size_px)
+    side_px, padding_px = packing_square(size_px, float(task["gutter_px"]))
     while True:
         packed = _largest(task, side_px, padding_px)
         if packed is not None:

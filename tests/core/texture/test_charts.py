@@ -67,7 +67,11 @@ def test_overlaps_are_those_of_brute_force() -> None:
     found = {(min(pair), max(pair)) for pair in conflicts(flat, labels).tolist()}
     assert len(expected) > 10
     assert expected <= found
-    assert len(found - expected) <= 3  # what the grid is too coarse for
+    # What the grid is too coarse to see still touches.
+    for i, j in found - expected:
+        low = np.maximum(flat[i].min(axis=0), flat[j].min(axis=0))
+        assert (low < np.minimum(flat[i].max(axis=0), flat[j].max(axis=0))).all()
+    assert len(found - expected) <= 6
 
 
 def test_a_strip_that_runs_over_itself_is_cut_once() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError
+from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, ResourceError
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.texture import charts as charts_module
@@ -76,9 +76,9 @@ def bowl(n: int) -> SurfaceMesh:
     return SurfaceMesh(vertices, faces.astype(np.int32))
 
 
-def wire(sides: int) -> SurfaceMesh:
+def wire(sides: int, rings: int) -> SurfaceMesh:
     """An open tube along a helix, of so many faces around."""
-    t = np.linspace(0, 4 * np.pi, 300)
+    t = np.linspace(0, 4 * np.pi, rings)
     centre = np.stack([np.cos(t), np.sin(t), 0.2 * t], axis=1)
     along = np.gradient(centre, axis=0)
     along /= np.linalg.norm(along, axis=1)[:, None]
@@ -182,15 +182,34 @@ def test_noise_does_not_shatter_the_surface(tmp_path: Path) -> None:
     assert stretch.collapsed_share == 0.0
 
 
-@pytest.mark.parametrize("sides", [3, 4])
-def test_thin_wires_keep_their_tubes(sides: int, tmp_path: Path) -> None:
-    mesh = wire(sides)
+@pytest.mark.parametrize(("sides", "rings"), [(3, 300), (3, 600), (4, 300)])
+def test_thin_wires_keep_their_tubes(sides: int, rings: int, tmp_path: Path) -> None:
+    mesh = wire(sides, rings)
     unwrapped = unwrap(mesh, 1024, 2, tmp_path, Progress(), threads=2)
     assert unwrapped.method == "xatlas"
     assert_usable(mesh, unwrapped, 1024, 2)
     stretch = texture_stretch(mesh.vertices, mesh.faces, unwrapped.corner_uvs)
     assert stretch.mean < 1.1
     assert stretch.collapsed_share == 0.0
+
+
+def test_a_smoothed_copy_that_xatlas_refuses_is_not_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = charts_module.run_helper
+    calls = []
+
+    def helper(module: str, folder: Path, progress: Progress, **options: float) -> None:
+        calls.append(module)
+        if len(calls) == 1:
+            raise ResourceError("took too long")
+        run(module, folder, progress, **options)
+
+    monkeypatch.setattr(charts_module, "run_helper", helper)
+    mesh = sphere(3)
+    unwrapped = unwrap(mesh, 256, 2, tmp_path, Progress())
+    assert unwrapped.method == "xatlas"
+    assert_usable(mesh, unwrapped, 256, 2)
 
 
 def test_a_mesh_that_is_not_finite_ends_in_words(tmp_path: Path) -> None:
