@@ -29,8 +29,6 @@ class AtlasRaster:
     """(size, size) bool: the centre lies in the face; else the face only touches the texel."""
     overlaps: int
     """Texels whose centre is strictly inside two or more faces."""
-    later_faces: np.ndarray
-    """(f,) bool: faces that claim a texel strictly inside an earlier one."""
 
 
 def texel_corners(corner_uvs: np.ndarray, size_px: int) -> np.ndarray:
@@ -58,26 +56,20 @@ def raster_atlas(corner_uvs: np.ndarray, size_px: int, threads: int) -> AtlasRas
     touched = np.full((size_px, size_px), -1, np.int32)
     distance = np.full((size_px, size_px), TOUCH_TEXELS**2)
     hits = np.zeros((size_px, size_px), np.uint8)
-    strict_face = np.full((size_px, size_px), -1, np.int32)
     bounds = even_bounds(size_px, threads)
-    later = np.zeros((len(bounds) - 1, len(corners)), np.bool_)
-    band_of = {int(b): i for i, b in enumerate(bounds[:-1])}
 
     def band(begin: int, end: int) -> None:
-        own = later[band_of[begin]]
-        _raster_centres(corners, begin, end, face, bary, hits, strict_face, own)
+        _raster_centres(corners, begin, end, face, bary, hits)
         _raster_touched(corners, begin, end, face, bary, distance, touched)
 
     run_chunks(band, bounds, threads)
     inside = face >= 0
     face = np.where(inside, face, touched)
-    return AtlasRaster(face, bary, inside, int((hits > 1).sum()), later.any(axis=0))
+    return AtlasRaster(face, bary, inside, int((hits > 1).sum()))
 
 
 @kernel(fast=False)
-def _raster_centres(
-    corners: Any, begin: int, end: int, face: Any, bary: Any, hits: Any, strict: Any, later: Any
-) -> None:
+def _raster_centres(corners: Any, begin: int, end: int, face: Any, bary: Any, hits: Any) -> None:
     size = face.shape[1]
     for f in range(len(corners)):
         x0, y0 = corners[f, 0, 0], corners[f, 0, 1]
@@ -104,13 +96,9 @@ def _raster_centres(
                 w2 = 1.0 - w0 - w1
                 if w0 < 0.0 or w1 < 0.0 or w2 < 0.0:
                     continue
-                if min(w0 * height0, w1 * height1, w2 * height2) > STRICT_TEXELS:
-                    if strict[y, x] >= 0:
-                        later[f] = True
-                    else:
-                        strict[y, x] = f
-                    if hits[y, x] < 255:
-                        hits[y, x] += 1
+                strict = min(w0 * height0, w1 * height1, w2 * height2) > STRICT_TEXELS
+                if strict and hits[y, x] < 255:
+                    hits[y, x] += 1
                 if face[y, x] < 0:
                     face[y, x] = f
                     bary[y, x, 0] = w0

@@ -174,7 +174,7 @@ def test_faces_smaller_than_a_texel_are_neither_seen_nor_unseen(areas: tuple) ->
     )
     unwrapped = Unwrap(np.zeros((3, 3, 2), np.float32), np.zeros(3, np.int32), "box", 2.0)
     nothing = np.zeros(0)
-    raster = AtlasRaster(nothing, nothing, nothing, 0, nothing)
+    raster = AtlasRaster(nothing, nothing, nothing, 0)
     counts = _statistics(
         SIZE_PX, TextureSettings(SIZE_PX, 4), unwrapped, raster, points, baked, np.array(areas)
     )
