@@ -80,14 +80,15 @@ def photos_that_see(
 
 
 def steps_between_texels(textured: TexturedMesh, texels_apart: int) -> float:
-    """Return the difference that one in a thousand pairs of seen texels so far apart exceeds.
+    """Return the difference that one in a thousand pairs of texels so far apart exceeds.
 
-    Of a thing of one colour that photos show in different brightness, this is how visible the
+    Of texels into which two photos or more were blended: what one photo alone shows cannot be
+    evened with anything. Of a thing of one colour that photos show in different brightness, this is how visible the
     borders are where the leading view changes.
     """
     size = len(textured.albedo)
     assert textured.views is not None
-    good = raster_atlas(textured.corner_uvs, size, 2).inside & (textured.views > 0)
+    good = raster_atlas(textured.corner_uvs, size, 2).inside & (textured.views >= 2)
     grey = textured.albedo.astype(np.float64).mean(axis=2)
     steps = []
     for image, usable in ((grey, good), (grey.T, good.T)):
