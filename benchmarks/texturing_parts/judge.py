@@ -83,8 +83,8 @@ def steps_between_texels(textured: TexturedMesh, texels_apart: int) -> float:
     """Return the difference that one in a thousand pairs of texels so far apart exceeds.
 
     Of texels into which two photos or more were blended: what one photo alone shows cannot be
-    evened with anything. Of a thing of one colour that photos show in different brightness, this is how visible the
-    borders are where the leading view changes.
+    evened with anything. Of a thing of one colour that photos show in different brightness, this is
+    how visible the borders are where the leading view changes.
     """
     size = len(textured.albedo)
     assert textured.views is not None
