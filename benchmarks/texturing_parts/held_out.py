@@ -34,7 +34,7 @@ def held_out_figures(job: Path, picture: Path, threads: int) -> dict[str, Any]:
     Parameters
     ----------
     job : Path
-        A job folder with one region.
+        A job folder; the region that was meshed last counts.
     picture : Path
         Gets the photo of median PSNR, left, and the rendering, right.
 
@@ -48,7 +48,7 @@ def held_out_figures(job: Path, picture: Path, threads: int) -> dict[str, Any]:
     scene = load_saved_scene(stage_folder(job, "cameras"))
     trained = read_json(stage_folder(job, "train") / "done.json")
     names = {figure["name"] for figure in trained["held_out"]}
-    mesh = load_mesh(stage_folder(job, "mesh") / "mesh.npz")
+    mesh = load_mesh(_newest(job, "mesh") / "mesh.npz")
     seen = tuple(view for view in scene.views if view.camera.name not in names)
     kept = dataclasses.replace(scene, views=seen)
     with tempfile.TemporaryDirectory() as folder:
@@ -91,6 +91,12 @@ def held_out_figures(job: Path, picture: Path, threads: int) -> dict[str, Any]:
         "covered": score.covered,
         "texture": textured.statistics,
     }
+
+
+def _newest(job: Path, name: str) -> Path:
+    """Return the folder of the stage that finished last: a job may have been meshed again."""
+    done = list((job / "stages").glob(f"{name}-*/done.json"))
+    return max(done, key=lambda path: path.stat().st_mtime).parent
 
 
 def _fitted_psnr(photo: np.ndarray, image: np.ndarray, covered: np.ndarray) -> float:
