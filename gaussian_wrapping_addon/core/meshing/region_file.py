@@ -56,12 +56,10 @@ def parse_region(values: Any, path: Path) -> Region:
         raise ParseError(
             path, "version", f"{str(version)[:20]!r} is not known; {VERSION} is.", again
         )
-    name = values.get("blender_object_name")
-    if not isinstance(name, str) or not name.strip():
-        name = path.stem
+    name = _clean_name(values.get("blender_object_name")) or _clean_name(path.stem) or "region"
     vertices = _parse_vertices(values.get("vertices"), path, again)
     try:
-        region = Region(name[: limits.MAX_NAME_BYTES], vertices)
+        region = Region(name, vertices)
     except MeshingError as error:
         raise ParseError(path, "vertices", error.message, error.hint) from None
     used = len(np.unique(region.simplices))
@@ -71,6 +69,19 @@ def parse_region(values: Any, path: Path) -> Region:
             path.name, len(vertices) - used, len(vertices),
         )  # fmt: skip
     return region
+
+
+def _clean_name(name: Any) -> str:
+    """Return a name that fits into any text file and its bound in bytes; empty without one.
+
+    JSON may hold half of a surrogate pair, which no encoding writes; it becomes a question mark.
+    NUL ends names in Blender and in file systems, so it goes.
+    """
+    text = name.replace("\0", "") if isinstance(name, str) else ""
+    if not text.strip():
+        return ""
+    encoded = text.encode(errors="replace")
+    return encoded[: limits.MAX_NAME_BYTES].decode(errors="ignore")
 
 
 def _parse_vertices(rows: Any, path: Path, hint: str) -> np.ndarray:

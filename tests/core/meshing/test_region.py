@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import MeshingError, ParseError
+from gaussian_wrapping_addon.core.limits import MAX_NAME_BYTES
 from gaussian_wrapping_addon.core.meshing.region import Region, read_region, write_region
 
 TURN = Rotation.from_euler("xyz", [20, 30, 50], degrees=True).as_matrix()
@@ -109,6 +110,28 @@ def test_variants_that_are_read(values: dict[str, Any], tmp_path: Path) -> None:
     region = read_region(path)
     assert region.volume == pytest.approx(1)
     assert region.name in ("Cube", "roi")
+
+
+@pytest.mark.parametrize(
+    ("name", "clean"),
+    [
+        ("\ud800x", "?x"),
+        ("x\udfff", "x?"),
+        ("a\0b", "ab"),
+        ("\0", "roi"),
+        ("Würfel \U0001f600", "Würfel \U0001f600"),
+        ("ü" * 600, "ü" * 512),  # 1024 bytes
+        ("x" + "ü" * 600, "x" + "ü" * 511),  # no half letter
+    ],
+)
+def test_names_can_be_written_anywhere(name: str, clean: str, tmp_path: Path) -> None:
+    path = tmp_path / "roi.json"
+    path.write_text(json.dumps(body(blender_object_name=name)))
+    region = read_region(path)
+    assert region.name == clean
+    assert len(region.name.encode()) <= MAX_NAME_BYTES
+    write_region(path, region)
+    assert read_region(path).name == clean
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,10 @@ def write_report(result: Path, summary: dict[str, Any], regions: dict[str, Any])
     report = finite({"version": 1, **summary, "regions": regions})
     report["warnings"] = [warning.to_json() for warning in collect_warnings(report)]
     write_json(result / "report.json", report)
-    write_bytes(result / "report.md", report_markdown(report, result).encode())
+    # Names of files and of regions may hold what no encoding writes; a report is written all the
+    # same.
+    text = report_markdown(report, result).encode(errors="replace")
+    write_bytes(result / "report.md", text)
 
 
 def headline(report: dict[str, Any]) -> list[str]:

@@ -426,3 +426,13 @@ def test_bars_and_tables() -> None:
     assert set(bar(1.0)) == {"█"}
     with pytest.raises(ValueError, match="cells"):
         table(("a", "b"), [("1",)], "lr")
+
+
+def test_names_that_no_encoding_writes_do_not_stop_the_report(tmp_path: Path) -> None:
+    summary, region = full_summary(), full_region()
+    summary["source"] = "photos \udcff"  # a folder's name that is not UTF-8
+    region["provenance"]["region"] = "\ud800x"
+    write_pictures(tmp_path)
+    values, text = write(tmp_path, summary, {REGION: region})
+    assert values["source"] == "photos \udcff"
+    assert "# Report: photos ?" in text
