@@ -79,7 +79,12 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     if status.state != "DONE":
         _logger.error("error: %s %s", status.error, status.hint)
         if client.folder.read_status().state == "DONE":
-            _logger.info("the job and its result are as they were before: %s", client.folder.root)
+            same = shown_result(client.folder.result) == before
+            _logger.info(
+                "the job and its result are as they were before: %s" if same
+                else "the job is as it was before, its result is not; mesh it again: %s",
+                client.folder.root,
+            )  # fmt: skip
         return status.exit_code or EXIT_OTHER
     return _finish(client.folder.result, before, job, options) or EXIT_DONE
 

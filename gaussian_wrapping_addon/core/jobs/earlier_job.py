@@ -18,6 +18,7 @@ from ..errors import ParseError, UsageError
 from ..files import read_json, write_json
 from .job_file import JobFile, read_job, write_job
 from .job_folder import JobFolder, JobStatus
+from .result_swap import recover
 from .stages import read_done
 
 _logger = logging.getLogger(__name__)
@@ -84,6 +85,8 @@ def put_back(folder: JobFolder) -> JobStatus | None:
     for stage in (*folder.stages.glob("mesh-*"), *folder.stages.glob("texture-*")):
         if stage.name not in known and read_done(stage) is None:
             shutil.rmtree(stage, ignore_errors=True)
+    if folder.result.is_dir():
+        recover(folder.result)
     write_job(folder.job_path, job)
     forget_finished(folder)
     _logger.info("the job is again as it was before this mesh")

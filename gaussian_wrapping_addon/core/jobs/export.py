@@ -15,7 +15,11 @@ from ..files import finite, read_json, resolve_inside, write_json
 from ..progress import Progress
 from .job_file import JobFile
 from .job_folder import JobFolder
+from .result_swap import new_result
 from .stages import Stage
+
+REPORTS = ("report.json", "report.md")
+"""They tell of all the other files."""
 
 
 def export_results(
@@ -29,6 +33,8 @@ def export_results(
 ) -> None:
     """Fill ``result/``; regions of earlier jobs in the same folder stay.
 
+    All of it changes at the end: where anything fails before, it is as it was.
+
     Parameters
     ----------
     regions : list of (name, mesh stage, texture stage)
@@ -40,34 +46,38 @@ def export_results(
     from ..gaussians.splat_ply import write_splat_ply
     from .runner import write_scene_summary
 
-    result = folder.result
-    result.mkdir(exist_ok=True)
-    progress.update(0.1, "writing the scene")
-    write_scene_summary(result / "scene.json", cameras)
-    scene = load_saved_scene(cameras.folder)
-    gaussians = load_gaussians(trained.folder / "gaussians.npz")
-    write_splat_ply(result / "gaussians.ply", gaussians, scene.world_from_scene)
-    for index, (name, meshed, textured) in enumerate(regions):
-        progress.update(0.2 + 0.6 * index / len(regions), f"writing {name}")
-        target = result / name
-        if target.exists():
-            shutil.rmtree(target)
-        shutil.copytree(textured.folder / "files", target)
-        shutil.copy2(meshed.folder / "region.json", target / "region.json")
-        for picture in sorted(textured.folder.glob("comparison-*.jpg")):
-            shutil.copy2(picture, target / picture.name)
-        figures = _region_figures(trained, meshed, textured)
-        figures["world"] = _in_world_units(meshed, figures, scene.world_from_scene)
-        write_json(target / "figures.json", _plain(figures))
-    shutil.copy2(regions[0][2].folder / "preview.png", result / "preview.png")
-    for name, _, textured in regions:
-        shutil.copy2(textured.folder / "preview.png", result / name / "preview.png")
-    progress.update(0.9, "writing the report")
-    _training_pictures(trained, result / PICTURES)
-    known = {path.parent.name: read_json(path) for path in sorted(result.glob("*/figures.json"))}
-    # Regions of an earlier training stay on disk; this report is about this training.
-    all_regions = {n: f for n, f in known.items() if f.get("training") == trained.key}
-    write_report(result, _plain({**summary, **_whole(cameras, trained, regions)}), all_regions)
+    with new_result(folder.result, last=REPORTS) as new:
+        progress.update(0.1, "writing the scene")
+        write_scene_summary(new / "scene.json", cameras)
+        scene = load_saved_scene(cameras.folder)
+        gaussians = load_gaussians(trained.folder / "gaussians.npz")
+        write_splat_ply(new / "gaussians.ply", gaussians, scene.world_from_scene)
+        for index, (name, meshed, textured) in enumerate(regions):
+            progress.update(0.2 + 0.6 * index / len(regions), f"writing {name}")
+            target = new / name
+            shutil.copytree(textured.folder / "files", target)
+            shutil.copy2(meshed.folder / "region.json", target / "region.json")
+            for picture in sorted(textured.folder.glob("comparison-*.jpg")):
+                shutil.copy2(picture, target / picture.name)
+            shutil.copy2(textured.folder / "preview.png", target / "preview.png")
+            figures = _region_figures(trained, meshed, textured)
+            figures["world"] = _in_world_units(meshed, figures, scene.world_from_scene)
+            write_json(target / "figures.json", _plain(figures))
+        shutil.copy2(regions[0][2].folder / "preview.png", new / "preview.png")
+        progress.update(0.9, "writing the report")
+        # A region may have the name of this folder, of this job or of an earlier one.
+        if (folder.result / PICTURES).is_dir() and not (new / PICTURES).exists():
+            shutil.copytree(folder.result / PICTURES, new / PICTURES)
+        _training_pictures(trained, new / PICTURES)
+        # Regions of an earlier training stay on disk; this report is about this training.
+        known = {**_figures_in(folder.result), **_figures_in(new)}
+        of_training = {n: f for n, f in sorted(known.items()) if f.get("training") == trained.key}
+        whole = _plain({**summary, **_whole(cameras, trained, regions)})
+        write_report(new, whole, of_training, earlier=folder.result)
+
+
+def _figures_in(result: Path) -> dict[str, dict[str, Any]]:
+    return {path.parent.name: read_json(path) for path in sorted(result.glob("*/figures.json"))}
 
 
 def _whole(
@@ -111,7 +121,7 @@ def _training_pictures(trained: Stage, folder: Path) -> None:
     """Bring the pictures of the training there; those of an earlier training go."""
     from ..evaluation.report.pictures import write_learning_curve
 
-    # Only these files: a region may have the name of this folder.
+    # Only these files: others are not ours, or of a region of this name.
     folder.mkdir(exist_ok=True)
     for old in (*folder.glob("held-out-*.jpg"), folder / CURVE):
         old.unlink(missing_ok=True)

@@ -61,7 +61,7 @@ _FACTS = {
 }
 
 
-def report_markdown(report: dict[str, Any], result: Path) -> str:
+def report_markdown(report: dict[str, Any], result: Path, earlier: Path | None = None) -> str:
     """Return the text of ``report.md``.
 
     Parameters
@@ -70,8 +70,11 @@ def report_markdown(report: dict[str, Any], result: Path) -> str:
         Content of ``report.json``; of any version, whatever it lacks is said to be not measured.
     result : Path
         The result folder: a picture is linked only where its file lies there.
+    earlier : Path or None
+        A result folder whose entries the first one is going to join: what it lacks counts from
+        there.
     """
-    picture = _pictures_of(result)
+    picture = _pictures_of(result, earlier)
     lines = [
         f"# Report: {words(report.get('source'), 'job')}",
         "",
@@ -113,9 +116,10 @@ def _without_gaps(lines: list[str]) -> list[str]:
     return [t for i, t in enumerate(lines) if t or i == 0 or lines[i - 1]]
 
 
-def _pictures_of(result: Path) -> Picture:
+def _pictures_of(result: Path, earlier: Path | None) -> Picture:
     def picture(path: str, caption: str) -> list[str]:
-        file = resolve_inside(result, path)
+        replaced = earlier is None or (result / PurePosixPath(path).parts[0]).exists()
+        file = resolve_inside(result if replaced or earlier is None else earlier, path)
         if file is None or not file.is_file():
             return []
         link = urllib.parse.quote(PurePosixPath(path).as_posix())

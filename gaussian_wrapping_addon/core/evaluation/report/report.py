@@ -13,7 +13,12 @@ from .text import duration, items, measured, number, part, percent, plural
 from .warnings import collect_warnings
 
 
-def write_report(result: Path, summary: dict[str, Any], regions: dict[str, Any]) -> None:
+def write_report(
+    result: Path,
+    summary: dict[str, Any],
+    regions: dict[str, Any],
+    earlier: Path | None = None,
+) -> None:
     """Write both files into the result folder; the pictures must lie there already.
 
     Parameters
@@ -25,13 +30,15 @@ def write_report(result: Path, summary: dict[str, Any], regions: dict[str, Any])
     regions : dict
         For each region: mesh statistics, residuals, size in world units, texture coverage,
         renderings of the mesh, seconds.
+    earlier : Path or None
+        The result that this one will join: pictures of other regions lie there.
     """
     report = finite({"version": 1, **summary, "regions": regions})
     report["warnings"] = [warning.to_json() for warning in collect_warnings(report)]
     write_json(result / "report.json", report)
     # Names of files and of regions may hold what no encoding writes; a report is written all the
     # same.
-    text = report_markdown(report, result).encode(errors="replace")
+    text = report_markdown(report, result, earlier).encode(errors="replace")
     write_bytes(result / "report.md", text)
 
 
