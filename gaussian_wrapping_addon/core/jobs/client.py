@@ -13,17 +13,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import ParseError, UsageError, WorkerError
+from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError
 from ..helper_process import child_command, child_environment, kill_group
 from .earlier_job import keep_finished
 from .job_file import JobFile, read_job, write_job
 from .job_folder import JobFolder, JobStatus, process_alive
-from .smaller import killed_hint
+from .smaller import killed_hint, killed_mesh_hint
 
 PYTHON_VARIABLE = "GAUSSIAN_WRAPPING_PYTHON"
 LAST_WORDS_BYTES = 2000
 KILLED_CODES = (-9, 137)
 """Of a process that SIGKILL ended, itself or under a shell: what the kernel does for memory."""
+
+AFTER_TRAINING = ("mesh", "texture", "export")
+"""Stages of a job whose training is finished."""
 
 
 def worker_python(preference: str = "") -> str:
@@ -153,11 +156,15 @@ class JobClient:
         failed = self._failed(
             status, "The worker was stopped by signal 9: killed, probably out of memory."
         )
+        failed = replace(failed, exit_code=EXIT_RESOURCES)
         try:
-            training = read_job(self.folder.job_path).settings.training
+            job = read_job(self.folder.job_path)
         except (UsageError, ParseError, OSError):
             return failed
-        return replace(failed, hint=killed_hint(training))
+        if job.command != "mesh" and status.stage not in AFTER_TRAINING:
+            return replace(failed, hint=killed_hint(job.settings.training))
+        kept = job.command == "mesh" and (self.folder.result / "report.json").is_file()
+        return replace(failed, hint=killed_mesh_hint(job.settings.meshing, kept=kept))
 
     def _failed(self, status: JobStatus, error: str) -> JobStatus:
         return replace(

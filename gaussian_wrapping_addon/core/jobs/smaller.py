@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 
 from ..errors import ParseError, ResourceError
 from ..files import read_json, write_json
-from ..settings import TrainingSettings
+from ..settings import MeshingSettings, TrainingSettings
 
 _logger = logging.getLogger(__name__)
 
@@ -146,3 +146,20 @@ def killed_hint(settings: TrainingSettings) -> str:
         "Close other programs and resume, which continues from the last checkpoint; or resume with "
         f"--max-gaussians {number}, which trains anew with fewer."
     )
+
+
+def killed_mesh_hint(meshing: MeshingSettings, *, kept: bool) -> str:
+    """Return the same for a worker that was meshing or texturing: no training would help it.
+
+    Parameters
+    ----------
+    kept : bool
+        Whether the folder has the result of an earlier job.
+    """
+    finer = "fewer --points, a larger --edge-length, or --tiles N with more tiles"
+    if meshing.method == "pivots":
+        finer = "a smaller region, or --method pam with fewer --points"
+    elif meshing.tiles == "auto":
+        finer = "fewer --points, a larger --edge-length, or --tiles N"
+    unchanged = " The earlier result is unchanged." if kept else ""
+    return f"Close other programs and resume; or use mesh with {finer}.{unchanged}"

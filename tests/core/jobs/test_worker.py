@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.errors import ParseError, UsageError
+from gaussian_wrapping_addon.core.errors import EXIT_RESOURCES, ParseError, UsageError
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.helper_process import child_command
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, write_job
-from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, process_start_ticks
+from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus, process_start_ticks
 from gaussian_wrapping_addon.core.jobs.worker import parent_to_watch
-from gaussian_wrapping_addon.core.settings import JobSettings
+from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings
 
 BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"
 
@@ -48,6 +48,43 @@ def test_a_killed_worker_is_lost_and_says_the_signal(tmp_path: Path) -> None:
     assert status.state in ("LOST", "FAILED")
     assert "signal 9: killed, probably out of memory" in status.error
     assert "--max-gaussians 48000" in status.hint  # 0.6 of the default's 80 000
+
+
+@pytest.mark.parametrize(
+    ("command", "stage", "result", "meshing", "wanted", "unwanted"),
+    [
+        ("mesh", "", True, {}, "--points", "--max-gaussians"),
+        ("mesh", "mesh", True, {}, "--tiles N. The earlier result is unchanged", "more tiles"),
+        ("mesh", "texture", False, {}, "--edge-length", "unchanged"),
+        ("mesh", "mesh", True, {"tiles": "4"}, "more tiles", "--max-gaussians"),
+        ("mesh", "mesh", True, {"method": "pivots"}, "--method pam", "--tiles"),
+        ("wrap", "mesh", True, {}, "--points", "unchanged"),
+        ("more", "texture", True, {}, "--points", "--max-gaussians"),
+        ("wrap", "train", False, {}, "--max-gaussians 48000", "--points"),
+        ("more", "", True, {}, "--max-gaussians 48000", "--points"),
+    ],
+)
+def test_a_killed_worker_is_told_what_its_stage_can_do_with_less(
+    tmp_path: Path, command: str, stage: str, result: bool, meshing: dict, wanted: str,
+    unwanted: str,
+) -> None:  # fmt: skip
+    (tmp_path / "photos").mkdir()
+    folder = JobFolder(tmp_path / "out")
+    folder.create()
+    settings = JobSettings(meshing=MeshingSettings(**meshing))
+    write_job(folder.job_path, make_job(command, tmp_path / "photos", settings))
+    if result:
+        folder.result.mkdir()
+        write_json(folder.result / "report.json", {})
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        started = process_start_ticks(process.pid)
+        folder.write_status(JobStatus("RUNNING", stage, pid=process.pid, pid_started=started))
+        client = JobClient(folder, process)
+        process.kill()
+        status = client.wait(60)
+    assert (status.state, status.exit_code) == ("LOST", EXIT_RESOURCES)
+    assert wanted in status.hint
+    assert unwanted not in status.hint
 
 
 def test_a_locked_folder_is_refused(tmp_path: Path) -> None:
