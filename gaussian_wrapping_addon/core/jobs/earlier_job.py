@@ -29,23 +29,23 @@ NAME = "job-finished.json"
 def keep_finished(folder: JobFolder, job: JobFile) -> None:
     """Keep what a folder holds before ``job`` is written there.
 
-    Of several meshes without an end in between, the job before the first is kept. Commands that
-    train change the result itself: nothing is kept.
+    Of several meshes without an end in between, the job before the first is kept: where the last
+    one fails, what the others have begun goes as well. Commands that train change the result
+    itself: nothing is kept.
     """
     path = folder.root / NAME
     if job.command != "mesh":
         path.unlink(missing_ok=True)
         return
     status = folder.read_status()
-    kept = None if status.state == "DONE" else _read(path)
-    if kept is None:
-        if status.state != "DONE":
-            return
-        try:
-            finished = read_job(folder.job_path)
-        except (UsageError, ParseError):
-            return  # nothing that could be put back
-        kept = {"job": finished.to_json(), "status": asdict(_without_error(status))}
+    if status.state != "DONE":
+        return  # what is kept already, its list of stages too, is of the time before all of them
+    try:
+        finished = read_job(folder.job_path)
+    except (UsageError, ParseError):
+        path.unlink(missing_ok=True)
+        return  # nothing that could be put back
+    kept = {"job": finished.to_json(), "status": asdict(_without_error(status))}
     write_json(path, {**kept, "stages": sorted(p.name for p in folder.stages.iterdir())})
 
 

@@ -14,6 +14,8 @@ from ..errors import MeshingError
 from ..progress import Progress
 from ..settings import JobSettings, MeshingSettings, from_json, to_json
 from .claims import Claims, work_through
+from .job_file import read_job
+from .job_folder import JobFolder
 
 if TYPE_CHECKING:
     from ..dataset.camera import Camera
@@ -248,13 +250,22 @@ def remove_tiles(stage_folder: Path) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def open_lists(stages: Path) -> list[Path]:
-    """Return the folders of tile lists that are being worked on."""
+def open_lists(folder: JobFolder) -> list[Path]:
+    """Return the folders of the tile lists that the job in a folder is not done with.
+
+    Lists of jobs before it, which nobody will join, do not count. Whether its worker is alive does
+    not matter: from another machine that cannot be seen.
+    """
     from ..meshing.tiles.store import LIST_NAME
+    from .runner import mesh_stages
     from .stages import read_done
 
-    found = sorted(stages.glob(f"mesh-*/{FOLDER}/{LIST_NAME}"))
-    return [path.parent for path in found if read_done(path.parent.parent) is None]
+    found = sorted(folder.stages.glob(f"mesh-*/{FOLDER}/{LIST_NAME}"))
+    undone = [path.parent for path in found if read_done(path.parent.parent) is None]
+    if not undone or folder.read_status().state == "DONE":
+        return []
+    owned = mesh_stages(folder, read_job(folder.job_path))
+    return [path for path in undone if path.parent.name in owned]
 
 
 def work_on_list(

@@ -20,7 +20,7 @@ from ..settings import to_json
 from .job_file import AUTOMATIC_REGIONS, JobFile
 from .job_folder import JobFolder
 from .machine import describe_machine, peak_memory_bytes
-from .stages import Stage, run_stage, source_fingerprint, stage_key
+from .stages import Stage, read_done, run_stage, source_fingerprint, stage_key
 
 _logger = logging.getLogger(__name__)
 
@@ -186,6 +186,26 @@ def _run_training(
     return run_training(folder, job, cameras, progress, version=version, threads=threads)
 
 
+def _mesh_key(job: JobFile, request: str, name: str, trained_key: str) -> str:
+    body = job.region_bodies.get(request)
+    return stage_key(
+        STAGE_VERSIONS["mesh"], trained_key, request if body is None else body, name,
+        to_json(job.settings.meshing), job.settings.seed,
+    )  # fmt: skip
+
+
+def mesh_stages(folder: JobFolder, job: JobFile) -> set[str]:
+    """Return the names of the mesh stages that the job has, or would have, in a folder."""
+    finished = [p for p in folder.stages.glob("train-*") if read_done(p) is not None]
+    trained = [path.name.partition("-")[2] for path in finished]
+    names = {r: region_name(r, job.region_bodies.get(r)) for r in job.settings.regions}
+    return {
+        f"mesh-{name}-{_mesh_key(job, request, name, key)}"
+        for request, name in names.items()
+        for key in trained
+    }
+
+
 def _run_meshing(
     folder: JobFolder,
     job: JobFile,
@@ -198,10 +218,7 @@ def _run_meshing(
 ) -> Stage:
     meshing = job.settings.meshing
     body = job.region_bodies.get(request)
-    key = stage_key(
-        STAGE_VERSIONS["mesh"], trained.key, request if body is None else body, name,
-        to_json(meshing), job.settings.seed,
-    )  # fmt: skip
+    key = _mesh_key(job, request, name, trained.key)
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         import numpy as np

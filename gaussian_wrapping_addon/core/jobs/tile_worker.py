@@ -57,7 +57,7 @@ def help_with_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
         raise UsageError(f"{folder.root} is no job folder.", "Give the --out of a job.")
     until_s = time.monotonic() + wait_s
     progress = Progress("mesh", None, folder.cancel_path.exists)
-    while not (lists := open_lists(folder.stages)):
+    while not (lists := open_lists(folder)):
         progress.check()
         if time.monotonic() >= until_s:
             raise UsageError(
@@ -71,6 +71,6 @@ def help_with_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
             work_on_list(folder.stages, path, progress, done, threads=threads or default_threads())
         except (WrapError, OSError):
             # The job has joined the tiles and removed their files while we looked.
-            if path in open_lists(folder.stages):
+            if path in open_lists(folder):
                 raise
     return len(done)

@@ -10,12 +10,17 @@ from pathlib import Path
 
 import pytest
 
+from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.earlier_job import NAME, finished_job, keep_finished
 from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_job, write_job
 from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.settings import JobSettings
+from gaussian_wrapping_addon.core.jobs.region_meshing import open_lists
+from gaussian_wrapping_addon.core.jobs.runner import mesh_stages
+from gaussian_wrapping_addon.core.jobs.tile_worker import help_with_tiles
+from gaussian_wrapping_addon.core.meshing.tiles.store import LIST_NAME
+from gaussian_wrapping_addon.core.settings import JobSettings, TextureSettings
 
 WORKER = """
 import sys
@@ -111,11 +116,42 @@ def test_a_mesh_that_was_stopped_can_be_resumed_but_is_not_the_finished_job(
     assert read_job(folder.job_path) == stopped
     assert (folder.stages / "mesh-bad-k" / "tiles").is_dir()
     assert finished_job(folder) == job
-    # Another one that fails leaves the stopped one's tiles, and the job from before both.
+    # Another one that fails leaves the job from before both, and the stages of that time.
+    (folder.stages / "mesh-bad-k").rename(folder.stages / "mesh-stopped-k")
     begin(folder, regions=("auto",), seed=7)
     assert work(folder, 'MeshingError("a")') == 3
     assert read_job(folder.job_path) == job
-    assert (folder.stages / "mesh-bad-k").is_dir()
+    assert sorted(p.name for p in folder.stages.glob("mesh-*")) == [
+        "mesh-auto-begun", "mesh-first-done",
+    ]  # fmt: skip
+
+
+def test_tiles_are_open_for_the_job_that_they_are_of_alone(folder: JobFolder) -> None:
+    write_json(folder.stages / "train-before" / "done.json", {})
+    stopped = begin(folder, regions=("all",))
+    (name,) = mesh_stages(folder, stopped)
+    tiles = folder.stages / name / "tiles"
+    tiles.mkdir(parents=True)
+    write_json(tiles / LIST_NAME, {})
+    for state in ("NEW", "LOST", "CANCELLED", "FAILED"):
+        folder.write_status(JobStatus(state))
+        assert open_lists(folder) == [tiles]
+    # The texture is another one, the mesh the same.
+    begin(folder, regions=("auto", "all"), texture=TextureSettings(size_px=256))
+    assert open_lists(folder) == [tiles]
+    begin(folder, regions=("auto",))
+    assert open_lists(folder) == []
+    with pytest.raises(UsageError, match="no tiles to work on"):
+        help_with_tiles(folder, 1, 0.0)
+    assert work(folder, 'MeshingError("a")') == 3
+    assert not tiles.exists()
+    # Nor where the job is done and another one, which ended well, has left them.
+    begin(folder, regions=("all",))
+    tiles.mkdir(parents=True)
+    write_json(tiles / LIST_NAME, {})
+    begin(folder, regions=("auto",))
+    assert work(folder, "") == 0
+    assert open_lists(folder) == []
 
 
 def test_a_mesh_that_ends_well_is_the_finished_job(folder: JobFolder) -> None:
