@@ -82,10 +82,8 @@ def make_job(command: str, source: Path, settings: JobSettings) -> JobFile:
             names.append(region)
             continue
         path = Path(region)
-        if not path.is_file():
-            raise DatasetError(f"Region file {region} does not exist.", "Check the path.")
         name = str(path.resolve())
-        bodies[name] = read_json(path)
+        bodies[name] = read_region_body(path)
         _check_region(bodies[name], path)
         names.append(name)
     start = settings.start_splat
@@ -103,6 +101,26 @@ def make_job(command: str, source: Path, settings: JobSettings) -> JobFile:
         start_splat=str(Path(start).resolve()) if start else "",
     )
     return JobFile(command, str(source.resolve()), settings, bodies)
+
+
+def read_region_body(path: Path) -> Any:
+    """Read the content of a region file, which :func:`parse_region` takes.
+
+    Raises
+    ------
+    DatasetError
+        There is no file, or it cannot be read.
+    """
+    if path.is_dir():
+        raise DatasetError(f"{path} is a folder, not a region file.", "Give a file in it.")
+    if not path.is_file():
+        raise DatasetError(f"Region file {path} does not exist.", "Check the path.")
+    try:
+        return read_json(path)
+    except OSError as error:
+        raise DatasetError(
+            f"Region file {path} cannot be read: {error.strerror}.", "Check its permissions."
+        ) from None
 
 
 def _check_region(body: Any, path: Path) -> None:

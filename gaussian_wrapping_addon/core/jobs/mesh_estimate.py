@@ -12,14 +12,13 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from ..errors import EXIT_DONE, MeshingError, UsageError, WrapError
-from ..files import read_json
+from ..errors import EXIT_DONE, EXIT_OTHER, MeshingError, UsageError, WrapError
 from ..helper_process import emit
 from ..parallel import default_threads
 from ..progress import Progress
 from ..settings import MeshingSettings, from_json
 from .evaluate import end_with
-from .job_file import AUTOMATIC_REGIONS
+from .job_file import AUTOMATIC_REGIONS, read_region_body
 from .job_folder import JobFolder
 from .region_meshing import expected_by_pivots, expected_mesh, free_bytes
 from .stages import read_done
@@ -39,6 +38,9 @@ def main(arguments: list[str]) -> int:
     except WrapError as error:
         emit(error=error.message, hint=error.hint)
         return error.exit_code
+    except OSError as error:
+        emit(error=f"{error}.", hint="Check the path and its permissions.")
+        return EXIT_OTHER
     for line in lines:
         emit(line=line)
     return EXIT_DONE
@@ -65,12 +67,13 @@ def _lines(request: dict[str, Any]) -> list[str]:
     folder = JobFolder(Path(request["out"]))
     meshing = from_json(MeshingSettings, request["meshing"], "meshing")
     threads = int(request["threads"]) or default_threads()
+    if request["region"] not in AUTOMATIC_REGIONS:
+        path = Path(request["region"])
+        world_region = parse_region(read_region_body(path), path)
     scene = load_saved_scene(_newest(folder.stages, "cameras"))
     gaussians = load_gaussians(_newest(folder.stages, "train") / "gaussians.npz")
     arrays = gaussians.arrays()
     if request["region"] not in AUTOMATIC_REGIONS:
-        path = Path(request["region"])
-        world_region = parse_region(read_json(path), path)
         region = world_region.transformed(scene.world_from_scene.inverse())
     else:
         automatic = request["region"] == "auto"

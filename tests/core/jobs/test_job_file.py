@@ -9,7 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
+from gaussian_wrapping_addon.core.errors import (
+    EXIT_BAD_DATA,
+    DatasetError,
+    ParseError,
+    UsageError,
+)
+from gaussian_wrapping_addon.core.jobs import mesh_estimate
 from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_job, write_job
 from gaussian_wrapping_addon.core.jobs.runner import region_name
 from gaussian_wrapping_addon.core.jobs.training_stage import training_keys
@@ -111,3 +117,22 @@ def test_regions_that_a_training_favours_stay_its_own(tmp_path: Path) -> None:
     assert training_keys(1, "cameras", meshed) == training_keys(1, "cameras", trained)
     again = make_job("wrap", tmp_path, other)
     assert training_keys(1, "cameras", again) != training_keys(1, "cameras", trained)
+
+
+@pytest.mark.parametrize(
+    ("region", "message"), [("none.json", "does not exist"), (".", "is a folder, not")]
+)
+def test_a_region_that_is_no_file_is_told_by_all_commands(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    region: str,
+    message: str,
+) -> None:
+    monkeypatch.setattr(mesh_estimate, "end_with", lambda _parent: None)
+    path = str(tmp_path / region)
+    with pytest.raises(DatasetError, match=message):
+        make_job("mesh", tmp_path, JobSettings(regions=(path,)))
+    request = {"out": str(tmp_path), "region": path, "threads": 1, "meshing": {}}
+    assert mesh_estimate.main([json.dumps(request)]) == EXIT_BAD_DATA
+    assert message in json.loads(capsys.readouterr().out)["error"]
