@@ -12,7 +12,7 @@ import numpy as np
 from ..core.errors import UsageError
 from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.earlier_job import finished_job
-from ..core.jobs.job_file import make_job
+from ..core.jobs.job_file import make_job, region_names
 from ..core.jobs.job_folder import JobFolder
 from ..core.jobs.more import job_with_more
 from ..core.jobs.stages import read_done
@@ -111,8 +111,6 @@ def start_mesh(
     WrapError
         A region cannot be used, or the job folder holds no finished training.
     """
-    from ..core.jobs.runner import region_name
-
     frame = _common_frame(regions)
     folder = job_folder_of(frame)
     _require_training(folder)
@@ -145,9 +143,7 @@ def start_mesh(
         texture=replace(earlier.settings.texture, **texture_choices(scene)),
     )
     job = make_job("mesh", Path(earlier.source), settings)
-    names = [region_name(request, job.region_bodies[request]) for request in job.settings.regions]
-    if len(set(names)) < len(names):
-        raise UsageError("Two of the regions have nearly the same name.", "Rename one of them.")
+    names = region_names(job.settings.regions, job.region_bodies)
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
     )

@@ -90,7 +90,8 @@ def put_back(folder: JobFolder) -> JobStatus | None:
     write_job(folder.job_path, job)
     forget_finished(folder)
     _logger.info("the job is again as it was before this mesh")
-    return status
+    # The folder may be a copy, whose status names the place of the other one.
+    return replace(status, result=str(folder.result) if status.result else "")
 
 
 def _without_error(status: JobStatus) -> JobStatus:

@@ -46,7 +46,7 @@ def main(arguments: list[str]) -> int:
 
 def _estimate(job: JobFile) -> list[str]:
     from ..parallel import default_threads
-    from ..training.estimate import estimate, judge, this_machine
+    from ..training.estimate import MESH_AND_TEXTURE_SHARE, estimate, judge, this_machine
     from ..training.machine_speed import machine_speed, renderer_is_compiled
     from ..training.splat_start import wrapping_settings
     from .splat_scene import start_splat_of
@@ -60,6 +60,7 @@ def _estimate(job: JobFile) -> list[str]:
     speed = machine_speed(threads) if compiled else 1.0
     machine = this_machine(Path.cwd(), threads, speed)
     expected = estimate(facts, training, machine)
+    low, high = MESH_AND_TEXTURE_SHARE
     points = f"{facts.points} sparse points" if facts.points else "camera poses still to be solved"
     lines = [
         f"{facts.photos} photos, long side {facts.long_side_px} px, {points}",
@@ -67,7 +68,7 @@ def _estimate(job: JobFile) -> list[str]:
         f"memory: {expected.memory_bytes / 2**30:.1f} GB",
         f"disk: {expected.disk_bytes / 2**30:.2f} GB",
         f"Gaussians: up to {expected.gaussians}",
-        "mesh and texture take about a tenth of it more"
+        f"mesh and texture of a region take about {100 * low:.0f} to {100 * high:.0f} % of it more"
         + ("" if facts.points else "; solving the cameras takes minutes before"),
     ]
     if not compiled:

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +14,12 @@ from typing import Any
 from ..errors import DatasetError, UsageError
 from ..files import read_json, write_json
 from ..settings import JobSettings, from_json, to_json
+from .stages import stage_key
 
 SCHEMA_VERSION = 1
 COMMANDS = ("wrap", "mesh", "more")
 AUTOMATIC_REGIONS = ("auto", "all")
+NAME_CHARACTERS = 40
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,8 @@ def make_job(command: str, source: Path, settings: JobSettings) -> JobFile:
     Raises
     ------
     UsageError, DatasetError
-        A setting is out of range; the source or a region file is missing or unreadable.
+        A setting is out of range; the source or a region file is missing or unreadable; two
+        regions have one name.
     """
     settings = settings.validated()
     if not source.exists():
@@ -86,6 +91,8 @@ def make_job(command: str, source: Path, settings: JobSettings) -> JobFile:
         bodies[name] = read_region_body(path)
         _check_region(bodies[name], path)
         names.append(name)
+    names = list(dict.fromkeys(names))
+    region_names(names, bodies)
     start = settings.start_splat
     if start and not Path(start).is_file():
         raise DatasetError(f"The start splat {start} does not exist.", "Check the path.")
@@ -101,6 +108,35 @@ def make_job(command: str, source: Path, settings: JobSettings) -> JobFile:
         start_splat=str(Path(start).resolve()) if start else "",
     )
     return JobFile(command, str(source.resolve()), settings, bodies)
+
+
+def region_name(request: str, body: Any) -> str:
+    """Return the folder name of a requested region: ASCII, short, never empty."""
+    if request in AUTOMATIC_REGIONS:
+        return request
+    wanted = body.get("blender_object_name") if isinstance(body, dict) else None
+    text = wanted if isinstance(wanted, str) and wanted.strip() else Path(request).stem
+    clean = re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_")[:NAME_CHARACTERS]
+    if not clean or clean.lower() in AUTOMATIC_REGIONS:
+        clean = f"region_{stage_key(request)[:6]}"
+    return clean
+
+
+def region_names(requests: Sequence[str], bodies: dict[str, Any]) -> list[str]:
+    """Return the folder names of all requested regions.
+
+    Raises
+    ------
+    UsageError
+        Two have one name: the result of one would replace that of the other.
+    """
+    names = [region_name(request, bodies.get(request)) for request in requests]
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise UsageError(
+                f"Two regions have the same name, {name}.", "Give each region its own name."
+            )
+    return names
 
 
 def read_region_body(path: Path) -> Any:

@@ -5,19 +5,18 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import MeshingError, UsageError
+from ..errors import MeshingError
 from ..files import write_json
 from ..parallel import default_threads
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
-from .job_file import AUTOMATIC_REGIONS, JobFile
+from .job_file import JobFile, region_name, region_names
 from .job_folder import JobFolder
 from .machine import describe_machine, peak_memory_bytes
 from .stages import Stage, read_done, run_stage, source_fingerprint, stage_key
@@ -29,8 +28,6 @@ STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 9, "texture": 8}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
-
-NAME_CHARACTERS = 40
 
 DENSE_MESH = "dense.npz"
 """In a mesh stage whose mesh was decimated: the mesh before, for the texture stage's maps."""
@@ -71,18 +68,6 @@ class _Overall:
         self._offset = fraction
 
 
-def region_name(request: str, body: Any) -> str:
-    """Return the folder name of a requested region: ASCII, short, never empty."""
-    if request in AUTOMATIC_REGIONS:
-        return request
-    wanted = body.get("blender_object_name") if isinstance(body, dict) else None
-    text = wanted if isinstance(wanted, str) and wanted.strip() else Path(request).stem
-    clean = re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_")[:NAME_CHARACTERS]
-    if not clean or clean.lower() in AUTOMATIC_REGIONS:
-        clean = f"region_{stage_key(request)[:6]}"
-    return clean
-
-
 def run_job(
     folder: JobFolder,
     job: JobFile,
@@ -103,9 +88,7 @@ def run_job(
 
     for request, body in job.region_bodies.items():
         parse_region(body, Path(request))
-    names = [region_name(r, job.region_bodies.get(r)) for r in job.settings.regions]
-    if len(set(names)) < len(names):
-        raise UsageError("Two regions have the same name.", "Give each region its own name.")
+    names = region_names(job.settings.regions, job.region_bodies)
 
     cameras = _run_cameras(folder, job, overall, threads)
     if cameras.reused:

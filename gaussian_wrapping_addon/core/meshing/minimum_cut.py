@@ -32,7 +32,7 @@ def minimum_cut(
     links : (k, 4) int
         Neighbours, -1 for none; mutual, each at most once in a row.
     capacity : (k, 4) int
-        Of each link, >= 0; the smaller of both directions counts. At most 2**30.
+        Of each link, >= 0; the smaller of both directions counts. Below 2**30.
     pull : (k,) int
         Towards the inside where positive.
     progress : Progress, optional

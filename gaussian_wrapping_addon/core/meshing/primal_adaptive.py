@@ -62,7 +62,7 @@ def mesh_region(
 
     With adaptive spacing a denser mesh is made, and of its vertices those stay that the shape needs
     (:mod:`.vertex_selection`). What stands where no camera looks, ``vacancy`` says. With neither an
-    edge length nor a number of points the mesh gets 40 to 50 thousand faces.
+    edge length nor a number of points the mesh gets about 50 thousand faces.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def mesh_region(
         "sightings": 0 if sightings is None else len(sightings),
         "candidate_area": sampler.area,
         "spacing": settings.spacing,
-        "notes": [*request.notes, *cloud.notes],
+        "notes": [*wanted.request.notes, *cloud.notes],
         "seed": seed,
         **cloud.figures,
         **figures,

@@ -53,6 +53,11 @@ MULTI_VIEW_SHARE = 0.4
 LOW, HIGH = 0.75, 1.95
 """The range told is the model's figure times these: it holds every measured training."""
 
+MESH_AND_TEXTURE_SHARE = (0.2, 0.9)
+"""What meshing and texture took, as a share of the training before them: from 17 to 94 % in the
+jobs of README.md and of benchmarks/scenes, with one region of about 50 thousand faces. Long
+trainings have the small shares."""
+
 ROUND_GROWTH = 1.8
 """Growth of the number of Gaussians in one round of densification, until the budget (measured: 1.55
 to 1.87 in the first round)."""
@@ -277,7 +282,7 @@ def estimate(
     -------
     Estimate
         Seconds of the training alone: solving cameras from photos, meshing and texture come on top
-        (a few minutes, about a tenth, in the measured jobs).
+        (:data:`MESH_AND_TEXTURE_SHARE`).
     """
     decided = settings.multi_view == "auto"
     cheap = dataclasses.replace(settings, multi_view="off") if decided else settings

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -94,6 +95,14 @@ def test_a_failed_mesh_leaves_the_job_as_it_was(folder: JobFolder) -> None:
     assert JobClient.attach(folder.root).poll().state == "DONE"
     assert work(folder, "") == 0
     assert folder.read_status().error == ""
+
+
+def test_a_copy_that_is_put_back_names_its_own_place(folder: JobFolder) -> None:
+    begin(folder, regions=("all",))
+    copy = JobFolder(folder.root.parent / "copy")
+    shutil.copytree(folder.root, copy.root)
+    assert work(copy) == 3
+    assert copy.read_status().result == str(copy.result)
 
 
 def test_an_unexpected_failure_and_one_after_another_do_as_well(folder: JobFolder) -> None:

@@ -16,8 +16,13 @@ from gaussian_wrapping_addon.core.errors import (
     UsageError,
 )
 from gaussian_wrapping_addon.core.jobs import mesh_estimate
-from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_job, write_job
-from gaussian_wrapping_addon.core.jobs.runner import region_name
+from gaussian_wrapping_addon.core.jobs.job_file import (
+    JobFile,
+    make_job,
+    read_job,
+    region_name,
+    write_job,
+)
 from gaussian_wrapping_addon.core.jobs.training_stage import training_keys
 from gaussian_wrapping_addon.core.settings import JobSettings, preset
 
@@ -136,3 +141,18 @@ def test_a_region_that_is_no_file_is_told_by_all_commands(
     request = {"out": str(tmp_path), "region": path, "threads": 1, "meshing": {}}
     assert mesh_estimate.main([json.dumps(request)]) == EXIT_BAD_DATA
     assert message in json.loads(capsys.readouterr().out)["error"]
+
+
+def test_two_regions_of_one_name_are_refused_before_anything_starts(tmp_path: Path) -> None:
+    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    for name in ("a", "b", "c"):
+        body = {"class_name": "GaussianWrappingBoundingVolume", "version": 1, "vertices": vertices}
+        body["blender_object_name"] = "head" if name != "c" else "foot"
+        (tmp_path / f"{name}.json").write_text(json.dumps(body))
+    a, b, c = (str(tmp_path / f"{name}.json") for name in ("a", "b", "c"))
+    with pytest.raises(UsageError, match="same name, head"):
+        make_job("mesh", tmp_path, JobSettings(regions=(a, "auto", b)))
+    # One file by two spellings is one region.
+    again = f"{tmp_path}/../{tmp_path.name}/a.json"
+    job = make_job("mesh", tmp_path, JobSettings(regions=(a, c, again)))
+    assert job.settings.regions == (a, c)

@@ -14,6 +14,7 @@ from gaussian_wrapping_addon.core.field.vacancy import VacancyResult
 from gaussian_wrapping_addon.core.meshing import surface_points
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.meshing.region import Region
+from gaussian_wrapping_addon.core.meshing.resolution import MIN_VERTICES
 from gaussian_wrapping_addon.core.meshing.sampling import sample_triangles
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
@@ -50,6 +51,16 @@ def mesh_shape(
         field, field, arrays, some_cameras(), region, settings(points, share, spacing), Progress(),
         seed=seed, threads=threads, edge_length_scene=edge,
     )  # fmt: skip
+
+
+def test_a_request_for_too_few_points_is_said() -> None:
+    for points, said in ((1, True), (99, True), (100, False)):
+        mesh = mesh_shape(sphere(), cube(1.3), points=points)
+        notes = " ".join(mesh.provenance["notes"])
+        assert (f"surface points; {points} were asked for" in notes) == said
+        assert len(mesh.vertices) >= MIN_VERTICES - 4
+    uniform = mesh_shape(sphere(), cube(1.3), points=60, spacing="uniform")
+    assert "surface points" not in " ".join(uniform.provenance["notes"])
 
 
 def test_sphere_is_closed_of_genus_0_and_on_the_surface() -> None:

@@ -145,6 +145,11 @@ def test_pieces_cover_the_part_of_the_surface_in_a_box() -> None:
     assert len(none) == len(nothing) == 0
 
 
+def test_a_request_for_too_few_points_is_said() -> None:
+    mesh = mesh_tiles(sphere(), cube(1.3), 2, 40, spacing="adaptive")
+    assert "surface points; 40 were asked for" in " ".join(mesh.provenance["notes"])
+
+
 def plan_around(region: Region, tiling: Tiling, radius: float, side: float) -> TilePlan:
     fillers = lattice(region, side, CLEAR_RADII * radius, 0)
     surface = CandidateSurface(np.zeros((3, 3)), np.array([[0, 1, 2]]), 0, 0)

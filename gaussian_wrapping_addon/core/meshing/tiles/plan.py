@@ -145,6 +145,6 @@ def make_plan(
     fillers = lattice(region, side, clearance, seed)
     return TilePlan(
         region, surface, sampler.area, spacing, tiling, fillers.points, fillers.ball, caps, seed,
-        (*request.notes, *notes), nominal_edge(request, sampler.area, region), wanted.target,
+        (*wanted.request.notes, *notes), nominal_edge(request, sampler.area, region), wanted.target,
         wanted.share, sightings,
     )  # fmt: skip
