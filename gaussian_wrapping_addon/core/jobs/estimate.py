@@ -7,14 +7,11 @@ Speaks as :mod:`~.evaluate` does: one JSON object a line on stdout.
 from __future__ import annotations
 
 import json
-import os
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import EXIT_DONE, EXIT_OTHER, DatasetError, WrapError
-from ..helper_process import emit
-from .evaluate import end_with
+from ..errors import DatasetError
+from .answer import answer
 from .job_file import JobFile
 
 if TYPE_CHECKING:
@@ -23,25 +20,7 @@ if TYPE_CHECKING:
 
 def main(arguments: list[str]) -> int:
     """Estimate the job of ``arguments = [job file as JSON]``; return the exit code."""
-    # Not the caller's own id: where Python is started through a launcher, that is the parent.
-    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
-    try:
-        lines = _estimate(JobFile.from_json(json.loads(arguments[0])))
-    except WrapError as error:
-        emit(error=error.message, hint=error.hint)
-        return error.exit_code
-    except ImportError as error:
-        emit(
-            error=f"The worker's Python lacks a package: {error}.",
-            hint="pip install -r requirements-worker.txt there.",
-        )
-        return EXIT_OTHER
-    except OSError as error:
-        emit(error=f"{error}.", hint="Check the path and its permissions.")
-        return EXIT_OTHER
-    for line in lines:
-        emit(line=line)
-    return EXIT_DONE
+    return answer(lambda: _estimate(JobFile.from_json(json.loads(arguments[0]))))
 
 
 def _estimate(job: JobFile) -> list[str]:

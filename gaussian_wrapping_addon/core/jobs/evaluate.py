@@ -14,7 +14,6 @@ import logging
 import os
 import subprocess
 import tempfile
-import threading
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -24,15 +23,14 @@ from ..errors import (
     EXIT_CANCELLED,
     EXIT_DONE,
     EXIT_OTHER,
-    EXIT_RESOURCES,
     DatasetError,
     ParseError,
     UsageError,
     WorkerError,
-    WrapError,
 )
 from ..files import read_json, write_json
 from ..helper_process import child_command, child_environment, emit, kill_group
+from .answer import answer
 from .job_folder import MARKER, JobFolder
 
 if TYPE_CHECKING:
@@ -40,7 +38,6 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger("gaussian_wrapping")
 
-PARENT_POLL_S = 1.0
 LAST_WORDS_BYTES = 2000
 _EXTRA_PACKAGES = ("libigl", "trimesh")
 
@@ -126,40 +123,17 @@ def _show(raw: bytes) -> bool:
 
 def main(arguments: list[str]) -> int:
     """Evaluate ``arguments = [request as JSON]`` in this process; return the exit code."""
-    # Not the caller's own id: where Python is started through a launcher, that is the parent.
-    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
-    try:
+
+    def work() -> list[str]:
         request = json.loads(arguments[0])
         report, lines = _evaluate(request)
         if request["out"]:
             out = Path(request["out"])
             write_json(out, report)
             lines.append(f"written to {out}")
-    except WrapError as error:
-        emit(error=error.message, hint=error.hint)
-        return error.exit_code
-    except MemoryError:
-        emit(error="Not enough memory.", hint="Use fewer --samples or close other programs.")
-        return EXIT_RESOURCES
-    except OSError as error:
-        emit(error=f"{error}.", hint="Check the path and its permissions.")
-        return EXIT_OTHER
-    except ImportError as error:
-        emit(
-            error=f"The worker's Python lacks a package: {error}.",
-            hint="pip install -r requirements-worker.txt there.",
-        )
-        return EXIT_OTHER
-    for line in lines:
-        emit(line=line)
-    return EXIT_DONE
+        return lines
 
-
-def end_with(parent: int) -> None:
-    """End this process when the one that asked has gone: nobody waits for the answer."""
-    while os.getppid() == parent:
-        time.sleep(PARENT_POLL_S)
-    os._exit(EXIT_CANCELLED)
+    return answer(work, "Use fewer --samples or close other programs.")
 
 
 def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:

@@ -8,10 +8,8 @@ Speaks as :mod:`~.evaluate` does: one JSON object a line on stdout.
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import threading
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,10 +21,9 @@ import numpy as np
 from ..dataset.file_frame import FileFrame, file_offset
 from ..dataset.placement_file import FILE_NAME, read_placement
 from ..dataset.similarity import Similarity
-from ..errors import EXIT_DONE, EXIT_OTHER, DatasetError, ParseError, UsageError, WrapError
+from ..errors import DatasetError, ParseError, UsageError
 from ..files import read_json
-from ..helper_process import emit
-from .evaluate import end_with
+from .answer import answer
 from .sidecar import write_sidecar
 
 if TYPE_CHECKING:
@@ -296,26 +293,13 @@ def _write_splat(
 
 def main(arguments: list[str]) -> int:
     """Export ``arguments = [the request as JSON]`` in this process; return the exit code."""
-    # Not the caller's own id: where Python is started through a launcher, that is the parent.
-    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
-    asked = json.loads(arguments[0])
-    try:
+
+    def work() -> Iterator[str]:
+        asked = json.loads(arguments[0])
         request = ExportRequest(
             Path(asked["result"]), Path(asked["out"]), tuple(asked["formats"]), asked["placed"],
             tuple(asked["regions"]), asked["levels"], asked["shading"],
         )  # fmt: skip
-        for path in export_files(request):
-            emit(line=f"written: {path}")
-    except WrapError as error:
-        emit(error=error.message, hint=error.hint)
-        return error.exit_code
-    except ImportError as error:
-        emit(
-            error=f"The worker's Python lacks a package: {error}.",
-            hint="pip install -r requirements-worker.txt there.",
-        )
-        return EXIT_OTHER
-    except OSError as error:
-        emit(error=f"{error}.", hint="Check the path and its permissions.")
-        return EXIT_OTHER
-    return EXIT_DONE
+        yield from (f"written: {path}" for path in export_files(request))
+
+    return answer(work)

@@ -7,17 +7,14 @@ Runs in the worker's Python. Speaks as :mod:`~.evaluate` does: one JSON object a
 from __future__ import annotations
 
 import json
-import os
-import threading
 from pathlib import Path
 from typing import Any
 
-from ..errors import EXIT_DONE, EXIT_OTHER, MeshingError, UsageError, WrapError
-from ..helper_process import emit
+from ..errors import MeshingError, UsageError
 from ..parallel import default_threads
 from ..progress import Progress
 from ..settings import MeshingSettings, from_json
-from .evaluate import end_with
+from .answer import answer
 from .job_file import AUTOMATIC_REGIONS, read_region_body
 from .job_folder import JobFolder
 from .region_meshing import expected_by_pivots, expected_mesh, free_bytes
@@ -30,20 +27,7 @@ MOST_SIGHTINGS = 60_000
 
 def main(arguments: list[str]) -> int:
     """Estimate ``arguments = [{"out", "region", "meshing", "threads"} as JSON]``."""
-    # Not the caller's own id: where Python is started through a launcher, that is the parent.
-    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
-    request = json.loads(arguments[0])
-    try:
-        lines = _lines(request)
-    except WrapError as error:
-        emit(error=error.message, hint=error.hint)
-        return error.exit_code
-    except OSError as error:
-        emit(error=f"{error}.", hint="Check the path and its permissions.")
-        return EXIT_OTHER
-    for line in lines:
-        emit(line=line)
-    return EXIT_DONE
+    return answer(lambda: _lines(json.loads(arguments[0])))
 
 
 def _newest(stages: Path, name: str) -> Path:

@@ -8,16 +8,13 @@ as :mod:`~.evaluate` does: one JSON object a line on stdout.
 from __future__ import annotations
 
 import json
-import os
-import threading
 import time
 from pathlib import Path
 
-from ..errors import EXIT_DONE, UsageError, WrapError
-from ..helper_process import emit
+from ..errors import UsageError, WrapError
 from ..parallel import default_threads
 from ..progress import Progress
-from .evaluate import end_with
+from .answer import answer
 from .job_folder import JobFolder
 from .region_meshing import open_lists, work_on_list
 
@@ -26,18 +23,14 @@ POLL_S = 0.5
 
 def main(arguments: list[str]) -> int:
     """Work for ``arguments = [{"out": folder, "threads": n, "wait_s": s} as JSON]``."""
-    # Not the caller's own id: where Python is started through a launcher, that is the parent.
-    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
-    request = json.loads(arguments[0])
-    try:
-        done = help_with_tiles(
-            JobFolder(Path(request["out"])), int(request["threads"]), float(request["wait_s"])
-        )
-    except WrapError as error:
-        emit(error=error.message, hint=error.hint)
-        return error.exit_code
-    emit(line=f"{done} parts done here")
-    return EXIT_DONE
+
+    def work() -> list[str]:
+        request = json.loads(arguments[0])
+        folder = JobFolder(Path(request["out"]))
+        done = help_with_tiles(folder, int(request["threads"]), float(request["wait_s"]))
+        return [f"{done} parts done here"]
+
+    return answer(work)
 
 
 def help_with_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:

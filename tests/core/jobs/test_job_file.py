@@ -15,7 +15,7 @@ from gaussian_wrapping_addon.core.errors import (
     ParseError,
     UsageError,
 )
-from gaussian_wrapping_addon.core.jobs import mesh_estimate
+from gaussian_wrapping_addon.core.jobs import answer, mesh_estimate
 from gaussian_wrapping_addon.core.jobs.job_file import (
     JobFile,
     make_job,
@@ -134,7 +134,7 @@ def test_a_region_that_is_no_file_is_told_by_all_commands(
     region: str,
     message: str,
 ) -> None:
-    monkeypatch.setattr(mesh_estimate, "end_with", lambda _parent: None)
+    monkeypatch.setattr(answer, "end_with", lambda _parent: None)
     path = str(tmp_path / region)
     with pytest.raises(DatasetError, match=message):
         make_job("mesh", tmp_path, JobSettings(regions=(path,)))
