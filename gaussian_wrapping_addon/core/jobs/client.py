@@ -25,6 +25,8 @@ LAST_WORDS_BYTES = 2000
 KILLED_CODES = (-9, 137)
 """Of a process that SIGKILL ended, itself or under a shell: what the kernel does for memory."""
 
+CODE_WAIT_S = 0.5
+"""For the exit code of a worker that has ended; longer only where a launcher stands between."""
 AFTER_TRAINING = ("mesh", "texture", "export")
 """Stages of a job whose training is finished."""
 
@@ -140,6 +142,10 @@ class JobClient:
         code = None if self._process is None else self._process.poll()
         # Read after the process was looked at: its last status may be its last deed.
         status = self.folder.read_status()
+        if code is None and self._process is not None and status.state == "LOST":
+            # It has ended between our two looks: only its code tells of what.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                code = self._process.wait(CODE_WAIT_S)
         if code is None:
             if status.state == "NEW" and self._process is None and not self.folder.locked():
                 return self._failed(status, "The worker did not start.")

@@ -87,6 +87,30 @@ def test_a_killed_worker_is_told_what_its_stage_can_do_with_less(
     assert unwanted not in status.hint
 
 
+def test_a_worker_killed_between_two_looks_is_killed_too(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    folder = JobFolder(tmp_path / "out")
+    folder.create()
+    write_job(folder.job_path, make_job("mesh", tmp_path / "photos", JobSettings()))
+
+    class Late(subprocess.Popen):
+        """Is killed after it was asked for its code."""
+
+        def poll(self) -> int | None:
+            if self.returncode is None:
+                os.kill(self.pid, signal.SIGKILL)
+                os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT)  # ended, its code is kept
+            return self.returncode
+
+    with Late([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        started = process_start_ticks(process.pid)
+        folder.write_status(JobStatus("RUNNING", "mesh", pid=process.pid, pid_started=started))
+        status = JobClient(folder, process).poll()
+    assert "signal 9" in status.error
+    assert "--points" in status.hint
+    assert status.exit_code == EXIT_RESOURCES
+
+
 def test_a_locked_folder_is_refused(tmp_path: Path) -> None:
     source = tmp_path / "photos"
     source.mkdir()
