@@ -22,8 +22,6 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 
-from ..speed_error.score import stage_folder
-
 LONG_SIDE_PX = 800
 PICTURE_WIDTH_PX = 1400
 
@@ -45,8 +43,8 @@ def held_out_figures(job: Path, picture: Path, threads: int) -> dict[str, Any]:
         mesh covers wholly; ``fitted_psnr``: with one gain a channel fitted to each photo, since
         nobody knows the exposure of a photo that was held out.
     """
-    scene = load_saved_scene(stage_folder(job, "cameras"))
-    trained = read_json(stage_folder(job, "train") / "done.json")
+    scene = load_saved_scene(_newest(job, "cameras"))
+    trained = read_json(_newest(job, "train") / "done.json")
     names = {figure["name"] for figure in trained["held_out"]}
     mesh = load_mesh(_newest(job, "mesh") / "mesh.npz")
     seen = tuple(view for view in scene.views if view.camera.name not in names)
