@@ -55,6 +55,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--jobs", type=Path, nargs="+", default=[], help="finished jobs of real photos"
     )
+    parser.add_argument(
+        "--unshown", nargs="+", default=[], metavar="NAME",
+        help="jobs of which the report has no picture, as where a licence forbids it",
+    )  # fmt: skip
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument(
         "--only", nargs="+", choices=PARTS, default=list(PARTS), help="only these parts"
@@ -76,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "known": _known,
         "uneven": _uneven,
         "large": _large,
-        "real": lambda threads: _real(options.jobs, out, threads),
+        "real": lambda threads: _real(options.jobs, out, threads, options.unshown),
     }
     for name in options.only:
         lines += ["", *parts[name](options.threads)]
@@ -199,7 +203,7 @@ def _large(threads: int) -> list[str]:
     ]
 
 
-def _real(jobs: Sequence[Path], out: Path, threads: int) -> list[str]:
+def _real(jobs: Sequence[Path], out: Path, threads: int, unshown: Sequence[str]) -> list[str]:
     lines = [
         "## Real photos, held out",
         "",
@@ -216,7 +220,7 @@ def _real(jobs: Sequence[Path], out: Path, threads: int) -> list[str]:
     pictures = []
     for job in jobs:
         _logger.info("held-out photos of %s", job.name)
-        picture = out / f"texturing-{job.name}.jpg"
+        picture = None if job.name in unshown else out / f"texturing-{job.name}.jpg"
         f = held_out_figures(job, picture, threads)
         lines.append(
             f"| {job.name} | {f['photos']} | {f['held_out']} | {f['faces']:,} "
@@ -224,7 +228,8 @@ def _real(jobs: Sequence[Path], out: Path, threads: int) -> list[str]:
             f"| {f['ssim']:.3f} | {100 * f['covered']:.0f} % "
             f"| {f['texture']['texels_overlapping']} |"
         )
-        pictures += ["", f"![{job.name}]({picture.name})"]
+        if picture is not None:
+            pictures += ["", f"![{job.name}]({picture.name})"]
     return lines + pictures if jobs else [*lines[:2], "No job was named with `--jobs`."]
 
 

@@ -26,14 +26,14 @@ LONG_SIDE_PX = 800
 PICTURE_WIDTH_PX = 1400
 
 
-def held_out_figures(job: Path, picture: Path, threads: int) -> dict[str, Any]:
+def held_out_figures(job: Path, picture: Path | None, threads: int) -> dict[str, Any]:
     """Texture a finished job's mesh anew without its held-out photos, and compare with these.
 
     Parameters
     ----------
     job : Path
         A job folder; the region that was meshed last counts.
-    picture : Path
+    picture : Path or None
         Gets the photo of median PSNR, left, and the rendering, right.
 
     Returns
@@ -76,9 +76,9 @@ def held_out_figures(job: Path, picture: Path, threads: int) -> dict[str, Any]:
             covered = renderer.render(camera).covered
             fitted.append(_fitted_psnr(photo, image, covered))
     ranked = sorted(score.views, key=lambda view: view.scores.psnr)
-    write_side_by_side(
-        picture, *shown[ranked[len(ranked) // 2].name], max_width_px=PICTURE_WIDTH_PX
-    )
+    if picture is not None:
+        middle = ranked[len(ranked) // 2].name
+        write_side_by_side(picture, *shown[middle], max_width_px=PICTURE_WIDTH_PX)
     return {
         "photos": len(seen),
         "held_out": len(score.views),
