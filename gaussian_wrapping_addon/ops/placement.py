@@ -27,8 +27,9 @@ MATRIX_TOLERANCE = 1e-5
 """Share by which an object's matrix (single precision, by way of angles) may differ from the
 placement that was set."""
 
-# What this session has written, by path: undo takes it back there as well.
-_written: dict[Path, str] = {}
+# What this session has written, by path, and the empty that it is of: undo takes it back there as
+# well. Of two empties of one result the one that wrote last decides.
+_written: dict[Path, tuple[str, str]] = {}
 
 
 def placement_of(frame: bpy.types.Object) -> Similarity:
@@ -129,7 +130,7 @@ def _keep(frame: bpy.types.Object, placement: Similarity) -> str:
         write_placement(path, placement, world_from_scene)
     except UsageError as error:
         return f"{lost}: {error}"
-    _written[path] = frame[tags.PLACEMENT]
+    _written[path] = frame.name, frame[tags.PLACEMENT]
     return ""
 
 
@@ -150,11 +151,12 @@ def after_undo(_scene: object = None, _unused: object = None) -> None:
             world_from_scene = tags.world_from_scene(frame)
         except UsageError:
             continue
-        if path not in _written or _written[path] == frame.get(tags.PLACEMENT, ""):
+        name, text = _written.get(path, ("", ""))
+        if frame.name != name or text == frame.get(tags.PLACEMENT, ""):
             continue
         # Before its first placement, a scene lies as it was trained.
         try:
             write_placement(path, _stored(frame) or Similarity(), world_from_scene)
-            _written[path] = frame.get(tags.PLACEMENT, "")
+            _written[path] = name, frame.get(tags.PLACEMENT, "")
         except UsageError:
             _logger.exception("the placement beside the result is not the one in Blender")

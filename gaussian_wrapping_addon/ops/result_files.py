@@ -19,6 +19,7 @@ from ..core.dataset.similarity import Similarity
 from ..core.errors import DatasetError, ParseError
 from ..core.files import read_json
 from ..core.settings import MAX_LODS
+from ..core.texture.file_checks import SINGLE_MAX
 from .region_geometry import vertices_of_region
 from .report_data import figures_of_report
 
@@ -192,7 +193,7 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         with np.load(path, allow_pickle=False) as arrays:
             vertices = np.asarray(arrays["vertices"], np.float64)
             faces = np.asarray(arrays["faces"])
-            corner_uvs = np.asarray(arrays["corner_uvs"], np.float32)
+            corner_uvs = np.asarray(arrays["corner_uvs"], np.float64)
     except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as error:
         raise ParseError(path, "whole file", f"not a mesh file ({error}).", hint) from None
     if vertices.ndim != 2 or vertices.shape[1:] != (3,):
@@ -204,9 +205,10 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if len(faces) == 0:
         raise ParseError(path, "faces", "there is none.", hint)
     for name, values in (("vertices", vertices), ("corner_uvs", corner_uvs)):
-        bad = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(1))
+        # Blender holds floats of 32 bits: what is beyond them would become infinite there.
+        bad = np.flatnonzero(~(np.abs(values) <= SINGLE_MAX).reshape(len(values), -1).all(1))
         if len(bad):
-            raise ParseError(path, f"{name}[{bad[0]}]", "not a finite number.", hint)
+            raise ParseError(path, f"{name}[{bad[0]}]", "not a finite number of 32 bits.", hint)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ParseError(path, "faces", "an index is out of range.", hint)
-    return vertices, faces.astype(np.int32), corner_uvs
+    return vertices, faces.astype(np.int32), corner_uvs.astype(np.float32)

@@ -172,6 +172,7 @@ def set_scene(result: Path, **changes: object) -> None:
 
 
 NAN_VERTICES = np.where(np.arange(24).reshape(8, 3) == 10, np.nan, cube_mesh()[0])
+VAST_VERTICES = np.where(np.arange(24).reshape(8, 3) == 10, 1e39, cube_mesh()[0])
 HUGE_UVS = np.full((12, 3, 2), np.inf, np.float32)
 
 
@@ -179,6 +180,7 @@ HUGE_UVS = np.full((12, 3, 2), np.inf, np.float32)
     ("damage", "place"),
     [
         (lambda r: break_npz(r, vertices=NAN_VERTICES), r"vertices\[3\]"),
+        (lambda r: break_npz(r, vertices=VAST_VERTICES), r"vertices\[3\].*32 bits"),
         (lambda r: break_npz(r, corner_uvs=HUGE_UVS), r"corner_uvs\[0\]"),
         (lambda r: break_npz(r, corner_uvs=np.zeros((5, 3, 2), np.float32)), "corner_uvs"),
         (lambda r: break_npz(r, faces=np.full((12, 3), 8)), "out of range"),

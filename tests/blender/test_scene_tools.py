@@ -348,6 +348,26 @@ def test_undo_and_redo_take_the_file_along(job: Path, result: ImportedResult, mo
     assert kept.to_json() == placed.to_json()
 
 
+def test_undo_of_something_else_leaves_what_another_empty_has_written(
+    job: Path, result: ImportedResult
+) -> None:
+    """A copied parent is of the same result: it must not write its own placement over this one."""
+    path = job / "result" / FILE_NAME
+    twin = result.frame.copy()
+    bpy.context.scene.collection.objects.link(twin)
+    name = result.frame.name
+    pick_vertices(result.meshes[0], [0, 7])
+    assert bpy.ops.gwrap.set_scale("EXEC_DEFAULT", distance=3.0) == {"FINISHED"}
+    push("scaled")
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("other", None))
+    push("added")
+    bpy.ops.ed.undo()
+    kept = read_placement(path, WORLD_FROM_SCENE)
+    assert kept is not None
+    assert kept.scale == pytest.approx(np.sqrt(3.0), rel=1e-6)
+    assert same_matrix(bpy.data.objects[name], kept)
+
+
 def start_again(job: Path) -> ImportedResult:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     imported = import_result(job / "result", bpy.context.scene)
