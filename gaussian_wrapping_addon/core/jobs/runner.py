@@ -138,6 +138,14 @@ def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: in
     key = stage_key(
         STAGE_VERSIONS["cameras"], job.source, source_fingerprint(source), job.settings.seed
     )
+    if job.command == "mesh" and read_done(folder.stages / f"cameras-{key}") is None:
+        earlier = _trained_before(folder, job)
+        if earlier is not None:
+            _logger.warning(
+                "%s has changed since the training, or its files have new dates: the mesh is of "
+                "the training as it is. To train anew, run wrap.", source,
+            )  # fmt: skip
+            return earlier
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         if is_splat(source):
@@ -156,6 +164,21 @@ def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: in
 
     span = _Span(0.0, SHARES["cameras"])
     return run_stage(folder.stages, "cameras", key, overall.stage("cameras", span), work)
+
+
+def _trained_before(folder: JobFolder, job: JobFile) -> Stage | None:
+    """Return the newest finished cameras that the job's training was finished on."""
+    from .training_stage import training_keys
+
+    found: list[tuple[float, int, Stage]] = []
+    for path in sorted(folder.stages.glob("cameras-*")):
+        done, key = read_done(path), path.name.removeprefix("cameras-")
+        train_key, _ = training_keys(STAGE_VERSIONS["train"], key, job)
+        trained = read_done(folder.stages / f"train-{train_key}")
+        if done is not None and trained is not None:
+            stage = Stage("cameras", key, path, done, True)
+            found.append((trained["finished_unix_s"], len(found), stage))
+    return max(found)[2] if found else None
 
 
 def _run_training(
