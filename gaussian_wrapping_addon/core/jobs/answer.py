@@ -11,7 +11,15 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 
-from ..errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER, EXIT_RESOURCES, WrapError
+from ..errors import (
+    EXIT_CANCELLED,
+    EXIT_DONE,
+    EXIT_OTHER,
+    EXIT_RESOURCES,
+    NO_ROOM,
+    WrapError,
+    cannot_be_written,
+)
 from ..helper_process import emit
 
 PARENT_POLL_S = 1.0
@@ -40,6 +48,10 @@ def answer(work: Callable[[], Iterable[str]], memory_hint: str = "Close other pr
         )
         return EXIT_OTHER
     except OSError as error:
+        if error.errno in NO_ROOM:
+            full = cannot_be_written(error.filename or "a file", error)
+            emit(error=full.message, hint=full.hint)
+            return full.exit_code
         emit(error=f"{error}.", hint="Check the path and its permissions.")
         return EXIT_OTHER
     return EXIT_DONE

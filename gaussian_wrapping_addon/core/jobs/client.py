@@ -4,22 +4,26 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError
+from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, cannot_be_written
 from ..helper_process import child_command, child_environment, kill_group
+from ..worker_environment import known_environments, ready_worker
 from .earlier_job import keep_finished
 from .job_file import JobFile, read_job, write_job
 from .job_folder import JobFolder, JobStatus, process_alive
 from .smaller import killed_hint, killed_mesh_hint
 
+WORKER_MODULE = "jobs.worker"
 PYTHON_VARIABLE = "GAUSSIAN_WRAPPING_PYTHON"
 LAST_WORDS_BYTES = 2000
 KILLED_CODES = (-9, 137)
@@ -27,19 +31,54 @@ KILLED_CODES = (-9, 137)
 
 CODE_WAIT_S = 0.5
 """For the exit code of a worker that has ended; longer only where a launcher stands between."""
+KILL_GRACE_S = 2.0
+KILL_POLL_S = 0.05
 AFTER_TRAINING = ("mesh", "texture", "export")
 """Stages of a job whose training is finished."""
 
 
 def worker_python(preference: str = "") -> str:
-    """Return the interpreter for workers: preference, environment variable, or this one."""
-    chosen = preference or os.environ.get(PYTHON_VARIABLE, "") or sys.executable
-    if not Path(chosen).exists():
+    """Return the interpreter for workers, or the folder of an environment that names one.
+
+    In this order: the preference, the environment variable, the environment that the add-on has
+    made, the Python that runs this where it has torch.
+
+    Raises
+    ------
+    UsageError
+        The one that was named does not exist, or nothing is there.
+    """
+    chosen = preference or os.environ.get(PYTHON_VARIABLE, "")
+    if chosen and not Path(chosen).exists():
         raise UsageError(
             f"The worker's Python {chosen} does not exist.",
             f"Correct it in the add-on's preferences or in {PYTHON_VARIABLE}.",
         )
-    return chosen
+    found = chosen or ready_worker() or (sys.executable if _has_torch() else "")
+    if not found:
+        half = any(e.is_half() for e in known_environments())
+        raise UsageError(
+            "The worker is only half set up." if half else "No worker is set up.",
+            "Press Set Up Worker in the add-on's preferences, run batch.py set-up-worker, or name"
+            f" a Python that has the packages in {PYTHON_VARIABLE}.",
+        )
+    return found
+
+
+def _has_torch() -> bool:
+    """Tell whether the Python that runs this could be a worker; imports nothing."""
+    try:
+        return importlib.util.find_spec("torch") is not None
+    except (ImportError, ValueError):
+        return False
+
+
+@contextlib.contextmanager
+def _writing(root: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise cannot_be_written(error.filename2 or error.filename or root, error) from None
 
 
 class JobClient:
@@ -49,6 +88,7 @@ class JobClient:
         self.folder = folder
         self._process = process
         self._seen_at_work = process is not None
+        self._gone_since_s: float | None = None
 
     @classmethod
     def start(
@@ -81,8 +121,9 @@ class JobClient:
         target.create()
         if target.locked():
             raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
-        keep_finished(target, job)
-        write_job(target.job_path, job)
+        with _writing(target.root):
+            keep_finished(target, job)
+            write_job(target.job_path, job)
         return cls._launch(target, python, keep_running)
 
     @classmethod
@@ -92,23 +133,27 @@ class JobClient:
         """Start a worker for the job that lies in ``folder``; finished stages are re-used."""
         target = JobFolder(folder.resolve())
         if not target.is_job():
-            raise UsageError(f"{folder} holds no job.", "Choose the folder given as --out.")
+            raise UsageError(
+                f"{folder} holds no job.", "Choose the folder given as --out, or press Find Job."
+            )
         if target.locked():
             raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
         return cls._launch(target, python, keep_running)
 
     @classmethod
     def _launch(cls, target: JobFolder, python: str | None, keep_running: bool) -> JobClient:
-        target.cancel_path.unlink(missing_ok=True)
-        target.write_status(JobStatus(heartbeat_s=time.time()))
+        with _writing(target.root):
+            target.cancel_path.unlink(missing_ok=True)
+            target.write_status(JobStatus(heartbeat_s=time.time()))
+            output = (target.root / "worker-output.txt").open("wb")
         options: dict[str, Any] = {"start_new_session": True}
         if sys.platform == "win32":
             options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
         parent = "0" if keep_running else str(os.getpid())
-        with (target.root / "worker-output.txt").open("wb") as output:
+        with output:
             process = subprocess.Popen(
                 child_command(
-                    "jobs.worker", str(target.root), parent, python=python or worker_python()
+                    WORKER_MODULE, str(target.root), parent, python=python or worker_python()
                 ),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
@@ -127,12 +172,15 @@ class JobClient:
         return cls(target, None)
 
     def poll(self) -> JobStatus:
-        """Return the job's status; cheap enough for a timer.
+        """Return the job's status; cheap enough for a timer, and never waits.
 
         A job that is finished as before, but could not be meshed again, has failed for those who
         saw it at work, and is done for all others.
         """
         status = self._poll()
+        if status.result:
+            # Where it is now: the job may have been moved, and one from elsewhere may name any.
+            status = replace(status, result=str(self.folder.result))
         self._seen_at_work = self._seen_at_work or status.active
         if self._seen_at_work and status.state == "DONE" and status.error:
             return replace(status, state="FAILED")
@@ -145,7 +193,11 @@ class JobClient:
         if code is None and self._process is not None and status.state == "LOST":
             # It has ended between our two looks: only its code tells of what.
             with contextlib.suppress(subprocess.TimeoutExpired):
-                code = self._process.wait(CODE_WAIT_S)
+                code = self._process.wait(0.0)
+            now_s = time.monotonic()
+            self._gone_since_s = self._gone_since_s or now_s
+            if code is None and now_s - self._gone_since_s < CODE_WAIT_S:
+                return replace(status, state="RUNNING", error="", hint="")
         if code is None:
             if status.state == "NEW" and self._process is None and not self.folder.locked():
                 return self._failed(status, "The worker did not start.")
@@ -183,10 +235,13 @@ class JobClient:
     def last_words(self) -> str:
         """Return the end of what the worker wrote to its terminal."""
         try:
-            data = (self.folder.root / "worker-output.txt").read_bytes()
+            with (self.folder.root / "worker-output.txt").open("rb") as output:
+                length = output.seek(0, os.SEEK_END)
+                output.seek(max(length - LAST_WORDS_BYTES, 0))
+                data = output.read(LAST_WORDS_BYTES)
         except OSError:
             return ""
-        lines = data[-LAST_WORDS_BYTES:].decode(errors="replace").strip().splitlines()
+        lines = data.decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else ""
 
     def cancel(self) -> None:
@@ -195,17 +250,26 @@ class JobClient:
             self.folder.cancel_path.touch()
 
     def kill(self) -> None:
-        """End the worker and its helpers at once."""
+        """End the worker and its helpers: terminate, wait two seconds, kill.
+
+        A worker that another process started is known from the job folder alone, which may come
+        from elsewhere: it is ended only where the system says that it is a worker.
+        """
         if self._process is not None:
             kill_group(self._process)
             return
         status = self.folder.read_status()
-        if process_alive(status.pid, status.pid_started):
+        if not _is_worker(status.pid):
+            return
+        for number in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)):
+            end_s = time.monotonic() + KILL_GRACE_S
             with contextlib.suppress(ProcessLookupError, PermissionError):
-                if hasattr(os, "killpg"):
-                    os.killpg(status.pid, signal.SIGTERM)
-                else:
-                    os.kill(status.pid, signal.SIGTERM)
+                if process_alive(status.pid, status.pid_started):
+                    _signal_group(status.pid, number)
+            while time.monotonic() < end_s:
+                if not process_alive(status.pid, status.pid_started):
+                    return
+                time.sleep(KILL_POLL_S)
 
     def wait(self, timeout_s: float | None = None) -> JobStatus:
         """Wait until our worker process has ended and return the final status.
@@ -219,3 +283,19 @@ class JobClient:
             raise WorkerError("This job was started by another process.", "Poll it instead.")
         self._process.wait(timeout_s)
         return self.poll()
+
+
+def _signal_group(pid: int, number: int) -> None:
+    """Signal a worker with its group; alone where its id names no group of its own."""
+    if hasattr(os, "killpg") and os.getpgid(pid) == pid:
+        os.killpg(pid, number)
+    else:
+        os.kill(pid, number)
+
+
+def _is_worker(pid: int) -> bool:
+    """Tell whether a process is a worker of ours; false where the system does not say."""
+    try:
+        return WORKER_MODULE.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+    except OSError:
+        return False

@@ -13,8 +13,10 @@ import sys
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from ..errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError
+from ..errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError, WrapError
 from ..helper_process import child_command, child_environment, emit
+from ..worker_environment import known_environments
+from ..worker_requirements import read_requirements, requirements_file
 
 MIN_PYTHON = (3, 11)
 MIN_MEMORY_BYTES = 4 * 2**30
@@ -48,15 +50,7 @@ def diagnose(folder: str = ".") -> list[Diagnosis]:
             "Use Python 3.11 or newer.",
         )
     ]
-    for module, package in REQUIRED.items():
-        try:
-            importlib.import_module(module)
-        except Exception as error:  # a broken binary package can raise anything
-            found.append(
-                Diagnosis(package, False, f"cannot be imported: {error}", f"pip install {package}")
-            )
-        else:
-            found.append(Diagnosis(package, True, importlib.metadata.version(package)))
+    found += _packages()
     found.append(_device())
     found.append(_memory())
     free_bytes = shutil.disk_usage(folder).free
@@ -71,11 +65,38 @@ def diagnose(folder: str = ".") -> list[Diagnosis]:
     return found
 
 
+def _packages() -> list[Diagnosis]:
+    """Compare every pinned package with the list, and import it."""
+    modules = {package: module for module, package in REQUIRED.items()}
+    found = []
+    for requirement in read_requirements(requirements_file()):
+        name = requirement.name
+        hint = f"Press Repair, or: pip install {requirement.text}"
+        try:
+            module = importlib.import_module(modules.get(name, name))
+            version = importlib.metadata.version(name)
+        except Exception as error:  # a broken binary package can raise anything
+            found.append(Diagnosis(name, False, f"cannot be imported: {error}", hint))
+            continue
+        good = requirement.allows(version)
+        wanted = "" if good else f", but {requirement.versions} is wanted"
+        found.append(Diagnosis(name, good, f"{version}{_build(module)}{wanted}", hint))
+    return found
+
+
+def _build(module: Any) -> str:
+    """Return for which device torch was built; nothing for other packages."""
+    if getattr(module, "__name__", "") != "torch":
+        return ""
+    cuda = getattr(module.version, "cuda", None)
+    return f", built for CUDA {cuda}" if cuda else ", built for the processor"
+
+
 def _device() -> Diagnosis:
     try:
         import torch
-    except ImportError:
-        return Diagnosis("Device", False, "torch is missing", "pip install torch")
+    except Exception:  # the line of torch says what it is
+        return Diagnosis("Device", False, "torch is missing", "Press Set Up Worker.")
     if torch.cuda.is_available():
         return Diagnosis(
             "Device", True, f"{torch.cuda.get_device_name(0)} is present; jobs run on the processor"
@@ -123,7 +144,9 @@ def diagnose_worker(python: str) -> list[Diagnosis]:
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise WorkerError(f"{python} does not run: {error}.", "Choose another Python.") from None
+        raise WorkerError(
+            f"{python} does not run: {error}.", "Press Repair, or choose another Python."
+        ) from None
     findings: list[Diagnosis] = []
     for line in done.stdout.decode(errors="replace").splitlines():
         try:
@@ -135,6 +158,28 @@ def diagnose_worker(python: str) -> list[Diagnosis]:
         words = done.stderr.decode(errors="replace").strip().splitlines()
         raise WorkerError(
             f"{python} gave no answer: {words[-1] if words else 'no output'}.",
-            "Choose a Python 3.11 or newer that has the packages of requirements-worker.txt.",
+            "Press Repair, or choose a Python 3.11 or newer with the worker's packages.",
         )
     return findings
+
+
+def find_and_diagnose(preference: str = "") -> list[Diagnosis]:
+    """Examine the interpreter that jobs would use; where there is none, say what to do."""
+    from .client import worker_python
+
+    half = [e for e in known_environments() if e.is_half()]
+    found = [
+        Diagnosis(
+            "Environment",
+            False,
+            f"half made, not used: {e.root}",
+            "Press Set Up Worker to go on, or Remove.",
+        )
+        for e in half
+    ]
+    try:
+        python = worker_python(preference)
+        found += diagnose_worker(python)
+    except WrapError as error:
+        return [*found, Diagnosis("Worker", False, error.message, error.hint)]
+    return found

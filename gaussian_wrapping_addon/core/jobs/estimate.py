@@ -46,10 +46,11 @@ def _estimate(job: JobFile) -> list[str]:
         f"training ({job.settings.preset}, {threads} threads): {expected.span()}",
         f"memory: {expected.memory_bytes / 2**30:.1f} GB",
         f"disk: {expected.disk_bytes / 2**30:.2f} GB",
-        f"Gaussians: up to {expected.gaussians}",
-        f"mesh and texture of a region take about {100 * low:.0f} to {100 * high:.0f} % of it more"
-        + ("" if facts.points else "; solving the cameras takes minutes before"),
+        f"Gaussians: up to {expected.gaussians:,}",
+        f"mesh and texture: {100 * low:.0f} to {100 * high:.0f} % more",
     ]
+    if not facts.points:
+        lines.append("solving the cameras: minutes before")
     if not compiled:
         lines.append("not timed here: the first job compiles the renderer, about a minute, once")
     return [*lines, *(f"warning: {text}" for text in judge(expected, machine))]

@@ -8,6 +8,7 @@ line: ``{"message"}`` while it works, ``{"line"}`` for the table, ``{"error", "h
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib.metadata
 import json
 import logging
@@ -27,6 +28,7 @@ from ..errors import (
     ParseError,
     UsageError,
     WorkerError,
+    cannot_be_written,
 )
 from ..files import read_json, write_json
 from ..helper_process import child_command, child_environment, emit, kill_group
@@ -124,16 +126,30 @@ def _show(raw: bytes) -> bool:
 def main(arguments: list[str]) -> int:
     """Evaluate ``arguments = [request as JSON]`` in this process; return the exit code."""
 
+    from ..texture.file_checks import writing
+
     def work() -> list[str]:
         request = json.loads(arguments[0])
+        out = Path(request["out"]) if request["out"] else None
+        if out is not None:
+            _refuse_output(out)
         report, lines = _evaluate(request)
-        if request["out"]:
-            out = Path(request["out"])
-            write_json(out, report)
+        if out is not None:
+            with writing(out):
+                write_json(out, report)
             lines.append(f"written to {out}")
         return lines
 
     return answer(work, "Use fewer --samples or close other programs.")
+
+
+def _refuse_output(out: Path) -> None:
+    """Refuse a file that cannot be written: before the work, not after it."""
+    if out.is_dir():
+        raise UsageError(f"{out} is a folder.", "Give a file for the figures.")
+    if not (out.parent.is_dir() and os.access(out.parent, os.W_OK)):
+        reason = errno.EACCES if out.parent.is_dir() else errno.ENOENT
+        raise cannot_be_written(out, OSError(reason, os.strerror(reason)))
 
 
 def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -197,12 +213,12 @@ def job_mesh(folder: Path, region: str | None) -> Path:
     Raises
     ------
     UsageError
-        The job has several regions and none was named, or lacks the one named.
+        The folder is no job; it has several regions and none was named, or lacks the one named.
     DatasetError
-        The folder is no job, or a job without results.
+        The job has no results.
     """
     if not (folder / MARKER).exists():
-        raise DatasetError(
+        raise UsageError(
             f"{folder.name} is no job folder.", "Give the folder of --out, or a mesh file."
         )
     found = {path.parent.name: path for path in sorted(folder.glob("result/*/mesh.ply"))}

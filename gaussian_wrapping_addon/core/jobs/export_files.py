@@ -8,8 +8,6 @@ Speaks as :mod:`~.evaluate` does: one JSON object a line on stdout.
 from __future__ import annotations
 
 import json
-import re
-import shutil
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,18 +20,18 @@ from ..dataset.file_frame import FileFrame, file_offset
 from ..dataset.placement_file import FILE_NAME, read_placement
 from ..dataset.similarity import Similarity
 from ..errors import DatasetError, ParseError, UsageError
-from ..files import read_json
+from ..files import read_json, write_bytes
+from ..texture.file_checks import atlas_file
 from .answer import answer
+from .export_formats import OWN_FORMATS, SHADINGS
+from .file_stems import SPLAT_STEM, file_stems
+from .job_folder import MARKER
 from .sidecar import write_sidecar
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-OWN_FORMATS = ("glb", "obj", "ply", "splat")
-"""Written here; the others need Blender."""
-BLENDER_FORMATS = ("usd", "fbx")
-SHADINGS = ("auto", "lit", "unlit")
-SPLAT_NAME = "gaussians.splat.ply"
+SPLAT_NAME = f"{SPLAT_STEM}.ply"
 
 
 @dataclass(frozen=True)
@@ -66,17 +64,15 @@ class StoredMesh:
     vertices: np.ndarray  # (v, 3) float64, scene frame
     faces: np.ndarray  # (f, 3) int32
     corner_uvs: np.ndarray  # (f, 3, 2) float32
+    stem: str
+    """Name of its files, without their endings."""
+    face_atlas: np.ndarray | None = None  # (f,) uint8, None where there is one atlas
 
-    @property
-    def stem(self) -> str:
-        """Name of its files: no spaces, which OBJ readers do not agree on."""
-        return file_stem(self.region, self.level)
-
-
-def file_stem(region: str, level: int) -> str:
-    """Return the name, without its ending, of the files of a region's level."""
-    clean = re.sub(r"[^\w.-]+", "_", region).strip("._") or "mesh"
-    return f"{clean}-lod{level}" if level else clean
+    def maps(self, name: str) -> list[Path]:
+        """Return the files of a map, one for each atlas; none where the mesh has no such map."""
+        atlases = 1 if self.face_atlas is None else int(self.face_atlas.max()) + 1
+        paths = [self.folder / atlas_file(name, number) for number in range(atlases)]
+        return paths if paths[0].is_file() else []
 
 
 def result_of(folder: Path) -> Path:
@@ -84,13 +80,17 @@ def result_of(folder: Path) -> Path:
 
     Raises
     ------
+    UsageError
+        The folder is no job's.
     DatasetError
-        There is none.
+        The job has no result yet.
     """
     for path in (folder / "result", folder):
         if (path / "scene.json").is_file():
             return path.resolve()
-    raise DatasetError(f"{folder} holds no result.", "Give the folder of a finished job.")
+    if (folder / MARKER).exists():
+        raise DatasetError(f"The job {folder} has no result yet.", "Resume it first.")
+    raise UsageError(f"{folder} holds no job's result.", "Give the folder of a finished job.")
 
 
 def frames_of(result: Path) -> tuple[Similarity, Similarity]:
@@ -137,6 +137,8 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
         if wrong:
             raise UsageError(f"{wrong[0]!r} is not written here.", f"Use {', '.join(known)}.")
     frames = frames_of(request.result)
+    if request.out.exists() and not request.out.is_dir():
+        raise UsageError(f"{request.out} is a file.", "Give a folder for the exports.")
     with writing(request.out):
         request.out.mkdir(parents=True, exist_ok=True)
     wanted = [f for f in request.formats if f != "splat"]
@@ -151,23 +153,31 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
 def _meshes(request: ExportRequest) -> Iterator[StoredMesh]:
     known = sorted(path.parent.name for path in request.result.glob("*/mesh.npz"))
     missing = sorted(set(request.regions) - set(known))
-    if missing or not known:
+    if not known:
+        raise DatasetError(f"{request.result} holds no mesh.", "Mesh a region first.")
+    if missing:
         raise UsageError(
-            f"{request.result} holds no mesh {missing[0] if missing else ''}".rstrip() + ".",
-            f"Use {', '.join(known)}." if known else "Mesh a region first.",
+            f"{request.result} holds no mesh {missing[0]}.", f"Use {', '.join(known)}."
         )
-    for region in request.regions or known:
-        folder, level = request.result / region, 0
-        while (folder / "mesh.npz").is_file():
-            yield _read_mesh(region, level, folder)
-            level += 1
-            folder = request.result / region / f"lod{level}"
-            if not request.levels:
-                break
+    places = {(r, n): path for r in known for n, path in _levels(request.result / r)}
+    stems = file_stems(places)
+    for region in dict.fromkeys(request.regions or known):
+        for (owner, level), folder in places.items():
+            if owner == region and (request.levels or level == 0):
+                yield _read_mesh(region, level, folder, stems[region, level])
 
 
-def _read_mesh(region: str, level: int, folder: Path) -> StoredMesh:
-    from ..texture.file_checks import check_mesh
+def _levels(folder: Path) -> Iterator[tuple[int, Path]]:
+    """Give the number and the folder of each level that a region has."""
+    level, place = 0, folder
+    while (place / "mesh.npz").is_file():
+        yield level, place
+        level += 1
+        place = folder / f"lod{level}"
+
+
+def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
+    from ..texture.file_checks import check_face_atlas, check_mesh
 
     path = folder / "mesh.npz"
     try:
@@ -176,6 +186,9 @@ def _read_mesh(region: str, level: int, folder: Path) -> StoredMesh:
                 np.asarray(arrays[n], t)
                 for n, t in (("vertices", "f8"), ("faces", "i4"), ("corner_uvs", "f4"))
             )
+            face_atlas = arrays["face_atlas"] if "face_atlas" in arrays.files else None
+        if face_atlas is not None:
+            face_atlas = check_face_atlas(face_atlas, len(faces))
         if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
             raise ValueError("not lists of triples")
         if corner_uvs.shape != (len(faces), 3, 2):
@@ -184,7 +197,7 @@ def _read_mesh(region: str, level: int, folder: Path) -> StoredMesh:
         raise ParseError(
             path, "whole file", f"not a mesh file ({error}).", "Mesh the region again."
         ) from None
-    mesh = StoredMesh(region, level, folder, vertices, faces, corner_uvs)
+    mesh = StoredMesh(region, level, folder, vertices, faces, corner_uvs, stem, face_atlas)
     check_mesh(vertices, faces, corner_uvs, name=f"mesh {mesh.stem}")
     return mesh
 
@@ -204,41 +217,47 @@ def _write_mesh(
     frame = FileFrame(format, target_from_scene)
     if not request.placed and format != "ply":  # doubles need no offset
         # That of the finest level, so that all levels lie over each other.
-        finest = mesh if mesh.level == 0 else _read_mesh(mesh.region, 0, mesh.folder.parent)
+        finest = mesh
+        if mesh.level:
+            finest = _read_mesh(mesh.region, 0, mesh.folder.parent, mesh.stem)
         frame = FileFrame(
             format, target_from_scene, file_offset(target_from_scene.points(finest.vertices))
         )
     local = frame.local(mesh.vertices)
     path = request.out / f"{mesh.stem}.{format}"
     textures: list[str] = []
+    missing = mesh.folder / "albedo.png"
     shading = "lit"
     if format == "ply":
-        albedo = np.asarray(_image(mesh.folder / "albedo.png"))
-        colors = vertex_colors(len(local), mesh.faces, mesh.corner_uvs, albedo)
+        albedos = [np.asarray(_image(file)) for file in mesh.maps("albedo") or [missing]]
+        colors = vertex_colors(len(local), mesh.faces, mesh.corner_uvs, albedos, mesh.face_atlas)
         write_mesh_ply(path, local, mesh.faces, colors)
     elif format == "obj":
-        present = [n for n in ("albedo", "normal") if (mesh.folder / f"{n}.png").is_file()]
-        textures = [f"{mesh.stem}-{name}.png" for name in present]
-        with writing(request.out):
-            for name, target in zip(present, textures, strict=True):
-                _image(mesh.folder / f"{name}.png")
-                shutil.copyfile(mesh.folder / f"{name}.png", request.out / target)
-        write_obj(path, local @ frame.turn.T, mesh.faces, mesh.corner_uvs, *textures)
+        sources = {name: mesh.maps(name) for name in ("albedo", "normal")}
+        beside = {n: [f"{mesh.stem}-{f.name}" for f in files] for n, files in sources.items()}
+        textures = [*beside["albedo"], *beside["normal"]]
+        for file in [*sources["albedo"], *sources["normal"]]:
+            data, copy = _png(file), request.out / f"{mesh.stem}-{file.name}"
+            with writing(copy):
+                write_bytes(copy, data)
+        write_obj(
+            path, local @ frame.turn.T, mesh.faces, mesh.corner_uvs,
+            beside["albedo"], beside["normal"], mesh.face_atlas,
+        )  # fmt: skip
     else:
         maps = {
-            f"{name}_png": file.read_bytes()
+            f"{name}_png": [_png(file) for file in files]
             for name in ("normal", "occlusion")
-            if (file := mesh.folder / f"{name}.png").is_file()
+            if (files := mesh.maps(name))
         }
-        _image(mesh.folder / "albedo.png")
-        albedo_png = (mesh.folder / "albedo.png").read_bytes()
+        albedo_png = [_png(file) for file in mesh.maps("albedo") or [missing]]
         shading = request.shading
         if shading == "auto":
             shading = "lit" if maps else "unlit"
         write_glb(
             path, local, mesh.faces, mesh.corner_uvs, albedo_png, frame.offset,
             normal_png=maps.get("normal_png"), occlusion_png=maps.get("occlusion_png"),
-            shading=shading,
+            shading=shading, face_atlas=mesh.face_atlas,
         )  # fmt: skip
     contents = {
         "region": mesh.region, "level": mesh.level, "shading": shading, "textures": textures,
@@ -261,6 +280,12 @@ def _image(path: Path) -> Image:
         raise ParseError(
             path, "whole file", f"not an image ({error}).", "Mesh the region again."
         ) from None
+
+
+def _png(path: Path) -> bytes:
+    """Return the bytes of an image that can be read."""
+    _image(path)
+    return path.read_bytes()
 
 
 def _write_splat(

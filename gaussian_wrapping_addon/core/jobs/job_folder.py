@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import ParseError, UsageError
-from ..files import read_json, write_json
+from ..errors import NO_ROOM, ParseError, UsageError, cannot_be_written
+from ..files import overwrite_json, read_json, write_json
 
 STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
 ACTIVE_STATES = ("NEW", "RUNNING", "CANCELLING")
@@ -51,9 +51,39 @@ class JobStatus:
 
     @classmethod
     def from_json(cls, values: Any) -> JobStatus:
-        """Build from JSON values, ignoring entries of other versions."""
-        known = {f.name for f in fields(cls)}
-        return cls(**{k: v for k, v in dict(values).items() if k in known})
+        """Build from JSON values, ignoring entries of other versions.
+
+        Raises
+        ------
+        TypeError, ValueError
+            An entry is not of its kind: the file is not ours, or is being written.
+        """
+        given = dict(values)
+        known = {f.name: given[f.name] for f in fields(cls) if f.name in given}
+        for name, value in known.items():
+            if not _is_kind(name, value):
+                raise TypeError(f"{name} is {type(value).__name__}")
+        return cls(**known)
+
+
+_WHOLE_NUMBERS = ("pid", "pid_started", "exit_code")
+_NUMBERS = ("fraction", "seconds_left", "heartbeat_s")
+_MAY_BE_NONE = ("seconds_left", "exit_code")
+
+
+def _is_kind(name: str, value: Any) -> bool:
+    """Tell whether a value can be the field of this name of a status."""
+    if value is None:
+        return name in _MAY_BE_NONE
+    if isinstance(value, bool):
+        return False
+    if name in _WHOLE_NUMBERS:
+        return isinstance(value, int)
+    if name in _NUMBERS:
+        return isinstance(value, int | float)
+    if name == "figures":
+        return isinstance(value, dict) and all(_is_kind("fraction", v) for v in value.values())
+    return isinstance(value, str) and (name != "state" or value in STATES)
 
 
 def process_start_ticks(pid: int) -> int:
@@ -152,6 +182,8 @@ class JobFolder:
         ------
         UsageError
             The path is a file, or a folder with other content.
+        ResourceError
+            It cannot be written.
         """
         if self.root.exists() and not self.root.is_dir():
             raise UsageError(f"{self.root} is a file.", "Choose a folder for the results.")
@@ -164,9 +196,7 @@ class JobFolder:
             (self.root / MARKER).touch()
             self.stages.mkdir(exist_ok=True)
         except OSError as error:
-            raise UsageError(
-                f"{self.root} cannot be written: {error.strerror}.", "Choose another folder."
-            ) from None
+            raise cannot_be_written(self.root, error) from None
 
     def is_job(self) -> bool:
         """Whether a job was started here."""
@@ -200,10 +230,19 @@ class JobFolder:
 
     def write_status(self, status: JobStatus) -> None:
         """Write the status atomically."""
-        write_json(self.status_path, asdict(status))
+        try:
+            write_json(self.status_path, asdict(status))
+        except OSError as error:
+            if error.errno not in NO_ROOM or status.active:
+                raise
+            # The last words of a worker that has met a full disk.
+            overwrite_json(self.status_path, asdict(status))
 
     def lock(self) -> None:
-        """Take the folder for this process; a lock of a dead process is taken over.
+        """Take the folder for this process.
+
+        The lock of a dead process, or one that is broken, is taken over: locks of living ones
+        appear whole.
 
         Raises
         ------
@@ -214,8 +253,7 @@ class JobFolder:
         owner = self._lock_owner()
         if owner == (mine["pid"], mine["started"]):
             return
-        if owner is not None and not process_alive(*owner):
-            self.lock_path.unlink(missing_ok=True)
+        self._drop_stale_lock()
         # A hard link to a finished file appears whole or not at all, and for one process only.
         ready = self.lock_path.with_name(f"lock.{os.getpid()}.json")
         write_json(ready, mine)
@@ -232,6 +270,30 @@ class JobFolder:
             os.replace(ready, self.lock_path)
         finally:
             ready.unlink(missing_ok=True)
+
+    def _drop_stale_lock(self) -> None:
+        try:
+            content = self.lock_path.read_bytes()
+        except OSError:
+            return
+        owner = self._lock_owner()
+        if owner is not None and process_alive(*owner):
+            return
+        aside = self.lock_path.with_name(f"lock.{os.getpid()}.stale")
+        try:
+            os.replace(self.lock_path, aside)
+        except FileNotFoundError:
+            return
+        try:
+            if aside.read_bytes() != content:
+                # Another process has taken it over between our looks: its lock goes back.
+                os.link(aside, self.lock_path)
+        except FileExistsError:
+            pass
+        except OSError:  # no hard links
+            os.replace(aside, self.lock_path)
+        finally:
+            aside.unlink(missing_ok=True)
 
     def _lock_owner(self) -> tuple[int, int] | None:
         try:

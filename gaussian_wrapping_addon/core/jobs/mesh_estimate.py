@@ -17,6 +17,7 @@ from ..settings import MeshingSettings, from_json
 from .answer import answer
 from .job_file import AUTOMATIC_REGIONS, read_region_body
 from .job_folder import JobFolder
+from .more import no_finished_training
 from .region_meshing import expected_by_pivots, expected_mesh, free_bytes
 from .stages import read_done
 
@@ -35,9 +36,7 @@ def _newest(stages: Path, name: str) -> Path:
     done = [(values["finished_unix_s"], path) for path in sorted(stages.glob(f"{name}-*"))
             if (values := read_done(path)) is not None]  # fmt: skip
     if not done:
-        raise UsageError(
-            f"{stages.parent} holds no finished training.", "Run wrap, or resume it, first."
-        )
+        raise no_finished_training(stages.parent)
     return max(done)[1]
 
 
@@ -47,8 +46,11 @@ def _lines(request: dict[str, Any]) -> list[str]:
     from ..field.vacancy import VacancyField
     from ..gaussians.gaussian_file import load_gaussians
     from ..meshing.region import automatic_region, parse_region, whole_region
+    from ..meshing.resolution import checked_request
 
     folder = JobFolder(Path(request["out"]))
+    if not folder.is_job():
+        raise UsageError(f"{folder.root} holds no job.", "Choose the folder given as --out.")
     meshing = from_json(MeshingSettings, request["meshing"], "meshing")
     threads = int(request["threads"]) or default_threads()
     if request["region"] not in AUTOMATIC_REGIONS:
@@ -63,6 +65,8 @@ def _lines(request: dict[str, Any]) -> list[str]:
         automatic = request["region"] == "auto"
         region = automatic_region(scene) if automatic else whole_region(scene, arrays)
     cameras = scene.cameras[:: max(1, -(-len(scene.cameras) // MOST_VIEWS))]
+    edge_length = meshing.edge_length / scene.world_from_scene.scale
+    notes = checked_request(edge_length, meshing.points, region).notes  # refuses before any work
     sightings = find_sightings(
         gaussians, cameras, lambda points: region.contains(points, 0.0), Progress(),
         most=MOST_SIGHTINGS, threads=threads,
@@ -78,11 +82,8 @@ def _lines(request: dict[str, Any]) -> list[str]:
         by_pivots = expected_by_pivots(vacancy, arrays, region, meshing, sightings)
         by_pivots.refuse(memory_bytes)
         return by_pivots.lines()
-    expected = expected_mesh(
-        vacancy, scene.cameras, region, meshing,
-        meshing.edge_length / scene.world_from_scene.scale, sightings,
-    )  # fmt: skip
+    expected = expected_mesh(vacancy, scene.cameras, region, meshing, edge_length, sightings)
     tiled = meshing.tiles != "off" and (meshing.tiles != "auto" or expected.tiles_for(memory_bytes))
     expected.refuse(memory_bytes, tiled=tiled)
     how = "it would be meshed in tiles" if tiled else "it would be meshed whole"
-    return [*expected.lines(), how]
+    return [*expected.lines(), how, *(f"warning: {note}" for note in notes)]

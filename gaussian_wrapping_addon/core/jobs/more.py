@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import UsageError
+from ..errors import DatasetError, UsageError
 from .job_file import JobFile
 from .job_folder import JobFolder
 from .stages import read_done
@@ -28,18 +28,17 @@ def job_with_more(folder: JobFolder, job: JobFile, iterations: int) -> JobFile:
     Raises
     ------
     UsageError
-        The number is not positive, the folder holds no finished training, or no checkpoint that
-        training could go on from.
+        The number is not positive.
+    DatasetError
+        The folder holds no finished training, or no checkpoint that training could go on from.
     """
     if iterations < 1:
         raise UsageError(f"--iterations {iterations} adds nothing.", "Give a positive number.")
     finished = [path for path in folder.stages.glob("train-*") if read_done(path) is not None]
     if not finished:
-        raise UsageError(
-            f"{folder.root} holds no finished training.", "Run wrap, or resume it, first."
-        )
+        raise no_finished_training(folder.root)
     if not any(checkpoints(path) for path in finished):
-        raise UsageError(
+        raise DatasetError(
             f"The training in {folder.root} has kept no checkpoint to go on from.", _INSTEAD
         )
     training = job.settings.training
@@ -110,9 +109,14 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def nothing_to_continue(folder: JobFolder) -> UsageError:
+def no_finished_training(root: Path) -> DatasetError:
+    """Return the error of what needs a finished training, whichever command it is."""
+    return DatasetError(f"{root} holds no finished training.", "Run wrap, or resume it, first.")
+
+
+def nothing_to_continue(folder: JobFolder) -> DatasetError:
     """Return the error of a ``more`` whose job has no training that fits it."""
-    return UsageError(
+    return DatasetError(
         f"No finished training in {folder.root} fits this job's photos and settings and has a "
         "checkpoint.",
         _INSTEAD,

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DeviceError
+from .job_file import AUTOMATIC_REGIONS
 
 if TYPE_CHECKING:
     from ..dataset.scene import Scene
@@ -16,6 +18,30 @@ if TYPE_CHECKING:
     from ..settings import MeshingSettings, TrainingSettings
 
 _logger = logging.getLogger(__name__)
+
+
+def requested_region(
+    request: str, body: Any, scene: Scene, arrays: GaussianArrays
+) -> tuple[Region, Region]:
+    """Return the region that a job asks for, in the scene's frame and in the world's.
+
+    That of a file stays in the world's frame as it was read: taken through the scene's and back,
+    its last digits would change each time.
+
+    Parameters
+    ----------
+    request : str
+        ``"auto"``, ``"all"`` or the path of a region file.
+    body : object
+        Content of that file.
+    """
+    from ..meshing.region import automatic_region, parse_region, whole_region
+
+    if request in AUTOMATIC_REGIONS:
+        region = automatic_region(scene) if request == "auto" else whole_region(scene, arrays)
+        return region, region.transformed(scene.world_from_scene)
+    world_region = parse_region(body, Path(request))
+    return world_region.transformed(scene.world_from_scene.inverse()), world_region
 
 
 def region_field(

@@ -16,7 +16,7 @@ from ..files import write_json
 from ..parallel import default_threads
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
-from .job_file import JobFile, region_name, region_names
+from .job_file import JobFile, refuse_other_regions, region_name, region_names
 from .job_folder import JobFolder
 from .machine import describe_machine, peak_memory_bytes
 from .stages import Stage, read_done, run_stage, source_fingerprint, stage_key
@@ -24,7 +24,7 @@ from .stages import Stage, read_done, run_stage, source_fingerprint, stage_key
 _logger = logging.getLogger(__name__)
 
 # Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
-STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 9, "texture": 9}
+STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 9, "texture": 11}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
@@ -86,9 +86,12 @@ def run_job(
     begun_s = time.time()
     from ..meshing.region import parse_region
 
-    for request, body in job.region_bodies.items():
-        parse_region(body, Path(request))
+    own = {
+        parse_region(body, Path(request)).name: region_name(request, body)
+        for request, body in job.region_bodies.items()
+    }
     names = region_names(job.settings.regions, job.region_bodies)
+    refuse_other_regions(folder.result, own)
 
     cameras = _run_cameras(folder, job, overall, threads)
     if cameras.reused:
@@ -196,7 +199,7 @@ def _mesh_key(job: JobFile, request: str, name: str, trained_key: str) -> str:
     body = job.region_bodies.get(request)
     return stage_key(
         STAGE_VERSIONS["mesh"], trained_key, request if body is None else body, name,
-        to_json(job.settings.meshing), job.settings.seed,
+        to_json(job.meshing_of(request)), job.settings.seed,
     )  # fmt: skip
 
 
@@ -222,7 +225,7 @@ def _run_meshing(
     progress: Progress,
     threads: int,
 ) -> Stage:
-    meshing = job.settings.meshing
+    meshing = job.meshing_of(request)
     body = job.region_bodies.get(request)
     key = _mesh_key(job, request, name, trained.key)
 
@@ -237,9 +240,9 @@ def _run_meshing(
         from ..meshing.mesh_check import check_mesh
         from ..meshing.mesh_file import save_mesh
         from ..meshing.open_boundary import opened
-        from ..meshing.region import automatic_region, parse_region, whole_region, write_region
+        from ..meshing.region import write_region
         from ..meshing.statistics import mesh_statistics
-        from .region_field import field_figures, region_field
+        from .region_field import field_figures, region_field, requested_region
         from .region_meshing import (
             mesh_by_pivots_in_stage,
             mesh_in_stage,
@@ -250,13 +253,7 @@ def _run_meshing(
         scene = load_saved_scene(cameras.folder)
         gaussians = load_gaussians(trained.folder / "gaussians.npz")
         arrays = gaussians.arrays()
-        if request == "auto":
-            region = automatic_region(scene)
-        elif request == "all":
-            region = whole_region(scene, arrays)
-        else:
-            world_region = parse_region(body, Path(request))
-            region = world_region.transformed(scene.world_from_scene.inverse())
+        region, world_region = requested_region(request, body, scene, arrays)
         vacancy = region_field(
             scene, arrays, region, job.settings.training, meshing, threads=threads,
             device=str(gaussians.means.device),
@@ -295,7 +292,7 @@ def _run_meshing(
         if dense is not None:
             save_mesh(stage_folder / DENSE_MESH, dense)
         remove_tiles(stage_folder)
-        write_region(stage_folder / "region.json", region.transformed(scene.world_from_scene))
+        write_region(stage_folder / "region.json", world_region)
         progress.update(0.97, "measuring the mesh")
         return {
             "statistics": mesh_statistics(mesh).to_json(),
@@ -334,6 +331,7 @@ def _run_texture(
         from ..texture.export import file_offset, write_textured
         from ..texture.levels import levels_of_detail
         from ..texture.texture_mesh import texture_mesh
+        from .region_meshing import free_bytes
 
         scene = load_saved_scene(cameras.folder)
         photos = PhotoStore(scene, MAX_IMAGE_SIDE_PX)
@@ -350,7 +348,7 @@ def _run_texture(
         coarse_from = 0.7 if texture.lods else 0.9
         textured = texture_mesh(
             mesh, scene, source, texture, stage_folder, progress.span(0.0, coarse_from),
-            threads=threads, dense=dense,
+            threads=threads, dense=dense, free_bytes=free_bytes(stage_folder, threads),
         )  # fmt: skip
         region_path = meshed.folder / "region.json"
         region = parse_region(read_json(region_path), region_path)
@@ -368,8 +366,9 @@ def _run_texture(
         progress.update(0.92, "comparing with photos")
         held_out = {figure["name"] for figure in trained.done["held_out"]}
         rendering = compare_with_photos(
-            textured, scene, photos, held_out, stage_folder, threads=threads
-        )
+            textured, scene, photos, held_out, stage_folder, progress.span(0.92, 0.97),
+            from_gaussians=texture.source == "gaussians", threads=threads,
+        )  # fmt: skip
         progress.update(0.97, "rendering the preview")
         write_preview(textured, scene, photos, stage_folder / "preview.png", threads=threads)
         return {"texture": textured.statistics, "mesh_rendering": rendering}

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
@@ -14,7 +15,17 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from types import FrameType
 
-from ..errors import EXIT_DONE, EXIT_OTHER, EXIT_RESOURCES, Cancelled, WrapError
+from .. import limits
+from ..errors import (
+    EXIT_DONE,
+    EXIT_OTHER,
+    EXIT_RESOURCES,
+    NO_ROOM,
+    Cancelled,
+    WrapError,
+    cannot_be_written,
+)
+from ..helper_process import end_helpers
 from ..progress import ProgressEvent
 from .earlier_job import forget_finished, put_back
 from .job_file import read_job
@@ -27,6 +38,8 @@ HEARTBEAT_S = 5.0
 STATUS_EVERY_S = 0.25
 PARENT_POLL_S = 1.0
 RESUME_HINT = "Resume continues from the last checkpoint."
+FULL_DISK_HINT = "Make room on that disk, then resume: the last checkpoint is intact."
+BUG_HINT = "Send the job folder's log.txt with a bug report."
 
 
 class _Reporter:
@@ -39,6 +52,7 @@ class _Reporter:
         self._written_s = 0.0
         self._logged_s = 0.0
         self._stop = threading.Event()
+        self._last_word = threading.Lock()
         self.stop_asked = False
 
     def event(self, event: ProgressEvent) -> None:
@@ -73,27 +87,45 @@ class _Reporter:
 
     def beat(self, parent: int) -> None:
         """Keep the heartbeat; ask for a stop when the parent has gone. Runs in a thread."""
+        asked_s = math.inf
         while not self._stop.wait(PARENT_POLL_S):
             if parent and os.getppid() != parent:
                 self.stop_asked = True
+            if self.cancelled():
+                asked_s = min(asked_s, time.monotonic())
             if self.cancelled() and self.status.message == COMPILING:
                 self._end_at_once()
-            elif self.cancelled() and self.status.state == "RUNNING":
-                self.write(state="CANCELLING")
-            elif time.time() - self.status.heartbeat_s > HEARTBEAT_S:
-                self.write()
+                continue
+            if time.monotonic() - asked_s > limits.CANCEL_ALONE_S:
+                _logger.warning("busy with %r: ended without waiting", self.status.message)
+                self._end_at_once()
+            # On a full disk the main thread ends the job, with words.
+            with contextlib.suppress(OSError):
+                if self.cancelled() and self.status.state == "RUNNING":
+                    self.write(state="CANCELLING")
+                elif time.time() - self.status.heartbeat_s > HEARTBEAT_S:
+                    self.write()
 
     def _end_at_once(self) -> None:
-        """Leave while the main thread compiles: it asks for nothing then, and has done nothing."""
+        """Leave while the main thread is in a long native call, such as a compilation.
+
+        What it is making is lost, as after a kill: a stage counts once ``done.json`` is there.
+        """
+        self._last_word.acquire()
+        if self._stop.is_set():
+            return  # the main thread was quicker, and says how it ended
         _logger.info("cancelled")
-        self.write(state="CANCELLED", error="", hint=RESUME_HINT, exit_code=Cancelled.exit_code)
-        self.folder.unlock()
-        logging.shutdown()
+        end_helpers()
+        with contextlib.suppress(OSError):  # on a full disk, leaving is all that is left to do
+            self.write(state="CANCELLED", error="", hint=RESUME_HINT, exit_code=Cancelled.exit_code)
+            self.folder.unlock()
+            logging.shutdown()
         os._exit(Cancelled.exit_code)
 
     def end(self) -> None:
-        """Stop the heartbeat."""
-        self._stop.set()
+        """Stop the heartbeat; what the caller writes then is the last word."""
+        with self._last_word:
+            self._stop.set()
 
 
 def _merged(known: dict[str, float], news: dict[str, float]) -> dict[str, float]:
@@ -167,6 +199,17 @@ def main(arguments: list[str]) -> int:
     except WrapError as failure:
         _logger.error("%s", failure)
         code, state, error, hint = failure.exit_code, "FAILED", failure.message, failure.hint
+        if isinstance(failure.__cause__, OSError) and failure.__cause__.errno in NO_ROOM:
+            hint = FULL_DISK_HINT
+    except OSError as failure:
+        _logger.exception("a file could not be read or written")
+        if failure.errno in NO_ROOM:
+            full = cannot_be_written(failure.filename or folder.root, failure)
+            code, state, error = full.exit_code, "FAILED", full.message
+            hint = FULL_DISK_HINT
+        else:
+            code, state = EXIT_OTHER, "FAILED"
+            error, hint = f"Unexpected {type(failure).__name__}: {failure}", BUG_HINT
     except MemoryError:
         _logger.exception("out of memory")
         code, state = EXIT_RESOURCES, "FAILED"
@@ -175,7 +218,7 @@ def main(arguments: list[str]) -> int:
         _logger.exception("unexpected failure")
         code, state = EXIT_OTHER, "FAILED"
         error = f"Unexpected {type(failure).__name__}: {failure}"
-        hint = "Send the job folder's log.txt with a bug report."
+        hint = BUG_HINT
     else:
         code, state, error, hint = EXIT_DONE, "DONE", "", ""
     reporter.end()
@@ -183,8 +226,8 @@ def main(arguments: list[str]) -> int:
     if state == "DONE":
         forget_finished(folder)
     earlier = _put_back(folder) if state == "FAILED" else None
-    full = {"fraction": 1.0, "seconds_left": 0.0, "message": ""} if state == "DONE" else {}
-    last = {**full, "state": state, "result": result}
+    finished = {"fraction": 1.0, "seconds_left": 0.0, "message": ""} if state == "DONE" else {}
+    last = {**finished, "state": state, "result": result}
     if earlier is not None:
         last = {k: v for k, v in asdict(earlier).items() if k != "heartbeat_s"}
     reporter.write(**{**last, "error": error, "hint": hint, "exit_code": code})

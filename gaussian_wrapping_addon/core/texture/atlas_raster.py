@@ -13,6 +13,8 @@ from ..parallel import even_bounds, run_chunks
 
 TOUCH_TEXELS = 0.75
 """A texel whose centre is this near to a triangle may touch it (half diagonal 0.71)."""
+BAND_ROWS = 256
+"""Rows whose scratch arrays are held at once, for each thread."""
 STRICT_TEXELS = 0.05
 """Inside by more than this counts as inside when looking for overlaps."""
 
@@ -38,7 +40,12 @@ def texel_corners(corner_uvs: np.ndarray, size_px: int) -> np.ndarray:
     return corners
 
 
-def raster_atlas(corner_uvs: np.ndarray, size_px: int, threads: int) -> AtlasRaster:
+def raster_atlas(
+    corner_uvs: np.ndarray,
+    size_px: int,
+    threads: int,
+    faces: np.ndarray | None = None,
+) -> AtlasRaster:
     """Rasterise UV triangles: exact at centres, then one ring of texels that are only touched.
 
     Parameters
@@ -49,23 +56,31 @@ def raster_atlas(corner_uvs: np.ndarray, size_px: int, threads: int) -> AtlasRas
         Side of the atlas.
     threads : int
         Threads to use; the result does not depend on it.
+    faces : (f,) bool, optional
+        Those that lie in this atlas; all of them by default.
     """
     corners = texel_corners(corner_uvs, size_px)
+    if faces is not None:
+        corners[~faces] = -2.0 * size_px  # far above the first row
     face = np.full((size_px, size_px), -1, np.int32)
     bary = np.zeros((size_px, size_px, 2), np.float32)
-    touched = np.full((size_px, size_px), -1, np.int32)
-    distance = np.full((size_px, size_px), TOUCH_TEXELS**2)
-    hits = np.zeros((size_px, size_px), np.uint8)
-    bounds = even_bounds(size_px, threads)
+    inside = np.zeros((size_px, size_px), np.bool_)
+    bounds = even_bounds(size_px, threads, max(4, -(-size_px // (BAND_ROWS * threads))))
+    overlaps: list[int] = []
 
     def band(begin: int, end: int) -> None:
+        shape = (end - begin, size_px)
+        hits = np.zeros(shape, np.uint8)
         _raster_centres(corners, begin, end, face, bary, hits)
+        overlaps.append(int((hits > 1).sum()))
+        touched = np.full(shape, -1, np.int32)
+        distance = np.full(shape, TOUCH_TEXELS**2)
         _raster_touched(corners, begin, end, face, bary, distance, touched)
+        np.greater_equal(face[begin:end], 0, out=inside[begin:end])
+        np.copyto(face[begin:end], touched, where=~inside[begin:end])
 
     run_chunks(band, bounds, threads)
-    inside = face >= 0
-    face = np.where(inside, face, touched)
-    return AtlasRaster(face, bary, inside, int((hits > 1).sum()))
+    return AtlasRaster(face, bary, inside, sum(overlaps))
 
 
 @kernel(fast=False)
@@ -97,8 +112,8 @@ def _raster_centres(corners: Any, begin: int, end: int, face: Any, bary: Any, hi
                 if w0 < 0.0 or w1 < 0.0 or w2 < 0.0:
                     continue
                 strict = min(w0 * height0, w1 * height1, w2 * height2) > STRICT_TEXELS
-                if strict and hits[y, x] < 255:
-                    hits[y, x] += 1
+                if strict and hits[y - begin, x] < 255:
+                    hits[y - begin, x] += 1
                 if face[y, x] < 0:
                     face[y, x] = f
                     bary[y, x, 0] = w0
@@ -141,10 +156,10 @@ def _raster_touched(
                 d0, t0 = _nearest_on_edge(px, py, x0, y0, x1, y1)
                 d1, t1 = _nearest_on_edge(px, py, x1, y1, x2, y2)
                 d2, t2 = _nearest_on_edge(px, py, x2, y2, x0, y0)
-                if min(d0, d1, d2) >= distance[y, x]:
+                if min(d0, d1, d2) >= distance[y - begin, x]:
                     continue
-                distance[y, x] = min(d0, d1, d2)
-                touched[y, x] = f
+                distance[y - begin, x] = min(d0, d1, d2)
+                touched[y - begin, x] = f
                 if d0 <= d1 and d0 <= d2:
                     bary[y, x, 0], bary[y, x, 1] = 1.0 - t0, t0
                 elif d1 <= d2:

@@ -79,8 +79,17 @@ class Baked:
     field_spread: float
     """Standard deviation of the log brightness fields within photos."""
     fields_applied: bool
-    rejected_share: float
-    """Share of kept views that were outliers."""
+    rejected: int
+    """Kept views that were outliers."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is known of the photos before colours are taken."""
+
+    plans: list[_Plan]
+    """Of the photos that show the mesh."""
+    exposure: _Exposure
 
 
 @dataclass(frozen=True)
@@ -103,7 +112,7 @@ def bake(
     points: SurfacePoints,
     surface: SurfaceArrays,
     photos: Photos,
-    count: int,
+    survey: Survey,
     progress: Progress,
     *,
     threads: int,
@@ -116,8 +125,8 @@ def bake(
         Points in texture order.
     photos : Photos
         Read one at a time, at the level that the texel size needs.
-    count : int
-        Number of photos.
+    survey : Survey
+        Of these photos, by :func:`look_at_photos`.
 
     Notes
     -----
@@ -125,7 +134,7 @@ def bake(
     image border. The best ``KEPT_VIEWS`` are kept; with three or more, those far from their
     median are dropped (method.md 8).
     """
-    plans, exposure = _exposure(points, surface, photos, count, progress.span(0.0, 0.25), threads)
+    plans, exposure = survey.plans, survey.exposure
     colors = np.zeros((len(points), 3), np.uint8)
     views = np.zeros(len(points), np.uint8)
     rejected = np.zeros(len(points), np.uint8)
@@ -139,7 +148,7 @@ def bake(
         weights = np.zeros((end - begin, KEPT_VIEWS), np.float32)
         kept = np.zeros((end - begin, KEPT_VIEWS, 3), np.uint8)
         for step, plan in enumerate(plans):
-            fraction = 0.25 + 0.7 * (block * len(plans) + step) / steps
+            fraction = 0.95 * (block * len(plans) + step) / steps
             progress.update(fraction, f"texture: photo {step + 1} of {len(plans)}")
             view = _view(photos, plan.index, plan.divisor, surface, threads)
             sample_photo(
@@ -152,12 +161,11 @@ def bake(
                 clearance[begin:end],
                 threads,
             )
-        progress.update(0.25 + 0.7 * (block + 1) / blocks, "blending views")
+        progress.update(0.95 * (block + 1) / blocks, "blending views")
         sure[begin:end] = weights.max(axis=1) > LAST_RESORT_BELOW
         _blend_block(
             weights, kept, colors[begin:end], views[begin:end], rejected[begin:end], threads
         )
-    offered = int(views.sum(dtype=np.int64) + rejected.sum(dtype=np.int64))
     return Baked(
         colors,
         views,
@@ -168,7 +176,7 @@ def bake(
         exposure.gains_applied,
         exposure.field_spread,
         exposure.fields_applied,
-        float(rejected.sum(dtype=np.int64)) / max(offered, 1),
+        int(rejected.sum(dtype=np.int64)),
     )
 
 
@@ -186,17 +194,30 @@ def _view(
     )
 
 
-def _exposure(
-    points: SurfacePoints,
+def survey_points(count: int) -> int:
+    """Return how many points :func:`look_at_photos` can do with for a number of photos."""
+    return max(1, min(EXPOSURE_POINTS, EXPOSURE_CELLS // max(count, 1)))
+
+
+def look_at_photos(
+    part: SurfacePoints,
     surface: SurfaceArrays,
     photos: Photos,
     count: int,
     progress: Progress,
+    *,
     threads: int,
-) -> tuple[list[_Plan], _Exposure]:
-    """Look at every photo coarsely: which see the mesh, at what level, with what exposure."""
-    wanted = max(1, min(EXPOSURE_POINTS, EXPOSURE_CELLS // max(count, 1), len(points)))
-    part = points.part(np.linspace(0, len(points) - 1, wanted).astype(np.int64))
+) -> Survey:
+    """Look at every photo coarsely: which see the mesh, at what level, with what exposure.
+
+    Parameters
+    ----------
+    part : SurfacePoints
+        Evenly over the surface, :func:`survey_points` of them.
+    count : int
+        Number of photos.
+    """
+    wanted = len(part)
     colors = np.zeros((wanted, count, 3), np.uint8)
     valid = np.zeros((wanted, count), np.bool_)
     places = np.zeros((wanted, count, 2), np.float32)
@@ -224,13 +245,14 @@ def _exposure(
         places[:, index] = full.project(positions)[0] / [full.width, full.height]
     gains, gain_spread = solve_gains(colors, valid)
     fields, field_spread = solve_fields(colors, valid, places, gains)
-    return plans, _Exposure(
+    exposure = _Exposure(
         gains[:, None, None] * fields,
         gain_spread,
         bool((gains != 1.0).any()),
         field_spread,
         bool((fields != 1.0).any()),
     )
+    return Survey(plans, exposure)
 
 
 def _blend_block(

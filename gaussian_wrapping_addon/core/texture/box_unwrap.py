@@ -7,6 +7,7 @@ import numpy as np
 
 from ..meshing.surface_mesh import SurfaceMesh
 from ..progress import Progress
+from .chart_boxes import cut_wide_charts
 from .chart_overlaps import split_overlaps
 from .face_graph import FaceGraph, components
 
@@ -27,13 +28,16 @@ def box_unwrap(
     size_px: int,
     gutter_px: int,
     progress: Progress,
-) -> tuple[np.ndarray, float]:
+    atlases: int = 1,
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Unwrap by projection along six directions.
 
     Returns
     -------
     corner_uvs : (f, 3, 2) float32
         UVs in [0, 1], v upwards; charts that would cover themselves are split.
+    face_atlas : (f,) uint8
+        Which of the ``atlases`` each face is in.
     gutter_px : float
         Texels kept between charts; less than asked for when there is no room.
     """
@@ -46,7 +50,9 @@ def box_unwrap(
     charts = components(graph, axis[other] == axis[:, None])
     charts = split_overlaps(flat - corners.mean(axis=(0, 1))[plane][:, None, :], charts, graph)
     progress.update(0.6, "box projection: packing")
-    return _pack(flat, charts, size_px, gutter_px)
+    if atlases > 1:
+        charts = cut_wide_charts(flat, charts, atlases)
+    return _pack(flat, charts, size_px, gutter_px, atlases)
 
 
 def _axis_of_faces(graph: FaceGraph) -> np.ndarray:
@@ -69,8 +75,8 @@ def _axis_of_faces(graph: FaceGraph) -> np.ndarray:
 
 
 def _pack(
-    flat: np.ndarray, charts: np.ndarray, size_px: int, gutter_px: int
-) -> tuple[np.ndarray, float]:
+    flat: np.ndarray, charts: np.ndarray, size_px: int, gutter_px: int, atlases: int
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Place charts in shelves at the largest scale that fits; gutters shrink when none does."""
     count = int(charts.max()) + 1
     low = np.full((count, 2), np.inf)
@@ -83,7 +89,7 @@ def _pack(
     lying = np.where(turned[:, None], extent[:, ::-1], extent)
     gutter = float(gutter_px)
     while True:
-        scale, places = _largest_scale(lying, size_px, gutter)
+        scale, places = _largest_scale(lying, size_px, gutter, atlases)
         if places is not None or gutter < 0.01:
             break
         gutter *= 0.7
@@ -93,30 +99,31 @@ def _pack(
     # A quarter turn keeps the orientation: (x, y) -> (y, width - x).
     quarter = np.stack([local[..., 1], width - local[..., 0]], axis=-1)
     local = np.where(turned[charts][:, None, None], quarter, local)
-    corner_uvs = (local + places[charts][:, None, :]) / size_px
-    return np.clip(corner_uvs, 0.0, 1.0).astype(np.float32), gutter
+    corner_uvs = (local + places[charts][:, None, :2]) / size_px
+    face_atlas = places[charts, 2].astype(np.uint8)
+    return np.clip(corner_uvs, 0.0, 1.0).astype(np.float32), face_atlas, gutter
 
 
 def _largest_scale(
-    extent: np.ndarray, size_px: int, gutter: float
+    extent: np.ndarray, size_px: int, gutter: float, atlases: int
 ) -> tuple[float, np.ndarray | None]:
     high = size_px / max(float(extent.max()), 1e-300)
     low = 0.0
-    places = _shelves(extent * high, size_px, gutter)
+    places = _shelves(extent * high, size_px, gutter, atlases)
     if places is not None:
         return high, places
     best: np.ndarray | None = None
     # Charts of under a hundredth of the largest scale would hold no texels.
     low = 0.01 * high
-    best = _shelves(extent * low, size_px, gutter)
+    best = _shelves(extent * low, size_px, gutter, atlases)
     if best is None and gutter >= 0.01:
         return low, None
     if best is None:
         low = 0.0
-        best = np.zeros_like(extent)
+        best = np.zeros((len(extent), 3))
     for _ in range(SCALE_STEPS):
         middle = 0.5 * (low + high)
-        places = _shelves(extent * middle, size_px, gutter)
+        places = _shelves(extent * middle, size_px, gutter, atlases)
         if places is None:
             high = middle
         else:
@@ -124,23 +131,27 @@ def _largest_scale(
     return low, best
 
 
-def _shelves(extent_px: np.ndarray, size_px: int, gutter: float) -> np.ndarray | None:
-    """Return the lower left corner of each box, or ``None`` when they do not fit."""
+def _shelves(extent_px: np.ndarray, size_px: int, gutter: float, atlases: int) -> np.ndarray | None:
+    """Return x, y of the lower left corner of each box and its atlas; ``None``: no room."""
     if float(((extent_px + gutter) ** 2).min()) < 0:
         return None
-    if float(np.prod(extent_px + gutter, axis=1).sum()) > float(size_px) ** 2:
+    if float(np.prod(extent_px + gutter, axis=1).sum()) > atlases * float(size_px) ** 2:
         return None
     order = np.argsort(-extent_px[:, 1], kind="stable")
-    places = np.empty_like(extent_px)
+    places = np.empty((len(extent_px), 3))
+    atlas = 0
     x, y, shelf = 0.5 * gutter, 0.5 * gutter, 0.0
     for index in order.tolist():
         width, height = extent_px[index]
         if x + width + 0.5 * gutter > size_px and x > 0.5 * gutter:
             x, y = 0.5 * gutter, y + shelf + gutter
             shelf = 0.0
+        if y + height + 0.5 * gutter > size_px and y > 0.5 * gutter and atlas + 1 < atlases:
+            atlas += 1
+            x, y, shelf = 0.5 * gutter, 0.5 * gutter, 0.0
         if x + width + 0.5 * gutter > size_px or y + height + 0.5 * gutter > size_px:
             return None
-        places[index] = x, y
+        places[index] = x, y, atlas
         x += width + gutter
         shelf = max(shelf, height)
     return places

@@ -14,6 +14,12 @@ ROUNDING_TEXELS = 2
 FILL_SHARE = 0.8
 """Share of the square that the boxes of charts and their gutters take when they just fit."""
 SCALE_STEPS = 30
+WIDE_SHARE = 0.45
+"""Of a square's side: wider charts of a mesh with several squares are cut, to fill each of them."""
+USED_SHARE = 0.6
+"""Share of a square that is used after packing, about."""
+MAX_CUTS = 12
+"""Rounds of halving."""
 MIN_SCALE_SHARE = 0.01
 """Of the scale at which the largest chart fills the square: given when not even gutters fit."""
 
@@ -45,12 +51,54 @@ def chart_extents(points: np.ndarray, corners: np.ndarray, charts: np.ndarray) -
     return high - low
 
 
-def scale_that_fits(extents: np.ndarray, side_px: int, padding_px: int) -> float:
-    """Return the texels for a unit at which boxes with their padding fill most of a square."""
+def scale_that_fits(extents: np.ndarray, side_px: int, padding_px: int, squares: int = 1) -> float:
+    """Return the texels for a unit at which boxes with their padding fill most of the squares."""
     low, high = 0.0, side_px / max(float(extents.max()), 1e-30)
     largest = high
     for _ in range(SCALE_STEPS):
         middle = 0.5 * (low + high)
         boxes = float(np.prod(extents * middle + padding_px + ROUNDING_TEXELS, axis=1).sum())
-        low, high = (middle, high) if boxes < FILL_SHARE * side_px**2 else (low, middle)
+        low, high = (middle, high) if boxes < FILL_SHARE * squares * side_px**2 else (low, middle)
     return max(low, MIN_SCALE_SHARE * largest)
+
+
+def cut_wide_charts(corner_uvs: np.ndarray, charts: np.ndarray, squares: int) -> np.ndarray:
+    """Halve charts that are too wide to be spread over several squares.
+
+    One chart cannot be larger than a square: where it holds most of the surface, several squares
+    would show no more of it than one.
+
+    Parameters
+    ----------
+    corner_uvs : (f, 3, 2) float64
+        At one scale.
+    charts : (f,) int
+        Labels from 0.
+    squares : int
+
+    Returns
+    -------
+    (f,) int32
+        New labels; pieces of one label need not be connected.
+    """
+    labels = charts.astype(np.int64)
+    edge_one, edge_two = (corner_uvs[:, k] - corner_uvs[:, 0] for k in (1, 2))
+    double = edge_one[:, 0] * edge_two[:, 1] - edge_one[:, 1] * edge_two[:, 0]
+    side = math.sqrt(0.5 * float(np.abs(double).sum()) / (USED_SHARE * squares))
+    centres = corner_uvs.mean(axis=1)  # (f, 2)
+    rows = np.arange(len(labels))
+    corners = np.arange(3 * len(labels)).reshape(-1, 3)
+    for _ in range(MAX_CUTS):
+        count = int(labels.max()) + 1
+        extents = chart_extents(corner_uvs.reshape(-1, 2), corners, labels)
+        low = np.full((count, 2), np.inf)
+        np.minimum.at(low, labels, corner_uvs.min(axis=1))
+        wide = extents.max(axis=1) > WIDE_SHARE * side
+        axis = extents.argmax(axis=1)
+        middle = (low + 0.5 * extents)[np.arange(count), axis]
+        beyond = wide[labels] & (centres[rows, axis[labels]] > middle[labels])
+        if not beyond.any():
+            break
+        labels[beyond] += count
+        labels = np.unique(labels, return_inverse=True)[1].ravel()
+    return labels.astype(np.int32)

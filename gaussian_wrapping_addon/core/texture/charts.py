@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import DatasetError, ResourceError, WorkerError
 from ..helper_process import run_helper
 from ..progress import Progress
-from .chart_boxes import chart_extents, packing_square, scale_that_fits
+from .chart_boxes import chart_extents, cut_wide_charts, packing_square, scale_that_fits
 from .chart_overlaps import signed_areas, split_overlaps
 from .chart_shapes import chart_points, even_density, flat_faces, relax, smoothed_copy
 from .chunks import split_into_chunks
@@ -49,12 +49,12 @@ class Charts:
     """(k,) int32."""
     stretch: Stretch
 
-    def density(self, size_px: int, gutter_px: int) -> float:
+    def density(self, size_px: int, gutter_px: int, atlases: int = 1) -> float:
         """Return how many texels an edge gets, about, on all but 5 % of the surface."""
         corners = np.arange(self.corner_uvs.size // 2).reshape(-1, 3)
         extents = chart_extents(self.corner_uvs.reshape(-1, 2), corners, self.labels)
         side_px, padding_px = packing_square(size_px, gutter_px)
-        scale = scale_that_fits(extents, side_px, padding_px) * size_px / side_px
+        scale = scale_that_fits(extents, side_px, padding_px, atlases) * size_px / side_px
         return scale / max(self.stretch.p95, 1.0)
 
 
@@ -65,6 +65,7 @@ def find_charts(
     gutter_px: int,
     folder: Path,
     progress: Progress,
+    atlases: int = 1,
 ) -> Charts:
     """Let xatlas cut the mesh into charts without folds.
 
@@ -84,6 +85,8 @@ def find_charts(
         For the files of the helper process.
     progress : Progress
         Span of this step.
+    atlases : int
+        Textures that the charts are spread over.
 
     Raises
     ------
@@ -100,7 +103,7 @@ def find_charts(
     if not poor and len(first.faces) == len(faces):
         return first
     second = _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0))
-    density = [one.density(size_px, gutter_px) for one in (first, second)]
+    density = [one.density(size_px, gutter_px, atlases) for one in (first, second)]
     _logger.debug("texels for an edge: %.2f, without smoothing %.2f", *density)
     lost = first.stretch.collapsed_share - second.stretch.collapsed_share
     lost += (len(second.faces) - len(first.faces)) / len(faces)
@@ -181,14 +184,21 @@ def _run(helper: str, folder: Path, faces: int, progress: Progress) -> dict[str,
 
 
 def pack_charts(
-    charts: Charts, size_px: int, gutter_px: int, folder: Path, progress: Progress
-) -> tuple[np.ndarray, float]:
-    """Place charts in the unit square.
+    charts: Charts,
+    size_px: int,
+    gutter_px: int,
+    folder: Path,
+    progress: Progress,
+    atlases: int = 1,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Place charts in unit squares, ``atlases`` at most, all at one scale.
 
     Returns
     -------
     corner_uvs : (k, 3, 2) float32
-        v upwards; NaN for faces that found no place.
+        v upwards, no chart mirrored; NaN for faces that found no place.
+    face_atlas : (k,) uint8
+        The square of each face.
     gutter_px : float
         Texels kept between charts; less than asked for when there is no room.
 
@@ -197,20 +207,26 @@ def pack_charts(
     WorkerError, DatasetError, ResourceError
         xatlas crashed, answered nonsense or took too long.
     """
-    flat = charts.corner_uvs.astype(np.float32)
-    corners, first = chart_points(flat, charts.labels)
+    # Rows of a texture go down, v goes up: turned over here, charts are as given in the end.
+    flat = (charts.corner_uvs * [1.0, -1.0]).astype(np.float32)
+    labels = charts.labels
+    if atlases > 1:
+        labels = cut_wide_charts(charts.corner_uvs, labels, atlases)
+    corners, first = chart_points(flat, labels)
     np.savez(
         folder / "input.npz",
         points=flat.reshape(-1, 2)[first],
         corners=corners.astype(np.uint32),
-        charts=charts.labels.astype(np.uint32),
+        charts=labels.astype(np.uint32),
         size_px=size_px,
         gutter_px=gutter_px,
+        atlases=atlases,
     )
     output = _run(PACK_HELPER, folder, len(flat), progress)
-    points = output["points"]
-    if points.shape != (len(first), 2):
+    points, numbers = output["points"], output["atlas"]
+    if points.shape != (len(first), 2) or numbers.shape != (len(first),):
         raise WorkerError("xatlas left UVs of other charts.")
     corner_uvs = points[corners].astype(np.float32)
     corner_uvs[..., 1] = 1.0 - corner_uvs[..., 1]
-    return corner_uvs, float(output["gutter_px"])
+    # Corners of a face are of one chart, and so in one atlas.
+    return corner_uvs, numbers[corners[:, 0]].astype(np.uint8), float(output["gutter_px"])

@@ -15,6 +15,7 @@ to ``transform.json`` and into the GLB's node.
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from ..dataset.file_frame import file_offset
 from ..dataset.similarity import Similarity
 from ..errors import UsageError
 from ..files import write_bytes, write_json
-from .file_checks import check_mesh, writing
+from .file_checks import atlas_file, check_mesh, writing
 from .glb import glb_bytes
 from .mesh_ply import vertex_colors, write_mesh_ply
 from .shading import OBJ_SHININESS, SPECULAR_LEVEL
@@ -38,8 +39,9 @@ def write_obj(
     vertices: np.ndarray,
     faces: np.ndarray,
     corner_uvs: np.ndarray,
-    image_name: str,
-    normal_name: str | None = None,
+    image_name: str | Sequence[str],
+    normal_name: str | Sequence[str] | None = None,
+    face_atlas: np.ndarray | None = None,
 ) -> None:
     """Write ``path`` and its ``.mtl`` beside it, which names an image in the same folder.
 
@@ -49,14 +51,19 @@ def write_obj(
     faces : (f, 3) int32
     corner_uvs : (f, 3, 2) float32
         v upwards, as OBJ wants it.
-    image_name : str
-        Without spaces, which OBJ readers do not agree on.
-    normal_name : str, optional
+    image_name : str or sequence of str
+        One for each atlas; without spaces, which OBJ readers do not agree on.
+    normal_name : the same, optional
         A normal map, under the name of ``map_Bump``, by which Blender writes and reads them.
+    face_atlas : (f,) int, optional
+        Where there are several atlases; each has a material of its own.
     """
     check_mesh(vertices, faces, corner_uvs)
-    if any(c.isspace() for c in image_name + path.name):
-        raise UsageError(f"OBJ files cannot name {image_name!r}.", "Use a name without spaces.")
+    names = [image_name] if isinstance(image_name, str) else list(image_name)
+    bumps = [normal_name] if isinstance(normal_name, str) else list(normal_name or ())
+    for name in names:
+        if any(c.isspace() for c in name + path.name):
+            raise UsageError(f"OBJ files cannot name {name!r}.", "Use a name without spaces.")
     uvs, corner = np.unique(corner_uvs.reshape(-1, 2), axis=0, return_inverse=True)
     corner = corner.reshape(-1, 3) + 1
     owner = np.asarray(faces) + 1
@@ -67,13 +74,17 @@ def write_obj(
     np.savetxt(text, uvs, fmt="vt %.7f %.7f")
     # Without normals, readers show every face flat, and a normal map on faces that it is not for.
     np.savetxt(text, shading_normals(vertices, faces), fmt="vn %.6f %.6f %.6f")
-    text.write("usemtl albedo\n")
-    np.savetxt(text, table, fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
+    atlas = np.zeros(len(table), np.uint8) if face_atlas is None else face_atlas
     shine = " ".join([str(SPECULAR_LEVEL)] * 3)
-    material = "newmtl albedo\n" + f"Ns {OBJ_SHININESS:.6g}\nKa 1 1 1\nKd 1 1 1\nKs {shine}\n"
-    material += f"Ni 1.5\nd 1\nillum 2\nmap_Kd {image_name}\n"
-    if normal_name is not None:
-        material += f"map_Bump -bm 1 {normal_name}\n"
+    material = ""
+    for number, name in enumerate(names):
+        called = Path(atlas_file("albedo", number)).stem
+        text.write(f"usemtl {called}\n")
+        np.savetxt(text, table[atlas == number], fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
+        material += f"newmtl {called}\nNs {OBJ_SHININESS:.6g}\nKa 1 1 1\nKd 1 1 1\nKs {shine}\n"
+        material += f"Ni 1.5\nd 1\nillum 2\nmap_Kd {name}\n"
+        if bumps:
+            material += f"map_Bump -bm 1 {bumps[number]}\n"
     with writing(path):
         write_bytes(path.with_suffix(".mtl"), material.encode())
         write_bytes(path, text.getvalue().encode())
@@ -84,12 +95,13 @@ def write_glb(
     vertices: np.ndarray,
     faces: np.ndarray,
     corner_uvs: np.ndarray,
-    png: bytes,
+    png: bytes | Sequence[bytes],
     offset: np.ndarray,
     *,
-    normal_png: bytes | None = None,
-    occlusion_png: bytes | None = None,
+    normal_png: bytes | Sequence[bytes] | None = None,
+    occlusion_png: bytes | Sequence[bytes] | None = None,
     shading: str = "auto",
+    face_atlas: np.ndarray | None = None,
 ) -> None:
     """Write a binary glTF with the images inside; see :func:`.glb.glb_bytes`."""
     check_mesh(vertices, faces, corner_uvs)
@@ -97,6 +109,7 @@ def write_glb(
         data = glb_bytes(
             vertices, faces, corner_uvs, png, offset,
             normal_png=normal_png, occlusion_png=occlusion_png, shading=shading,
+            face_atlas=face_atlas,
         )  # fmt: skip
         write_bytes(path, data)
 
@@ -110,7 +123,8 @@ def write_textured(
 ) -> None:
     """Write ``mesh.npz``, ``albedo.png``, ``mesh.ply``, ``transform.json`` and the formats asked.
 
-    ``normal.png`` and ``occlusion.png`` stand beside them where the mesh has such maps.
+    ``normal.png`` and ``occlusion.png`` stand beside them where the mesh has such maps; further
+    atlases are ``albedo-2.png`` and on.
 
     Parameters
     ----------
@@ -142,11 +156,14 @@ def write_textured(
     check_mesh(mesh.vertices, mesh.faces, textured.corner_uvs)
     world = world_from_scene.points(mesh.vertices)
     offset = file_offset(world) if offset is None else offset
-    maps = {
-        "normal": None if textured.normal_map is None else png_bytes(textured.normal_map),
-        "occlusion": None if textured.occlusion is None else png_bytes(textured.occlusion),
+    atlases, face_atlas = textured.atlases, textured.face_atlas
+    images = {
+        "albedo": [a.albedo for a in atlases],
+        "normal": [a.normal_map for a in atlases if a.normal_map is not None],
+        "occlusion": [a.occlusion for a in atlases if a.occlusion is not None],
     }
-    png = png_bytes(textured.albedo)
+    pngs = {name: [png_bytes(image) for image in several] for name, several in images.items()}
+    arrays = {} if face_atlas is None else {"face_atlas": np.asarray(face_atlas, np.uint8)}
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         stream = io.BytesIO()
@@ -155,12 +172,12 @@ def write_textured(
             vertices=np.asarray(mesh.vertices, np.float64),
             faces=np.asarray(mesh.faces, np.int32),
             corner_uvs=np.asarray(textured.corner_uvs, np.float32),
+            **arrays,
         )
         write_bytes(folder / "mesh.npz", stream.getvalue())
-        write_bytes(folder / "albedo.png", png)
-        for name, data in maps.items():
-            if data is not None:
-                write_bytes(folder / f"{name}.png", data)
+        for name, several in pngs.items():
+            for number, data in enumerate(several):
+                write_bytes(folder / atlas_file(name, number), data)
         write_json(
             folder / "transform.json",
             {
@@ -175,7 +192,9 @@ def write_textured(
                 },
             },
         )
-    colors = vertex_colors(len(world), mesh.faces, textured.corner_uvs, textured.albedo)
+    colors = vertex_colors(
+        len(world), mesh.faces, textured.corner_uvs, images["albedo"], face_atlas
+    )
     write_mesh_ply(folder / "mesh.ply", world, mesh.faces, colors)
     local = world - offset
     if "obj" in formats:
@@ -184,8 +203,9 @@ def write_textured(
             local,
             mesh.faces,
             textured.corner_uvs,
-            "albedo.png",
-            None if maps["normal"] is None else "normal.png",
+            [atlas_file("albedo", number) for number in range(len(atlases))],
+            [atlas_file("normal", number) for number in range(len(images["normal"]))],
+            face_atlas,
         )
     if "glb" in formats:
         write_glb(
@@ -193,10 +213,11 @@ def write_textured(
             local,
             mesh.faces,
             textured.corner_uvs,
-            png,
+            pngs["albedo"],
             offset,
-            normal_png=maps["normal"],
-            occlusion_png=maps["occlusion"],
+            normal_png=pngs["normal"] or None,
+            occlusion_png=pngs["occlusion"] or None,
+            face_atlas=face_atlas,
         )
 
 

@@ -21,7 +21,9 @@ def solve_gains(colors: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, floa
     """Find factors that bring the photos' colours of the same points together.
 
     Robust least squares of ``log c[i, p] = a[i] - log gain[p]`` by alternation, with weights
-    ``1 / max(|residual|, 0.05)``; the mean of the log gains is 0.
+    ``1 / max(|residual|, 0.05)``; the median of the log gains is 0: the texture has the exposure
+    of most photos. At the mean of two kinds of exposure, what is white in the darker photos would
+    be brighter than 255.
 
     Parameters
     ----------
@@ -48,6 +50,9 @@ def solve_gains(colors: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, floa
         usable = valid[shared] & (values >= DARKEST) & (values <= BRIGHTEST)
         values_log = np.log(np.maximum(values, 1).astype(np.float32))
         log_gains[:, channel] = _solve(values_log, usable)
+        sees = usable.any(axis=0)
+        if sees.any():
+            log_gains[sees, channel] -= np.median(log_gains[sees, channel])
     spread = float(log_gains.std())
     if spread < MIN_GAIN_SPREAD:
         return gains, spread

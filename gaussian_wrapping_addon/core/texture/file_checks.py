@@ -12,10 +12,39 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import MeshingError, ResourceError
+from ..errors import MeshingError, cannot_be_written
+from ..limits import MAX_ATLASES
 
 SINGLE_MAX = float(np.finfo(np.float32).max)
 """Coordinates beyond become infinite in single precision, which most formats have."""
+
+
+def atlas_file(name: str, atlas: int) -> str:
+    """Return the name of a map's file: ``albedo.png``, then ``albedo-2.png`` and on.
+
+    Parameters
+    ----------
+    name : str
+        ``"albedo"``, ``"normal"`` or ``"occlusion"``.
+    atlas : int
+        From 0.
+    """
+    return f"{name}-{atlas + 1}.png" if atlas else f"{name}.png"
+
+
+def check_face_atlas(face_atlas: np.ndarray, faces: int) -> np.ndarray:
+    """Return (f,) uint8 atlases of faces as a file holds them.
+
+    Raises
+    ------
+    ValueError
+        Not one for each face, no integers, or more than :data:`~..limits.MAX_ATLASES`.
+    """
+    if face_atlas.shape != (faces,) or face_atlas.dtype.kind not in "iu":
+        raise ValueError("face_atlas is not one integer for each face")
+    if faces and not 0 <= int(face_atlas.min()) <= int(face_atlas.max()) < MAX_ATLASES:
+        raise ValueError("a face lies in an atlas that cannot be")
+    return face_atlas.astype(np.uint8)
 
 
 def check_mesh(
@@ -68,7 +97,4 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ResourceError(
-            f"{path} cannot be written: {error.strerror or error}.",
-            "Check that the folder exists, is not read-only, and that the disk has room.",
-        ) from error
+        raise cannot_be_written(path, error) from error

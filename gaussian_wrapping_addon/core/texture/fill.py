@@ -9,6 +9,7 @@ then fades to averages, so that mip maps stay clean.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ NEAREST_PULL = 1e-4
 """Weight of the nearest seen cell against one neighbour: decides for pieces that touch none."""
 UNKNOWN_GREY = 128
 CELL_BITS = 10
+BACKGROUND_ROWS = 256
+"""Rows of the image that are held as floats at once; even, so that pairs stay together."""
 
 
 def surface_positions(points: SurfacePoints, surface: SurfaceArrays) -> np.ndarray:
@@ -35,40 +38,57 @@ def surface_positions(points: SurfacePoints, surface: SurfaceArrays) -> np.ndarr
     return np.einsum("nc,ncx->nx", weights, corners)
 
 
-def continue_over_surface(known: np.ndarray, colors: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Colour points by the harmonic continuation of others over the surface.
+class Continuation:
+    """The harmonic continuation of some points' colours over the surface.
 
     Parameters
     ----------
     known : (n, 3) float64
-        Positions with colours; may be empty.
+        Positions with colours; may be empty, then all is mid grey.
     colors : (n, 3) uint8
-    wanted : (m, 3) float64
-        Positions that want a colour, at least one.
-
-    Returns
-    -------
-    (m, 3) float32
-        Mid grey when nothing is known.
+    wanted : callable
+        Each call yields anew the positions that want a colour, (m, 3) float64 at a time: there
+        may be tens of millions of them.
     """
-    if len(known) == 0:
-        return np.full((len(wanted), 3), UNKNOWN_GREY, np.float32)
-    low = np.minimum(known.min(axis=0), wanted.min(axis=0))
-    extent = np.maximum(known.max(axis=0), wanted.max(axis=0)) - low
-    cell = max(float(extent.max()), 1e-12) / CELLS_PER_SIDE
-    key_known, key_wanted = (_key(((p - low) / cell).astype(np.int64)) for p in (known, wanted))
-    keys = np.union1d(key_known, key_wanted)
-    place = np.searchsorted(keys, key_known)
-    count = np.bincount(place, minlength=len(keys))
-    has = count > 0
-    values = np.empty((len(keys), 3))
-    for channel in range(3):
-        total = np.bincount(place, colors[:, channel], len(keys))
-        values[:, channel] = total / np.maximum(count, 1)
-    centres = np.stack([keys >> (2 * CELL_BITS), (keys >> CELL_BITS), keys], axis=1)
-    centres = centres & ((1 << CELL_BITS) - 1)  # (cells, 3)
-    values[~has] = _harmonic(keys, centres, has, values[has])
-    return _interpolate(keys, values, (wanted - low) / cell)
+
+    def __init__(
+        self,
+        known: np.ndarray,
+        colors: np.ndarray,
+        wanted: Callable[[], Iterable[np.ndarray]],
+    ) -> None:
+        self._keys = np.empty(0, np.int64)
+        if len(known) == 0:
+            return
+        low, high = known.min(axis=0), known.max(axis=0)
+        for block in wanted():
+            low, high = np.minimum(low, block.min(axis=0)), np.maximum(high, block.max(axis=0))
+        self._low = low
+        self._cell = max(float((high - low).max()), 1e-12) / CELLS_PER_SIDE
+        key_known = self._cells(known)
+        keys = np.unique(key_known)
+        for block in wanted():
+            keys = np.union1d(keys, self._cells(block))
+        place = np.searchsorted(keys, key_known)
+        count = np.bincount(place, minlength=len(keys))
+        has = count > 0
+        values = np.empty((len(keys), 3))
+        for channel in range(3):
+            total = np.bincount(place, colors[:, channel], len(keys))
+            values[:, channel] = total / np.maximum(count, 1)
+        centres = np.stack([keys >> (2 * CELL_BITS), (keys >> CELL_BITS), keys], axis=1)
+        centres = centres & ((1 << CELL_BITS) - 1)  # (cells, 3)
+        values[~has] = _harmonic(keys, centres, has, values[has])
+        self._keys, self._values = keys, values
+
+    def at(self, positions: np.ndarray) -> np.ndarray:
+        """Return (m, 3) float32 colours of positions that were wanted."""
+        if len(self._keys) == 0:
+            return np.full((len(positions), 3), UNKNOWN_GREY, np.float32)
+        return _interpolate(self._keys, self._values, (positions - self._low) / self._cell)
+
+    def _cells(self, positions: np.ndarray) -> np.ndarray:
+        return _key(((positions - self._low) / self._cell).astype(np.int64))
 
 
 def _key(coordinates: np.ndarray) -> np.ndarray:
@@ -151,8 +171,8 @@ def grow(image: np.ndarray, ring: np.ndarray, chart: np.ndarray, rings: int, ins
     inside : bool
         Grow within each chart only; otherwise only between charts.
     """
-    begin = np.flatnonzero((ring == 0).ravel())
-    frontier = _with_open_neighbour(begin, ring, chart, inside)
+    frontier = np.empty(_with_open_neighbour(ring, chart, inside, np.empty(0, np.int64)), np.int64)
+    _with_open_neighbour(ring, chart, inside, frontier)
     for number in range(1, rings + 1):
         if len(frontier) == 0:
             return
@@ -160,23 +180,24 @@ def grow(image: np.ndarray, ring: np.ndarray, chart: np.ndarray, rings: int, ins
 
 
 @kernel(fast=False)
-def _with_open_neighbour(texels: Any, ring: Any, chart: Any, inside: bool) -> np.ndarray:
+def _with_open_neighbour(ring: Any, chart: Any, inside: bool, out: Any) -> int:
+    """Count the filled texels beside some that are not; write as many as fit."""
     height, width = ring.shape
-    out = np.empty(len(texels), np.int64)
     count = 0
-    for texel in texels:
-        y, x = texel // width, texel % width
-        for v in range(max(y - 1, 0), min(y + 2, height)):
-            for u in range(max(x - 1, 0), min(x + 2, width)):
-                wanted = chart[v, u] == chart[y, x] if inside else chart[v, u] < 0
-                if ring[v, u] < 0 and wanted:
-                    out[count] = texel
-                    count += 1
-                    break
-            else:
+    for y in range(height):
+        for x in range(width):
+            if ring[y, x] != 0:
                 continue
-            break
-    return out[:count]
+            is_open = False
+            for v in range(max(y - 1, 0), min(y + 2, height)):
+                for u in range(max(x - 1, 0), min(x + 2, width)):
+                    wanted = chart[v, u] == chart[y, x] if inside else chart[v, u] < 0
+                    is_open = is_open or (ring[v, u] < 0 and wanted)
+            if is_open:
+                if count < len(out):
+                    out[count] = y * width + x
+                count += 1
+    return count
 
 
 @kernel(fast=False)
@@ -221,24 +242,47 @@ def fill_background(image: np.ndarray, filled: np.ndarray) -> None:
     if not filled.any():
         image[:] = UNKNOWN_GREY
         return
-    colors = [image.astype(np.float32) * filled[..., None]]
-    weights = [filled.astype(np.float32)]
+    height, width = filled.shape
+    if max(height, width) == 1:
+        return
+    # The finest level is the image itself: as floats it would be the largest array of all.
+    colors = [np.empty((-(-height // 2), -(-width // 2), 3), np.float32)]
+    weights = [np.empty(colors[0].shape[:2], np.float32)]
+    bands = [(row, min(row + BACKGROUND_ROWS, height)) for row in range(0, height, BACKGROUND_ROWS)]
+    for begin, end in bands:
+        known = filled[begin:end].astype(np.float32)
+        rows = slice(begin // 2, -(-end // 2))
+        colors[0][rows], weights[0][rows] = _coarser(image[begin:end] * known[..., None], known)
     while max(weights[-1].shape) > 1:
-        colors.append(_halved(colors[-1]))
-        weights.append(_halved(weights[-1][..., None])[..., 0])
-        scale = np.maximum(weights[-1], 1e-6)
-        colors[-1] /= scale[..., None]
-        weights[-1] = (weights[-1] > 0).astype(np.float32)
-        colors[-1] *= weights[-1][..., None]
-    current = colors[-1]
-    for color, weight in zip(colors[-2::-1], weights[-2::-1], strict=True):
-        height, width = weight.shape
-        wide = current.repeat(2, axis=0).repeat(2, axis=1)[:height, :width]
-        current = np.where(weight[..., None] > 0, color, wide)
-    image[~filled] = np.rint(current[~filled]).astype(np.uint8)
+        color, weight = _coarser(colors[-1], weights[-1])
+        colors.append(color)
+        weights.append(weight)
+    current = colors.pop()
+    weights.pop()
+    while colors:
+        color, weight = colors.pop(), weights.pop()
+        wide = _finer(current, *weight.shape)
+        np.copyto(color, wide, where=weight[..., None] == 0)
+        current = color
+    for begin, end in bands:
+        wide = _finer(current[begin // 2 : -(-end // 2)], end - begin, width)
+        empty = ~filled[begin:end]
+        image[begin:end][empty] = np.rint(wide[empty]).astype(np.uint8)
+
+
+def _coarser(color: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Average blocks of 2 x 2 by weights of 0 and 1; the result has such weights too."""
+    total = _halved(weight[..., None])
+    known = (total > 0).astype(np.float32)
+    return _halved(color) / np.maximum(total, 1e-6) * known, known[..., 0]
+
+
+def _finer(values: np.ndarray, height: int, width: int) -> np.ndarray:
+    return values.repeat(2, axis=0)[:height].repeat(2, axis=1)[:, :width]
 
 
 def _halved(values: np.ndarray) -> np.ndarray:
     height, width = values.shape[:2]
-    even = np.pad(values, ((0, height % 2), (0, width % 2), (0, 0)))
-    return even[0::2, 0::2] + even[1::2, 0::2] + even[0::2, 1::2] + even[1::2, 1::2]
+    if height % 2 or width % 2:
+        values = np.pad(values, ((0, height % 2), (0, width % 2), (0, 0)))
+    return values[0::2, 0::2] + values[1::2, 0::2] + values[0::2, 1::2] + values[1::2, 1::2]

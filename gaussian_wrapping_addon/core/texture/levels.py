@@ -21,15 +21,15 @@ from ..meshing.decimation import decimate
 from ..meshing.surface_mesh import SurfaceMesh
 from ..progress import Progress
 from ..settings import TextureSettings
-from .atlas_raster import AtlasRaster, raster_atlas
+from .atlas_raster import AtlasRaster
+from .chart_pyramid import ChartPyramid, chart_pyramid
 from .dense_surface import BLOCK, NO_HIT, DenseSurface, cage_distance
-from .detail import bake_detail
+from .detail import bake_detail, merged_statistics
 from .fill import fill_background, grow
-from .sampling import pyramid
 from .tangent_frame import shading_normals
 from .texel_points import texel_points
 from .texture_size import gutter_for
-from .textured_mesh import TexturedMesh
+from .textured_mesh import AtlasMaps, TexturedMesh
 from .unwrap import unwrap
 
 _logger = logging.getLogger(__name__)
@@ -47,6 +47,8 @@ class Colors(NamedTuple):
     textured: TexturedMesh
     surface: DenseSurface
     """Of the textured mesh."""
+    pyramids: list[ChartPyramid]
+    """Of its texture, one for each atlas."""
 
 
 def levels_of_detail(
@@ -69,7 +71,8 @@ def levels_of_detail(
         What level 0 was decimated from; otherwise level 0 is the dense mesh of the others.
     settings : TextureSettings
         ``lods`` levels are made, fewer where the next would have less than
-        :data:`FLOOR_FACES` faces, or where no more faces can go without tearing the mesh.
+        :data:`FLOOR_FACES` faces, or where no more faces can go without tearing the mesh: why
+        becomes an entry of ``warnings`` in the statistics of ``textured``.
     work_folder : Path
         For temporary sub-folders.
     region : Region, optional
@@ -84,23 +87,27 @@ def levels_of_detail(
     if settings.lods == 0:
         return levels
     source = textured.mesh if dense is None else dense
-    colors = Colors(textured, DenseSurface(textured.mesh))
+    pyramids = [
+        chart_pyramid(textured, settings.lods, threads, number)
+        for number in range(len(textured.atlases))
+    ]
+    colors = Colors(textured, DenseSurface(textured.mesh), pyramids)
     current, size_px = textured.mesh, textured.albedo.shape[0]
     for number in range(1, settings.lods + 1):
         span = progress.span((number - 1) / settings.lods, number / settings.lods)
         target = len(current.faces) // FACES_DIVISOR
         if target < FLOOR_FACES:
-            _logger.info("level of detail %d would have %d faces: none is made", number, target)
+            _ended(textured, settings, number, f"it would have {target} faces")
             break
         try:
             fewer = decimate(
                 current.vertices, current.faces, target, span.span(0.0, 0.2), region=region
             )
         except MeshingError as error:
-            _logger.warning("no level of detail %d: %s", number, error.message)
+            _ended(textured, settings, number, error.message.rstrip("."))
             break
         if 2 * len(fewer.faces) > len(current.faces):
-            _logger.warning("no level of detail %d: fewer faces would tear the mesh", number)
+            _ended(textured, settings, number, "fewer faces would tear the mesh")
             break
         current = SurfaceMesh(fewer.vertices, fewer.faces.astype(np.int32))
         size_px = max(size_px // 2, min(size_px, MIN_SIDE_PX))
@@ -109,6 +116,13 @@ def levels_of_detail(
         )
     progress.update(1.0, f"{len(levels)} levels of detail")
     return levels
+
+
+def _ended(textured: TexturedMesh, settings: TextureSettings, number: int, reason: str) -> None:
+    """Say, in the log and for the report, why there is no further level."""
+    text = f"{number - 1} of {settings.lods} levels of detail were made, no further one: {reason}."
+    _logger.warning("%s", text)
+    textured.statistics.setdefault("warnings", []).append(text)
 
 
 def _level(
@@ -123,24 +137,31 @@ def _level(
 ) -> TexturedMesh:
     gutter_px = gutter_for(size_px, settings.gutter_px)
     unwrapped = unwrap(
-        mesh, size_px, gutter_px, work_folder, progress.span(0.2, 0.5), threads=threads
-    )
-    raster = raster_atlas(unwrapped.corner_uvs, size_px, threads)
-    albedo = transferred(mesh, raster, colors, gutter_px, progress.span(0.5, 0.7))
-    detail = bake_detail(
-        mesh, unwrapped.corner_uvs, raster, source, settings, progress.span(0.7, 1.0),
-        threads=threads,
+        mesh, size_px, gutter_px, work_folder, progress.span(0.2, 0.5),
+        threads=threads, atlases=len(colors.textured.atlases),
     )  # fmt: skip
+    maps, details, overlaps = [], [], 0
+    for number in range(unwrapped.atlases):
+        low, high = (0.5 + 0.5 * n / unwrapped.atlases for n in (number, number + 1))
+        span = progress.span(low, high)
+        raster = unwrapped.raster(size_px, threads, number)
+        overlaps += raster.overlaps
+        albedo = transferred(mesh, raster, colors, gutter_px, span.span(0.0, 0.4))
+        detail = bake_detail(
+            mesh, unwrapped, raster, source, settings, span.span(0.4, 1.0),
+            threads=threads, atlas=number,
+        )  # fmt: skip
+        details.append(detail)
+        maps.append(AtlasMaps(albedo, detail.normal_map, detail.occlusion))
     statistics = {
         "faces": len(mesh.faces),
         "size_px": size_px,
+        "atlases": unwrapped.atlases,
         "unwrap": unwrapped.method,
-        "texels_overlapping": raster.overlaps,
-        **detail.statistics,
+        "texels_overlapping": overlaps,
+        **merged_statistics(details),
     }
-    return TexturedMesh(
-        mesh, unwrapped.corner_uvs, albedo, statistics, detail.normal_map, detail.occlusion
-    )
+    return TexturedMesh.of(mesh, unwrapped.corner_uvs, unwrapped.face_atlas, maps, statistics)
 
 
 def transferred(
@@ -152,15 +173,14 @@ def transferred(
     ----------
     mesh : SurfaceMesh
     raster : AtlasRaster
-        Of its UVs, at the size wanted: the source is averaged to the same fineness.
+        Of its UVs, at the size wanted: the source is averaged to the same fineness, within its
+        charts.
     gutter_px : int
     """
     size = raster.face.shape[0]
     cage = cage_distance(mesh, DenseSurface(mesh), colors.surface)
     level = max(0, round(math.log2(colors.textured.albedo.shape[0] / size)))
-    levels = pyramid(colors.textured.albedo, level + 1)
-    begin, width, height = levels.levels[min(level, len(levels.levels) - 1)].tolist()
-    source = levels.pixels[begin : begin + width * height].reshape(height, width, 3)
+    atlas_of_faces = colors.textured.atlas_of_faces
     normals = shading_normals(mesh.vertices, mesh.faces)
     image = np.zeros((size, size, 3), np.uint8)
     texels = np.flatnonzero(raster.face.ravel() >= 0)
@@ -175,23 +195,14 @@ def transferred(
             places.face[lost], places.weights[lost] = near.face, near.weights
         uvs = np.asarray(colors.textured.corner_uvs, np.float64)[places.face]  # (n, 3, 2)
         uv = np.einsum("nc,ncx->nx", places.weights, uvs)
-        image.reshape(-1, 3)[part] = _looked_up(source, uv)
+        owner = atlas_of_faces[places.face]
+        for number, pyramid in enumerate(colors.pyramids):
+            mine = owner == number
+            found = pyramid.looked_up(uv[mine], places.face[mine], level)
+            image.reshape(-1, 3)[part[mine]] = found
     owned = raster.face >= 0
     ring, chart = np.where(owned, 0, -1).astype(np.int16), np.where(owned, 0, -1).astype(np.int32)
     grow(image, ring, chart, gutter_px, inside=False)
     fill_background(image, ring >= 0)
     progress.update(1.0, "level of detail: colours")
     return image
-
-
-def _looked_up(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Bilinear (n, 3) uint8 colours at (n, 2) UVs, v upwards."""
-    height, width = image.shape[:2]
-    x = (uv[:, 0] * width - 0.5).clip(0.0, width - 1.0)
-    y = ((1.0 - uv[:, 1]) * height - 0.5).clip(0.0, height - 1.0)
-    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    across, down = (x - left)[:, None], (y - top)[:, None]
-    upper = image[top, left] * (1.0 - across) + image[top, right] * across
-    lower = image[below, left] * (1.0 - across) + image[below, right] * across
-    return np.rint(upper * (1.0 - down) + lower * down).astype(np.uint8)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +65,11 @@ def write_mesh_ply(
 
 
 def vertex_colors(
-    count: int, faces: np.ndarray, corner_uvs: np.ndarray, albedo: np.ndarray
+    count: int,
+    faces: np.ndarray,
+    corner_uvs: np.ndarray,
+    albedos: Sequence[np.ndarray],
+    face_atlas: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return (v, 3) uint8 means of the texture at the corners of each vertex.
 
@@ -75,14 +80,21 @@ def vertex_colors(
     faces : (f, 3) int
     corner_uvs : (f, 3, 2) float
         v upwards.
-    albedo : (h, w, 3) uint8
-        The first row is the top.
+    albedos : sequence of (h, w, 3) uint8
+        One for each atlas. The first row is the top.
+    face_atlas : (f,) int, optional
+        Where there are several.
     """
-    size = np.array(albedo.shape[1::-1])
-    texels = np.asarray(corner_uvs, np.float64).reshape(-1, 2) * size
-    column = np.floor(texels[:, 0]).clip(0, size[0] - 1).astype(np.int64)
-    row = np.floor(size[1] - texels[:, 1]).clip(0, size[1] - 1).astype(np.int64)
-    values = albedo[row, column].astype(np.float64)  # (3 f, 3)
+    uvs = np.asarray(corner_uvs, np.float64).reshape(-1, 2)
+    atlas = np.zeros(len(uvs), np.int64) if face_atlas is None else np.repeat(face_atlas, 3)
+    values = np.zeros((len(uvs), 3))
+    for number, albedo in enumerate(albedos):
+        here = np.flatnonzero(atlas == number)
+        size = np.array(albedo.shape[1::-1])
+        texels = uvs[here] * size
+        column = np.floor(texels[:, 0]).clip(0, size[0] - 1).astype(np.int64)
+        row = np.floor(size[1] - texels[:, 1]).clip(0, size[1] - 1).astype(np.int64)
+        values[here] = albedo[row, column]
     corner = np.asarray(faces).ravel()
     corners = np.bincount(corner, minlength=count)
     sums = [np.bincount(corner, values[:, c], count) for c in range(3)]

@@ -30,9 +30,10 @@ CLEAR_FLOOR = 0.02
 BORDER_SHARE = 0.04
 """Weights fade over this share of the image side towards its border."""
 BORDER_FLOOR = 0.02
-CLIPPED_FROM, CLIPPED_RANGE = 254.0, 14.0
+CLIPPED_FROM, CLIPPED_RANGE = 254.0, 40.0
 """Views fade over this range below white: a clipped pixel is a lower bound, which after another
-photo's exposure is a flat grey beside it. Highlights go where another view has none."""
+photo's exposure is a flat grey beside it, and cameras bend the curve long before. Over 14 levels
+the white paper of the flowerpot set had grey patches. Highlights go where another view has none."""
 CLIPPED_FLOOR = 0.02
 MAX_USEFUL_PX = 1.5
 """A photo with more pixels a texel than this is no better."""

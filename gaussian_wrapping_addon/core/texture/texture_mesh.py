@@ -6,7 +6,6 @@ from __future__ import annotations
 import logging
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,34 +15,21 @@ from ..errors import MeshingError, UsageError
 from ..meshing.surface_mesh import SurfaceMesh
 from ..progress import Progress
 from ..settings import TextureSettings
-from .atlas_raster import AtlasRaster, raster_atlas
-from .bake import Baked, Photos, bake
-from .detail import bake_detail, wants_normal_map
-from .face_graph import face_graph
-from .fill import (
-    RING_TEXELS,
-    continue_over_surface,
-    fill_background,
-    grow,
-    surface_positions,
-)
+from .atlas_colors import CONTINUED_POINTS, AtlasColors, continue_colors
+from .atlas_points import atlas_points, blocks_of
+from .atlas_raster import AtlasRaster
+from .bake import Photos, bake, look_at_photos, survey_points
+from .detail import bake_detail, merged_statistics, wants_normal_map
+from .face_graph import FaceGraph, face_graph
 from .photo_samples import SurfaceArrays, SurfacePoints
 from .stretch import texture_stretch
-from .texture_size import automatic_size, gutter_for
-from .textured_mesh import TexturedMesh
+from .texture_memory import fit_into_memory
+from .texture_size import gutter_for, plan_textures, wanted_side
+from .texture_tally import Tally
+from .textured_mesh import AtlasMaps, TexturedMesh
 from .unwrap import Unwrap, unwrap
 
 _logger = logging.getLogger(__name__)
-
-CONTINUED_POINTS = 1_000_000
-"""As many seen texels are enough for the cells from which colours are continued."""
-OUTLINE_TEXELS = 8
-"""Texels seen only at silhouettes take their neighbours' colour within this distance."""
-
-
-UNSURE_LEVELS = 15.0
-"""What only grazing or half hidden views show is taken while it is this near to what lies around,
-and not at all at twice this: on trained meshes such views are often of something before it."""
 
 
 def texture_mesh(
@@ -56,6 +42,8 @@ def texture_mesh(
     *,
     threads: int,
     dense: SurfaceMesh | None = None,
+    free_bytes: int = 0,
+    unwrapped: Unwrap | None = None,
 ) -> TexturedMesh:
     """Unwrap a mesh and bake its texture from the photos (method.md 8).
 
@@ -68,7 +56,8 @@ def texture_mesh(
     photos : PhotoStore
         Anything with ``camera``, ``photo`` and ``mask`` by index and divisor.
     settings : TextureSettings
-        ``size_px = 0`` chooses the size from the photos' footprint.
+        ``size_px = 0`` chooses the size from the photos' footprint, and ``max_atlases = 0`` how
+        many textures.
     work_folder : Path
         For a temporary sub-folder of the unwrap.
     progress : Progress
@@ -77,6 +66,10 @@ def texture_mesh(
         Threads to use; the result does not depend on it.
     dense : SurfaceMesh, optional
         What the mesh was decimated from: its detail goes into the normal map.
+    free_bytes : int
+        Memory that may be taken; 0 where it is not known, then nothing is judged.
+    unwrapped : Unwrap, optional
+        UVs to keep; the size must be given.
 
     Raises
     ------
@@ -84,6 +77,8 @@ def texture_mesh(
         The mesh has no face with area, a vertex that is not finite, or an index out of range.
     UsageError
         The size is out of range.
+    ResourceError
+        A texture of the size asked for needs more memory than is free.
     """
     check_mesh(mesh)
     if settings.size_px < 0 or settings.size_px > limits.MAX_TEXTURE_SIDE_PX:
@@ -93,50 +88,137 @@ def texture_mesh(
         )
     graph = face_graph(mesh.vertices, mesh.faces)
     count = len(scene.views)
+    size_px, atlases, warning = _plan(graph, photos, count, settings, dense, free_bytes)
+    gutter_px = gutter_for(size_px, settings.gutter_px)
+    if unwrapped is None:
+        progress.update(0.0, f"unwrapping for {atlases} x {size_px} x {size_px} texels")
+        unwrapped = unwrap(
+            mesh, size_px, gutter_px, work_folder, progress.span(0.0, 0.3),
+            threads=threads, atlases=atlases,
+        )  # fmt: skip
+    atlases = unwrapped.atlases
+    surface, sample, first = _sampled(mesh, graph, unwrapped, size_px, count, threads)
+    survey = look_at_photos(
+        sample, surface, photos, count, progress.span(0.3, 0.42), threads=threads
+    )
+    tally = Tally(len(mesh.faces))
+    colors, details, views = [], [], []
+    for number in range(atlases):
+        span = progress.span(0.42 + 0.48 * number / atlases, 0.42 + 0.48 * (number + 1) / atlases)
+        raster = unwrapped.raster(size_px, threads, number) if first is None else first
+        details.append(
+            bake_detail(
+                mesh, unwrapped, raster, dense, settings, span.span(0.0, 0.2),
+                threads=threads, atlas=number,
+            )
+        )  # fmt: skip
+        overlaps = raster.overlaps
+        atlas = atlas_points(raster, unwrapped.charts)
+        del raster
+        first = None  # half of the memory
+        baked = bake(atlas.points, surface, photos, survey, span.span(0.2, 1.0), threads=threads)
+        tally.add(atlas.points, baked, overlaps)
+        shown = np.zeros((size_px, size_px), np.uint8)
+        for rows in blocks_of(len(atlas.texels)):
+            shown.reshape(-1)[atlas.texels[rows]] = baked.views[rows]
+        views.append(shown)
+        colors.append(AtlasColors(atlas, baked, CONTINUED_POINTS // atlases, surface))
+        del atlas, baked
+    progress.update(0.9, "filling what no photo saw")
+    continuation = continue_colors(colors, surface)
+    images = []
+    while colors:
+        images.append(colors.pop(0).finish(continuation, surface, gutter_px))
+    stretch = texture_stretch(mesh.vertices, mesh.faces, unwrapped.corner_uvs)
+    statistics = {
+        **tally.statistics(size_px, settings, unwrapped, graph.areas),
+        "stretch_mean": stretch.mean,
+        "stretch_p95": stretch.p95,
+        "area_collapsed_share": stretch.collapsed_share,
+        "warnings": [warning] if warning else [],
+        **merged_statistics(details),
+    }
+    if statistics["texels_seen"] == 0:
+        _logger.warning("no photo sees the mesh: its texture is plain grey")
+    progress.update(1.0, f"texture: {100 * statistics['coverage']:.1f} % seen by photos")
+    maps = [
+        AtlasMaps(image, detail.normal_map, detail.occlusion, shown)
+        for image, detail, shown in zip(images, details, views, strict=True)
+    ]
+    return TexturedMesh.of(mesh, unwrapped.corner_uvs, unwrapped.face_atlas, maps, statistics)
+
+
+def _plan(
+    graph: FaceGraph,
+    photos: Photos,
+    count: int,
+    settings: TextureSettings,
+    dense: SurfaceMesh | None,
+    free_bytes: int,
+) -> tuple[int, int, str]:
+    """Return side and number of textures, and a warning where memory makes them fewer."""
     detail_points = 0
     if dense is not None and wants_normal_map(settings, is_decimated=True):
         detail_points = len(dense.vertices)
-    size_px = settings.size_px or automatic_size(graph, photos, count, detail_points)
-    progress.update(0.0, f"unwrapping for {size_px} x {size_px} texels")
-    gutter_px = gutter_for(size_px, settings.gutter_px)
-    unwrapped = unwrap(
-        mesh, size_px, gutter_px, work_folder, progress.span(0.0, 0.3), threads=threads
+    wanted = wanted_side(graph, photos, count, detail_points)
+    size_px, atlases = plan_textures(wanted, settings.size_px, settings.max_atlases)
+    size_px, atlases, warning = fit_into_memory(
+        size_px, atlases, len(graph.areas), free_bytes, may_lower=settings.size_px == 0
     )
-    raster = raster_atlas(unwrapped.corner_uvs, size_px, threads)
-    texels = np.flatnonzero(raster.face.ravel() >= 0)
-    points = SurfacePoints(
-        raster.face.ravel()[texels], raster.bary.reshape(-1, 2)[texels].astype(np.float32)
-    )
-    texel_size = math.sqrt(float(graph.areas.sum()) / max(int(raster.inside.sum()), 1))
+    if warning:
+        _logger.warning("%s", warning)
+    return size_px, atlases, warning
+
+
+def _sampled(
+    mesh: SurfaceMesh,
+    graph: FaceGraph,
+    unwrapped: Unwrap,
+    size_px: int,
+    photos: int,
+    threads: int,
+) -> tuple[SurfaceArrays, SurfacePoints, AtlasRaster | None]:
+    """Return the surface with its texel size, points all over it, and the raster if there is one.
+
+    Several rasters would take too much memory: they are made once more when they are needed.
+    """
+    wanted, inside = survey_points(photos), 0
+    samples, counts = [], []
+    raster = None
+    for number in range(unwrapped.atlases):
+        raster = unwrapped.raster(size_px, threads, number)
+        inside += int(raster.inside.sum())
+        used = int(np.count_nonzero(raster.face >= 0))
+        counts.append(used)
+        samples.append(_spread(raster, used, min(wanted, used)))
+    texel_size = math.sqrt(float(graph.areas.sum()) / max(inside, 1))
     surface = SurfaceArrays.of(
         np.ascontiguousarray(mesh.vertices, np.float64),
         np.ascontiguousarray(mesh.faces, np.int32),
         graph.normals,
         texel_size,
     )
-    baked = bake(points, surface, photos, count, progress.span(0.3, 0.8), threads=threads)
-    detail = bake_detail(
-        mesh, unwrapped.corner_uvs, raster, dense, settings, progress.span(0.8, 0.9),
-        threads=threads,
-    )  # fmt: skip
-    progress.update(0.9, "filling what no photo saw")
-    albedo = _image(size_px, texels, points, surface, baked, raster, unwrapped, gutter_px)
-    stretch = texture_stretch(mesh.vertices, mesh.faces, unwrapped.corner_uvs)
-    statistics = {
-        **_statistics(size_px, settings, unwrapped, raster, points, baked, graph.areas),
-        "stretch_mean": stretch.mean,
-        "stretch_p95": stretch.p95,
-        "area_collapsed_share": stretch.collapsed_share,
-        **detail.statistics,
-    }
-    if statistics["texels_seen"] == 0:
-        _logger.warning("no photo sees the mesh: its texture is plain grey")
-    progress.update(1.0, f"texture: {100 * statistics['coverage']:.1f} % seen by photos")
-    views = np.zeros((size_px, size_px), np.uint8)
-    views.ravel()[texels] = baked.views
-    return TexturedMesh(
-        mesh, unwrapped.corner_uvs, albedo, statistics, detail.normal_map, detail.occlusion, views
-    )
+    if len(samples) == 1:
+        return surface, samples[0], raster
+    parts = []
+    for used, sample in zip(counts, samples, strict=True):
+        share = min(len(sample), max(1, round(wanted * used / max(sum(counts), 1))))
+        parts.append(sample.part(np.linspace(0, len(sample) - 1, share).astype(np.int64)))
+    face, bary = (np.concatenate([getattr(p, n) for p in parts]) for n in ("face", "bary"))
+    return surface, SurfacePoints(face, bary), None
+
+
+def _spread(raster: AtlasRaster, used: int, wanted: int) -> SurfacePoints:
+    """Return texels that faces own, evenly in their order."""
+    rank = np.linspace(0, used - 1, wanted).astype(np.int64)
+    ends = np.cumsum((raster.face >= 0).sum(axis=1))
+    row = np.searchsorted(ends, rank, side="right")
+    column = np.empty(wanted, np.int64)
+    for y in np.unique(row).tolist():
+        owned = np.flatnonzero(raster.face[y] >= 0)
+        mine = row == y
+        column[mine] = owned[rank[mine] - (ends[y] - len(owned))]
+    return SurfacePoints(raster.face[row, column], raster.bary[row, column])
 
 
 def check_mesh(mesh: SurfaceMesh) -> None:
@@ -158,102 +240,3 @@ def check_mesh(mesh: SurfaceMesh) -> None:
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     if not (np.abs(cross).max() > 0 and np.isfinite(cross).all()):
         raise MeshingError("No face of the mesh has an area.", hint)
-
-
-def _image(
-    size_px: int,
-    texels: np.ndarray,
-    points: SurfacePoints,
-    surface: SurfaceArrays,
-    baked: Baked,
-    raster: AtlasRaster,
-    unwrapped: Unwrap,
-    gutter_px: int,
-) -> np.ndarray:
-    """Put the colours into the image; fill unseen texels, gutters and the rest."""
-    seen = baked.sure
-    image = np.zeros((size_px, size_px, 3), np.uint8)
-    pixels = image.reshape(-1, 3)
-    pixels[texels] = baked.colors
-    chart = np.where(raster.face >= 0, unwrapped.charts[raster.face], -1).astype(np.int32)
-    ring = np.full((size_px, size_px), -1, np.int16)
-    flat_ring = ring.ravel()
-    # Seen at silhouettes only: the neighbours' colour is cleaner, where there are neighbours.
-    clear = seen & baked.clear
-    flat_ring[texels[clear]] = 0
-    grow(image, ring, chart, OUTLINE_TEXELS, inside=True)
-    trusted = seen & (flat_ring[texels] >= 0)
-    trusted = trusted if trusted.any() else seen
-    flat_ring[texels[~seen]] = -1
-    flat_ring[texels[seen]] = 0
-    if not seen.all():
-        grow(image, ring, chart, RING_TEXELS, inside=True)
-        unseen = texels[~seen]
-        known = np.flatnonzero(trusted)
-        known = known[:: max(1, len(known) // CONTINUED_POINTS)]
-        far = continue_over_surface(
-            surface_positions(points.part(known), surface),
-            pixels[texels[known]],
-            surface_positions(points.part(~seen), surface),
-        )
-        number = flat_ring[unseen].astype(np.float32)
-        share = np.where(number < 0, 1.0, number / (RING_TEXELS + 1.0))[:, None]
-        near = pixels[unseen]
-        pixels[unseen] = np.rint(near + share * (far - near)).astype(np.uint8)
-    unsure = np.flatnonzero((baked.views > 0) & ~seen)
-    around, shown = pixels[texels[unsure]].astype(np.float32), baked.colors[unsure]
-    off = np.abs(shown - around).max(axis=1, initial=0.0)
-    number = flat_ring[texels[unsure]].astype(np.float32)
-    away = np.where(number < 0, 1.0, number / (RING_TEXELS + 1.0))  # no step at the sure ones
-    share = (away * (2.0 - off / UNSURE_LEVELS).clip(0.0, 1.0))[:, None]
-    pixels[texels[unsure]] = np.rint(around + share * (shown - around)).astype(np.uint8)
-    flat_ring[texels] = 0
-    grow(image, ring, chart, gutter_px, inside=False)
-    fill_background(image, ring >= 0)
-    return image
-
-
-def _statistics(
-    size_px: int,
-    settings: TextureSettings,
-    unwrapped: Unwrap,
-    raster: AtlasRaster,
-    points: SurfacePoints,
-    baked: Baked,
-    areas: np.ndarray,
-) -> dict[str, Any]:
-    seen = baked.views > 0
-    with_texel = np.zeros(len(areas), np.bool_)
-    with_texel[points.face] = True
-    face_seen = np.zeros(len(areas), np.bool_)
-    face_seen[points.face[seen]] = True
-    used, texels_seen = len(points), int(seen.sum())
-    judged_area = float(areas[with_texel].sum())
-    return {
-        "size_px": size_px,
-        "size_automatic": settings.size_px == 0,
-        "unwrap": unwrapped.method,
-        "unwrap_fallback_reason": unwrapped.reason,
-        "charts": int(unwrapped.charts.max()) + 1,
-        "gutter_px": round(unwrapped.gutter_px, 2),
-        "utilisation": used / size_px**2,
-        "texels_used": used,
-        "texels_seen": texels_seen,
-        "texels_filled": used - texels_seen,
-        "texels_seen_at_outlines_only": int((baked.sure & ~baked.clear).sum()),
-        "texels_seen_badly": int((seen & ~baked.sure).sum()),
-        "texels_overlapping": raster.overlaps,
-        "coverage": texels_seen / max(used, 1),
-        "faces_seen_share": float(face_seen.sum()) / max(int(with_texel.sum()), 1),
-        # Of the faces that have a texel: whether a photo saw the others is not known.
-        "area_seen_share": float(areas[face_seen].sum()) / judged_area if judged_area else 0.0,
-        "area_without_texel_share": float(areas[~with_texel].sum() / areas.sum()),
-        "faces_without_texel": int((~with_texel).sum()),
-        "views_per_seen_texel": float(baked.views[seen].mean()) if texels_seen else 0.0,
-        "views_rejected_share": baked.rejected_share,
-        "photos_used": baked.photos_used,
-        "exposure_spread": baked.gain_spread,
-        "exposure_corrected": baked.gains_applied,
-        "brightness_spread_within_photos": baked.field_spread,
-        "brightness_evened_within_photos": baked.fields_applied,
-    }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Side of the texture from what the photos resolve on the surface."""
+"""Side and number of textures from what the photos resolve on the surface."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ ENOUGH = 0.8
 """A texture of this share of the photos' resolution is enough: the next size costs four times."""
 
 
-def automatic_size(
+def wanted_side(
     graph: FaceGraph, photos: Photos, count: int, detail_points: int = 0, seed: int = 0
-) -> int:
-    """Return the side in pixels, a power of two from 256 to 4096.
+) -> float:
+    """Return the side in pixels of one texture that shows about what the photos do; no limits.
 
     The footprint of a photo's pixel on the surface is ``z / focal``; each sampled face takes its
     best photo, and the surface their median (by area). Occlusion is not tested: a size needs no
@@ -53,14 +53,48 @@ def automatic_size(
         best = np.where(sees, np.minimum(best, depth / camera.fx), best)
     best = best[np.isfinite(best)]
     if len(best) == 0:
-        return MIN_SIZE_PX
+        return 0.0
     footprint = float(np.median(best))
     wanted = ENOUGH * math.sqrt(area / EXPECTED_UTILISATION) / footprint
     room = max(TEXELS_PER_FACE * len(graph.areas), TEXELS_PER_DETAIL_POINT * detail_points)
-    wanted = max(wanted, math.sqrt(room / EXPECTED_UTILISATION))
+    return max(wanted, math.sqrt(room / EXPECTED_UTILISATION))
+
+
+def automatic_size(
+    graph: FaceGraph, photos: Photos, count: int, detail_points: int = 0, seed: int = 0
+) -> int:
+    """Return the side in pixels, a power of two from 256 to 4096, that :func:`wanted_side` asks."""
+    return _power_of_two(wanted_side(graph, photos, count, detail_points, seed))
+
+
+def _power_of_two(wanted: float) -> int:
     exponent = math.ceil(math.log2(max(wanted, 1.0)))
     largest = min(MAX_AUTOMATIC_SIZE_PX, limits.MAX_TEXTURE_SIDE_PX)
     return int(min(max(2**exponent, MIN_SIZE_PX), largest))
+
+
+def plan_textures(wanted: float, size_px: int, max_atlases: int) -> tuple[int, int]:
+    """Return the side of each texture in pixels and how many there are.
+
+    Parameters
+    ----------
+    wanted : float
+        Side of the one texture that would do (:func:`wanted_side`).
+    size_px : int
+        What was asked for; 0 chooses a power of two from 256 to 4096.
+    max_atlases : int
+        As many textures as hold what one of side ``wanted`` would, up to this. 0 means one, but
+        where one of 8192 would not do and no smaller size was asked for:
+        :data:`~..limits.MAX_AUTOMATIC_ATLASES`.
+    """
+    side = size_px or _power_of_two(wanted)
+    most = max_atlases
+    if most == 0:
+        is_free = size_px in (0, limits.MAX_TEXTURE_SIDE_PX)
+        beyond = wanted > limits.MAX_TEXTURE_SIDE_PX
+        most = limits.MAX_AUTOMATIC_ATLASES if is_free and beyond else 1
+    # A rounding error more than full does not need another texture.
+    return side, min(max(math.ceil((wanted / side) ** 2 - 1e-6), 1), most)
 
 
 def gutter_for(size_px: int, gutter_px: int) -> int:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.evaluation.report.figures import figure_rows
+from gaussian_wrapping_addon.core.jobs.client import JobClient
+from gaussian_wrapping_addon.core.jobs.job_file import make_job, read_job
 from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder
 from tests.synthetic import BALL_RADIUS, BallScene, write_ball_scene
 
@@ -178,6 +181,42 @@ def test_another_region_and_resolution_needs_no_training(
     assert np.abs(local[:, :2]).max() < 0.6 + 1e-6
     edges = mesh.edges_unique_length / scene.scale
     assert 0.02 < np.median(edges) < 0.08
+
+
+def test_each_region_of_one_job_has_its_own_edge_length(
+    wrapped: tuple[BallScene, Path, str],
+) -> None:
+    scene, root, _ = wrapped
+    fine, coarse = (
+        str(write_box(root / f"{name}.json", scene, 0.5, (0, 0, 1.0)))
+        for name in ("fine", "coarse")
+    )
+    earlier = read_job(root / "out" / "job.json")
+    settings = replace(
+        earlier.settings,
+        regions=(fine, coarse),
+        meshing=replace(earlier.settings.meshing, edge_length=0.12 * SCALE, points=0),
+        texture=replace(earlier.settings.texture, size_px=128),
+        export=("ply",),
+    )
+    job = make_job("mesh", Path(earlier.source), settings, {fine: 0.04 * SCALE})
+    status = JobClient.start(root / "out", job).wait(240)
+    assert status.state == "DONE", status.error
+    report = json.loads((root / "out" / "result" / "report.json").read_text())
+    reused = {s["name"]: s["reused"] for s in report["stages"]}
+    assert reused["train"]
+    medians = {}
+    for name, asked in (("fine", 0.04), ("coarse", 0.12)):
+        mesh = world_mesh(root, name)
+        assert mesh.is_watertight
+        medians[name] = float(np.median(mesh.edges_unique_length)) / scene.scale
+        assert 0.5 * asked < medians[name] < 2.0 * asked, name
+    assert medians["coarse"] > 1.8 * medians["fine"]
+    body = json.loads((root / "out" / "result" / "fine" / "region.json").read_text())
+    assert set(body) == {
+        "class_name", "version", "blender_object_name", "vertices", "hull_simplices",
+    }  # fmt: skip
+    assert body["version"] == 1
 
 
 def test_a_region_without_surface_leaves_the_finished_job_as_it_was(

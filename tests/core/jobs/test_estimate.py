@@ -46,7 +46,7 @@ def test_what_comes_after_the_training_is_said(
     monkeypatch.setattr(name, lambda: False)
     lines = estimate._estimate(make_job("wrap", tmp_path, JobSettings()))
     (line,) = [line for line in lines if line.startswith("mesh and texture")]
-    assert "take about 20 to 90 % of it more" in line
+    assert line == "mesh and texture: 20 to 90 % more"
 
 
 def test_an_empty_folder_is_refused(tmp_path: Path) -> None:

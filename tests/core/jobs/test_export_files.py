@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,11 +31,11 @@ from gaussian_wrapping_addon.core.jobs.export_files import (
     SPLAT_NAME,
     ExportRequest,
     export_files,
-    file_stem,
     frames_of,
     main,
     result_of,
 )
+from gaussian_wrapping_addon.core.jobs.file_stems import file_stem, file_stems
 from gaussian_wrapping_addon.core.jobs.job_file import JobFile, write_job
 from gaussian_wrapping_addon.core.jobs.sidecar import code_fingerprint, sidecar_path
 from gaussian_wrapping_addon.core.ply_table import read_ply_header
@@ -210,25 +213,105 @@ def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no gaussians\.ply"):
         exported(replace(good, formats=("splat",)))
     (tmp_path / "file").write_text("")
-    with pytest.raises(ResourceError, match="cannot be written"):
+    with pytest.raises(UsageError, match="is a file"):
         exported(replace(good, out=tmp_path / "file"))
+    with pytest.raises(ResourceError, match="cannot be written"):
+        exported(replace(good, out=tmp_path / "file" / "out"))
     (result / "auto" / "albedo.png").write_text("no image")
     with pytest.raises(ParseError, match=r"albedo\.png"):
         exported(good)
     (result / "auto" / "mesh.npz").write_text("no mesh")
     with pytest.raises(ParseError, match=r"mesh\.npz"):
         exported(good)
-    with pytest.raises(DatasetError, match="holds no result"):
+    with pytest.raises(UsageError, match="holds no job's result"):
         result_of(tmp_path)
     assert result_of(tmp_path / "job") == result_of(result) == result.resolve()
 
 
 @pytest.mark.parametrize(
+    ("format", "map_name"), [("glb", "normal"), ("glb", "occlusion"), ("obj", "normal")]
+)
+def test_a_broken_map_is_not_handed_on(tmp_path: Path, format: str, map_name: str) -> None:
+    result = write_result(tmp_path / "job")
+    request = ExportRequest(result, tmp_path / "out", (format,))
+    (result / "auto" / f"{map_name}.png").write_text("no image")
+    with pytest.raises(ParseError, match=rf"{map_name}\.png"):
+        exported(request)
+    assert not (tmp_path / "out" / f"auto.{format}").exists()
+
+
+@pytest.mark.parametrize("format", ["glb", "obj"])
+def test_a_full_disk_leaves_no_cut_file(
+    tmp_path: Path, format: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = write_result(tmp_path / "job")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(ResourceError, match=r"No room is left.*auto"):
+        exported(ExportRequest(result, tmp_path / "out", (format,)))
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("format", ["glb", "obj"])
+def test_a_missing_map_of_a_further_atlas_is_named(tmp_path: Path, format: str) -> None:
+    result = write_result(tmp_path / "job")
+    folder = result / "auto"
+    with np.load(folder / "mesh.npz") as arrays:
+        mesh = dict(arrays)
+    mesh["face_atlas"] = (np.arange(len(mesh["faces"])) % 2).astype(np.uint8)
+    np.savez(folder / "mesh.npz", **mesh)
+    (folder / "albedo-2.png").write_bytes((folder / "albedo.png").read_bytes())
+    with pytest.raises(ParseError, match=r"normal-2\.png"):
+        exported(ExportRequest(result, tmp_path / "out", (format,)))
+
+
+@pytest.mark.parametrize(
     ("region", "level", "wanted"),
-    [("auto", 0, "auto"), ("My Head", 2, "My_Head-lod2"), ("...", 0, "mesh"), ("é/b", 0, "é_b")],
+    [
+        ("auto", 0, "auto"),
+        ("My Head", 2, "My_Head-lod2"),
+        ("...", 0, "mesh"),
+        ("é/b", 0, "é_b"),
+        ("con", 0, "mesh_con"),
+        ("COM1.old", 1, "mesh_COM1.old-lod1"),
+        ("console", 0, "console"),
+    ],
 )
 def test_names_of_files(region: str, level: int, wanted: str) -> None:
     assert file_stem(region, level) == wanted
+
+
+def test_no_two_meshes_have_one_name() -> None:
+    meshes = [
+        ("Head", 0), ("head", 0), ("a b", 0), ("a_b", 0), ("auto", 0), ("auto", 1),
+        ("auto-lod1", 0), ("Gaussians.Splat", 0), ("x" * 300, 0), ("x" * 301, 0), ("é" * 150, 0),
+    ]  # fmt: skip
+    stems = file_stems(meshes)
+    assert len({stem.casefold() for stem in stems.values()} | {"gaussians.splat"}) == 12
+    assert stems["auto", 0] == "auto"
+    assert all(len(f"{stem}-occlusion.png.json.writing.12345678".encode()) < 255
+               for stem in stems.values())  # fmt: skip
+    # Which others there are changes no name of those that would be alike.
+    assert file_stems([("a b", 0), ("a_b", 0)])["a b", 0] == stems["a b", 0]
+
+
+def test_exports_of_regions_with_one_name_do_not_replace_each_other(tmp_path: Path) -> None:
+    """Folders of a result may be renamed; regions may be exported one by one."""
+    result = write_result(tmp_path / "job")
+    names = ("a b", "a_b", "A_B", "auto-lod1")
+    for name in names:
+        shutil.copytree(result / "auto", result / name)
+    out = tmp_path / "out"
+    whole = ExportRequest(result, out, ("glb", "obj"), levels=True)
+    written = [p for name in names for p in export_files(replace(whole, regions=(name,)))]
+    written += export_files(replace(whole, regions=("auto",)))
+    assert len(written) == 2 * 2 * 5
+    assert len({str(path).casefold() for path in written}) == len(written)
+    assert {sidecar(path)["region"] for path in written} == {*names, "auto"}
+    assert sorted(export_files(whole)) == sorted(written)
 
 
 @pytest.mark.parametrize("placed", [False, True])

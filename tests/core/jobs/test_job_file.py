@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,16 +16,21 @@ from gaussian_wrapping_addon.core.errors import (
     ParseError,
     UsageError,
 )
+from gaussian_wrapping_addon.core.evaluation.report import markdown
 from gaussian_wrapping_addon.core.jobs import answer, mesh_estimate
 from gaussian_wrapping_addon.core.jobs.job_file import (
+    PICTURES,
     JobFile,
     make_job,
     read_job,
+    refuse_other_regions,
     region_name,
+    region_names,
     write_job,
 )
+from gaussian_wrapping_addon.core.jobs.job_folder import MARKER
 from gaussian_wrapping_addon.core.jobs.training_stage import training_keys
-from gaussian_wrapping_addon.core.settings import JobSettings, preset
+from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings, preset
 
 
 def test_round_trip_keeps_settings_and_region_content(tmp_path: Path) -> None:
@@ -94,6 +100,30 @@ def test_region_names_are_safe_folder_names(request_: str, body: object, name: s
     assert region_name(request_, body) == name
 
 
+@pytest.mark.parametrize("name", ["report", "Report", "CON", "nul", "com1"])
+def test_a_region_never_has_a_folder_that_is_taken(name: str) -> None:
+    assert PICTURES == markdown.PICTURES
+    assert region_name("x/a.json", {"blender_object_name": name}) == f"region_{name}"
+    assert region_name("x/a.json", {"blender_object_name": f"{name}s"}) == f"{name}s"
+
+
+def test_names_that_differ_in_case_alone_are_one() -> None:
+    with pytest.raises(UsageError, match="same name"):
+        region_names(["x/Head.json", "x/head.json"], {})
+    assert region_names(["x/Head.json", "x/Heads.json"], {}) == ["Head", "Heads"]
+
+
+@pytest.mark.parametrize(("new", "refused"), [("Würfel", False), ("Wörfel", True), ("w", False)])
+def test_a_region_does_not_replace_the_result_of_another(
+    new: str, refused: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "W_rfel").mkdir()
+    (tmp_path / "W_rfel" / "region.json").write_text('{"blender_object_name": "Würfel"}')
+    folder = region_name("r.json", {"blender_object_name": new})
+    with pytest.raises(UsageError, match="Würfel") if refused else nullcontext():
+        refuse_other_regions(tmp_path, {"auto": "auto", new: folder})
+
+
 def test_a_region_name_never_hides_the_automatic_one() -> None:
     assert region_name("x/auto.json", {}) not in ("auto", "all", "")
     assert region_name("x/\u4e2d.json", {}) not in ("auto", "all", "")
@@ -138,6 +168,8 @@ def test_a_region_that_is_no_file_is_told_by_all_commands(
     path = str(tmp_path / region)
     with pytest.raises(DatasetError, match=message):
         make_job("mesh", tmp_path, JobSettings(regions=(path,)))
+    for name in (MARKER, "job.json"):
+        (tmp_path / name).write_text("{}")
     request = {"out": str(tmp_path), "region": path, "threads": 1, "meshing": {}}
     assert mesh_estimate.main([json.dumps(request)]) == EXIT_BAD_DATA
     assert message in json.loads(capsys.readouterr().out)["error"]
@@ -156,3 +188,38 @@ def test_two_regions_of_one_name_are_refused_before_anything_starts(tmp_path: Pa
     again = f"{tmp_path}/../{tmp_path.name}/a.json"
     job = make_job("mesh", tmp_path, JobSettings(regions=(a, c, again)))
     assert job.settings.regions == (a, c)
+
+
+def test_a_region_has_an_edge_length_of_its_own(tmp_path: Path) -> None:
+    body = {"class_name": "GaussianWrappingBoundingVolume", "version": 1}
+    body |= {"blender_object_name": "head", "hull_simplices": None}
+    body |= {"vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+    (tmp_path / "head.json").write_text(json.dumps(body))
+    head = str(tmp_path / ".." / tmp_path.name / "head.json")
+    settings = JobSettings(regions=("auto", head), meshing=MeshingSettings(points=5000))
+    job = make_job("mesh", tmp_path, settings, {head: 0.25})
+    write_job(tmp_path / "job.json", job)
+    again = read_job(tmp_path / "job.json")
+    assert again == job
+    (_, name) = again.settings.regions
+    assert again.meshing_of(name) == replace(settings.meshing, edge_length=0.25, points=0)
+    assert again.meshing_of("auto") == settings.meshing
+    assert again.region_bodies[name] == body, "the file keeps to version 1"
+
+
+def test_a_job_without_own_lengths_is_written_as_ever(tmp_path: Path) -> None:
+    assert "edge_lengths" not in make_job("wrap", tmp_path, JobSettings()).to_json()
+
+
+@pytest.mark.parametrize(
+    "lengths",
+    [{"auto": 0.0}, {"auto": -1.0}, {"auto": float("nan")}, {"auto": float("inf")},
+     {"auto": "1"}, {"auto": True}, {"nobody": 1.0}, [1.0]],
+)  # fmt: skip
+def test_impossible_lengths_are_refused(tmp_path: Path, lengths: object) -> None:
+    values = {**make_job("mesh", tmp_path, JobSettings()).to_json(), "edge_lengths": lengths}
+    with pytest.raises(UsageError, match="edge_lengths"):
+        JobFile.from_json(values)
+    if isinstance(lengths, dict):
+        with pytest.raises(UsageError, match="edge_lengths"):
+            make_job("mesh", tmp_path, JobSettings(), lengths)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -104,3 +105,55 @@ def test_lock_of_a_living_process_is_respected_and_a_stale_one_taken(tmp_path: P
     folder.lock()
     folder.unlock()
     assert not folder.lock_path.exists()
+
+
+@pytest.mark.parametrize("case", ["dead", "reused", "half", "empty", "other", "clock"])
+def test_a_stale_lock_is_taken_over(case: str, tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    here, ticks = os.getppid(), process_start_ticks(os.getppid())
+    owner = {
+        "dead": {"pid": dead_pid(), "started": 1},
+        "reused": {"pid": here, "started": ticks + 1},
+        "clock": {"pid": here, "started": ticks + 10**12},  # it began when the clock was ahead
+        "other": {"pid": "me"},
+    }.get(case)
+    text = json.dumps(owner) if owner else {"half": '{"pid": 1', "empty": ""}[case]
+    folder.lock_path.write_text(text)
+    os.utime(folder.lock_path, (2e9 * 2, 2e9 * 2))
+    assert not folder.locked()
+    folder.lock()
+    assert folder.locked()
+    assert json.loads(folder.lock_path.read_text())["pid"] == os.getpid()
+    assert [p.name for p in tmp_path.iterdir()] == ["lock.json"]
+
+
+def test_a_living_owner_keeps_its_lock_whatever_the_clock_says(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    parent = os.getppid()
+    write_json(folder.lock_path, {"pid": parent, "started": process_start_ticks(parent)})
+    for time_s in (0.0, 4e9):
+        os.utime(folder.lock_path, (time_s, time_s))
+        with pytest.raises(UsageError, match=f"Process {parent} is working"):
+            folder.lock()
+    assert [p.name for p in tmp_path.iterdir()] == ["lock.json"]
+
+
+def test_two_that_take_over_at_once_leave_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other one has its lock in place between our look at the stale one and our move."""
+    folder = JobFolder(tmp_path)
+    write_json(folder.lock_path, {"pid": dead_pid(), "started": 1})
+    parent = os.getppid()
+
+    def slow(pid: int, started: int) -> bool:
+        alive = process_alive(pid, started)
+        if not alive:
+            write_json(folder.lock_path, {"pid": parent, "started": process_start_ticks(parent)})
+        return alive
+
+    monkeypatch.setattr(job_folder, "process_alive", slow)
+    with pytest.raises(UsageError, match=f"Process {parent} is working"):
+        folder.lock()
+    assert json.loads(folder.lock_path.read_text())["pid"] == parent
+    assert [p.name for p in tmp_path.iterdir()] == ["lock.json"]

@@ -51,10 +51,10 @@ def test_more_adds_up_and_keeps_all_else(tmp_path: Path) -> None:
 
 def test_more_without_a_finished_training_or_checkpoint_is_refused(tmp_path: Path) -> None:
     folder, job = JobFolder(tmp_path), job_of(tmp_path)
-    with pytest.raises(UsageError, match="no finished training"):
+    with pytest.raises(DatasetError, match="no finished training"):
         job_with_more(folder, job, 5)
     stage(folder.stages, "a", iterations=())
-    with pytest.raises(UsageError, match="no checkpoint") as caught:
+    with pytest.raises(DatasetError, match="no checkpoint") as caught:
         job_with_more(folder, job, 5)
     assert "--iterations" in caught.value.hint
     with pytest.raises(UsageError, match="adds nothing"):

@@ -8,6 +8,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.texture.chart_overlaps import (
     conflicts,
+    overlapping_pairs,
     signed_areas,
     split_overlaps,
 )
@@ -144,3 +145,60 @@ def test_smoothing_moves_nothing_further_than_half_an_edge() -> None:
     corners = (far + noise)[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max()
     assert 0.0 < moved.max() <= 0.5 * longest
+
+
+def quads(columns: int, rows: int, width: float = 1.0, height: float = 1.0) -> np.ndarray:
+    """A sheet of quads, two faces each, as (f, 3, 2)."""
+    x, y = np.meshgrid(np.arange(columns) * width, np.arange(rows) * height)
+    corner = np.stack([x, y], axis=-1).reshape(-1, 1, 2)
+    lower = np.array([[0, 0], [width, 0], [width, height]])
+    upper = np.array([[0, 0], [width, height], [0, height]])
+    return np.concatenate([corner + lower, corner + upper])
+
+
+def crossed_combs(n: int) -> np.ndarray:
+    """Long thin faces along x beside long thin faces along y: each alone is a bad case."""
+    lying = quads(1, n, n, 1.0)
+    return np.concatenate([lying, lying[..., ::-1] + [n + 1.0, 0.0]])
+
+
+SHEETS = {
+    "a row": lambda n: quads(n, 1),
+    "a column": lambda n: quads(1, n),
+    "a square": lambda n: quads(round(n**0.5), round(n**0.5)),
+    "slivers that lie on each other": lambda n: quads(1, n, 1.0, 1e-3),
+    "slivers beside each other": lambda n: quads(n, 1, 1e-3, 1.0),
+    "crossed combs": lambda n: crossed_combs(n // 2),
+}
+
+
+@pytest.mark.parametrize("name", SHEETS)
+def test_pairs_that_are_looked_at_grow_with_the_faces(name: str) -> None:
+    """A sweep in x alone looks at n^2 / 2 pairs of a column."""
+    for n in (400, 3600):
+        flat = SHEETS[name](n)
+        pairs, candidates = overlapping_pairs(flat, np.zeros(len(flat), np.int64), 1e-4)
+        assert len(pairs) == 0
+        assert candidates <= 16 * len(flat)
+
+
+def test_pairs_of_boxes_of_all_shapes_are_those_of_brute_force() -> None:
+    """Upright boxes as pairs of faces: that they meet is seen by their borders."""
+    generator = np.random.default_rng(5)
+    low = generator.uniform(-3, 3, (300, 2))
+    size = 10.0 ** generator.uniform(-3, 0.7, (300, 2))
+    corner = np.array([[0, 0], [1, 0], [1, 1]])
+    # Two faces of a box: what meets the box meets one of them.
+    faces = np.concatenate([low[:, None] + size[:, None] * c for c in (corner, corner[:, ::-1])])
+    labels = np.tile(np.arange(300) % 3, 2)
+    pairs, candidates = overlapping_pairs(faces, labels, 1e-9)
+    ends = pairs % 300
+    found = {(min(a, b), max(a, b)) for a, b in ends.tolist() if a != b}
+    assert len({(min(a, b), max(a, b)) for a, b in pairs.tolist()}) == len(pairs)
+    meets = np.all((low[:, None] + size[:, None] > low) & (low + size > low[:, None]), axis=2) & (
+        labels[:300, None] == labels[:300]
+    )
+    wanted = {(a, b) for a, b in np.argwhere(meets).tolist() if a < b}
+    assert found == wanted
+    assert len(wanted) > 300
+    assert candidates < 0.5 * len(faces) ** 2 / 6

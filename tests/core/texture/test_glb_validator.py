@@ -84,6 +84,14 @@ def mapped_ball() -> TexturedMesh:
     return replace(with_maps(), mesh=ball, corner_uvs=uvs)
 
 
+def several(make: Callable[[], TexturedMesh]) -> TexturedMesh:
+    """The same with every other face in a second atlas."""
+    mesh = make()
+    first = mesh.atlases[0]
+    owner = (np.arange(len(mesh.mesh.faces)) % 2).astype(np.uint8)
+    return replace(mesh, face_atlas=owner, further=(first,))
+
+
 MAKERS: dict[str, tuple[Callable[[], TexturedMesh], Similarity]] = {
     "plain": (cube, Similarity()),
     "maps": (with_maps, Similarity()),
@@ -92,6 +100,8 @@ MAKERS: dict[str, tuple[Callable[[], TexturedMesh], Similarity]] = {
     "tiny": (cube, Similarity(1e-6)),
     "huge": (cube, Similarity(1e7)),
     "odd": (odd, Similarity()),
+    "two": (lambda: several(cube), Similarity()),
+    "two maps": (lambda: several(mapped_ball), UTM),
 }
 
 
@@ -112,7 +122,9 @@ def test_the_khronos_validator_finds_nothing(tmp_path: Path) -> None:
     said = dict(zip(files, reports(list(files.values())), strict=True))
     assert {name: problems(report) for name, report in said.items() if problems(report)} == {}
     assert all(
-        r["info"]["totalTriangleCount"] == 12 for n, r in said.items() if n not in ("odd", "ball")
+        r["info"]["totalTriangleCount"] == 12
+        for n, r in said.items()
+        if n not in ("odd", "ball", "two maps")
     )
     assert said["plain"]["info"]["extensionsUsed"] == ["KHR_materials_unlit"]
     assert said["maps"]["info"]["extensionsUsed"] == ["KHR_materials_specular"]
@@ -121,6 +133,10 @@ def test_the_khronos_validator_finds_nothing(tmp_path: Path) -> None:
     assert len(unlit["resources"]) == 2  # nobody would look at the normal map
     assert said["lit"]["info"]["extensionsUsed"] == ["KHR_materials_specular"]
     assert len(said["maps"]["info"]["resources"]) == 4  # the buffer and three images
+    two = said["two maps"]["info"]
+    assert len(two["resources"]) == 7
+    assert two["drawCallCount"] == two["materialCount"] == 2
+    assert two["totalTriangleCount"] == said["ball"]["info"]["totalTriangleCount"]
 
 
 def test_the_validator_would_find_something(tmp_path: Path) -> None:

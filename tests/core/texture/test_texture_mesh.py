@@ -14,14 +14,15 @@ from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError, UsageEr
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.atlas_raster import AtlasRaster, raster_atlas
+from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
 from gaussian_wrapping_addon.core.texture.bake import Baked
 from gaussian_wrapping_addon.core.texture.exposure import solve_gains
 from gaussian_wrapping_addon.core.texture.face_graph import face_graph
 from gaussian_wrapping_addon.core.texture.fill import surface_positions
 from gaussian_wrapping_addon.core.texture.photo_samples import SurfaceArrays, SurfacePoints
-from gaussian_wrapping_addon.core.texture.texture_mesh import _statistics, texture_mesh
+from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 from gaussian_wrapping_addon.core.texture.texture_size import automatic_size, gutter_for
+from gaussian_wrapping_addon.core.texture.texture_tally import Tally
 from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.texture.unwrap import Unwrap
 from tests.core.texture.texture_scenes import (
@@ -170,14 +171,12 @@ def test_faces_smaller_than_a_texel_are_neither_seen_nor_unseen(areas: tuple) ->
     points = SurfacePoints(np.array([0, 0, 1]), np.zeros((3, 2), np.float32))
     views = np.array([2, 0, 0], np.uint8)
     baked = Baked(
-        np.zeros((3, 3), np.uint8), views, views > 0, views > 0, 1, 0.0, False, 0.0, False, 0.0
+        np.zeros((3, 3), np.uint8), views, views > 0, views > 0, 1, 0.0, False, 0.0, False, 0
     )
     unwrapped = Unwrap(np.zeros((3, 3, 2), np.float32), np.zeros(3, np.int32), "box", 2.0)
-    nothing = np.zeros(0)
-    raster = AtlasRaster(nothing, nothing, nothing, 0)
-    counts = _statistics(
-        SIZE_PX, TextureSettings(SIZE_PX, 4), unwrapped, raster, points, baked, np.array(areas)
-    )
+    tally = Tally(3)
+    tally.add(points, baked, 0)
+    counts = tally.statistics(SIZE_PX, TextureSettings(SIZE_PX, 4), unwrapped, np.array(areas))
     assert counts["area_seen_share"] == (0.75 if areas[0] else 0.0)
     assert counts["area_without_texel_share"] == areas[2] / sum(areas)
     assert counts["faces_without_texel"] == 1
@@ -245,7 +244,7 @@ def test_one_wrong_photo_is_outvoted(tmp_path: Path) -> None:
 def test_exposures_are_brought_together(tmp_path: Path) -> None:
     photos = photograph(ring(8, 3.0, 0.3), [(sphere_hit, waves)])
     gains = np.exp(np.random.default_rng(2).normal(0, 0.15, (8, 1)))
-    gains /= np.exp(np.log(gains).mean())
+    gains /= np.exp(np.median(np.log(gains)))
     photos.images = [
         np.rint((i * g).clip(0, 255)).astype(np.uint8)
         for i, g in zip(photos.images, gains, strict=True)
@@ -262,7 +261,7 @@ def test_exposures_are_brought_together(tmp_path: Path) -> None:
 def test_gains_are_recovered_and_absent_ones_left_alone() -> None:
     generator = np.random.default_rng(0)
     truth = np.exp(generator.normal(0, 0.2, (6, 3)))
-    truth /= np.exp(np.log(truth).mean(axis=0))
+    truth /= np.exp(np.median(np.log(truth), axis=0))
     points = generator.uniform(60, 150, (2000, 1, 3))
     colors = np.rint((points / truth).clip(0, 255)).astype(np.uint8)
     valid = generator.random((2000, 6)) < 0.5
@@ -273,6 +272,33 @@ def test_gains_are_recovered_and_absent_ones_left_alone() -> None:
     same, spread = solve_gains(np.broadcast_to(points, (2000, 6, 3)).astype(np.uint8), valid)
     assert (same == 1).all()
     assert spread < 0.01
+
+
+def test_the_texture_has_the_exposure_of_most_photos() -> None:
+    generator = np.random.default_rng(0)
+    brightness = np.array([1.0, 1.0, 1.0, 1.6, 1.6])
+    points = generator.uniform(20, 150, (2000, 1, 1))
+    colors = np.rint(np.repeat(points * brightness[:, None], 3, axis=2)).astype(np.uint8)
+    gains, _ = solve_gains(colors, np.ones((2000, 5), bool))
+    assert np.abs(np.log(gains * brightness[:, None])).max() < 0.02
+
+
+def test_overexposed_photos_leave_no_grey_on_white(tmp_path: Path) -> None:
+    def paper(points: np.ndarray) -> np.ndarray:
+        return np.where(np.sin(9.0 * points[..., 2:]) > 0.0, 200.0, 70.0) * np.ones(3)
+
+    photos = photograph(ring(9, 3.0, 0.3), [(sphere_hit, paper)])
+    for i in range(0, 9, 3):
+        bright = 1.7 * photos.images[i].astype(float)
+        # Cameras bend the curve before it ends at white.
+        bent = 205.0 + 45.0 * np.tanh((bright - 205.0) / 45.0)
+        photos.images[i] = np.rint(np.where(bright < 205.0, bright, bent)).astype(np.uint8)
+    textured = run(sphere(4), photos, tmp_path)
+    assert textured.statistics["exposure_corrected"]
+    positions, colors, normals = texels(textured)
+    white = (np.abs(normals[:, 2]) < 0.6) & (np.sin(9.0 * positions[:, 2]) > 0.5)
+    assert white.sum() > 1000
+    assert np.percentile(np.abs(colors[white] - 200.0), 99.0) < 10.0
 
 
 def test_the_automatic_size_follows_the_photos() -> None:

@@ -123,7 +123,8 @@ def assert_usable(mesh: SurfaceMesh, unwrapped: Unwrap, size_px: int, gutter_px:
     edge1, edge2 = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
     signed = edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]
     solid = areas > 1e-6 * areas.max()
-    assert (signed[solid] != 0).all()
+    # Seen from outside, no chart is mirrored: text and tangent-space normals read the right way.
+    assert (signed[solid] > 0).all()
     assert unwrapped.gutter_px >= gutter_px
     assert smallest_gap(raster.face, raster.inside, unwrapped.charts) >= gutter_px - 1.5
 
@@ -229,7 +230,7 @@ def test_82k_faces_do_not_crash(tmp_path: Path) -> None:
     assert len(mesh.faces) == 81_920
     begun_s = time.monotonic()
     unwrapped = unwrap(mesh, 1024, 8, tmp_path, Progress(), threads=2)
-    assert time.monotonic() - begun_s < 15
+    assert time.monotonic() - begun_s < 60  # a stall, not a speed
     assert unwrapped.method == "xatlas"
     raster = raster_atlas(unwrapped.corner_uvs, 1024, 2)
     assert raster.overlaps == 0

@@ -76,14 +76,16 @@ _ENDINGS = (
 )
 _COUNTS = frozenset(
     (
-        "bad_indices", "boundary_edges", "candidates", "cap_faces_left_out", "cap_points",
+        "atlases", "bad_indices", "boundary_edges", "candidates",
+        "cap_faces_left_out", "cap_points",
         "charts", "components", "cores", "degenerate_faces", "degenerate_faces_left",
         "dense_faces", "dense_high", "dense_low", "dense_vertices", "densify_every",
         "dropped_candidates",
         "faces", "faces_before_clean_up", "faces_without_texel", "field_evaluations",
         "frames", "gaussians", "gaussians_in_region", "holdout_every", "images_in_model",
         "inconsistent_edges", "interior_samples", "iterations", "jump_points", "left_out", "lods",
-        "max_gaussians", "nonmanifold_edges", "nonmanifold_vertices", "not_finite_vertices",
+        "max_atlases", "max_gaussians",
+        "nonmanifold_edges", "nonmanifold_vertices", "not_finite_vertices",
         "open_at_region", "open_edges", "part_count", "photos", "photos_placed",
         "photos_undistorted", "photos_used", "photos_with_focal_length", "pivots",
         "pivots_each", "pivots_high", "pivots_low",

@@ -214,6 +214,9 @@ def _texture(region: dict[str, Any]) -> list[str]:
     side = number(texture.get("size_px"))
     if side != NOT_MEASURED:
         side = f"{side} x {side} texels"
+        atlases = measured(texture.get("atlases")) or 1
+        if atlases > 1:
+            side = f"{int(atlases)} textures of {side}"
         if texture.get("size_automatic") is True:
             side += ", chosen from the photos"
     rows = [

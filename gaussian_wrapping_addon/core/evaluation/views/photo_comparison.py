@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -11,17 +12,22 @@ from typing import Any
 import numpy as np
 
 from ...dataset.scene import Scene
+from ...parallel import default_threads
+from ...progress import Progress
 from ...texture.bake import Photos
 from ...texture.textured_mesh import TexturedMesh
 from .lpips import lpips_if_ready
 from .mesh_rendering import render_views
 from .side_by_side import write_side_by_side
+from .texture_without import texture_without
 
 MAX_PHOTOS = 8
 LONG_SIDE_PX = 800
 MAX_PICTURES = 3
 PICTURE_WIDTH_PX = 1200
-NOTE = "the texture was baked from all photos, these included"
+INCLUDED = "the texture was baked from all photos, these included"
+WITHOUT = "the texture compared was baked again without the held-out photos; the files have all"
+FROM_GAUSSIANS = "the texture is of the Gaussians, which no held-out photo has trained"
 
 
 def compare_with_photos(
@@ -30,10 +36,15 @@ def compare_with_photos(
     photos: Photos,
     held_out: Collection[str],
     folder: Path,
+    progress: Progress,
     *,
+    from_gaussians: bool = False,
     threads: int = 0,
 ) -> dict[str, Any]:
     """Measure mesh-based rendering over covered pixels, and write some of the comparisons.
+
+    A photo that the texture was baked from proves little. Where photos were held out, a texture
+    baked without them is compared, as coarse as the pictures allow.
 
     Parameters
     ----------
@@ -47,6 +58,8 @@ def compare_with_photos(
         from these, or from all photos where there are none.
     folder : Path
         Gets ``comparison-1.jpg`` and so on: photo left, rendering right.
+    from_gaussians : bool
+        The texture has no colours of photos, so that none need be left out.
     threads : int
         0 uses every core.
 
@@ -54,8 +67,9 @@ def compare_with_photos(
     -------
     dict
         What :meth:`~.mesh_rendering.MeshRenderingScore.to_json` returns, with ``pictures`` (file
-        names), ``held_out`` (whether the photos were held out of training) and ``note``. A view
-        that is pictured names its ``picture``.
+        names), ``held_out`` (whether the photos were held out of training), ``note``, and where a
+        texture was baked for it ``texture_size_px`` and ``bake_s``. A view that is pictured names
+        its ``picture``.
 
     Raises
     ------
@@ -66,14 +80,28 @@ def compare_with_photos(
     wanted = [index for index, name in enumerate(names) if name in held_out]
     chosen = _evenly(wanted or list(range(len(names))), MAX_PHOTOS)
     cameras, images, counted = [], [], []
+    reduction = 0
     for index in chosen:
         full = photos.camera(index, 1)
         # Whole blocks of pixels are averaged, as the renderer averages whole blocks of rays.
         divisor = math.ceil(max(full.width, full.height) / LONG_SIDE_PX)
         divisor = min(divisor, full.width, full.height)
+        reduction = min(reduction or divisor, divisor)
         cameras.append(photos.camera(index, divisor))
         images.append(photos.photo(index, divisor))
         counted.append(photos.mask(index, divisor))
+    told: dict[str, Any] = {"note": FROM_GAUSSIANS if from_gaussians and wanted else INCLUDED}
+    if wanted and len(wanted) < len(names) and not from_gaussians:
+        begun_s = time.monotonic()
+        textured = texture_without(
+            textured, scene, photos, held_out, reduction, folder, progress,
+            threads=threads or default_threads(),
+        )  # fmt: skip
+        told = {
+            "note": WITHOUT,
+            "texture_size_px": len(textured.albedo),
+            "bake_s": round(time.monotonic() - begun_s, 1),
+        }
     shown: list[tuple[np.ndarray, np.ndarray]] = []
     lpips, reason = lpips_if_ready()
     score = render_views(
@@ -89,7 +117,7 @@ def compare_with_photos(
         write_side_by_side(folder / name, *shown[index], max_width_px=PICTURE_WIDTH_PX)
         values["views"][index]["picture"] = name
         values["pictures"].append(name)
-    return {**values, "held_out": bool(wanted), "note": NOTE}
+    return {**values, "held_out": bool(wanted), **told}
 
 
 def _evenly(items: list[int], count: int) -> list[int]:

@@ -12,7 +12,7 @@ from ...compiled import kernel
 from ...dataset.camera import Camera
 from ...parallel import default_threads, even_bounds, run_chunks
 from ...texture.depth_buffer import depth_buffer
-from ...texture.sampling import pyramid, trilinear
+from ...texture.sampling import Pyramid, pyramid, trilinear
 from ...texture.textured_mesh import TexturedMesh
 
 BACKGROUND = (92, 92, 94)
@@ -51,7 +51,8 @@ class TexturedRenderer:
         self._vertices = np.ascontiguousarray(textured.mesh.vertices, np.float64)
         self._faces = np.ascontiguousarray(textured.mesh.faces, np.int32)
         self._uvs = np.ascontiguousarray(textured.corner_uvs, np.float64)
-        self._texture = pyramid(textured.albedo)
+        self._textures = [pyramid(atlas.albedo) for atlas in textured.atlases]
+        self._atlas = textured.atlas_of_faces
 
     def render(self, camera: Camera, size: tuple[int, int] | None = None) -> TexturedView:
         """Render from a camera of the scene frame.
@@ -68,16 +69,24 @@ class TexturedRenderer:
         hit = depth_buffer(self._vertices, self._faces, fine, threads=self._threads).face
         local = fine.to_camera(self._vertices)
         intrinsics = np.array([fine.fx, fine.fy, fine.cx, fine.cy])
-        pixels, levels = self._texture.pixels, self._texture.levels
         image = np.empty((fine.height, fine.width, 3), np.uint8)
         image[:] = BACKGROUND
 
-        def band(begin: int, end: int) -> None:
-            _shade(
-                hit, begin, end, local, self._faces, self._uvs, intrinsics, pixels, levels, image
-            )
+        for number, texture in enumerate(self._textures):
+            shown = hit
+            if len(self._textures) > 1:
+                mine = self._atlas[hit.clip(0)] == number
+                shown = np.where(mine, hit, hit.dtype.type(-1))
 
-        run_chunks(band, even_bounds(fine.height, self._threads), self._threads)
+            def band(
+                begin: int, end: int, shown: np.ndarray = shown, texture: Pyramid = texture
+            ) -> None:
+                _shade(
+                    shown, begin, end, local, self._faces, self._uvs, intrinsics,
+                    texture.pixels, texture.levels, image,
+                )  # fmt: skip
+
+            run_chunks(band, even_bounds(fine.height, self._threads), self._threads)
         rays = SUPERSAMPLING**2
         return TexturedView(
             ((_pixel_sums(image) + rays // 2) // rays).astype(np.uint8),

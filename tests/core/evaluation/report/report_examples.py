@@ -151,7 +151,7 @@ def full_region() -> dict[str, Any]:
             "covered": 0.625,
             "pixels": "covered",
             "held_out": True,
-            "note": "the texture was baked from all photos, these included",
+            "note": "the texture compared was baked without the held-out photos",
             "lpips_note": "its weights are not here",
             "pictures": ["comparison-1.jpg"],
         },

@@ -190,7 +190,7 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         "typical error of 7.1 % of full brightness",  # 10 ** (-23 / 20)
         "photos saw 25.0 % of the texture",
         f'The textured mesh of "{escaped(REGION)}": 20.0 dB (2 photos, counted where the mesh is',
-        ": 62.5 % of the photo; the texture was baked from all photos, these included)",
+        ": 62.5 % of the photo; the texture compared was baked without the held-out photos)",
         "too few to trust",
     ):
         assert words in summary, words
@@ -226,11 +226,21 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         assert row(region, name) == figure
     assert "| p\\|q.jpg | 18.50 dB | 0.4500 | 75.0 % |" in region
     assert "| **mean** | 20.00 dB | 0.5000 | 62.5 % |" in region
-    assert "The texture was baked from all photos, these included." in region
+    assert "The texture compared was baked without the held-out photos." in region
     assert f"LPIPS was {NOT_MEASURED}: its weights are not here." in region
     machine = section(text, "## Machine, versions, seed")
     for words in ("Some CPU", "numpy 1.26.4", "numba 0.68.1", "seed: 7", "2026-11-21"):
         assert words in machine
+
+
+@pytest.mark.parametrize(
+    ("atlases", "size"), [(1, "512 x 512 texels"), (3, "3 textures of 512 x 512 texels")]
+)
+def test_several_textures_are_counted(tmp_path: Path, atlases: int, size: str) -> None:
+    region = full_region()
+    region["texture"].update(atlases=atlases, size_automatic=False)
+    _, text = write(tmp_path, None, {REGION: region})
+    assert row(section(text, f"## Region {escaped(REGION)}"), "Size") == size
 
 
 def test_defects_of_the_last_check_are_told_and_what_was_cleaned_up(tmp_path: Path) -> None:

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Pythons that are refused, commands as they are shown, versions, failures of commands."""
+
+from __future__ import annotations
+
+import io
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core import worker_requirements
+from gaussian_wrapping_addon.core.errors import ResourceError, UsageError, WorkerError
+from gaussian_wrapping_addon.core.jobs import client as job_client
+from gaussian_wrapping_addon.core.setup import command_runner, commands, pythons
+from gaussian_wrapping_addon.core.setup.commands import SetupRequest
+from gaussian_wrapping_addon.core.setup.pythons import FoundPython
+from gaussian_wrapping_addon.core.worker_environment import interpreter_of
+from gaussian_wrapping_addon.core.worker_requirements import Requirement, read_requirements
+
+
+def fake_python(folder: Path, version: str, name: str = "python3", bits: int = 64) -> str:
+    path = folder / name
+    words = (
+        f'{{"version": {version}, "executable": "{path}", "base": "{path}", "bits": {bits},'
+        ' "venv": true, "pip": true, "ensurepip": true}'
+    )
+    path.write_text(f"#!/bin/sh\necho '{words}'\n")
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("version", "bits", "words"),
+    [("[3, 10, 4]", 64, "3.10.4, which is too old"), ("[2, 7, 18]", 64, "too old"),
+     ("[3, 12, 1]", 32, "32-bit"), ("no", 64, "no Python that runs")],
+)  # fmt: skip
+def test_pythons_that_are_refused(tmp_path: Path, version: str, bits: int, words: str) -> None:
+    path = fake_python(tmp_path, version, bits=bits)
+    with pytest.raises(UsageError, match=words):
+        pythons.probe(path)
+    assert pythons.find_pythons(paths=[path]) == []
+
+
+def test_blender_is_no_python(tmp_path: Path) -> None:
+    path = fake_python(tmp_path, "[3, 11, 1]", "blender-4.3")
+    with pytest.raises(UsageError, match="is Blender"):
+        pythons.probe(path)
+    assert path not in pythons.candidates(path)
+
+
+def test_pythons_with_wheels_come_first(tmp_path: Path) -> None:
+    paths = [fake_python(tmp_path, f"[3, {n}, 0]", f"python3.{n}") for n in (14, 11, 13, 10)]
+    found = pythons.find_pythons(own=paths[1], paths=paths)
+    assert [p.version[1] for p in found] == [13, 11, 14], "the own one after others, 3.14 last"
+    assert [p.is_own for p in found] == [False, True, False]
+
+
+def test_the_running_python_is_found() -> None:
+    real = pythons.probe(sys.executable)
+    assert real.version == sys.version_info[:3]
+    assert real.path in [p.path for p in pythons.find_pythons(sys.executable)]
+
+
+def test_the_words_of_the_launcher() -> None:
+    text = (
+        " -V:3.12 *        C:\\Program Files\\Python312\\python.exe\r\n"
+        " -3.11-64    C:\\Users\\Zo\xeb\\Python311\\python.exe\r\nnothing\r\n"
+    )
+    assert pythons.paths_of_launcher(text) == [
+        "C:\\Program Files\\Python312\\python.exe",
+        "C:\\Users\\Zo\xeb\\Python311\\python.exe",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("choice", "system", "index"),
+    [("cpu", "Linux", commands.CPU_INDEX), ("cuda", "Linux", ""), ("cpu", "Windows", ""),
+     ("cuda", "Windows", commands.CUDA_INDEX), ("cpu", "Darwin", ""), ("index", "Linux", ""),
+     ("index", "Windows", "")],
+)  # fmt: skip
+def test_where_torch_comes_from(choice: str, system: str, index: str) -> None:
+    assert commands.torch_index(choice, system) == index
+
+
+def test_no_cuda_on_macos() -> None:
+    with pytest.raises(UsageError, match="no CUDA"):
+        commands.torch_index("cuda", "Darwin")
+
+
+PYTHON = FoundPython("/usr/bin/python3.12", (3, 12, 1))
+WANTED = [Requirement("numpy", ">=2"), Requirement("torch", "==2.13.0")]
+
+
+def test_commands_are_shown_as_they_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands.platform, "system", lambda: "Linux")
+    request = SetupRequest("/a b/w", PYTHON.path, "/r.txt", "cpu")
+    venv, torch, rest = commands.all_steps(request, PYTHON, WANTED)
+    assert venv.line == "/usr/bin/python3.12 -I -m venv --clear '/a b/w/env'"
+    assert "--extra-index-url" in torch.command
+    assert torch.command[-1] == "torch==2.13.0"
+    assert rest.command[-1] == "numpy>=2"
+    assert "--extra-index-url" not in rest.command
+    offline = SetupRequest("/a b/w", PYTHON.path, "/r.txt", "cpu", "/wheels")
+    _, single = commands.all_steps(offline, PYTHON, WANTED)
+    assert {"--isolated", "--no-index", "--find-links", "/wheels"} <= set(single.command)
+    assert not [word for word in single.command if "http" in word]
+
+
+def test_a_python_with_nothing_is_refused() -> None:
+    bare = FoundPython("/p", (3, 11, 2), has_venv=False, has_pip=False, has_ensurepip=False)
+    with pytest.raises(UsageError, match=r"neither venv nor pip.*python3\.11-venv"):
+        commands.kind_for(bare)
+
+
+@pytest.mark.parametrize(
+    ("versions", "version", "answer"),
+    [("==2.13.0", "2.13.0+cpu", True), ("==2.13.0", "2.13", True), ("==2.13.0", "2.13.1", False),
+     (">=1.26,<3", "1.26.4", True), (">=1.26,<3", "3.0.0", False), (">=1.26,<3", "1.9", False),
+     ("~=1.4.2", "1.4.9", True), ("~=1.4.2", "1.5", False), ("!=1.5", "1.5", False),
+     ("", "9", True)],
+)  # fmt: skip
+def test_versions(versions: str, version: str, answer: bool) -> None:
+    assert Requirement("x", versions).allows(version) is answer
+
+
+def test_our_list_is_read() -> None:
+    found = read_requirements(worker_requirements.requirements_file())
+    assert {"numpy", "torch", "xatlas"} <= {r.name for r in found}
+    assert all(r.versions for r in found)
+
+
+@pytest.mark.parametrize("text", ["", "-r other.txt", "x @ http://example.com/x.whl", "a b"])
+def test_lists_that_are_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "r.txt").write_text(text)
+    with pytest.raises(UsageError):
+        read_requirements(tmp_path / "r.txt")
+
+
+@pytest.mark.parametrize(
+    ("words", "kind", "text"),
+    [
+        ("ERROR: No matching distribution found for xatlas==0.0.11",
+         command_runner.PackageError, "xatlas==0.0.11"),
+        ("WARNING: NewConnectionError\nERROR: No matching distribution found for torch",
+         WorkerError, "cannot be reached"),
+        (("    The user requested (constraint) igl==2\n    The user requested libigl==2.6.3\n"
+         "ERROR: ResolutionImpossible: see"), command_runner.PackageError, "libigl==2.6.3"),
+        ("ERROR: [Errno 28] No space left on device", ResourceError, "disk is full"),
+        ("ERROR: odd\nlast", WorkerError, "ERROR: odd"),
+    ],
+)  # fmt: skip
+def test_failures_get_their_type(words: str, kind: type, text: str) -> None:
+    error = command_runner.failure_of(1, words.splitlines())
+    assert type(error) is kind
+    assert text in error.message
+    assert error.hint
+
+
+def test_a_command_that_hangs_is_ended(tmp_path: Path) -> None:
+    begun_s = time.monotonic()
+    with pytest.raises(ResourceError, match="stood still"):
+        command_runner.run_command(
+            [sys.executable, "-c", "import time; print('x', flush=True); time.sleep(60)"],
+            tmp_path, io.StringIO(), lambda _line: None, lambda: False, hang_s=0.5,
+        )  # fmt: skip
+    assert time.monotonic() - begun_s < 30
+
+
+def test_a_download_that_grows_is_no_hang(tmp_path: Path) -> None:
+    code = (
+        "import os, time, pathlib\n"
+        "p = pathlib.Path(os.environ['TMPDIR']) / 'part'\n"
+        "for n in range(15):\n    p.write_bytes(b'x' * n); time.sleep(0.1)\n"
+    )
+    command_runner.run_command(
+        [sys.executable, "-c", code],
+        tmp_path, io.StringIO(), lambda _line: None, lambda: False, hang_s=0.9,
+    )  # fmt: skip
+
+
+def test_settings_of_pip_cannot_lead_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PIP_TARGET", "/elsewhere")
+    monkeypatch.setenv("PIP_INDEX_URL", "https://mirror.example/simple")
+    environment = command_runner.setup_environment(tmp_path)
+    assert "PIP_TARGET" not in environment
+    assert environment["PIP_INDEX_URL"] == "https://mirror.example/simple"
+
+
+def test_no_worker_at_all_names_the_button(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(job_client.PYTHON_VARIABLE, raising=False)
+    monkeypatch.setattr(job_client, "_has_torch", lambda: False)
+    with pytest.raises(UsageError, match=r"No worker is set up.*Set Up Worker.*set-up-worker"):
+        job_client.worker_python()
+
+
+def test_a_plain_interpreter_is_itself() -> None:
+    assert interpreter_of("/usr/bin/python3") == ("/usr/bin/python3", "")
