@@ -20,7 +20,8 @@ def main(arguments: list[str]) -> int:
     """Run one command and return the exit code (0, 1, 2, 3, 4, 5: see the README)."""
     from .command_line.option_names import in_words_of_options
     from .command_line.parser import build_parser
-    from .core.errors import EXIT_OTHER, SettingError, WrapError
+    from .core.errors import EXIT_OTHER, NO_ROOM, SettingError, WrapError, cannot_be_written
+    from .core.worker_environment import interpreter_of, ready_worker
 
     _log_to_terminal()
     try:
@@ -32,7 +33,17 @@ def main(arguments: list[str]) -> int:
     except WrapError as error:
         _logger.error("error: %s", error)
         return error.exit_code
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith(__name__.partition(".")[0]):
+            raise
+        worker = interpreter_of(ready_worker())[0] or "that of Blender, or of the worker"
+        _logger.error("error: This Python lacks %s. Use another one: %s", error.name, worker)
+        return EXIT_OTHER
     except OSError as error:
+        if error.errno in NO_ROOM:
+            full = cannot_be_written(error.filename or "A file", error)
+            _logger.error("error: %s", full)
+            return full.exit_code
         _logger.error("error: %s", error)
         return EXIT_OTHER
 

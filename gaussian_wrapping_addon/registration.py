@@ -11,26 +11,42 @@ import bpy
 
 from .ops import (
     camera_operators,
+    cli_command,
     doctor,
     export_operators,
     import_operators,
+    input_operators,
     job_operators,
     job_timer,
     live_preview,
+    photo_check,
     placement,
     placement_operators,
+    region_estimate,
+    region_list_operators,
     region_operators,
+    region_watch,
     report_operators,
     training_estimate,
     training_operators,
+    worker_setup,
+    worker_setup_operators,
 )
 from .ui import (
-    panels,
+    dataset_panel,
+    mesh_panel,
     preferences,
     properties,
+    region_drawing,
+    region_gizmo,
+    region_panel,
+    region_properties,
     report_panel,
+    result_panel,
     scene_panel,
-    training_panel,
+    texture_panel,
+    train_advanced_panel,
+    train_panel,
     training_properties,
 )
 
@@ -39,17 +55,27 @@ _logger = logging.getLogger(__name__)
 CLASSES: Final[tuple[type, ...]] = (
     *training_properties.CLASSES,
     *properties.CLASSES,
+    *region_properties.CLASSES,
     *preferences.CLASSES,
+    *input_operators.CLASSES,
+    *worker_setup_operators.CLASSES,
     *job_operators.CLASSES,
     *region_operators.CLASSES,
+    *region_list_operators.CLASSES,
     *import_operators.CLASSES,
     *export_operators.CLASSES,
     *camera_operators.CLASSES,
     *placement_operators.CLASSES,
     *report_operators.CLASSES,
     *training_operators.CLASSES,
-    *panels.CLASSES,
-    *training_panel.CLASSES,
+    *dataset_panel.CLASSES,
+    *train_panel.CLASSES,
+    *train_advanced_panel.CLASSES,
+    *region_panel.CLASSES,
+    *mesh_panel.CLASSES,
+    *texture_panel.CLASSES,
+    *result_panel.CLASSES,
+    *region_gizmo.CLASSES,
     *report_panel.CLASSES,
     *scene_panel.CLASSES,
 )
@@ -57,10 +83,14 @@ CLASSES: Final[tuple[type, ...]] = (
 HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (
     ("load_post", job_timer.after_load),
     ("load_post", placement.after_load),
+    ("load_post", region_watch.after_load),
     ("undo_post", job_timer.after_undo),
     ("redo_post", job_timer.after_undo),
     ("undo_post", placement.after_undo),
     ("redo_post", placement.after_undo),
+    ("undo_post", region_watch.after_load),
+    ("redo_post", region_watch.after_load),
+    ("depsgraph_update_post", region_watch.after_update),
 )
 
 
@@ -73,6 +103,8 @@ def register() -> None:
         properties.add_pointers()
         for name, handler in HANDLERS:
             getattr(bpy.app.handlers, name).append(handler)
+        region_drawing.start()
+        cli_command.register()
         # While Blender starts, scripts may not see the open file yet.
         bpy.app.timers.register(job_timer.attach_later, first_interval=0.1, persistent=True)
     except Exception:
@@ -86,16 +118,24 @@ def unregister() -> None:
     if bpy.app.timers.is_registered(job_timer.attach_later):
         bpy.app.timers.unregister(job_timer.attach_later)
     doctor.stop()
+    photo_check.stop()
+    training_estimate.forget()
+    worker_setup.stop()
     training_estimate.stop()
+    region_estimate.stop()
+    region_drawing.stop()
+    region_gizmo.stop()
+    region_watch.forget()
     job_timer.forget_all()
     live_preview.stop()
+    cli_command.unregister()
     for name, handler in HANDLERS:
         handlers: list[Any] = getattr(bpy.app.handlers, name)
         while handler in handlers:
             handlers.remove(handler)
     properties.remove_pointers()
     for cls in reversed(CLASSES):
-        if not getattr(cls, "is_registered", False):
+        if "bl_rna" not in cls.__dict__:  # gizmo groups lack ``is_registered``
             continue
         try:
             bpy.utils.unregister_class(cls)

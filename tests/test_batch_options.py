@@ -16,7 +16,7 @@ from gaussian_wrapping_addon.command_line.meshing_options import method_settings
 from gaussian_wrapping_addon.command_line.option_names import option_of
 from gaussian_wrapping_addon.command_line.parser import build_parser
 from gaussian_wrapping_addon.command_line.training_options import NEEDS, training_settings
-from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
+from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs import evaluate
 from gaussian_wrapping_addon.core.settings import (
     PRESETS,
@@ -240,7 +240,7 @@ def test_export_refuses_before_it_writes(tmp_path: Path, monkeypatch: pytest.Mon
         with pytest.raises(UsageError, match=wanted):
             options.run(options)
     options.format = "glb"
-    with pytest.raises(DatasetError, match="holds no result"):
+    with pytest.raises(UsageError, match="holds no job's result"):
         options.run(options)
     assert not out.exists()
 

@@ -23,6 +23,7 @@ ALLOWED = {
     "meshing": {"dataset", "gaussians", "render", "field"},
     "texture": {"dataset", "gaussians", "render", "field", "meshing"},
     "evaluation": {"dataset", "gaussians", "render", "field", "meshing", "texture"},
+    "setup": {"jobs"},
     "jobs": {
         "dataset", "gaussians", "render", "training", "field", "meshing", "texture", "evaluation",
     },
@@ -31,7 +32,7 @@ ALLOWED = {
 # Blender's own process has only the standard library and numpy: what it loads may import no more.
 BLENDER_SIDE = (
     "core.jobs.client", "core.jobs.evaluate", "core.jobs.job_file", "core.dataset.check",
-    "core.settings",
+    "core.settings", "core.setup.client", "core.worker_environment",
 )  # fmt: skip
 HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl")
 

@@ -39,14 +39,13 @@ def add_doctor(commands: Commands) -> None:
 
 def _doctor(_options: Namespace) -> int:
     from ..core.errors import EXIT_BAD_DATA, EXIT_DONE
-    from ..core.jobs.client import worker_python
-    from ..core.jobs.doctor import diagnose_worker
+    from ..core.jobs.doctor import find_and_diagnose
 
-    findings = diagnose_worker(worker_python())
+    findings = find_and_diagnose()
     for finding in findings:
         mark = "good" if finding.good else "BAD "
-        _logger.info("%s  %-9s %s", mark, finding.subject, finding.finding)
+        _logger.info("%s  %-11s %s", mark, finding.subject, finding.finding)
         if not finding.good:
-            _logger.info("               %s", finding.hint)
-    _logger.info("bpy       %s", "present" if has_bpy() else "absent: use --no-blend")
+            _logger.info("                 %s", finding.hint)
+    _logger.info("bpy               %s", "present" if has_bpy() else "absent: use --no-blend")
     return EXIT_DONE if all(f.good for f in findings) else EXIT_BAD_DATA

@@ -15,7 +15,7 @@ _logger = logging.getLogger("gaussian_wrapping")
 
 def add_export(commands: Commands) -> None:
     """Add ``export``."""
-    from ..core.jobs.export_files import BLENDER_FORMATS, OWN_FORMATS, SHADINGS
+    from ..core.jobs.export_formats import BLENDER_FORMATS, OWN_FORMATS, SHADINGS
 
     parser = commands.add_parser("export", help="meshes of a finished job for other programs")
     parser.add_argument("job", type=Path, metavar="JOB", help="job folder, or its result folder")
@@ -47,7 +47,8 @@ def _export(options: Namespace) -> int:
     from ..core.errors import UsageError
     from ..core.jobs.client import worker_python
     from ..core.jobs.evaluate import run_in_worker
-    from ..core.jobs.export_files import BLENDER_FORMATS, OWN_FORMATS, result_of
+    from ..core.jobs.export_files import result_of
+    from ..core.jobs.export_formats import BLENDER_FORMATS, OWN_FORMATS
 
     formats = list(dict.fromkeys(f for f in options.format.split(",") if f))
     known = (*OWN_FORMATS, *BLENDER_FORMATS)

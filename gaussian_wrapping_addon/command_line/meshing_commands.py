@@ -32,19 +32,17 @@ def add_mesh(commands: Commands) -> None:
 
 
 def _mesh(options: Namespace) -> int:
-    from ..core.errors import UsageError
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.earlier_job import finished_job
     from ..core.jobs.job_file import make_job
     from ..core.jobs.job_folder import JobFolder
+    from ..core.jobs.more import no_finished_training
     from ..core.jobs.stages import read_done
 
     folder = JobFolder(options.out.resolve())
     earlier = finished_job(folder)
     if not any(read_done(path) for path in folder.stages.glob("train-*")):
-        raise UsageError(
-            f"{options.out} holds no finished training.", "Run wrap, or resume it, first."
-        )
+        raise no_finished_training(options.out)
     job = make_job("mesh", Path(earlier.source), region_settings(earlier.settings, options))
     require_bpy(job, options)
     return follow(JobClient.start(options.out, job, python=worker_python()), job, options)

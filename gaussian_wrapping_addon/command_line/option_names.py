@@ -21,6 +21,7 @@ _OTHERS = {
     "meshing.points": "--points",
     "meshing.tiles": "--tiles",
     "texture.size_px": "--texture-size",
+    "texture.max_atlases": "--max-atlases",
     "texture.source": "--texture-source",
     "texture.normal_map": "--normal-map",
     "texture.ambient_occlusion": "--ambient-occlusion",

@@ -10,6 +10,7 @@ from .check_commands import add_check, add_doctor
 from .evaluate_command import add_evaluate
 from .export_command import add_export
 from .meshing_commands import add_estimate_mesh, add_mesh, add_work_tiles
+from .setup_command import add_set_up_worker
 from .training_commands import add_estimate, add_more, add_resume, add_wrap
 
 _COMMANDS = (
@@ -24,6 +25,7 @@ _COMMANDS = (
     add_estimate,
     add_check,
     add_doctor,
+    add_set_up_worker,
 )
 """In the order of the help."""
 

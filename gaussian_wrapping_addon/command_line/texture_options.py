@@ -25,6 +25,13 @@ def add_texture_options(parser: ArgumentParser) -> None:
         help="of the dense mesh's detail; auto bakes it where --faces took faces away",
     )
     parser.add_argument(
+        "--max-atlases",
+        type=int,
+        default=default.max_atlases,
+        metavar="N",
+        help="spread over up to N textures where the photos show more than one holds; 0: automatic",
+    )
+    parser.add_argument(
         "--ambient-occlusion", action="store_true", help="bake how open the surface is"
     )
     parser.add_argument(
@@ -43,4 +50,5 @@ def texture_settings(options: Namespace) -> dict[str, Any]:
         "normal_map": options.normal_map,
         "ambient_occlusion": "on" if options.ambient_occlusion else "off",
         "lods": options.lods,
+        "max_atlases": options.max_atlases,
     }

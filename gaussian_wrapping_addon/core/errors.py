@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 EXIT_DONE = 0
@@ -11,6 +12,9 @@ EXIT_USAGE = 2
 EXIT_BAD_DATA = 3
 EXIT_RESOURCES = 4
 EXIT_CANCELLED = 5
+
+NO_ROOM = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
+"""What systems say of a disk or a quota that is full."""
 
 
 class WrapError(Exception):
@@ -104,6 +108,18 @@ class MeshingError(WrapError):
     """The field holds no surface in the region, or a mesh cannot be made of it."""
 
     exit_code = EXIT_BAD_DATA
+
+
+def cannot_be_written(path: str | Path, error: OSError) -> ResourceError:
+    """Return the error of a place that cannot be written, whatever command meets it."""
+    if error.errno in NO_ROOM:
+        return ResourceError(
+            f"No room is left on the disk: {path} could not be written.", "Make room there."
+        )
+    return ResourceError(
+        f"{path} cannot be written: {error.strerror or error}.",
+        "Check that the folder exists, is not read-only, and that the disk has room.",
+    )
 
 
 class DeviceError(WrapError):

@@ -30,8 +30,24 @@ def write_bytes(path: Path, data: bytes) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(partial, path)
+    except OSError as error:
+        # A full disk is met while writing: the system then names no file, or the partial one.
+        error.filename, error.filename2 = str(path), None
+        raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def overwrite_json(path: Path, values: Any) -> None:
+    """Write JSON into the room that a file has already: where the disk has none for another.
+
+    A reader may see a half of it; blanks fill what was longer before.
+    """
+    data = json.dumps(values, allow_nan=False).encode()
+    with path.open("r+b") as stream:
+        stream.write(data.ljust(os.fstat(stream.fileno()).st_size))
+        stream.flush()
+        os.fsync(stream.fileno())
 
 
 def finite(values: Any) -> Any:
@@ -88,6 +104,11 @@ def _check_depth(path: Path, values: Any, depth: int) -> None:
             _check_depth(path, child, depth + 1)
 
 
+def is_reserved_name(name: str) -> bool:
+    """Tell whether Windows keeps a name for itself, whatever its ending."""
+    return name.split(".")[0].rstrip(" ").upper() in _RESERVED
+
+
 def resolve_inside(root: Path, name: str) -> Path | None:
     """Return the path of ``name`` under ``root``, or ``None`` when the name is not safe.
 
@@ -100,7 +121,7 @@ def resolve_inside(root: Path, name: str) -> Path | None:
         return None
     if clean.startswith("/") or ":" in parts[0] or ".." in parts:
         return None
-    if any(part.split(".")[0].upper() in _RESERVED for part in parts):
+    if any(is_reserved_name(part) for part in parts):
         return None
     path = root.joinpath(*parts)
     if not path.resolve().is_relative_to(root.resolve()):

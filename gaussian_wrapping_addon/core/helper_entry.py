@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
 import threading
 import time
@@ -24,7 +25,9 @@ def main(arguments: list[str]) -> int:
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
-    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+    parent = os.getppid()
+    _ask_to_end_with_parent()
+    threading.Thread(target=_end_with_parent, args=(parent,), daemon=True).start()
     try:
         package = __name__.rsplit(".", 1)[0]
         importlib.import_module(f"{package}.{module}").main(folder)
@@ -34,6 +37,17 @@ def main(arguments: list[str]) -> int:
     finally:
         emit(peak_bytes=own_peak_bytes())
     return 0
+
+
+def _ask_to_end_with_parent() -> None:
+    """Let Linux end us with the thread that started us: while a native call holds the GIL, no
+    thread of ours can look."""
+    if not sys.platform.startswith("linux"):
+        return
+    import ctypes
+
+    set_parent_death_signal = 1  # PR_SET_PDEATHSIG of prctl(2)
+    ctypes.CDLL(None).prctl(set_parent_death_signal, int(signal.SIGKILL), 0, 0, 0)
 
 
 def _end_with_parent(parent: int) -> None:

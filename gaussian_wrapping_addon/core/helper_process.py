@@ -27,10 +27,12 @@ from . import limits
 from .errors import DatasetError, ResourceError, WorkerError
 from .peak_memory import note_helper
 from .progress import Progress
+from .worker_environment import PACKAGES_OPTION, interpreter_of
 
 _logger = logging.getLogger(__name__)
 
 _POLL_S = 0.1
+_running: set[subprocess.Popen[bytes]] = set()
 _LAST_WORDS_LINES = 8
 
 
@@ -45,9 +47,21 @@ def child_environment() -> dict[str, str]:
 
 
 def child_command(module: str, *arguments: str, python: str | None = None) -> list[str]:
-    """Return the argument list that runs ``core.<module>`` in a child interpreter."""
+    """Return the argument list that runs ``core.<module>`` in a child interpreter.
+
+    Parameters
+    ----------
+    python : str or None
+        An interpreter, or the folder of a worker's environment; None for the one that runs this,
+        with the packages that it was given.
+    """
     entry = Path(__file__).with_name("worker_main.py")
-    return [python or sys.executable, "-I", "-u", str(entry), module, *arguments]
+    if python:
+        interpreter, packages = interpreter_of(python)
+    else:
+        interpreter, packages = sys.executable, str(sys._xoptions.get(PACKAGES_OPTION) or "")
+    given = ["-X", f"{PACKAGES_OPTION}={packages}"] if packages else []
+    return [interpreter, "-I", *given, "-u", str(entry), module, *arguments]
 
 
 def emit(**values: Any) -> None:
@@ -68,6 +82,16 @@ def kill_group(process: subprocess.Popen[Any], grace_s: float = 2.0) -> None:
                 process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(grace_s)
+
+
+def end_helpers() -> None:
+    """Kill the helpers that run now; for a process that is about to leave without unwinding."""
+    for process in list(_running):
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            if hasattr(os, "killpg"):
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
 
 
 def run_helper(
@@ -100,6 +124,7 @@ def run_helper(
         env=child_environment(),
         start_new_session=True,
     )
+    _running.add(process)
     lines: queue.Queue[tuple[str, str]] = queue.Queue()
     assert process.stdout is not None
     assert process.stderr is not None
@@ -135,6 +160,7 @@ def run_helper(
                 progress.update(float(values.get("fraction", 0.0)), str(values.get("message", "")))
     finally:
         kill_group(process)
+        _running.discard(process)
         for reader in readers:
             reader.join(1.0)
     code = process.returncode

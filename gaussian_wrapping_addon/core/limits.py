@@ -16,10 +16,17 @@ MAX_REGION_VERTICES = 10_000
 MAX_MESH_POINTS = 5_000_000
 MAX_TILES = 4096
 MAX_TEXTURE_SIDE_PX = 8192
+MAX_ATLASES = 16
+"""Textures of one mesh that may be asked for: each is a material and an image for its readers."""
+MAX_AUTOMATIC_ATLASES = 4
+"""Textures of one mesh that are made unasked, where one of the largest would not do."""
 MIN_IMAGES = 3
 RENDER_BUDGET_BYTES = 512 * 1024 * 1024
 """What lists and gradients of (tile, Gaussian) pairs may take in one rendering: with it, a million
 Gaussians train at 1600 x 1200 pixels within 4 GB."""
 
 HELPER_DEADLINE_S = 3600.0
-CANCEL_GRACE_S = 10.0
+CANCEL_ALONE_S = 7.0
+"""After which a cancelled worker whose main thread asks for nothing ends itself."""
+CANCEL_GRACE_S = 9.0
+"""After which others end a cancelled worker: with the time to terminate it, within 12 s."""

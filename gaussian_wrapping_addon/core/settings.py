@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .errors import SettingError, UsageError
-from .limits import MAX_TILES
+from .limits import MAX_ATLASES, MAX_TILES
 
 PRESETS = ("draft", "standard", "fine")
 DECISIONS = ("auto", "on", "off")
@@ -169,6 +169,9 @@ class TextureSettings:
     source: str = "photos"
     """``"photos"``, or ``"gaussians"``: their colour without what changes with the direction,
     rendered from the photos' cameras."""
+    max_atlases: int = 0
+    """Textures that the mesh may be spread over where the photos show more than one holds; 0 is 1,
+    or a few where one of the largest would not do."""
 
 
 @dataclass(frozen=True)
@@ -297,6 +300,11 @@ class JobSettings:
                 "texture.size_px",
                 self.texture.size_px == 0 or 64 <= self.texture.size_px <= 8192,
                 "0 (automatic) or from 64 to 8192",
+            ),
+            (
+                "texture.max_atlases",
+                0 <= self.texture.max_atlases <= MAX_ATLASES,
+                f"0 (automatic) or from 1 to {MAX_ATLASES}",
             ),
             ("texture.gutter_px", 1 <= self.texture.gutter_px <= 64, "from 1 to 64"),
             ("texture.normal_map", self.texture.normal_map in DECISIONS, _one_of(DECISIONS)),

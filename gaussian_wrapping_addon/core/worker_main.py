@@ -17,6 +17,14 @@ from pathlib import Path
 _PACKAGE = "gaussian_wrapping_addon"
 
 
+def _add_packages() -> None:
+    """Put the folder of ``-X gwrap_packages=DIR`` before the interpreter's own packages."""
+    folder = sys._xoptions.get("gwrap_packages")
+    if isinstance(folder, str):
+        own = [i for i, p in enumerate(sys.path) if p.endswith(("site-packages", "dist-packages"))]
+        sys.path.insert(own[0] if own else len(sys.path), folder)
+
+
 def _load_package() -> None:
     root = Path(__file__).resolve().parents[1]
     spec = importlib.util.spec_from_file_location(
@@ -36,5 +44,6 @@ if __name__ == "__main__":
     sys.path[:] = [
         p for p in sys.path if p and Path(p).resolve() != Path(__file__).resolve().parent
     ]
+    _add_packages()
     _load_package()
     sys.exit(importlib.import_module(f"{_PACKAGE}.core.{sys.argv[1]}").main(sys.argv[2:]))

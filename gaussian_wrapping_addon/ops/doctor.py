@@ -9,9 +9,7 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import WrapError
-from ..core.jobs.client import worker_python
-from ..core.jobs.doctor import Diagnosis, diagnose_worker
+from ..core.jobs.doctor import Diagnosis, find_and_diagnose
 
 POLL_S = 0.3
 
@@ -40,27 +38,18 @@ def as_text() -> str:
 
 
 def start(preference: str) -> None:
-    """Begin a check of the interpreter that jobs would use.
-
-    Raises
-    ------
-    UsageError
-        The interpreter does not exist.
-    """
-    python = worker_python(preference)
+    """Begin a check of the interpreter that jobs would use."""
     _busy.set()
     _findings.clear()
-    threading.Thread(target=_examine, args=(python,), daemon=True).start()
+    threading.Thread(target=_examine, args=(preference,), daemon=True).start()
     if not bpy.app.timers.is_registered(show):
         bpy.app.timers.register(show, first_interval=POLL_S, persistent=True)
 
 
-def _examine(python: str) -> None:
+def _examine(preference: str) -> None:
     """Thread: touches nothing of Blender."""
     try:
-        found = diagnose_worker(python)
-    except WrapError as error:
-        found = [Diagnosis("Python", False, error.message, error.hint)]
+        found = find_and_diagnose(preference)
     except Exception as error:  # the queue must get an answer, or the check would never end
         found = [Diagnosis("Python", False, f"{type(error).__name__}: {error}", "")]
     _answers.put(found)

@@ -10,7 +10,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..core.errors import UsageError
+from ..core.errors import ResourceError, UsageError
 from .materials import fold_specular, set_shading, shading_of, show_as_emission
 
 _UNSAFE = re.compile(r"[^\w.-]+")
@@ -141,7 +141,9 @@ def _write_image(image: bpy.types.Image, path: Path) -> None:
         elif source.resolve() != path.resolve():
             shutil.copyfile(source, path)
     except (OSError, RuntimeError) as error:
-        raise UsageError(f"{path} cannot be written: {error}.", "Choose another folder.") from None
+        raise ResourceError(
+            f"{path} cannot be written: {error}.", "Choose another folder."
+        ) from None
 
 
 def _save_as_png(image: bpy.types.Image, path: Path) -> None:

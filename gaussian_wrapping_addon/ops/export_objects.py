@@ -19,8 +19,8 @@ import bpy
 import numpy as np
 
 from ..core.dataset.file_frame import FileFrame, file_offset
-from ..core.errors import UsageError
-from ..core.jobs.export_files import file_stem
+from ..core.errors import ResourceError, UsageError
+from ..core.jobs.file_stems import file_stems
 from ..core.jobs.sidecar import write_sidecar
 from ..core.texture.file_checks import check_mesh, writing
 from ..core.texture.mesh_ply import vertex_colors, write_mesh_ply
@@ -92,19 +92,39 @@ def export_objects(
     with writing(request.folder):
         request.folder.mkdir(parents=True, exist_ok=True)
     paths = []
+    stems = _stems(frame, things)
     for thing in things:
         with _copy_of(thing, frame) as (data, vertices):
             offset = np.zeros(3)
             if not request.placed and request.format != "ply":
                 offset = file_offset(target_from_scene.points(vertices))
             place = FileFrame(request.format, target_from_scene, offset)
-            path, contents = _write(thing, data, place.local(vertices), request, operator)
+            path, contents = _write(
+                thing, stems[thing.name], data, place.local(vertices), request, operator
+            )
             write_sidecar(
                 path, place, world_from_scene, blender_from_scene, placed=request.placed,
                 result=tags.result_folder(frame), contents=contents,
             )  # fmt: skip
             paths.append(path)
     return paths
+
+
+def _stems(frame: bpy.types.Object, things: list[bpy.types.Object]) -> dict[str, str]:
+    """Return the stem of each object's files, by the name of the object.
+
+    A duplicate of an object has the tags of the original: the one of the first name keeps them.
+    """
+    owners: dict[tuple[str, int], str] = {}
+    around = {thing.name: thing for thing in (*frame.children, *things)}
+    for name, thing in sorted(around.items()):
+        if thing.type != "MESH":
+            continue
+        region, level = str(thing.get(tags.REGION, name)), int(thing.get(tags.LEVEL, 0))
+        if (region, level) in owners:
+            region = f"{region} {name}"
+        owners[region, level] = name
+    return {owners[mesh]: stem for mesh, stem in file_stems(owners).items()}
 
 
 def _operator(format: str) -> Any:
@@ -152,6 +172,7 @@ def _copy_of(
 
 def _write(
     thing: bpy.types.Object,
+    stem: str,
     data: bpy.types.Mesh,
     local: np.ndarray,
     request: ObjectExport,
@@ -159,7 +180,6 @@ def _write(
 ) -> tuple[Path, dict[str, Any]]:
     """Write one checked mesh; return its file and what the sidecar says it holds."""
     region, level = str(thing.get(tags.REGION, thing.name)), int(thing.get(tags.LEVEL, 0))
-    stem = file_stem(region, level)
     data.calc_loop_triangles()
     count = len(data.loop_triangles)
     faces, corners = np.empty(3 * count, np.int32), np.empty(3 * count, np.int32)
@@ -177,7 +197,7 @@ def _write(
     suffixes = _SUFFIXES | (_PACKED_SUFFIXES if request.pack else {})
     path = request.folder / f"{stem}{suffixes.get(request.format, '.' + request.format)}"
     if operator is None:
-        write_mesh_ply(path, local, faces, _colors(thing, len(local), faces, uvs))
+        write_mesh_ply(path, local, faces, _colors(thing, data, len(local), faces, uvs))
         return path, contents
     inside = request.format == "glb" or (request.pack and request.format in ("usd", "fbx"))
     with contextlib.ExitStack() as stack:
@@ -210,12 +230,24 @@ def _corner_uvs(data: bpy.types.Mesh, corners: np.ndarray) -> np.ndarray | None:
 
 
 def _colors(
-    thing: bpy.types.Object, count: int, faces: np.ndarray, uvs: np.ndarray | None
+    thing: bpy.types.Object,
+    data: bpy.types.Mesh,
+    count: int,
+    faces: np.ndarray,
+    uvs: np.ndarray | None,
 ) -> np.ndarray | None:
-    image = next((i for s in thing.material_slots if (i := texture_of(s.material))), None)
-    if image is None or uvs is None:
+    images = [texture_of(slot.material) for slot in thing.material_slots]
+    used = [image for image in images if image is not None]
+    if not used or uvs is None:
         return None
-    return vertex_colors(count, faces, uvs, pixels_of(image))
+    slots = np.empty(len(data.polygons), np.int32)
+    data.polygons.foreach_get("material_index", slots)
+    polygons = np.empty(len(faces), np.int32)
+    data.loop_triangles.foreach_get("polygon_index", polygons)
+    # A slot without our texture, as with one atlas, takes the first that there is.
+    numbers = [used.index(image if image is not None else used[0]) for image in images]
+    owner = np.array(numbers)[slots[polygons].clip(0, len(numbers) - 1)]
+    return vertex_colors(count, faces, uvs, [pixels_of(image) for image in used], owner)
 
 
 @contextlib.contextmanager
@@ -286,4 +318,4 @@ def _run(operator: Any, path: Path, options: dict[str, Any]) -> None:
             f"{path.name} cannot be written: {str(error).strip()}", "Choose another folder."
         ) from None
     if "FINISHED" not in result or not path.is_file():
-        raise UsageError(f"{path} cannot be written.", "Check the folder's permissions.")
+        raise ResourceError(f"{path} cannot be written.", "Check the folder's permissions.")

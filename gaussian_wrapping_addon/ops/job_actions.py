@@ -7,17 +7,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
-import numpy as np
 
-from ..core.errors import UsageError
+from ..core.errors import UsageError, WrapError
 from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.earlier_job import finished_job
-from ..core.jobs.job_file import make_job, region_names
+from ..core.jobs.job_file import (
+    AUTOMATIC_REGIONS,
+    make_job,
+    read_job,
+    region_name,
+    region_names,
+)
 from ..core.jobs.job_folder import JobFolder
 from ..core.jobs.more import job_with_more
 from ..core.jobs.stages import read_done
 from . import job_timer, tags
-from .region_objects import export_region, hull_in_blender, scene_from_blender
+from .region_objects import export_region
+from .region_resolution import own_lengths, world_per_blender
 from .training_choices import job_settings, texture_choices
 
 
@@ -49,7 +55,7 @@ def source_of(scene: bpy.types.Scene) -> Path:
         None is chosen.
     """
     if not scene.gwrap.source:
-        raise UsageError("No photo folder is chosen.", "Choose one in the Photos panel.")
+        raise UsageError("No photo folder is chosen.", "Choose one in Dataset.")
     return Path(bpy.path.abspath(scene.gwrap.source)).resolve()
 
 
@@ -61,17 +67,39 @@ def output_of(scene: bpy.types.Scene, source: Path) -> Path:
     UsageError
         It lies inside the photo folder, which is never written to.
     """
-    text = scene.gwrap.output
+    text = "" if _is_of_other_photos(scene, source) else scene.gwrap.output
     if source.suffix.lower() == ".ply":
         base = source.with_suffix("")  # a splat: other files in its folder are not its input
     else:
         base = source.parent if source.is_file() else source
+    if not text and not base.name:  # a memory card, or the root of a disk
+        raise UsageError(
+            f"{base} is a whole disk, which has no folder beside it.",
+            "Copy the photos into a folder of their own.",
+        )
     folder = Path(bpy.path.abspath(text)).resolve() if text else base.with_name(f"{base.name}_wrap")
     if folder.is_relative_to(base):
         raise UsageError(
             f"{folder} lies inside the photo folder.", "Choose an output folder outside of it."
         )
     return folder
+
+
+def _is_of_other_photos(scene: bpy.types.Scene, source: Path) -> bool:
+    """Tell whether the output is that of this scene's last job, which had another source.
+
+    Typing over the photos' path must not wrap other photos over a finished job.
+    """
+    properties = scene.gwrap
+    if not properties.output or properties.output != properties.job_folder:
+        return False
+    job = JobFolder(Path(bpy.path.abspath(properties.job_folder)))
+    if not job.is_job():
+        return False
+    try:
+        return Path(read_job(job.job_path).source).resolve() != source
+    except WrapError:
+        return False
 
 
 def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
@@ -99,7 +127,7 @@ def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
 def start_mesh(
     scene: bpy.types.Scene, regions: list[bpy.types.Object], choice: WorkerChoice
 ) -> Path:
-    """Mesh regions of a finished training, at the scene's resolution; return the job folder.
+    """Mesh regions of a finished training, each at its resolution; return the job folder.
 
     Parameters
     ----------
@@ -111,19 +139,22 @@ def start_mesh(
     WrapError
         A region cannot be used, or the job folder holds no finished training.
     """
-    frame = _common_frame(regions)
+    frame = common_frame(regions)
     folder = job_folder_of(frame)
     _require_training(folder)
     _refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
-    edge_length = _edge_length_world(scene, regions, frame)
+    _refuse_linked(regions)
+    properties = scene.gwrap
+    by_length = properties.resolution == "EDGE_LENGTH"
+    edge_length = properties.edge_length * world_per_blender(frame) if by_length else 0.0
+    own = own_lengths(scene, regions, frame)
     requests = []
     for region in regions:
         path = folder / "regions" / f"{region.session_uid}.json"
         path.parent.mkdir(exist_ok=True)
-        export_region(region, path)
+        export_region(region, path, _result_name(region, frame))
         requests.append(str(path))
-    properties = scene.gwrap
     settings = replace(
         earlier.settings,
         threads=choice.threads,
@@ -142,7 +173,10 @@ def start_mesh(
         ),
         texture=replace(earlier.settings.texture, **texture_choices(scene)),
     )
-    job = make_job("mesh", Path(earlier.source), settings)
+    lengths = {
+        request: length for request, length in zip(requests, own, strict=True) if length is not None
+    }
+    job = make_job("mesh", Path(earlier.source), settings, lengths)
     names = region_names(job.settings.regions, job.region_bodies)
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
@@ -216,12 +250,45 @@ def _require_training(folder: Path) -> None:
         )
 
 
+def _refuse_linked(regions: list[bpy.types.Object]) -> None:
+    for region in regions:
+        if not region.is_editable:
+            raise UsageError(
+                f"Region {region.name} is linked from a library.",
+                "Make it local (Object > Relations > Make Local).",
+            )
+
+
+def _result_name(region: bpy.types.Object, frame: bpy.types.Object) -> str:
+    """Return the name under which a region's mesh replaces the one made of it before.
+
+    A region that was renamed keeps it. Its copies, which carry the same mark, do not have it: of
+    several, it belongs to the one that is still called so, or else to none. Nor has the automatic
+    region, once a person asks for what its box encloses.
+    """
+    name = region.get(tags.REGION, "")
+    if not isinstance(name, str) or name in ("", *AUTOMATIC_REGIONS):
+        return ""
+    things = [t for t in bpy.data.objects if tags.kind_of(t) == "region"]
+    same = [t for t in things if t.get(tags.REGION) == name and tags.frame_of(t) == frame]
+    if len(same) == 1 or region_name(region.name, {"blender_object_name": region.name}) == name:
+        return name
+    return ""
+
+
 def _refuse_running(folder: Path) -> None:
     if job_timer.is_running(str(folder)):
         raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
 
 
-def _common_frame(regions: list[bpy.types.Object]) -> bpy.types.Object:
+def common_frame(regions: list[bpy.types.Object]) -> bpy.types.Object:
+    """Return the frame that regions have in common.
+
+    Raises
+    ------
+    UsageError
+        There is none, or there are several.
+    """
     if not regions:
         raise UsageError("No region is selected.", "Select a region box.")
     frames = {tags.frame_of(region) for region in regions}
@@ -233,22 +300,3 @@ def _common_frame(regions: list[bpy.types.Object]) -> bpy.types.Object:
             f"{regions[0].name} belongs to no result.", "Add a region after wrapping the scene."
         )
     return frame
-
-
-def _edge_length_world(
-    scene: bpy.types.Scene, regions: list[bpy.types.Object], frame: bpy.types.Object
-) -> float:
-    """Turn the edge length as seen in Blender into world units; 0 where it does not decide."""
-    if scene.gwrap.resolution != "EDGE_LENGTH":
-        return 0.0
-    edge_length = scene.gwrap.edge_length
-    for region in regions:
-        diagonal = float(np.linalg.norm(np.ptp(hull_in_blender(region)[0], 0)))
-        if edge_length > 0.5 * diagonal:
-            raise UsageError(
-                f"Edge length {edge_length:g} is too coarse for region {region.name}, "
-                f"which measures {diagonal:.3g} from corner to corner.",
-                "Choose a smaller edge length.",
-            )
-    scale = abs(np.linalg.det(scene_from_blender(frame)[:3, :3])) ** (1.0 / 3.0)
-    return float(edge_length * scale * tags.world_from_scene(frame).scale)

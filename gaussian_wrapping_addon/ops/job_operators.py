@@ -5,10 +5,19 @@ from pathlib import Path
 from typing import Final
 
 import bpy
-from bpy.props import StringProperty
+from bpy.props import BoolProperty, StringProperty
 
-from ..core.errors import UsageError
-from . import doctor, job_actions, job_timer, known_jobs, tags
+from ..core.errors import UsageError, WrapError
+from . import (
+    doctor,
+    job_actions,
+    job_timer,
+    known_jobs,
+    panel_state,
+    photo_check,
+    tags,
+    worker_setup,
+)
 from .reporting import ReportsErrors
 
 
@@ -20,11 +29,31 @@ def no_job_runs(cls: type, context: bpy.types.Context) -> bool:
     return True
 
 
+def has_worker(cls: type) -> bool:
+    """Tell whether a job has a Python to run in; the tooltip says what to do where it has none."""
+    problem = worker_setup.worker_problem()
+    if problem:
+        cls.poll_message_set(problem)  # type: ignore[attr-defined]
+    return not problem
+
+
 def selected_regions(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the selected region objects, the active one first."""
+    """Return the selected region objects, the active one first; else a result's only one."""
     active = context.view_layer.objects.active
     things = [t for t in context.selected_objects if tags.kind_of(t) == "region"]
+    frame = None if things else tags.current_frame(context.scene, active)
+    if frame is not None:
+        own = [t for t in frame.children if tags.kind_of(t) == "region"]
+        things = own if len(own) == 1 else []
     return sorted(things, key=lambda t: (t != active, t.name))
+
+
+def chosen_regions(context: bpy.types.Context, *, checked: bool) -> list[bpy.types.Object]:
+    """Return the checked regions of the scene by name, or the selected ones."""
+    if not checked:
+        return selected_regions(context)
+    things = tags.objects_of_kind(context.scene, "region")
+    return sorted((t for t in things if t.gwrap.checked), key=lambda t: t.name)
 
 
 class AsksAboutFolder(ReportsErrors):
@@ -58,19 +87,23 @@ class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
         if not context.scene.gwrap.source:
             cls.poll_message_set("Choose the folder of the photos first")
             return False
+        if photo_check.is_busy():
+            cls.poll_message_set("The check is under way; it takes seconds")
+            return False
         return True
 
-    def work(self, context: bpy.types.Context) -> set[str]:
-        from ..core.dataset.check import check_input
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """Look in a thread: the button must not make Blender wait for a slow disk."""
+        try:
+            photo_check.start(context.scene)
+        except WrapError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
 
+    def work(self, context: bpy.types.Context) -> set[str]:
         properties = context.scene.gwrap
-        properties.findings.clear()
-        properties.checked_source = properties.source
-        for finding in check_input(job_actions.source_of(context.scene)):
-            row = properties.findings.add()
-            row.severity = finding.severity
-            row.message = finding.message
-            row.hint = finding.hint
+        photo_check.check_now(context.scene)
         errors = sum(row.severity == "error" for row in properties.findings)
         warnings = sum(row.severity == "warning" for row in properties.findings)
         kind = "WARNING" if errors or warnings else "INFO"
@@ -88,7 +121,12 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
         if not context.scene.gwrap.source:
             cls.poll_message_set("Choose the folder of the photos first")
             return False
-        return no_job_runs(cls, context)
+        if panel_state.has_errors(context.scene):
+            cls.poll_message_set(
+                "The photos cannot be used as they are: see Dataset, then press Check Photos again"
+            )
+            return False
+        return has_worker(cls) and no_job_runs(cls, context)
 
     def work(self, context: bpy.types.Context) -> set[str]:
         folder = job_actions.start_wrap(context.scene, job_actions.worker_choice(context))
@@ -99,21 +137,36 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
 class GWRAP_OT_mesh_region(AsksAboutFolder, bpy.types.Operator):
     bl_idname = "gwrap.mesh_region"
     bl_label = "Mesh Region"
-    bl_description = "Mesh the selected regions from the finished training, without training again"
+    bl_description = (
+        "Mesh the selected or the checked regions from the finished training, without training "
+        "again"
+    )
+
+    checked: BoolProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not selected_regions(context):
-            cls.poll_message_set("Select a region box of a wrapped scene")
+        if tags.current_frame(context.scene, context.view_layer.objects.active) is None:
+            cls.poll_message_set("Needs a finished training: press Wrap Scene first")
             return False
-        return no_job_runs(cls, context)
+        if not selected_regions(context) and not chosen_regions(context, checked=True):
+            cls.poll_message_set("Select or check a region in the list, or press Add Region Box")
+            return False
+        return has_worker(cls) and no_job_runs(cls, context)
+
+    def _regions(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        # With nothing selected, what is checked was meant.
+        return (not self.checked and selected_regions(context)) or chosen_regions(
+            context, checked=True
+        )
 
     def folder(self, context: bpy.types.Context) -> Path | None:
-        frame = tags.frame_of(selected_regions(context)[0])
+        regions = self._regions(context)
+        frame = tags.frame_of(regions[0]) if regions else None
         return tags.result_folder(frame).parent if frame and frame.get(tags.RESULT) else None
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        regions = selected_regions(context)
+        regions = self._regions(context)
         choice = job_actions.worker_choice(context)
         job_actions.start_mesh(context.scene, regions, choice)
         self.report({"INFO"}, f"Meshing {', '.join(r.name for r in regions)}")
@@ -128,7 +181,7 @@ class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if not job_timer.is_running(context.scene.gwrap.job_folder):
-            cls.poll_message_set("No job is running")
+            cls.poll_message_set("No job is running; Wrap Scene starts one")
             return False
         return True
 
@@ -145,7 +198,7 @@ class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if not context.scene.gwrap.job_folder:
-            cls.poll_message_set("This scene has no job")
+            cls.poll_message_set("This scene has no job; press Wrap Scene, or find its folder")
             return False
         return no_job_runs(cls, context)
 
@@ -187,7 +240,7 @@ class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if doctor.is_busy():
-            cls.poll_message_set("The check is running")
+            cls.poll_message_set("The check is running; it takes seconds")
             return False
         return True
 
@@ -203,7 +256,10 @@ class GWRAP_OT_copy_findings(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return bool(doctor.findings())
+        if not doctor.findings():
+            cls.poll_message_set("Press Check Worker first")
+            return False
+        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         context.window_manager.clipboard = doctor.as_text()

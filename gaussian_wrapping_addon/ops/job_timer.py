@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,11 +25,14 @@ from ..core.errors import UsageError, WrapError
 from ..core.jobs.client import JobClient
 from ..core.jobs.job_folder import JobStatus
 from . import known_jobs, live_preview, tags
+from .result_reading import ResultReading
 from .scene_objects import import_result
 
 _logger = logging.getLogger(__name__)
 
 POLL_S = 0.3
+IMPORT_STAGE = "import"
+"""Shown as a stage of the job while its result is read."""
 
 
 @dataclass
@@ -43,6 +47,8 @@ class _Job:
     command: str = "WRAP"
     waits_for_mode: bool = False
     """Finished, but Blender is in a mode in which nothing can be imported."""
+    reading: ResultReading | None = None
+    """The result while it is read, and until it can be imported."""
 
 
 _jobs: dict[str, _Job] = {}
@@ -103,6 +109,8 @@ def waits_for_object_mode(folder: str) -> bool:
 def cancel(folder: str) -> None:
     """Ask a job to stop; it is ended by force when it does not.
 
+    A finished job whose result is being read stays finished, and its result is offered.
+
     Raises
     ------
     UsageError
@@ -111,9 +119,21 @@ def cancel(folder: str) -> None:
     job = _jobs.get(key_of(folder))
     if job is None:
         raise UsageError("No job is running.", "Start one first.")
+    if job.reading is not None:
+        job.imports, job.reading, job.waits_for_mode = False, None, False
+        job.status = job.client.poll()
+        return
     job.client.cancel()
     if job.cancel_asked_s is None:
         job.cancel_asked_s = time.monotonic()
+
+
+def detach(scene: bpy.types.Scene) -> None:
+    """Let a scene show no job any more; the job's folder and its result stay."""
+    for job in _jobs.values():
+        if job.scene_uid == scene.session_uid:
+            job.scene_uid, job.imports = 0, False
+    scene.gwrap.job_folder = ""
 
 
 def forget_all() -> None:
@@ -146,7 +166,16 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
             continue
         before = (job.status, job.waits_for_mode)
         now_s = clock()
-        _poll(folder, job, now_s)
+        try:
+            _poll(folder, job, now_s)
+        except Exception as error:  # a timer that raises would be dropped without a word
+            _logger.exception("looking at the job in %s", folder)
+            job.status = replace(
+                job.status,
+                state="FAILED",
+                error=f"The job folder cannot be read: {error}",
+                hint="See the system console, then choose Find Job.",
+            )
         if not job.status.active:
             live_preview.forget(folder)
         elif job.status.stage == "train":
@@ -168,27 +197,42 @@ def _poll(folder: str, job: _Job, now_s: float) -> None:
         if job.cancel_asked_s is not None and now_s - job.cancel_asked_s > limits.CANCEL_GRACE_S:
             _logger.warning("job in %s does not stop; ending it", folder)
             job.cancel_asked_s = now_s
-            job.client.kill()
+            # It waits for the process to end, which Blender must not.
+            threading.Thread(target=job.client.kill, daemon=True).start()
         return
     if job.status.state == "LOST" and job.cancel_asked_s is not None:
         hint = "Resume continues from the last checkpoint."
         job.status = replace(job.status, state="CANCELLED", error="", hint=hint)
     if job.status.state == "DONE" and job.imports:
-        scene = scene_of_uid(job.scene_uid)
-        # Without its scene another file is open: opening the old one again imports it.
-        job.waits_for_mode = scene is not None and bpy.context.mode != "OBJECT"
-        if scene is not None and not job.waits_for_mode:
-            job.imports = False
-            _import(folder, job, scene)
+        _bring_in(folder, job)
 
 
-def _import(folder: str, job: _Job, scene: bpy.types.Scene) -> None:
+def _bring_in(folder: str, job: _Job) -> None:
+    """Read a finished job's result in the background, then import it in one piece."""
+    scene = scene_of_uid(job.scene_uid)
+    if scene is None:
+        job.reading = None  # another file is open: opening the old one again imports it
+        return
+    if job.reading is None:
+        job.reading = ResultReading(Path(job.status.result))
+    if not job.reading.finished():
+        job.status = replace(
+            job.status, state="RUNNING", stage=IMPORT_STAGE, message="reading the result"
+        )
+        return
+    job.waits_for_mode = bpy.context.mode != "OBJECT"
+    if not job.waits_for_mode:
+        reading, job.imports, job.reading = job.reading, False, None
+        _import(folder, job, scene, reading)
+
+
+def _import(folder: str, job: _Job, scene: bpy.types.Scene, reading: ResultReading) -> None:
     try:
-        import_result(Path(job.status.result), scene)
+        import_result(Path(job.status.result), scene, reading.files())
         _push_undo("Import Wrap Result")
     except WrapError as error:
         job.status = replace(job.status, state="FAILED", error=error.message, hint=error.hint)
-    except Exception as error:  # a timer that raises would be dropped without a word
+    except Exception as error:
         _logger.exception("importing the result of %s", folder)
         job.status = replace(
             job.status,

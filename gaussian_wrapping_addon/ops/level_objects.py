@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from . import tags
-from .materials import create_material, load_texture
+from .materials import create_materials
 from .mesh_data import build_mesh
 from .result_files import RegionResult
 
@@ -52,9 +52,9 @@ def update_levels(
     made = []
     for number, level in enumerate(region.levels, 1):
         name = f"{region.name} LOD{number}"
-        data = build_mesh(name, level.vertices, level.faces, level.corner_uvs)
-        normal_map = load_texture(level.normal_map, "Non-Color") if level.normal_map else None
-        data.materials.append(create_material(name, load_texture(level.albedo), normal_map))
+        data = build_mesh(name, level.vertices, level.faces, level.corner_uvs, level.face_atlas)
+        for material in create_materials(name, level.albedo, level.normal_map):
+            data.materials.append(material)
         thing = bpy.data.objects.new(name, data)
         thing.parent = mesh.parent
         thing.matrix_basis = mesh.matrix_basis

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
@@ -70,6 +71,28 @@ def create_material(
     nodes.active = texture
     set_normal_map(material, normal_map)
     return material
+
+
+def create_materials(
+    name: str, albedo: Sequence[Path], normal_map: Sequence[Path]
+) -> list[bpy.types.Material]:
+    """Make a material for each atlas: ``name``, then ``name 2`` and on.
+
+    Parameters
+    ----------
+    albedo, normal_map : sequence of Path
+        Images, one for each atlas; normal maps may be empty.
+    """
+    normals = load_normal_maps(normal_map, len(albedo))
+    return [
+        create_material(f"{name} {number}" if number > 1 else name, load_texture(path), normal)
+        for number, (path, normal) in enumerate(zip(albedo, normals, strict=True), 1)
+    ]
+
+
+def load_normal_maps(paths: Sequence[Path], count: int) -> list[bpy.types.Image | None]:
+    """Load the normal maps of ``count`` atlases; each None where there are none."""
+    return [load_texture(path, "Non-Color") for path in paths] or [None] * count
 
 
 def set_normal_map(material: bpy.types.Material, image: bpy.types.Image | None) -> bool:

@@ -3,30 +3,40 @@
 
 from __future__ import annotations
 
-import logging
-
 import bpy
 import numpy as np
 
-_logger = logging.getLogger(__name__)
-
 
 def build_mesh(
-    name: str, vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    corner_uvs: np.ndarray,
+    face_material: np.ndarray | None = None,
 ) -> bpy.types.Mesh:
-    """Make mesh data of arrays: smooth shaded, one UV layer."""
+    """Make mesh data of arrays: smooth shaded, one UV layer, a material slot for each face.
+
+    Parameters
+    ----------
+    vertices : (v, 3) ndarray
+    faces : (f, 3) ndarray of int32
+        Sound (``result_files.sound_faces``): Blender's own check takes longer than all the rest.
+    corner_uvs : (f, 3, 2) ndarray of float32
+    face_material : (f,) ndarray of int, optional
+    """
     mesh = bpy.data.meshes.new(name)
     count = len(faces)
     mesh.vertices.add(len(vertices))
-    mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
     mesh.loops.add(3 * count)
-    mesh.loops.foreach_set("vertex_index", faces.ravel())
     mesh.polygons.add(count)
+    # Attributes are copied in one piece, which vertices and loops themselves are not.
+    positions = np.ascontiguousarray(vertices, np.float32)
+    mesh.attributes["position"].data.foreach_set("vector", positions.ravel())
+    mesh.attributes[".corner_vert"].data.foreach_set("value", faces.astype(np.int32).ravel())
     mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
-    mesh.polygons.foreach_set("use_smooth", np.ones(count, bool))
+    if face_material is not None:
+        mesh.polygons.foreach_set("material_index", face_material.astype(np.int32))
     layer = mesh.uv_layers.new(name="UVMap", do_init=False)
-    layer.uv.foreach_set("vector", corner_uvs.ravel())
+    layer.uv.foreach_set("vector", corner_uvs.astype(np.float32, copy=False).ravel())
     mesh.update(calc_edges=True)
-    if mesh.validate():
-        _logger.warning("mesh %s: broken faces were removed", name)
     return mesh

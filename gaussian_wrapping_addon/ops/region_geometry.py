@@ -24,6 +24,8 @@ CUBE_TRIANGLES = (
 
 # Share of the largest extent below which a volume counts as flat.
 FLAT_SHARE = 1e-6
+# Neighbouring faces of a hull count as one where the cosine of their angle differs from 1 by less.
+FLAT_EDGE = 1e-6
 # Share of the diagonal by which corners of a box may be off (float32 matrices of Blender).
 BOX_TOLERANCE = 1e-5
 
@@ -49,6 +51,34 @@ def check_volume(vertices: np.ndarray, name: str) -> None:
     extents = np.linalg.svd(vertices - vertices.mean(0), compute_uv=False)  # (3,)
     if not extents[2] > FLAT_SHARE * extents[0]:
         raise UsageError(f"Region {name} is flat.", "Scale it so that it encloses a volume.")
+
+
+def hull_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the edges of a convex hull that are seen: not those within its flat faces.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float64
+    triangles : (m, 3) int
+
+    Returns
+    -------
+    edges : (k, 2) int
+    """
+    corners = vertices[triangles]  # (m, 3, 3)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # (m, 3)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    owners = np.tile(np.arange(len(triangles)), 3)  # (3m,)
+    edges, which, counts = np.unique(
+        np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    order = np.argsort(which.ravel(), kind="stable")
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])  # (k,)
+    one, other = normals[owners[order[first]]], normals[owners[order[first + counts - 1]]]
+    # The sign of a normal follows the triangle's winding, which hulls of meshes leave open.
+    flat = (counts == 2) & (np.abs((one * other).sum(1)) > 1.0 - FLAT_EDGE)
+    return np.asarray(edges[~flat])
 
 
 def region_to_json(name: str, vertices: np.ndarray, simplices: Any) -> dict[str, Any]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import bmesh
 import bpy
@@ -21,6 +22,10 @@ from .region_geometry import (
     region_to_json,
     vertices_of_region,
 )
+from .region_hull import convex_hull
+
+# Share of the hull's volume by which that of a convex mesh may be off (float32 coordinates).
+CONVEX_TOLERANCE = 1e-3
 
 
 def matrix_of(thing: bpy.types.Object) -> np.ndarray:
@@ -77,49 +82,62 @@ def hull_in_blender(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int
     UsageError
         The object is of another kind, or encloses no volume.
     """
-    matrix = matrix_of(thing)
+    local, triangles = local_hull(thing)
+    vertices = transformed(matrix_of(thing), local)
+    check_volume(vertices, thing.name)
+    return vertices, triangles
+
+
+def local_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
+    """Return the convex hull of a region object in its own coordinates.
+
+    As :func:`hull_in_blender`, which also checks that it encloses a volume.
+    """
     if thing.type == "EMPTY":
         if thing.empty_display_type != "CUBE":
             raise UsageError(
                 f"Empty {thing.name} is not displayed as a cube.", "Set Display As to Cube."
             )
-        corners = CUBE_CORNERS * thing.empty_display_size
-        vertices, triangles = transformed(matrix, corners), list(CUBE_TRIANGLES)
-    elif thing.type == "MESH":
-        local, triangles = _mesh_hull(thing)
-        vertices = transformed(matrix, local)
-    else:
-        raise UsageError(
-            f"{thing.name} is a {thing.type.lower()}, not a region.", "Use a region box or a mesh."
-        )
-    check_volume(vertices, thing.name)
-    return vertices, triangles
+        return CUBE_CORNERS * thing.empty_display_size, list(CUBE_TRIANGLES)
+    if thing.type == "MESH":
+        return _mesh_hull(thing)
+    raise UsageError(
+        f"{thing.name} is a {thing.type.lower()}, not a region.", "Use a region box or a mesh."
+    )
 
 
 def _mesh_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
     evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    work = bmesh.new()
-    try:
-        mesh = evaluated.to_mesh()
-        work.from_mesh(mesh)
-        evaluated.to_mesh_clear()
-        if len(work.verts) < 4:
-            raise UsageError(
-                f"Region {thing.name} has {len(work.verts)} vertices.", "Use a box or a solid."
-            )
-        bmesh.ops.delete(work, geom=work.edges[:] + work.faces[:], context="EDGES_FACES")
-        bmesh.ops.convex_hull(work, input=work.verts[:], use_existing_faces=False)
-        used = {vertex for face in work.faces for vertex in face.verts}
-        if not used:
-            raise UsageError(f"Region {thing.name} is flat.", "Give it a thickness.")
-        bmesh.ops.delete(work, geom=[v for v in work.verts if v not in used], context="VERTS")
-        bmesh.ops.triangulate(work, faces=work.faces[:])
-        work.verts.index_update()
-        vertices = np.array([v.co[:] for v in work.verts], np.float64)
-        triangles = [tuple(v.index for v in face.verts) for face in work.faces]
-    finally:
-        work.free()
-    return vertices, triangles  # type: ignore[return-value]
+    if thing.modifiers and not evaluated.is_evaluated:
+        raise UsageError(
+            f"The modifiers of {thing.name} are not evaluated: it is disabled in viewports, or in "
+            "another scene.",
+            "Enable it, or apply its modifiers.",
+        )
+    mesh = evaluated.to_mesh()
+    points = np.zeros(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", points)
+    evaluated.to_mesh_clear()
+    return convex_hull(points.reshape(-1, 3).astype(np.float64), thing.name)
+
+
+def is_convex(thing: bpy.types.Object) -> bool:
+    """Tell whether a mesh, with its modifiers, is its own convex hull: closed, without dents."""
+    hull, triangles = _mesh_hull(thing)
+    center = hull.mean(0)
+    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    mesh = evaluated.to_mesh()
+    mesh.calc_loop_triangles()
+    vertices = np.zeros(3 * len(mesh.vertices), np.float32)
+    corners = np.zeros(3 * len(mesh.loop_triangles), np.int32)
+    mesh.vertices.foreach_get("co", vertices)
+    mesh.loop_triangles.foreach_get("vertices", corners)
+    evaluated.to_mesh_clear()
+    own = vertices.reshape(-1, 3).astype(np.float64)[corners.reshape(-1, 3)] - center  # (m, 3, 3)
+    volume = abs(float(np.linalg.det(own).sum()))
+    # The hull's triangles may wind either way; seen from inside, all of them count.
+    whole = float(np.abs(np.linalg.det(hull[np.array(triangles)] - center)).sum())
+    return abs(volume - whole) <= CONVEX_TOLERANCE * whole
 
 
 def region_from_object(thing: bpy.types.Object) -> np.ndarray:
@@ -145,11 +163,21 @@ def _region_in_world(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[in
     return vertices, triangles
 
 
-def export_region(thing: bpy.types.Object, path: Path) -> None:
+def region_body(thing: bpy.types.Object, name: str = "") -> dict[str, Any]:
+    """Return the bounding-volume JSON of a region object, named as the object unless told.
+
+    Raises
+    ------
+    UsageError
+        As :func:`region_from_object`.
+    """
+    return region_to_json(name or thing.name, *_region_in_world(thing))
+
+
+def export_region(thing: bpy.types.Object, path: Path, name: str = "") -> None:
     """Write a region object as bounding-volume JSON in world coordinates."""
-    vertices, triangles = _region_in_world(thing)
     try:
-        write_json(path, region_to_json(thing.name, vertices, triangles))
+        write_json(path, region_body(thing, name))
     except OSError as error:
         raise UsageError(
             f"{path} cannot be written: {error.strerror}.", "Choose another."

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators that add, select, export and import region boxes."""
 
+import itertools
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +17,7 @@ from .region_objects import (
     create_region,
     export_region,
     hull_in_blender,
+    is_convex,
     read_region_vertices,
     scene_from_blender,
     transformed,
@@ -42,9 +44,33 @@ def _select_only(context: bpy.types.Context, thing: bpy.types.Object) -> None:
 def _target(context: bpy.types.Context) -> tuple[bpy.types.Object | None, bpy.types.Collection]:
     """Return the frame and the collection for a new region."""
     frame = tags.current_frame(context.scene, context.view_layer.objects.active)
-    if frame is not None and frame.users_collection:
-        return frame, frame.users_collection[0]
-    return None, context.scene.collection
+    if frame is None:
+        return None, context.scene.collection
+    # Linked and overridden ones take no new objects; what is left out of the view layer cannot
+    # be selected.
+    shown = _shown_collections(context.view_layer.layer_collection)
+    places = [
+        c
+        for c in frame.users_collection
+        if c in shown and c.library is None and c.override_library is None
+    ]
+    return frame, places[0] if places else context.scene.collection
+
+
+def _shown_collections(layer: bpy.types.LayerCollection) -> list[bpy.types.Collection]:
+    below = [c for child in layer.children if not child.exclude for c in _shown_collections(child)]
+    return [layer.collection, *below]
+
+
+def _free_name(frame: bpy.types.Object | None) -> str:
+    """Return a name for a new box under which no mesh was made: meshing would replace it."""
+    children = frame.children if frame is not None else ()
+    made = {str(t.get(tags.REGION, "")) for t in children}
+    numbers = itertools.count(2)
+    name = "Region"
+    while name in made or name in bpy.data.objects:
+        name = f"Region_{next(numbers)}"
+    return name
 
 
 class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
@@ -66,7 +92,7 @@ class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
             inverse = scene_from_blender(frame)
             cursor = np.array(context.scene.cursor.location, np.float64)
             vertices = transformed(inverse, cursor[None]) + _CURSOR_BOX_HALF * CUBE_CORNERS
-        thing = create_region("Region", vertices, frame, collection)
+        thing = create_region(_free_name(frame), vertices, frame, collection)
         thing.show_name = True
         _select_only(context, thing)
         return {"FINISHED"}
@@ -182,7 +208,15 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> set[str]:
         active = context.view_layer.objects.active
         frame, _ = _target(context)
+        if not active.is_editable:
+            raise UsageError(
+                f"{active.name} is linked from a library.",
+                "Make it local (Object > Relations > Make Local).",
+            )
         hull_in_blender(active)  # refuses what encloses no volume
+        if not is_convex(active):
+            text = f"{active.name} is not convex: its convex hull is the region"
+            self.report({"WARNING"}, text)
         if frame is not None and tags.frame_of(active) is None:
             matrix = active.matrix_world.copy()
             active.parent = frame

@@ -67,6 +67,25 @@ class ReportData:
     known: bool = False
     """Whether there is a report at all."""
 
+    @property
+    def training(self) -> str:
+        """What was trained, for a heading: ``"12,235 Gaussians, 23.0 dB"``, or ``""``."""
+        rows = dict(self.rows)
+        gaussians, quality = rows.get("Gaussians"), rows.get("Held-Out PSNR")
+        parts = [f"{gaussians} Gaussians"] if gaussians and gaussians != NOT_MEASURED else []
+        if quality and quality != NOT_MEASURED:
+            parts.append(quality.partition(" (")[0])
+        return ", ".join(parts)
+
+    def as_text(self) -> str:
+        """Return all of it as text, a line for each row."""
+        lines = [f"{name}: {value}" for name, value in (*self.rows, *self.stages, *self.decisions)]
+        for region in self.regions:
+            lines += ["", region.name, *(f"  {name}: {value}" for name, value in region.rows)]
+        if self.warnings:
+            lines += ["", "Warnings", *(f"  {text}" for text in self.warnings)]
+        return "\n".join(lines) + "\n"
+
 
 def figures_of_report(report: Any) -> dict[str, Any]:
     """Pick the figures that the panel shows; what a report lacks is left out.

@@ -8,6 +8,7 @@ import bpy
 
 from ..core.errors import UsageError
 from . import known_jobs, tags
+from .report_data import report_of
 from .reporting import ReportsErrors
 
 MAX_PICTURES = 40
@@ -46,7 +47,7 @@ class _NeedsResult(ReportsErrors):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if tags.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene holds no result")  # type: ignore[attr-defined]
+            cls.poll_message_set("The scene holds no result; wrap it, or import one")  # type: ignore[attr-defined]
             return False
         return True
 
@@ -91,4 +92,27 @@ class GWRAP_OT_show_pictures(_NeedsResult, bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES: Final = (GWRAP_OT_read_report, GWRAP_OT_show_pictures)
+class GWRAP_OT_copy_report(_NeedsResult, bpy.types.Operator):
+    bl_idname = "gwrap.copy_report"
+    bl_label = "Copy"
+    bl_description = "Copy the figures and warnings shown here, to paste them elsewhere"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not super().poll(context):
+            return False
+        frame = tags.current_frame(context.scene, context.view_layer.objects.active)
+        if not report_of(tags.figures_of(frame)).known:
+            cls.poll_message_set("The result came without a report; run the job again")
+            return False
+        return True
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        frame = tags.current_frame(context.scene, context.view_layer.objects.active)
+        text = report_of(tags.figures_of(frame)).as_text()
+        context.window_manager.clipboard = text.replace(str(Path.home()), "~")
+        self.report({"INFO"}, "The report is in the clipboard")
+        return {"FINISHED"}
+
+
+CLASSES: Final = (GWRAP_OT_read_report, GWRAP_OT_show_pictures, GWRAP_OT_copy_report)

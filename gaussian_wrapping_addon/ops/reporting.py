@@ -40,7 +40,7 @@ class NeedsObjectMode(ReportsErrors):
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run; Blender calls this."""
         if context.mode != "OBJECT":
-            cls.poll_message_set("Leave the current mode first")  # type: ignore[attr-defined]
+            cls.poll_message_set("Change to Object Mode first")  # type: ignore[attr-defined]
             return False
         return True
 
@@ -52,6 +52,6 @@ class NeedsResult:
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run; Blender calls this."""
         if tags.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene holds no result")  # type: ignore[attr-defined]
+            cls.poll_message_set("The scene holds no result; wrap it, or import one")  # type: ignore[attr-defined]
             return False
         return True

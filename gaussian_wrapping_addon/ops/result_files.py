@@ -19,7 +19,7 @@ from ..core.dataset.similarity import Similarity
 from ..core.errors import DatasetError, ParseError
 from ..core.files import read_json
 from ..core.settings import MAX_LODS
-from ..core.texture.file_checks import SINGLE_MAX
+from ..core.texture.file_checks import SINGLE_MAX, atlas_file, check_face_atlas
 from .region_geometry import vertices_of_region
 from .report_data import figures_of_report
 
@@ -39,8 +39,12 @@ class LevelResult:
     """(f, 3) int32, indices within range."""
     corner_uvs: np.ndarray
     """(f, 3, 2) float32, finite."""
-    albedo: Path
-    normal_map: Path | None
+    albedo: tuple[Path, ...]
+    """One for each atlas."""
+    normal_map: tuple[Path, ...]
+    """The same, or empty."""
+    face_atlas: np.ndarray | None = None
+    """(f,) uint8 atlas of each face; None where there is one."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +58,16 @@ class RegionResult:
     """(f, 3) int32, indices within range."""
     corner_uvs: np.ndarray
     """(f, 3, 2) float32, finite."""
-    albedo: Path
+    albedo: tuple[Path, ...]
+    """One for each atlas."""
     box_vertices: np.ndarray
     """(n, 3) float64, world frame: corners of the region."""
     stamp: str
     """Changes when the mesh file changes."""
-    normal_map: Path | None = None
+    normal_map: tuple[Path, ...] = ()
+    """One for each atlas, or empty."""
+    face_atlas: np.ndarray | None = None
+    """(f,) uint8 atlas of each face; None where there is one."""
     levels: tuple[LevelResult, ...] = ()
     """Levels of detail 1, 2, ..."""
 
@@ -158,32 +166,42 @@ def _scene(path: Path) -> tuple[tuple[tuple[Camera, str], ...], Similarity, floa
 
 def _region(folder: Path) -> RegionResult:
     path = folder / "mesh.npz"
-    vertices, faces, corner_uvs = _mesh(path)
+    vertices, faces, corner_uvs, face_atlas = _mesh(path)
     state = path.stat()
     region_path = folder / "region.json"
     if not region_path.is_file():
         raise DatasetError(f"{folder} holds no region.json.", "Mesh the region again.")
-    albedo, normal_map = _textures(folder)
+    albedo, normal_map = _textures(folder, face_atlas)
     box = vertices_of_region(read_json(region_path), region_path)
     stamp = f"{state.st_size}:{state.st_mtime_ns}"
     levels = []
     while (level := folder / f"lod{len(levels) + 1}" / "mesh.npz").is_file():
         if len(levels) == MAX_LODS:
             raise DatasetError(f"{folder} holds too many levels.", "Mesh the region again.")
-        levels.append(LevelResult(*_mesh(level), *_textures(level.parent)))
+        *arrays, owner = _mesh(level)
+        levels.append(LevelResult(*arrays, *_textures(level.parent, owner), owner))
     return RegionResult(
-        folder.name, vertices, faces, corner_uvs, albedo, box, stamp, normal_map, tuple(levels)
+        folder.name, vertices, faces, corner_uvs, albedo, box, stamp, normal_map, face_atlas,
+        tuple(levels),
+    )  # fmt: skip
+
+
+def _textures(
+    folder: Path, face_atlas: np.ndarray | None
+) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    atlases = range(1 if face_atlas is None else int(face_atlas.max()) + 1)
+    albedo, normal_map = (
+        tuple(folder / atlas_file(name, number) for number in atlases)
+        for name in ("albedo", "normal")
     )
+    # A normal map is there whole or not at all.
+    for path in (*albedo, *(normal_map if normal_map[0].is_file() else ())):
+        if not path.is_file():
+            raise DatasetError(f"{folder} holds no {path.name}.", "Mesh the region again.")
+    return albedo, normal_map if normal_map[0].is_file() else ()
 
 
-def _textures(folder: Path) -> tuple[Path, Path | None]:
-    albedo, normal_map = folder / "albedo.png", folder / "normal.png"
-    if not albedo.is_file():
-        raise DatasetError(f"{folder} holds no albedo.png.", "Mesh the region again.")
-    return albedo, normal_map if normal_map.is_file() else None
-
-
-def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
     hint = "Mesh the region again."
     try:
         with zipfile.ZipFile(path) as archive:
@@ -194,6 +212,9 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             vertices = np.asarray(arrays["vertices"], np.float64)
             faces = np.asarray(arrays["faces"])
             corner_uvs = np.asarray(arrays["corner_uvs"], np.float64)
+            face_atlas = arrays["face_atlas"] if "face_atlas" in arrays.files else None
+        if face_atlas is not None:
+            face_atlas = check_face_atlas(face_atlas, len(faces))
     except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as error:
         raise ParseError(path, "whole file", f"not a mesh file ({error}).", hint) from None
     if vertices.ndim != 2 or vertices.shape[1:] != (3,):
@@ -211,4 +232,26 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             raise ParseError(path, f"{name}[{bad[0]}]", "not a finite number of 32 bits.", hint)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ParseError(path, "faces", "an index is out of range.", hint)
-    return vertices, faces.astype(np.int32), corner_uvs.astype(np.float32)
+    sound = sound_faces(faces)
+    if not sound.all():
+        removed = int(np.count_nonzero(~sound))
+        _logger.warning("%s: %d broken faces are left out", path, removed)
+        faces, corner_uvs = faces[sound], corner_uvs[sound]
+        face_atlas = None if face_atlas is None else face_atlas[sound]
+    return vertices, faces.astype(np.int32), corner_uvs.astype(np.float32), face_atlas
+
+
+def sound_faces(faces: np.ndarray) -> np.ndarray:
+    """Return (f,) bool: three different corners, and no earlier face of the same three.
+
+    Parameters
+    ----------
+    faces : (f, 3) ndarray of int
+        Indices within range.
+    """
+    corners = np.sort(faces.astype(np.int64), axis=1)  # (f, 3)
+    a, b, c = corners.T
+    order = np.lexsort((c, b, a))  # stable: the first of equals stays first
+    again = np.zeros(len(faces), bool)
+    again[order[1:]] = (corners[order[1:]] == corners[order[:-1]]).all(1)
+    return (a != b) & (b != c) & ~again

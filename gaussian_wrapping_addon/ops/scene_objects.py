@@ -11,11 +11,20 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import UsageError
+from ..core.errors import ResourceError, UsageError
 from . import tags
 from .camera_objects import create_camera, look_through, scale_display
 from .level_objects import update_levels
-from .materials import create_material, fold_specular, load_texture, set_normal_map
+from .materials import (
+    create_material,
+    create_materials,
+    fold_specular,
+    load_normal_maps,
+    load_texture,
+    set_normal_map,
+    set_shading,
+    shading_of,
+)
 from .mesh_data import build_mesh
 from .placement import restore, scale_of
 from .region_objects import create_region
@@ -42,7 +51,9 @@ class ImportedResult:
     regions: tuple[bpy.types.Object, ...]
 
 
-def import_result(folder: Path, scene: bpy.types.Scene) -> ImportedResult:
+def import_result(
+    folder: Path, scene: bpy.types.Scene, files: ResultFiles | None = None
+) -> ImportedResult:
     """Build, or bring up to date, the objects of a result folder.
 
     A result that was placed before (``placement.json``) is placed so again. One that was imported
@@ -56,14 +67,20 @@ def import_result(folder: Path, scene: bpy.types.Scene) -> ImportedResult:
         ``DIR/result`` (docs/architecture.md).
     scene : Scene
         Where new objects are linked.
+    files : ResultFiles, optional
+        The content of the folder where it has been read already.
 
     Raises
     ------
     DatasetError, ParseError
         The folder does not hold a sound result; nothing has been changed then.
+    UsageError
+        A mesh that has changed is in Edit Mode in another scene; nothing has been changed then.
     """
-    files = read_result(folder)
-    frame = _find_frame(files)
+    files = files or read_result(folder)
+    frame = _find_frame(files, scene)
+    if frame is not None:
+        _refuse_edited(files, frame)
     new = frame is None
     if frame is None:
         frame = _create_frame(files)
@@ -79,6 +96,9 @@ def import_result(folder: Path, scene: bpy.types.Scene) -> ImportedResult:
     for region in files.regions:
         meshes.append(_update_mesh(region, children, frame, collection))
         regions.append(_update_region(region, files, children, frame, collection))
+    for thing in (*meshes, *regions):
+        if not thing.users_collection:  # a person has deleted the collection, not what was in it
+            collection.objects.link(thing)
     cameras = _update_cameras(files, children, frame, collection)
     # Last: levels that are made anew leave dead entries among the children.
     for region, mesh in zip(files.regions, meshes, strict=True):
@@ -87,9 +107,24 @@ def import_result(folder: Path, scene: bpy.types.Scene) -> ImportedResult:
     return ImportedResult(collection, frame, tuple(meshes), cameras, tuple(regions))
 
 
-def _find_frame(files: ResultFiles) -> bpy.types.Object | None:
-    moved = None
+def _refuse_edited(files: ResultFiles, frame: bpy.types.Object) -> None:
+    """Refuse new geometry for a mesh in Edit Mode in another scene: Blender would not take it."""
+    stamps = {region.name: region.stamp for region in files.regions}
     for thing in bpy.data.objects:
+        if thing.parent != frame or tags.kind_of(thing) != "mesh" or thing.mode != "EDIT":
+            continue
+        if thing.get(tags.STAMP) != stamps.get(thing.get(tags.REGION), thing.get(tags.STAMP)):
+            raise UsageError(
+                f"{thing.name} is in Edit Mode, in another scene.",
+                "Leave Edit Mode there, then import the result.",
+            )
+
+
+def _find_frame(files: ResultFiles, scene: bpy.types.Scene) -> bpy.types.Object | None:
+    moved = None
+    # The scene's own first: a full copy of a scene has a copy of the frame as well.
+    own = set(scene.objects)
+    for thing in sorted(bpy.data.objects, key=lambda t: t not in own):
         if tags.kind_of(thing) != "frame" or thing.library is not None:
             continue
         try:
@@ -140,11 +175,12 @@ def _update_mesh(
     thing = _found(children, "mesh", tags.REGION, region.name)
     if thing is not None and thing.get(tags.STAMP) == region.stamp:
         return thing
-    mesh = build_mesh(region.name, region.vertices, region.faces, region.corner_uvs)
-    image = load_texture(region.albedo)
-    normal_map = load_texture(region.normal_map, "Non-Color") if region.normal_map else None
+    mesh = build_mesh(
+        region.name, region.vertices, region.faces, region.corner_uvs, region.face_atlas
+    )
     if thing is None:
-        mesh.materials.append(create_material(region.name, image, normal_map))
+        for material in create_materials(region.name, region.albedo, region.normal_map):
+            mesh.materials.append(material)
         thing = bpy.data.objects.new(region.name, mesh)
         thing.parent = frame
         thing[tags.KIND] = "mesh"
@@ -152,10 +188,7 @@ def _update_mesh(
         collection.objects.link(thing)
     else:
         old = thing.data
-        for material in old.materials:
-            mesh.materials.append(material)
-            if material is not None:
-                set_normal_map(material, normal_map)
+        _keep_materials(list(old.materials), mesh, region)
         thing.data = mesh
         if old.users == 0:
             name = old.name
@@ -163,6 +196,30 @@ def _update_mesh(
             mesh.name = name
     thing[tags.STAMP] = region.stamp
     return thing
+
+
+def _keep_materials(
+    old: list[bpy.types.Material | None], mesh: bpy.types.Mesh, region: RegionResult
+) -> None:
+    """Give new mesh data the materials that the object had, and those of further atlases.
+
+    Slots of atlases that are no more stay where they hold a material of the user.
+    """
+    images = [load_texture(path) for path in region.albedo]
+    normals = load_normal_maps(region.normal_map, len(images))
+    for number, (image, normal_map) in enumerate(zip(images, normals, strict=True)):
+        if number < len(old):
+            mesh.materials.append(old[number])
+            if old[number] is not None:
+                set_normal_map(old[number], normal_map)
+        else:
+            name = f"{region.name} {number + 1}"
+            material = create_material(name, image, normal_map)
+            set_shading(material, shading_of(old[0] if old else None) or "LIT")
+            mesh.materials.append(material)
+    for material in old[len(images) :]:
+        if shading_of(material) is None:
+            mesh.materials.append(material)
 
 
 def _update_region(
@@ -244,7 +301,9 @@ def write_blend(result_folder: Path, path: Path) -> None:
     try:
         bpy.ops.wm.save_as_mainfile(filepath=str(path), relative_remap=False, check_existing=False)
     except RuntimeError as error:
-        raise UsageError(f"{path} cannot be written: {error}.", "Choose another folder.") from None
+        raise ResourceError(
+            f"{path} cannot be written: {error}.", "Choose another folder."
+        ) from None
 
 
 def export_usd(result_folder: Path) -> list[Path]:
@@ -279,7 +338,7 @@ def export_usd(result_folder: Path) -> list[Path]:
             filepath=str(path), **{k: v for k, v in options.items() if k in known}
         )
         if not path.is_file():
-            raise UsageError(f"{path} cannot be written.", "Check the folder's permissions.")
+            raise ResourceError(f"{path} cannot be written.", "Check the folder's permissions.")
         paths.append(path)
     return paths
 

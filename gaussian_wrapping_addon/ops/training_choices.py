@@ -47,6 +47,7 @@ def texture_choices(scene: bpy.types.Scene) -> dict[str, object]:
         "normal_map": properties.normal_map.lower(),
         "ambient_occlusion": "on" if properties.ambient_occlusion else "off",
         "lods": properties.lods,
+        "max_atlases": properties.max_atlases,
     }
 
 
@@ -61,7 +62,8 @@ def _splat(stored: str) -> str:
         raise UsageError(f"{path.name} is no PLY file.", "Choose a splat saved as PLY, or none.")
     if not path.is_file():
         raise UsageError(
-            f"The splat {path} does not exist.", "Choose it again in Training, or clear the field."
+            f"The splat {path} does not exist.",
+            "Choose it again in Train, Advanced, or clear the field.",
         )
     return str(path.resolve())
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import queue
 import subprocess
-import sys
 import threading
 from dataclasses import dataclass
 from typing import Any
@@ -14,9 +13,10 @@ from typing import Any
 import bpy
 
 from ..core.errors import WorkerError, WrapError
-from ..core.helper_process import child_command, child_environment, kill_group
+from ..core.helper_process import child_command, kill_group
 from ..core.jobs.client import worker_python
 from ..core.jobs.job_file import make_job
+from .estimate_child import ask_child
 from .job_actions import WorkerChoice, source_of
 from .training_choices import choices_key, job_settings
 
@@ -25,6 +25,8 @@ DEADLINE_S = 300.0
 POLL_S = 0.3
 MAX_LINES = 20
 MAX_TEXT = 300
+MAX_KNOWN = 20
+"""Answers kept, so that going back to a preset shows its estimate again."""
 _WARNING = "warning: "
 
 
@@ -46,6 +48,7 @@ class _Question:
 
 
 _question = _Question()
+_known: dict[tuple[object, ...], Estimate] = {}
 _answers: queue.Queue[tuple[int, Estimate]] = queue.Queue()
 _guard = threading.Lock()
 
@@ -56,8 +59,26 @@ def is_busy() -> bool:
 
 
 def answer_for(scene: bpy.types.Scene) -> Estimate | None:
-    """Return the estimate for what a scene's panels ask for now; None after a change."""
-    return _question.answer if _question.key == choices_key(scene) else None
+    """Return the estimate for what a scene's panels ask for now; None where it is not known."""
+    return _known.get(choices_key(scene))
+
+
+def answer_with(scene: bpy.types.Scene, error: WrapError) -> None:
+    """Show in place of an estimate why there is none."""
+    _keep(choices_key(scene), Estimate((), (error.message, error.hint)))
+
+
+def _keep(key: tuple[object, ...], answer: Estimate) -> None:
+    _known.pop(key, None)
+    _known[key] = answer
+    while len(_known) > MAX_KNOWN:
+        del _known[next(iter(_known))]
+
+
+def forget() -> None:
+    """Forget all answers: the photos may be others under the same names."""
+    stop()
+    _known.clear()
 
 
 def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
@@ -93,42 +114,14 @@ def _ask(number: int, command: list[str]) -> None:
 
 def _run(number: int, command: list[str]) -> Estimate:
     """Start the child and return what it says."""
-    options: dict[str, Any] = {"start_new_session": True}
-    if sys.platform == "win32":
-        options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
-    try:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=child_environment(),
-            **options,
-        )
-    except OSError as error:
-        raise WorkerError(
-            f"{command[0]} does not run: {error}.", "Choose another Python."
-        ) from None
-    with _guard:
-        wanted = _question.number == number
-        _question.process = process if wanted else _question.process
-    if not wanted:
-        kill_group(process)
-    try:
-        output, words = process.communicate(timeout=DEADLINE_S)
-    except subprocess.TimeoutExpired:
-        kill_group(process)
-        raise WorkerError("The estimate took too long.", "Start the job without it.") from None
-    found = []
-    for line in output.decode(errors="replace").splitlines():
-        try:
-            values = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(values, dict):
-            found.append(values)
-    last = words.decode(errors="replace").strip().splitlines()
-    return estimate_of(found, last[-1] if last else "")
+
+    def begun(process: subprocess.Popen[bytes]) -> bool:
+        with _guard:
+            wanted = _question.number == number
+            _question.process = process if wanted else _question.process
+        return wanted
+
+    return estimate_of(*ask_child(command, begun, DEADLINE_S))
 
 
 def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
@@ -174,6 +167,7 @@ def show() -> float | None:
             break
         if number == _question.number:
             _question.answer, _question.process = answer, None
+            _keep(_question.key, answer)
     if is_busy():
         return POLL_S
     for window in bpy.context.window_manager.windows:

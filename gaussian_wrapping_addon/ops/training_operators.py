@@ -7,7 +7,7 @@ from typing import Final
 import bpy
 
 from ..core.errors import UsageError
-from . import job_actions, job_timer, tags, training_estimate
+from . import job_actions, tags, training_estimate
 from .job_operators import AsksAboutFolder, no_job_runs
 from .reporting import ReportsErrors
 
@@ -27,7 +27,7 @@ class GWRAP_OT_estimate(ReportsErrors, bpy.types.Operator):
             cls.poll_message_set("Choose the folder of the photos first")
             return False
         if training_estimate.is_busy():
-            cls.poll_message_set("The estimate is under way")
+            cls.poll_message_set("The estimate is under way; it takes seconds")
             return False
         return True
 
@@ -46,7 +46,7 @@ class GWRAP_OT_train_more(AsksAboutFolder, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if _frame(context) is None:
-            cls.poll_message_set("Wrap the scene or import a result first")
+            cls.poll_message_set("Needs a finished training: press Wrap Scene first")
             return False
         return no_job_runs(cls, context)
 
@@ -72,7 +72,7 @@ class GWRAP_OT_reset_training(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return not job_timer.is_running(context.scene.gwrap.job_folder)
+        return no_job_runs(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         training = context.scene.gwrap.training

@@ -8,6 +8,7 @@ from typing import Any
 from ..core.jobs.job_folder import JobStatus
 from ..ops import job_timer, live_preview
 from ..ops.live_figures import live_rows
+from .panel_base import table
 
 _PICTURE_SCALE = 9.0  # of an icon's size: about the width of the panel as Blender starts
 
@@ -17,13 +18,7 @@ def draw_live(layout: Any, folder: str, status: JobStatus) -> bool:
     rows = live_rows(status)
     if not rows:
         return False
-    column = layout.column(align=True)
-    for name, value in rows:
-        split = column.split(factor=0.55)
-        split.label(text=name, translate=False)
-        right = split.row()
-        right.alignment = "RIGHT"
-        right.label(text=value, translate=False)
+    table(layout, rows)
     icons = live_preview.icons_of(job_timer.key_of(folder))
     if icons:
         row = layout.row(align=True)

@@ -6,8 +6,7 @@ from typing import Final
 import bpy
 from bpy.props import BoolProperty, IntProperty, StringProperty
 
-from ..ops import doctor
-from .text import wrapped_label
+from .worker_setup_view import draw_doctor, draw_setup
 
 
 class GWRAP_preferences(bpy.types.AddonPreferences):
@@ -16,10 +15,18 @@ class GWRAP_preferences(bpy.types.AddonPreferences):
     worker_python: StringProperty(  # type: ignore[valid-type]
         name="Worker Python",
         description=(
-            "Python that has the packages of requirements-worker.txt; "
-            "empty uses GAUSSIAN_WRAPPING_PYTHON or Blender's own Python"
+            "Another Python that has the packages of requirements-worker.txt; empty uses "
+            "GAUSSIAN_WRAPPING_PYTHON, or the worker that was set up here"
         ),
         subtype="FILE_PATH",
+    )
+    wheel_folder: StringProperty(  # type: ignore[valid-type]
+        name="Wheel Folder",
+        description=(
+            "Folder with the wheels of all packages, for a set-up without network; "
+            "empty asks pip's package index"
+        ),
+        subtype="DIR_PATH",
     )
     threads: IntProperty(  # type: ignore[valid-type]
         name="Threads",
@@ -34,23 +41,17 @@ class GWRAP_preferences(bpy.types.AddonPreferences):
         default=False,
     )
 
-    def draw(self, _context: bpy.types.Context) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
+        box = layout.box()
+        draw_setup(box, context)
+        box.prop(self, "wheel_folder")
         layout.prop(self, "worker_python")
         layout.prop(self, "threads")
         layout.prop(self, "keep_running")
-        row = layout.row()
-        row.operator("gwrap.check_worker", icon="VIEWZOOM")
-        row.operator("gwrap.copy_findings", icon="COPYDOWN")
-        if doctor.is_busy():
-            layout.label(text="Checking…", icon="TIME")
-        for finding in doctor.findings():
-            icon = "CHECKMARK" if finding.good else "ERROR"
-            wrapped_label(layout, f"{finding.subject}: {finding.finding}", 90, icon=icon)
-            if not finding.good and finding.hint:
-                wrapped_label(layout, finding.hint, 90, icon="BLANK1")
+        draw_doctor(layout, context)
 
 
 CLASSES: Final = (GWRAP_preferences,)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What the panels edit: ``Scene.gwrap``.
 
-Objects carry plain custom properties (``ops/tags.py``), which also exist where the add-on is not
-enabled. No property has a callback: in Blender 4.2 one that ever had crashes the process at exit.
+Regions have ``Object.gwrap`` (``region_properties.py``). All other marks of objects are plain
+custom properties (``ops/tags.py``), which also exist where the add-on is not enabled. No property
+has a callback: in Blender 4.2 one that ever had crashes the process at exit.
 """
 
 from typing import Final
@@ -18,6 +19,8 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..core import limits
+from .region_properties import GWRAP_PG_region
 from .training_properties import GWRAP_PG_training
 
 _PRESETS: Final = (
@@ -90,7 +93,6 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
             "Folder of photos, of a COLMAP project, or with a transforms.json; or the PLY of a "
             "3D Gaussian splat"
         ),
-        subtype="FILE_PATH",
     )
     output: StringProperty(  # type: ignore[valid-type]
         name="Output",
@@ -185,6 +187,16 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
         min=0,
         max=8,
     )
+    max_atlases: IntProperty(  # type: ignore[valid-type]
+        name="Max Textures",
+        description=(
+            "Textures that a mesh may be spread over where the photos show more than one holds; "
+            "0 decides by itself"
+        ),
+        default=0,
+        min=0,
+        max=limits.MAX_ATLASES,
+    )
     texture_source: EnumProperty(  # type: ignore[valid-type]
         name="Texture From",
         description="Where the colours of the texture come from",
@@ -197,6 +209,7 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
         items=(("WRAP", "Wrap", ""), ("MESH", "Mesh", "")), options={"HIDDEN"}
     )
     checked_source: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
+    checked_text: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     findings: CollectionProperty(type=GWRAP_PG_finding, options={"HIDDEN"})  # type: ignore[valid-type]
 
 
@@ -204,11 +217,13 @@ CLASSES: Final = (GWRAP_PG_finding, GWRAP_PG_scene)
 
 
 def add_pointers() -> None:
-    """Give scenes their properties."""
+    """Give scenes and regions their properties."""
     bpy.types.Scene.gwrap = PointerProperty(type=GWRAP_PG_scene)
+    bpy.types.Object.gwrap = PointerProperty(type=GWRAP_PG_region)
 
 
 def remove_pointers() -> None:
     """Take them away, where they are there."""
-    if hasattr(bpy.types.Scene, "gwrap"):
-        del bpy.types.Scene.gwrap
+    for owner in (bpy.types.Object, bpy.types.Scene):
+        if hasattr(owner, "gwrap"):
+            del owner.gwrap

@@ -6,7 +6,8 @@ from typing import Any, Final
 import bpy
 
 from ..ops import tags
-from ..ops.report_data import Row, report_of
+from ..ops.report_data import report_of
+from .panel_base import table
 from .text import characters_of, wrapped_label
 
 _MAX_WARNINGS: Final = 8
@@ -19,6 +20,10 @@ class GWRAP_PT_report(bpy.types.Panel):
     bl_parent_id = "GWRAP_PT_result"
     bl_label = "Report"
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return tags.current_frame(context.scene, context.view_layer.objects.active) is not None
+
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
@@ -26,22 +31,24 @@ class GWRAP_PT_report(bpy.types.Panel):
         if not report.known:
             layout.label(text="No report yet", icon="INFO")
             return
-        self._table(layout, report.rows)
+        table(layout, report.rows)
         if report.stages:
             box = layout.box()
             box.label(text="Time of the Stages", icon="TIME")
-            self._table(box, report.stages)
+            table(box, report.stages)
         if report.decisions:
             box = layout.box()
             box.label(text="What the Scene Needed", icon="OPTIONS")
-            self._table(box, report.decisions)
+            table(box, report.decisions)
         for region in report.regions:
             box = layout.box()
             box.label(text=region.name, icon="MESH_DATA", translate=False)
-            self._table(box, region.rows)
+            table(box, region.rows)
         self._warnings(layout, report.warnings, characters_of(context))
         column = layout.column(align=True)
-        column.operator("gwrap.read_report", icon="TEXT")
+        row = column.row(align=True)
+        row.operator("gwrap.read_report", icon="TEXT")
+        row.operator("gwrap.copy_report", icon="COPYDOWN")
         column.operator("gwrap.show_pictures", icon="IMAGE_DATA")
 
     def _warnings(self, layout: Any, warnings: tuple[str, ...], characters: int) -> None:
@@ -54,15 +61,6 @@ class GWRAP_PT_report(bpy.types.Panel):
         more = len(warnings) - _MAX_WARNINGS
         if more > 0:
             box.label(text=f"and {more} more in the report", translate=False)
-
-    def _table(self, layout: Any, rows: tuple[Row, ...]) -> None:
-        column = layout.column(align=True)
-        for name, value in rows:
-            split = column.split(factor=0.55)
-            split.label(text=name, translate=False)
-            right = split.row()
-            right.alignment = "RIGHT"
-            right.label(text=value, translate=False)
 
 
 CLASSES: Final = (GWRAP_PT_report,)

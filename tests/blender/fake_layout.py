@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import dataclass
+from types import MethodType, SimpleNamespace
 from typing import Any
 
 import bpy
@@ -21,12 +22,48 @@ class _OperatorProperties:
         assert name in self._known, f"the operator has no property {name}"
 
 
+@dataclass(frozen=True)
+class Button:
+    """An operator as it was drawn."""
+
+    operator: str
+    text: str
+    layout: FakeLayout
+
+    @property
+    def enabled(self) -> bool:
+        """Whether the panel leaves it to be pressed (its poll may still refuse)."""
+        return all(part.values.get("enabled", True) for part in self.layout.chain)
+
+    @property
+    def large(self) -> bool:
+        """Whether it is drawn higher than others."""
+        return any(part.values.get("scale_y", 1.0) > 1.2 for part in self.layout.chain)
+
+
+@dataclass(frozen=True)
+class Field:
+    """A property as it was drawn."""
+
+    name: str
+    layout: FakeLayout
+
+    @property
+    def enabled(self) -> bool:
+        """Whether it can be changed."""
+        return all(part.values.get("enabled", True) for part in self.layout.chain)
+
+
 class FakeLayout:
     """Records ``(name, arguments, keywords)`` of every call, also those of its children."""
 
-    def __init__(self, log: list[tuple[str, tuple, dict]] | None = None) -> None:
-        object.__setattr__(self, "log", [] if log is None else log)
+    def __init__(self, parent: FakeLayout | None = None) -> None:
+        object.__setattr__(self, "log", [] if parent is None else parent.log)
+        object.__setattr__(self, "buttons", [] if parent is None else parent.buttons)
+        object.__setattr__(self, "fields", [] if parent is None else parent.fields)
+        object.__setattr__(self, "chain", [self] if parent is None else [*parent.chain, self])
         object.__setattr__(self, "values", {})
+        object.__setattr__(self, "header", "")
 
     def __setattr__(self, name: str, value: Any) -> None:
         assert name in bpy.types.UILayout.bl_rna.properties, name
@@ -48,15 +85,18 @@ class FakeLayout:
             self.log.append((name, arguments, keywords))
             if name == "prop":
                 assert arguments[1] in arguments[0].bl_rna.properties, arguments[1]
+                self.fields.append(Field(arguments[1], self))
             if name == "progress":
                 assert 0.0 <= keywords["factor"] <= 1.0
             if name.startswith("operator"):
                 module, operator = arguments[0].split(".")
                 kind = getattr(getattr(bpy.ops, module), operator).get_rna_type()
+                text = keywords.get("text", kind.name)
+                self.buttons.append(Button(arguments[0], text, self))
                 if name == "operator_menu_enum":
                     assert arguments[1] in kind.properties
                 return _OperatorProperties(set(kind.properties.keys()))
-            return FakeLayout(self.log) if name in _CHILDREN else None
+            return FakeLayout(self) if name in _CHILDREN else None
 
         return call
 
@@ -72,12 +112,22 @@ class FakeLayout:
 
 
 def draw(panel: type) -> FakeLayout:
-    """Let a panel draw itself in the present context."""
+    """Let a panel draw itself in the present context; ``header`` has the texts of its header."""
     layout = FakeLayout()
-    methods = {k: v for k, v in vars(panel).items() if callable(v) and k.startswith("_")}
-    fake = SimpleNamespace(layout=layout)
-    for name, method in methods.items():
-        if not name.startswith("__"):
-            setattr(fake, name, method.__get__(fake))
-    panel.draw(fake, bpy.context)  # type: ignore[attr-defined]
+    if hasattr(panel, "draw_header_preset"):
+        header = FakeLayout()
+        panel.draw_header_preset(_standing_for(panel, header), bpy.context)
+        object.__setattr__(layout, "header", header.texts)
+    panel.draw(_standing_for(panel, layout), bpy.context)  # type: ignore[attr-defined]
     return layout
+
+
+def _standing_for(panel: type, layout: FakeLayout) -> Any:
+    """Return an object with the panel's own methods: Blender makes no panels for us."""
+    fake = SimpleNamespace(layout=layout)
+    for cls in reversed(panel.__mro__):
+        if cls.__module__.startswith("gaussian_wrapping_addon"):
+            for name, method in vars(cls).items():
+                if callable(method) and not name.startswith("__"):
+                    setattr(fake, name, MethodType(method, fake))
+    return fake

@@ -55,7 +55,7 @@ def main() -> int:
         folder.write_status(
             JobStatus(
                 state=state,
-                stage="train",
+                stage=os.environ.get("GW_FAKE_STAGE", "train"),
                 fraction=fraction,
                 message="step",
                 seconds_left=(1.0 - fraction) * 90.0,
@@ -68,6 +68,8 @@ def main() -> int:
         )
 
     folder.lock()
+    if mode == "hang":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
     say("RUNNING", 0.25)
     if mode == "crash":
         print("the fake has crashed")
@@ -76,7 +78,6 @@ def main() -> int:
         say("FAILED", 0.25, error="There are no photos.", hint="Choose another folder.")
         return 3
     if mode == "hang":
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
         time.sleep(60)
     if mode == "slow":
         trained = folder.stages / "train-now"
@@ -84,9 +85,10 @@ def main() -> int:
         (trained / "preview-training.png").write_bytes(png_bytes(picture()))
     while mode == "slow":
         time.sleep(0.02)
-        if parent and os.getppid() != parent:
-            return 5  # as the real worker: it does not outlive its parent
-        if folder.cancel_path.exists():
+        if not folder.root.is_dir():
+            return 1  # as the real worker, which cannot write its status
+        # As the real worker: it does not outlive its parent, unless it was told to.
+        if folder.cancel_path.exists() or (parent and os.getppid() != parent):
             say("CANCELLED", 0.25, hint="Resume continues from the last checkpoint.")
             folder.unlock()
             return 5

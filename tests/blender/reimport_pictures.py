@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``python -m tests.blender.reimport_pictures FORMAT SHADING PACK FOLDER``: a process of its own.
+"""``python -m tests.blender.reimport_pictures FORMAT SHADING PACK ATLASES FOLDER``, a process.
 
 Exports a placed, textured ball with a normal map, reads the file with Blender's importer as it is
 by default, and renders both. Prints what was found as the last line, JSON.
@@ -21,6 +21,7 @@ import numpy as np
 from gaussian_wrapping_addon.core.dataset.placement_file import FILE_NAME, write_placement
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.jobs.export_files import ExportRequest, export_files
+from gaussian_wrapping_addon.core.texture.file_checks import atlas_file
 from gaussian_wrapping_addon.ops.export_objects import ObjectExport, export_objects
 from gaussian_wrapping_addon.ops.materials import set_shading
 from gaussian_wrapping_addon.ops.scene_objects import import_result
@@ -51,27 +52,33 @@ def textures() -> tuple[np.ndarray, np.ndarray]:
     return (255 * colors).astype(np.uint8), np.rint(127.5 * (normals + 1)).astype(np.uint8)
 
 
-def write_ball(job: Path) -> Path:
-    """A result with one region, a bumpy ball."""
+def write_ball(job: Path, atlases: int) -> Path:
+    """A result with one region, a bumpy ball; every other face in each of two atlases."""
     result = write_result(job)
     ball = bumpy_ball(24)
     colors, normals = textures()
+    # Bands around the ball: a picture tells which atlas is where.
+    owner = (4.0 * ball.vertices[ball.faces].mean(axis=1)[:, 2]).astype(int) % atlases
+    several = {"face_atlas": owner.astype(np.uint8)} if atlases > 1 else {}
     np.savez(
         result / "auto" / "mesh.npz", vertices=ball.vertices, faces=ball.faces,
-        corner_uvs=flat_uvs(ball),
+        corner_uvs=flat_uvs(ball), **several,
     )  # fmt: skip
-    (result / "auto" / "albedo.png").write_bytes(png_bytes(colors))
-    (result / "auto" / "normal.png").write_bytes(png_bytes(normals))
+    for number in range(atlases):
+        for name, pixels in (("albedo", np.roll(colors, number, 2)), ("normal", normals)):
+            path = result / "auto" / atlas_file(name, number)
+            path.write_bytes(png_bytes(np.ascontiguousarray(pixels)))
     return result
 
 
-def main(format: str, shading: str, pack: bool, folder: Path) -> dict:
+def main(format: str, shading: str, pack: bool, atlases: int, folder: Path) -> dict:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    result = write_ball(folder / "job")
+    result = write_ball(folder / "job", atlases)
     write_placement(result / FILE_NAME, PLACEMENT, WORLD_FROM_SCENE)
     imported = import_result(result, bpy.context.scene)
     (thing,) = imported.meshes
-    set_shading(thing.material_slots[0].material, shading)
+    for slot in thing.material_slots:
+        set_shading(slot.material, shading)
     if format.startswith("own-"):
         format = format.removeprefix("own-")
         own = ExportRequest(result, folder / "out", (format,), placed=True, shading=shading.lower())
@@ -87,7 +94,7 @@ def main(format: str, shading: str, pack: bool, folder: Path) -> dict:
     (read,) = [o for o in set(bpy.data.objects) - before if o.type == "MESH"]
     found = [i for i in set(bpy.data.images) - images if i.source == "FILE"]
     sizes = [list(image.size) for image in found]
-    for node in read.material_slots[0].material.node_tree.nodes:
+    for node in [n for slot in read.material_slots for n in slot.material.node_tree.nodes]:
         # Blender's reader of OBJ takes normal maps for colours: a person has to say it once.
         if format == "obj" and node.bl_idname == "ShaderNodeNormalMap":
             image = node.inputs["Color"].links[0].from_node.image
@@ -123,6 +130,6 @@ def rendered_file(thing: bpy.types.Object, folder: Path) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    kind, shade, packed, place_of_files = sys.argv[1:]
-    values = main(kind, shade, packed == "pack", Path(place_of_files))
+    kind, shade, packed, number_of_atlases, place_of_files = sys.argv[1:]
+    values = main(kind, shade, packed == "pack", int(number_of_atlases), Path(place_of_files))
     sys.stdout.write("\n" + json.dumps(values) + "\n")

@@ -70,7 +70,7 @@ def test_a_file_read_again_gives_the_same_picture(
 ) -> None:
     """In a process of its own; the original textures are away when the file is read."""
     name = "tests.blender.reimport_pictures"
-    command = [sys.executable, "-m", name, format, shading, "pack" if pack else "no", tmp_path]
+    command = [sys.executable, "-m", name, format, shading, "pack" if pack else "no", "1", tmp_path]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
@@ -86,6 +86,24 @@ def test_a_file_read_again_gives_the_same_picture(
     images = ["auto-albedo.png", "auto-normal.png"][: len(found["images"])]
     assert beside == ([] if inside else images)
     assert found["materials"] == ["albedo" if "own" in format else "auto.001"]
+
+
+@pytest.mark.parametrize("format", ["glb", "own-glb", "own-obj", "obj", "usd"])
+def test_two_atlases_are_read_back_with_the_same_picture(format: str, tmp_path: Path) -> None:
+    name = "tests.blender.reimport_pictures"
+    command = [sys.executable, "-m", name, format, "LIT", "no", "2", tmp_path]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["psnr"] > WANTED_DB
+    assert found["psnr_mirrored"] < 15.0
+    if "own" in format:
+        assert found["materials"] == ["albedo", "albedo-2"]
+    assert len(set(found["materials"])) == 2
+    assert found["images"] == [[128, 128]] * 4
+    beside = {n for n in found["files"] if n.endswith(".png")}
+    wanted = {f"auto-{n}.png" for n in ("albedo", "albedo-2", "normal", "normal-2")}
+    assert beside == (set() if format.endswith("glb") else wanted)
 
 
 READERS = {
@@ -198,6 +216,20 @@ def test_tangents_of_our_glb_are_those_of_blenders(
     for place, tangent in found.items():
         assert tangent[3] == wanted[place][3]
         assert np.abs(tangent - wanted[place]).max() < 1e-3
+
+
+def test_a_duplicate_does_not_replace_the_original(
+    imported: ImportedResult, tmp_path: Path
+) -> None:
+    """A copied object has the tags of the other; each keeps its name, alone or with the other."""
+    thing = imported.meshes[0]
+    copy = thing.copy()
+    bpy.context.scene.collection.objects.link(copy)
+    paths = export_objects(imported.frame, [thing, copy], ObjectExport("ply", tmp_path))
+    assert len(set(paths)) == 2
+    assert all(path.is_file() for path in paths)
+    assert paths[0].name == "auto.ply"
+    assert export_objects(imported.frame, [copy], ObjectExport("ply", tmp_path)) == paths[1:]
 
 
 def test_what_a_person_changed_is_exported(imported: ImportedResult, tmp_path: Path) -> None:

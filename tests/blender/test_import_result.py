@@ -17,7 +17,7 @@ from mathutils import Vector
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, WrapError
 from gaussian_wrapping_addon.ops import tags
 from gaussian_wrapping_addon.ops.camera_objects import look_through
-from gaussian_wrapping_addon.ops.materials import set_shading, shading_of
+from gaussian_wrapping_addon.ops.materials import set_shading, shading_of, texture_of
 from gaussian_wrapping_addon.ops.region_objects import region_from_object
 from gaussian_wrapping_addon.ops.scene_objects import export_usd, import_result, write_blend
 from tests.blender.synthetic_result import (
@@ -25,6 +25,7 @@ from tests.blender.synthetic_result import (
     CAMERAS,
     WORLD_FROM_SCENE,
     cube_mesh,
+    png_bytes,
     write_region_result,
     write_result,
 )
@@ -264,3 +265,64 @@ def test_gltf_export_of_both_shadings(tmp_path: Path) -> None:
         unlit = "KHR_materials_unlit" in written.get("extensions", {})
         assert unlit == (shading == "UNLIT")
         assert "baseColorTexture" in written["pbrMetallicRoughness"]
+
+
+def write_second_atlas(region: Path) -> np.ndarray:
+    """Put half of the cube's faces into a second, green atlas; return the faces' atlases."""
+    vertices, faces, corner_uvs = cube_mesh()
+    owner = (np.arange(12) // 6).astype(np.uint8)
+    np.savez(
+        region / "mesh.npz", vertices=vertices, faces=faces, corner_uvs=corner_uvs,
+        face_atlas=owner,
+    )  # fmt: skip
+    green = np.full((8, 8, 3), (10, 200, 20), np.uint8)
+    (region / "albedo-2.png").write_bytes(png_bytes(green))
+    return owner
+
+
+def test_two_atlases_are_two_materials(tmp_path: Path) -> None:
+    result = write_result(tmp_path / "job")
+    owner = write_second_atlas(result / "auto")
+    (thing,) = import_result(result, bpy.context.scene).meshes
+    assert [p.material_index for p in thing.data.polygons] == owner.tolist()
+    images = [texture_of(slot.material) for slot in thing.material_slots]
+    assert [Path(i.filepath).name for i in images] == ["albedo.png", "albedo-2.png"]
+    assert [slot.material.name for slot in thing.material_slots] == ["auto", "auto 2"]
+    assert edge_face_counts(thing.data) == {2}
+    assert [shading_of(slot.material) for slot in thing.material_slots] == ["LIT", "LIT"]
+
+
+def test_an_atlas_more_or_less_changes_the_materials(tmp_path: Path) -> None:
+    result = write_result(tmp_path / "job")
+    (thing,) = import_result(result, bpy.context.scene).meshes
+    first = thing.material_slots[0].material
+    set_shading(first, "UNLIT")
+    write_second_atlas(result / "auto")
+    import_result(result, bpy.context.scene)
+    assert [slot.material.name for slot in thing.material_slots] == ["auto", "auto 2"]
+    assert thing.material_slots[0].material == first
+    assert [shading_of(slot.material) for slot in thing.material_slots] == ["UNLIT", "UNLIT"]
+    write_region_result(result / "auto", half=0.3)
+    import_result(result, bpy.context.scene)
+    assert [slot.material for slot in thing.material_slots] == [first]
+    assert {p.material_index for p in thing.data.polygons} == {0}
+
+
+@pytest.mark.parametrize("bad", [np.zeros(11, np.uint8), np.zeros(12), np.full(12, 200)])
+def test_atlases_that_cannot_be_are_refused(bad: np.ndarray, tmp_path: Path) -> None:
+    result = write_result(tmp_path / "job")
+    vertices, faces, corner_uvs = cube_mesh()
+    np.savez(
+        result / "auto" / "mesh.npz", vertices=vertices, faces=faces, corner_uvs=corner_uvs,
+        face_atlas=bad,
+    )  # fmt: skip
+    with pytest.raises(ParseError, match="atlas"):
+        import_result(result, bpy.context.scene)
+
+
+def test_an_atlas_without_its_image_is_refused(tmp_path: Path) -> None:
+    result = write_result(tmp_path / "job")
+    write_second_atlas(result / "auto")
+    (result / "auto" / "albedo-2.png").unlink()
+    with pytest.raises(DatasetError, match=r"albedo-2\.png"):
+        import_result(result, bpy.context.scene)

@@ -21,7 +21,7 @@ from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.job_file import read_job
 from gaussian_wrapping_addon.ops import job_actions, job_timer, known_jobs, tags
-from gaussian_wrapping_addon.ui import panels, report_panel
+from gaussian_wrapping_addon.ui import dataset_panel, mesh_panel, report_panel, train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.synthetic_result import BOX_SCENE, WORLD_FROM_SCENE
 
@@ -122,8 +122,9 @@ def test_progress_cancel_and_resume(photos: Path, worker: Callable[[str], None])
     worker("slow")
     start_wrap(photos)
     wait_until_it_says_something(photos)
-    layout = draw(panels.GWRAP_PT_wrap)
+    layout = draw(train_panel.GWRAP_PT_train)
     assert "Train · 25 % · 1 min 08 s left" in layout.texts
+    assert layout.header == "25 %"
     assert "gwrap.cancel_job" in layout.operators
     assert "gwrap.wrap_scene" not in layout.operators
     assert not bpy.ops.gwrap.wrap_scene.poll(), "one job at a time"
@@ -133,7 +134,7 @@ def test_progress_cancel_and_resume(photos: Path, worker: Callable[[str], None])
     bpy.ops.gwrap.cancel_job()
     wait_for("CANCELLED")
     assert time.monotonic() - begun_s < 12.0
-    layout = draw(panels.GWRAP_PT_wrap)
+    layout = draw(train_panel.GWRAP_PT_train)
     assert "Cancelled at 25 %" in layout.texts
     assert {"gwrap.resume_job", "gwrap.wrap_scene"} <= set(layout.operators)
     assert not bpy.ops.gwrap.cancel_job.poll()
@@ -160,7 +161,7 @@ def test_failures_are_shown_with_the_next_step(
     job.client._process.wait(10)  # type: ignore[union-attr]
     assert words in status().error  # type: ignore[attr-defined]
     assert status().state == state  # type: ignore[attr-defined]
-    layout = draw(panels.GWRAP_PT_wrap)
+    layout = draw(train_panel.GWRAP_PT_train)
     assert status().hint.split()[0] in layout.texts  # type: ignore[attr-defined]
     assert "gwrap.resume_job" in layout.operators
     worker("quick")
@@ -225,9 +226,10 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     properties.boundary, properties.unseen = "OPEN", "OCCUPIED"
     properties.spacing = "UNIFORM"
     properties.normal_map, properties.ambient_occlusion, properties.lods = "OFF", True, 3
+    properties.max_atlases = 4
     select(region)
     region.name = "Front Door"
-    assert "Mesh Region" in draw(panels.GWRAP_PT_mesh).texts
+    assert "Mesh Region" in draw(mesh_panel.GWRAP_PT_mesh).texts
     assert bpy.ops.gwrap.mesh_region() == {"FINISHED"}
     job = read_job(folder / "job.json")
     assert job.command == "mesh"
@@ -239,6 +241,7 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     assert meshing.spacing == "uniform"
     texture = job.settings.texture
     assert (texture.normal_map, texture.ambient_occlusion, texture.lods) == ("off", "on", 3)
+    assert texture.max_atlases == 4
     assert (meshing.boundary, meshing.unseen) == ("open", "occupied")
     ((_, body),) = job.region_bodies.items()
     expected = WORLD_FROM_SCENE.points(BOX_SCENE)
@@ -254,6 +257,9 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
 def test_mesh_region_refuses_what_cannot_be_meshed(photos: Path, worker: object) -> None:
     assert not bpy.ops.gwrap.mesh_region.poll()
     region = finished_wrap(photos)
+    select()
+    assert bpy.ops.gwrap.mesh_region.poll(), "a result's only region need not be selected"
+    bpy.ops.gwrap.add_region_box()
     select()
     assert not bpy.ops.gwrap.mesh_region.poll()
     select(region)
@@ -311,7 +317,7 @@ def test_import_waits_for_object_mode(photos: Path, worker: Callable[[str], None
     wait_for("DONE")
     assert job_timer.poll_jobs(), "the timer goes on"
     assert not list(tags.objects_of_kind(bpy.context.scene, "mesh"))
-    assert "Leave Edit Mode" in draw(panels.GWRAP_PT_wrap).texts.replace("\n", " ")
+    assert "Leave Edit Mode" in draw(train_panel.GWRAP_PT_train).texts.replace("\n", " ")
     bpy.ops.object.mode_set(mode="OBJECT")
     assert not job_timer.poll_jobs()
     assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1
@@ -336,6 +342,7 @@ def test_a_file_finds_its_running_job_again(
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     assert status().state == "DONE"  # type: ignore[attr-defined]
     job_timer.poll_jobs()
+    wait_for("DONE")
     assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1
 
 
@@ -351,9 +358,9 @@ def test_another_blender_finds_the_job_and_offers_its_result(
     assert status().state == "DONE"  # type: ignore[attr-defined]
     assert not job_timer.poll_jobs()
     assert len(bpy.data.objects) == 0, "opening a file imports nothing by itself"
-    assert "Import Finished Result" in draw(panels.GWRAP_PT_wrap).texts
+    assert "Import Finished Result" in draw(train_panel.GWRAP_PT_train).texts
     bpy.ops.gwrap.import_result(directory=job_timer.result_to_import(bpy.context.scene))
-    assert "Import Finished Result" not in draw(panels.GWRAP_PT_wrap).texts
+    assert "Import Finished Result" not in draw(train_panel.GWRAP_PT_train).texts
 
 
 def test_a_project_folder_that_was_moved_finds_its_job(
@@ -387,7 +394,7 @@ def test_a_file_from_elsewhere_opens_no_job_unasked(
     bpy.ops.wm.open_mainfile(filepath=str(elsewhere / "work.blend"))
     assert job_timer._jobs == {}
     if bpy.context.scene.gwrap.job_folder:
-        assert "gwrap.find_job" in draw(panels.GWRAP_PT_wrap).operators
+        assert "gwrap.find_job" in draw(train_panel.GWRAP_PT_train).operators
     bpy.ops.gwrap.find_job(directory=folder)
     assert status().state == "DONE"  # type: ignore[attr-defined]
 
@@ -444,7 +451,7 @@ def test_a_deleted_job_folder_is_survived(photos: Path, worker: Callable[[str], 
     pid = status().pid  # type: ignore[attr-defined]
     shutil.rmtree(bpy.context.scene.gwrap.job_folder)
     job_timer.poll_jobs()
-    draw(panels.GWRAP_PT_wrap)
+    draw(train_panel.GWRAP_PT_train)
     os.kill(pid, signal.SIGKILL)
     wait_for("FAILED", "LOST")
     with pytest.raises(RuntimeError, match="holds no job"):
@@ -453,8 +460,8 @@ def test_a_deleted_job_folder_is_survived(photos: Path, worker: Callable[[str], 
 
 def test_check_photos_lists_findings(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = [
-        SimpleNamespace(severity="error", message="Only 1 photo.", hint="Take more."),
-        SimpleNamespace(severity="warning", message="w" * 200, hint=""),
+        SimpleNamespace(severity="error", message="Only 1 photo.", hint="Take more.", short=""),
+        SimpleNamespace(severity="warning", message="w" * 200, hint="", short=""),
     ]
     check = ModuleType("check")
     check.check_input = lambda source: found if source == photos else []  # type: ignore[attr-defined]
@@ -462,12 +469,12 @@ def test_check_photos_lists_findings(photos: Path, monkeypatch: pytest.MonkeyPat
     assert not bpy.ops.gwrap.check_photos.poll()
     bpy.context.scene.gwrap.source = str(photos)
     bpy.ops.gwrap.check_photos()
-    texts = draw(panels.GWRAP_PT_photos).texts
+    texts = draw(dataset_panel.GWRAP_PT_dataset).texts
     assert "Only 1 photo." in texts
     assert "Take more." in texts
     assert max(len(line) for line in texts.splitlines()) < 60
     bpy.context.scene.gwrap.source = str(photos.parent)
-    assert "Only 1 photo." not in draw(panels.GWRAP_PT_photos).texts
+    assert "Only 1 photo." not in draw(dataset_panel.GWRAP_PT_dataset).texts
 
 
 def test_check_photos_of_a_folder_that_is_no_data_set(photos: Path) -> None:
@@ -491,7 +498,7 @@ def test_job_status_of_a_half_written_file_is_survived(
     assert job_timer.poll_jobs()
     (folder / "status.json").write_text(json.dumps([1, 2]))
     assert job_timer.poll_jobs()
-    draw(panels.GWRAP_PT_wrap)
+    draw(train_panel.GWRAP_PT_train)
 
 
 def test_worker_choice_without_preferences() -> None:

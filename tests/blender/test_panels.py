@@ -9,16 +9,28 @@ from types import SimpleNamespace
 import bpy
 import pytest
 
+from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.core.jobs.doctor import Diagnosis
 from gaussian_wrapping_addon.core.jobs.job_folder import STATES, JobStatus
 from gaussian_wrapping_addon.ops import doctor, job_timer, tags
 from gaussian_wrapping_addon.ops.scene_objects import import_result
-from gaussian_wrapping_addon.ui import panels, preferences, report_panel, scene_panel
+from gaussian_wrapping_addon.ui import (
+    mesh_panel,
+    preferences,
+    result_panel,
+    scene_panel,
+    texture_panel,
+    train_panel,
+)
 from gaussian_wrapping_addon.ui.text import progress_text, time_span
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.synthetic_result import write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
+
+PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel)]
+REGION = next(cls for cls in PANELS if cls.bl_label == "Region")
+TRAIN, MESH = train_panel.GWRAP_PT_train, mesh_panel.GWRAP_PT_mesh
 
 
 class FakeClient:
@@ -42,7 +54,7 @@ def show(status: JobStatus, command: str = "WRAP") -> None:
     job_timer.watch(scene, Path("/tmp/gwrap-none"), FakeClient(status), imports=False)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("panel", [*panels.CLASSES, *report_panel.CLASSES, *scene_panel.CLASSES])
+@pytest.mark.parametrize("panel", [p for p in PANELS if p.bl_label != "Details"])
 def test_every_panel_draws_in_an_empty_file(panel: type) -> None:
     layout = draw(panel)
     assert layout.log
@@ -51,34 +63,32 @@ def test_every_panel_draws_in_an_empty_file(panel: type) -> None:
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("command", ["WRAP", "MESH"])
-@pytest.mark.parametrize("left", [None, 0.0, 75.0, 1e6])
-def test_job_states(state: str, command: str, left: float | None) -> None:
+def test_job_states(state: str, command: str) -> None:
     error = "It broke." if state in ("FAILED", "LOST") else ""
     hint = "Do that." if state in ("FAILED", "LOST", "CANCELLED") else ""
-    show(JobStatus(state, "train", 1.0000001, "step 5", left, error, hint), command)
-    texts = {p.bl_label: draw(p).texts for p in panels.CLASSES}
-    operators = {p.bl_label: draw(p).operators for p in panels.CLASSES}
-    here, other = ("Wrap", "Mesh") if command == "WRAP" else ("Mesh", "Wrap")
+    show(JobStatus(state, "train", 1.0000001, "step 5", 75.0, error, hint), command)
+    here, other = map(draw, (TRAIN, MESH) if command == "WRAP" else (MESH, TRAIN))
     running = state in ("NEW", "RUNNING", "CANCELLING")
-    assert ("gwrap.cancel_job" in operators[here]) == running
-    assert "gwrap.cancel_job" not in operators[other]
-    assert ("Train · 100 %" in texts[here]) == running
-    assert ("Cancelling…" in texts[here]) == (state == "CANCELLING")
-    assert error in texts[here]
-    assert hint in texts[here]
-    assert ("gwrap.resume_job" in operators[here]) == (state in ("FAILED", "LOST", "CANCELLED"))
-    assert error == "" or error not in texts[other]
+    assert ("gwrap.cancel_job" in here.operators) == running
+    assert "gwrap.cancel_job" not in other.operators
+    assert ("Train · 100 %" in here.texts) == running
+    assert ("Cancelling…" in here.texts) == (state == "CANCELLING")
+    assert error in here.texts
+    assert hint in here.texts
+    assert ("gwrap.resume_job" in here.operators) == (state in ("FAILED", "LOST", "CANCELLED"))
+    assert error == "" or error not in other.texts
+
+
+@pytest.mark.parametrize("left", [None, 0.0, 1e6])
+def test_any_time_left_is_drawn(left: float | None) -> None:
+    show(JobStatus("RUNNING", "train", -0.5, "step 5", left))
+    assert ("left" in draw(TRAIN).texts) == (left is not None)
 
 
 def test_a_first_wrap_can_be_started_at_one_glance() -> None:
-    layout = draw(panels.GWRAP_PT_wrap)
+    layout = draw(TRAIN)
     assert layout.operators == ["gwrap.wrap_scene"]
-    assert [a[1] for name, a, _ in layout.log if name == "prop"] == [
-        "preset",
-        "texture_size",
-        "texture_source",
-        "output",
-    ]
+    assert [field.name for field in layout.fields] == ["preset", "output"]
 
 
 @pytest.mark.parametrize(
@@ -87,32 +97,44 @@ def test_a_first_wrap_can_be_started_at_one_glance() -> None:
 )
 def test_mesh_panel_shows_what_decides(resolution: str, shown: set[str]) -> None:
     bpy.context.scene.gwrap.resolution = resolution
-    properties = {a[1] for name, a, _ in draw(panels.GWRAP_PT_mesh).log if name == "prop"}
-    assert properties == {"resolution", "decimate", "smooth_steps"} | shown
+    properties = {a[1] for name, a, _ in draw(MESH).log if name == "prop"}
+    assert properties == {"resolution"} | shown
 
 
 @pytest.mark.parametrize("method", ["PAM", "PIVOTS"])
 def test_advanced_panel_asks_for_what_counts_by_the_method(method: str) -> None:
     bpy.context.scene.gwrap.method = method
-    log = draw(panels.GWRAP_PT_mesh_advanced).log
+    log = draw(mesh_panel.GWRAP_PT_mesh_advanced).log
     properties = {a[1] for name, a, _ in log if name == "prop"}
     own = {"PAM": "spacing", "PIVOTS": "pivots"}[method]
-    maps = {"normal_map", "ambient_occlusion", "lods"}
-    assert properties == {"method", "boundary", "unseen", own} | maps
+    assert properties == {"decimate", "smooth_steps", "method", "boundary", "unseen", own}
+
+
+def test_texture_panel_has_every_map() -> None:
+    names = [field.name for field in draw(texture_panel.GWRAP_PT_texture).fields]
+    assert names == [
+        "texture_size",
+        "max_atlases",
+        "texture_source",
+        "normal_map",
+        "ambient_occlusion",
+        "lods",
+    ]
 
 
 @pytest.mark.parametrize("decimate", [False, True])
 def test_mesh_panel_asks_for_faces_only_where_they_are_limited(decimate: bool) -> None:
     bpy.context.scene.gwrap.decimate = decimate
-    properties = {a[1] for name, a, _ in draw(panels.GWRAP_PT_mesh).log if name == "prop"}
+    log = draw(mesh_panel.GWRAP_PT_mesh_advanced).log
+    properties = {a[1] for name, a, _ in log if name == "prop"}
     assert ("target_faces" in properties) == decimate
 
 
 def test_region_and_result_panels_with_a_result(tmp_path: Path) -> None:
     import_result(write_result(tmp_path / "job"), bpy.context.scene)
     bpy.context.view_layer.update()
-    assert "auto region" in draw(panels.GWRAP_PT_region).texts
-    layout = draw(panels.GWRAP_PT_result)
+    assert "auto region" in draw(REGION).texts
+    layout = draw(result_panel.GWRAP_PT_result)
     assert layout.operators.count("gwrap.set_shading") == 2
 
 
@@ -148,7 +170,7 @@ def test_result_panel_survives_edited_properties(tmp_path: Path, text: str) -> N
     imported.frame[tags.FIGURES] = text
     imported.frame[tags.RESULT] = 5
     imported.meshes[0].data.materials.clear()
-    for panel in (*panels.CLASSES, *report_panel.CLASSES, *scene_panel.CLASSES):
+    for panel in PANELS:
         draw(panel)
 
 
@@ -161,6 +183,7 @@ def test_preferences_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = SimpleNamespace(layout=layout, bl_rna=SimpleNamespace(properties=owner.properties))
     preferences.GWRAP_preferences.draw(fake, bpy.context)
     assert "pip install torch" in layout.texts
+    assert "gwrap.set_up_worker" in layout.operators
     assert {a[1] for name, a, _ in layout.log if name == "prop"} == set(names)
     assert doctor.as_text().splitlines()[0].startswith("BAD  torch: cannot be imported")
 

@@ -13,34 +13,51 @@ import pytest
 
 import gaussian_wrapping_addon
 from gaussian_wrapping_addon import registration
-from gaussian_wrapping_addon.ops import doctor, job_timer
+from gaussian_wrapping_addon.ops import doctor, job_timer, worker_setup
 
 REPOSITORY = Path(gaussian_wrapping_addon.__file__).resolve().parents[1]
 
 
 def left_behind() -> list[str]:
     found = [name for name in dir(bpy.types) if name.upper().startswith("GWRAP")]
-    found += [o.__name__ for o in (bpy.types.Scene,) if hasattr(o, "gwrap")]
+    found += [o.__name__ for o in (bpy.types.Scene, bpy.types.Object) if hasattr(o, "gwrap")]
     for name in dir(bpy.app.handlers):
         handlers = getattr(bpy.app.handlers, name)
         if isinstance(handlers, list):
             found += [name for h in handlers if "gaussian_wrapping" in h.__module__]
-    for function in (job_timer.tick, job_timer.attach_later, doctor.show):
+    for function in (job_timer.tick, job_timer.attach_later, doctor.show, worker_setup.tick):
         if bpy.app.timers.is_registered(function):
             found.append(function.__name__)
     return found
+
+
+BASES = (
+    bpy.types.Operator,
+    bpy.types.Panel,
+    bpy.types.PropertyGroup,
+    bpy.types.AddonPreferences,
+    bpy.types.GizmoGroup,
+)
+
+
+def is_there(cls: type) -> bool:
+    """Tell whether Blender knows a class, and this one of its name."""
+    (base,) = (base for base in BASES if issubclass(cls, base))
+    return bool(base.bl_rna_get_subclass_py(cls.__name__) is cls)
 
 
 def test_register_and_unregister_twice() -> None:
     assert left_behind() == []
     for _ in range(2):
         gaussian_wrapping_addon.register()
-        assert all(cls.is_registered for cls in registration.CLASSES)
+        assert [cls.__name__ for cls in registration.CLASSES if not is_there(cls)] == []
         for name, handler in registration.HANDLERS:
             assert getattr(bpy.app.handlers, name).count(handler) == 1
         job_timer.start_timer()
         gaussian_wrapping_addon.unregister()
         assert left_behind() == []
+        assert [cls.__name__ for cls in registration.CLASSES if is_there(cls)] == []
+        assert [c.__name__ for c in registration.CLASSES if "bl_rna" in c.__dict__] == []
     gaussian_wrapping_addon.unregister()
 
 
@@ -90,10 +107,11 @@ import gaussian_wrapping_addon
 from tests.blender.synthetic_result import write_result
 from tests.blender.fake_layout import draw
 gaussian_wrapping_addon.register()
-from gaussian_wrapping_addon.ui import panels
+from gaussian_wrapping_addon.registration import CLASSES
 bpy.ops.gwrap.import_result(directory=str(write_result(Path({str(tmp_path)!r}) / "job")))
-for panel in panels.CLASSES:
-    draw(panel)
+for panel in CLASSES:
+    if issubclass(panel, bpy.types.Panel):
+        draw(panel)
 gaussian_wrapping_addon.unregister()
 heavy = {{"torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl", "PIL"}}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)

@@ -16,8 +16,9 @@ import pytest
 from gaussian_wrapping_addon.core.dataset.placement_file import FILE_NAME, read_placement
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.ops import job_actions, known_jobs, placement, tags
+from gaussian_wrapping_addon.ops import known_jobs, placement, tags
 from gaussian_wrapping_addon.ops.region_objects import matrix_of, region_from_object, transformed
+from gaussian_wrapping_addon.ops.region_resolution import own_lengths
 from gaussian_wrapping_addon.ops.scene_objects import (
     ImportedResult,
     export_usd,
@@ -494,9 +495,9 @@ def test_an_edge_length_is_one_of_the_placed_scene(result: ImportedResult) -> No
     """0.01 as seen in Blender is 0.01 / scale in the scene frame."""
     pick_vertices(result.meshes[0], [0, 4])  # a side of 1 scene unit
     bpy.ops.gwrap.set_scale(distance=0.5)
-    scene = bpy.context.scene
-    scene.gwrap.resolution, scene.gwrap.edge_length = "EDGE_LENGTH", 0.01
-    world = job_actions._edge_length_world(scene, [result.regions[0]], result.frame)
+    region = result.regions[0]
+    region.gwrap.own_edge_length, region.gwrap.edge_length = True, 0.01
+    (world,) = own_lengths(bpy.context.scene, [region], result.frame)
     assert world == pytest.approx(0.02 * WORLD_FROM_SCENE.scale, rel=1e-5)
 
 

@@ -27,14 +27,15 @@ from gaussian_wrapping_addon.ops import (
 )
 from gaussian_wrapping_addon.ops.live_figures import live_rows
 from gaussian_wrapping_addon.ops.scene_objects import import_result
-from gaussian_wrapping_addon.ui import panels, training_panel
+from gaussian_wrapping_addon.ui import train_advanced_panel, train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.fake_worker import LIVE, picture
 from tests.blender.synthetic_result import png_bytes, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
 
-PANEL = training_panel.GWRAP_PT_training
+PANEL = train_advanced_panel.GWRAP_PT_train_advanced
+TRAIN = train_panel.GWRAP_PT_train
 
 
 class Client:
@@ -119,6 +120,8 @@ def test_the_panel_shows_every_choice_and_reads_no_file(monkeypatch: pytest.Monk
         for name in ("stat", "is_file", "exists", "open", "glob", "iterdir"):
             patch.setattr(Path, name, refuse)
         layout = draw(PANEL)
+        train = draw(TRAIN)
+    assert train.operators == ["gwrap.estimate", "gwrap.wrap_scene"]
     shown = {a[1] for name, a, _ in layout.log if name == "prop"}
     assert shown == set(training().bl_rna.properties.keys()) - {
         "rna_type",
@@ -126,8 +129,7 @@ def test_the_panel_shows_every_choice_and_reads_no_file(monkeypatch: pytest.Monk
         "more_iterations",
     }
     assert "80,000" in layout.texts
-    assert {"gwrap.estimate", "gwrap.reset_training"} <= set(layout.operators)
-    assert "gwrap.train_more" not in layout.operators
+    assert layout.operators == ["gwrap.reset_training"]
 
 
 def test_every_choice_has_a_tooltip_in_words() -> None:
@@ -209,15 +211,15 @@ def test_a_running_training_is_drawn_and_let_go(tmp_path: Path) -> None:
     client = Client(running)
     job_timer.watch(bpy.context.scene, tmp_path, client, imports=False)  # type: ignore[arg-type]
     job_timer.poll_jobs()
-    layout = draw(panels.GWRAP_PT_wrap)
+    layout = draw(train_panel.GWRAP_PT_train)
     assert "750 of 3,000" in layout.texts
     assert "iteration 750" not in layout.texts.lower().replace("750 of", ""), "not told twice"
     assert [name for name, *_ in layout.log].count("template_icon") == 2
-    assert "gwrap.estimate" not in draw(PANEL).operators
+    assert "gwrap.estimate" not in draw(TRAIN).operators
     client.status = replace(running, state="CANCELLED")
     job_timer.poll_jobs()
     assert live_preview.icons_of(str(tmp_path)) == ()
-    assert "template_icon" not in [name for name, *_ in draw(panels.GWRAP_PT_wrap).log]
+    assert "template_icon" not in [name for name, *_ in draw(train_panel.GWRAP_PT_train).log]
 
 
 def finished_job(folder: Path) -> Path:
@@ -248,7 +250,7 @@ def test_train_more_adds_iterations_and_changes_nothing_else(
     done = Client(JobStatus("DONE", "train", 1.0))
     monkeypatch.setattr(JobClient, "_launch", lambda *_: done)
     training().more_iterations = 1500
-    assert "gwrap.train_more" in draw(PANEL).operators
+    assert "gwrap.train_more" in draw(TRAIN).operators
     for extra in (1500, 3000):
         assert bpy.ops.gwrap.train_more() == {"FINISHED"}
         job = read_job(folder / "job.json")
@@ -285,7 +287,7 @@ def wait_for_answer() -> str:
     while training_estimate.show() is not None:
         assert time.monotonic() < end_s
         time.sleep(0.02)
-    return draw(PANEL).texts.replace("\n", " ")
+    return draw(TRAIN).texts.replace("\n", " ")
 
 
 def test_estimate_asks_the_worker_and_shows_its_words(
@@ -295,16 +297,18 @@ def test_estimate_asks_the_worker_and_shows_its_words(
     monkeypatch.setenv("GW_ANSWER", "\n".join(["noise", *map(json.dumps, said)]))
     training().iterations = 432
     assert bpy.ops.gwrap.estimate() == {"FINISHED"}
-    assert "Estimating…" in draw(PANEL).texts
+    assert "Estimating…" in draw(TRAIN).texts
     assert not bpy.ops.gwrap.estimate.poll(), "one at a time"
     texts = wait_for_answer()
-    for text in ("Training: 4 to 6 min", "Memory: 1.2 GB", "Full"):
+    for text in ("Training 4 to 6 min", "Memory 1.2 GB", "Full"):
         assert text in texts
     asked = JobFile.from_json(json.loads(worker.read_text()))
     assert asked.source == str(worker.parent)
     assert asked.settings == training_choices.job_settings(bpy.context.scene, 0)
     training().iterations = 433
-    assert "4 to 6 min" not in draw(PANEL).texts, "it was about other choices"
+    assert "4 to 6 min" not in draw(TRAIN).texts, "it was about other choices"
+    training().iterations = 432
+    assert "4 to 6 min" in draw(TRAIN).texts, "going back shows it again"
     monkeypatch.setenv("GW_ANSWER", json.dumps({"error": "No photos.", "hint": "Add some."}))
     assert bpy.ops.gwrap.estimate() == {"FINISHED"}
     assert "No photos. Add some." in wait_for_answer()
@@ -322,4 +326,4 @@ def test_stopping_forgets_the_question(worker: Path, monkeypatch: pytest.MonkeyP
     assert not training_estimate.is_busy()
     time.sleep(0.1)
     training_estimate.show()
-    assert "4 to 6 min" not in draw(PANEL).texts
+    assert "4 to 6 min" not in draw(TRAIN).texts

@@ -1,99 +1,37 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Runs inside a real Blender with a window: uses the panel as a person does, step by step.
 
-``blender ... -P drive_blender.py``; ``GW_GUI_FOLDER`` holds ``photos/`` and takes screenshots and
-``outcome.json``. An error in a timer does not change Blender's exit code, so that the outcome file
-tells how it went.
+``blender ... -P drive_blender.py``; ``GW_GUI_FOLDER`` holds ``photos/``; the worker is the fake one
+of ``tests/blender/fake_worker.py``, whose behaviour ``GW_FAKE`` chooses.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import shutil
-import subprocess
 import sys
-import time
-import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 
-FOLDER = Path(os.environ["GW_GUI_FOLDER"])
-NAME = "bl_ext.user_default.gaussian_wrapping_addon"
-DEADLINE_S = 60.0
-
-outcome: dict[str, object] = {"error": "not finished", "checks": []}
-
-
-def check(good: bool, what: str) -> None:
-    """Note a check; the first that fails ends the run."""
-    outcome["checks"].append({"good": bool(good), "what": what})  # type: ignore[union-attr]
-    assert good, what
-
-
-def view() -> tuple[bpy.types.Window, bpy.types.Area, bpy.types.Region]:
-    """Return window, 3D view and its main region."""
-    window = bpy.context.window_manager.windows[0]
-    area = next(a for a in window.screen.areas if a.type == "VIEW_3D")
-    return window, area, next(r for r in area.regions if r.type == "WINDOW")
-
-
-def press(operator: Callable[..., set[str]], **properties: object) -> None:
-    """Run an operator the way a button of the panel does."""
-    window, area, region = view()
-    with bpy.context.temp_override(window=window, area=area, region=region):
-        operator("INVOKE_DEFAULT", True, **properties)
-
-
-def screenshot(name: str) -> None:
-    """Photograph the screen; Blender's own screenshot is black under a virtual display."""
-    path = FOLDER / f"{name}.png"
-    tool = shutil.which("import")
-    if tool:
-        subprocess.run([tool, "-window", "root", str(path)], check=True, timeout=30)
-    else:
-        window, area, region = view()
-        with bpy.context.temp_override(window=window, area=area, region=region):
-            bpy.ops.screen.screenshot(filepath=str(path))
-
-
-def until(condition: Callable[[], bool], what: str) -> Iterator[float]:
-    """Wait while Blender's own loop runs."""
-    end_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        check(time.monotonic() < end_s, f"in time: {what}")
-        yield 0.1
-    check(True, what)
-
-
-def state_of_job() -> str:
-    timer = sys.modules[NAME + ".ops.job_timer"]
-    status = timer.status_of(bpy.context.scene.gwrap.job_folder)
-    return status.state if status else "none"
-
-
-def fraction_of_job() -> float:
-    timer = sys.modules[NAME + ".ops.job_timer"]
-    return timer.status_of(bpy.context.scene.gwrap.job_folder).fraction
-
-
-def kinds() -> list[str]:
-    return sorted(str(o.get("gwrap_kind", "")) for o in bpy.data.objects)
+sys.path.insert(0, str(Path(__file__).parent))
+import driving
+from driving import (
+    FOLDER,
+    check,
+    execute,
+    fraction_of_job,
+    kinds,
+    press,
+    screenshot,
+    state_of_job,
+    until,
+)
 
 
 def steps() -> Iterator[float]:
     """The visit; each value is the time to let Blender live."""
-    window, area, _ = view()
-    for thing in list(bpy.data.objects):
-        bpy.data.objects.remove(thing)
-    area.spaces.active.show_region_ui = True
-    yield 0.5
-    panel = next(r for r in area.regions if r.type == "UI")
-    panel.active_panel_category = "Gaussian Wrapping"
-    yield 0.5
-    check(panel.active_panel_category == "Gaussian Wrapping", "the tab is there")
+    yield from driving.open_tab()
     bpy.context.scene.gwrap.source = str(FOLDER / "photos")
     yield 0.5
     screenshot("1-start")
@@ -138,10 +76,7 @@ def steps() -> Iterator[float]:
     press(bpy.ops.gwrap.mesh_region)
     yield from until(lambda: kinds().count("mesh") == 2, "the region is meshed and imported")
     check(kinds().count("region") == 2, "its box is not doubled")
-    area.spaces.active.shading.color_type = "TEXTURE"
-    window, area, region = view()
-    with bpy.context.temp_override(window=window, area=area, region=region):
-        bpy.ops.view3d.view_all()
+    driving.frame_view()
     yield 0.8
     screenshot("5-result")
     for collection in bpy.data.collections:
@@ -160,19 +95,11 @@ def steps() -> Iterator[float]:
         bpy.context.window_manager.addon_search = "gaussian"
         yield 8.0
         screenshot("7-preferences")
-    outcome["error"] = ""
 
 
 def frame() -> bpy.types.Object:
     """Find the parent empty anew: undo replaces objects."""
     return next(o for o in bpy.data.objects if o.get("gwrap_kind") == "frame")
-
-
-def execute(operator: Callable[..., set[str]], **properties: object) -> None:
-    """Run an operator as its dialog does when it is confirmed."""
-    window, area, region = view()
-    with bpy.context.temp_override(window=window, area=area, region=region):
-        operator("EXEC_DEFAULT", True, **properties)
 
 
 def placing() -> Iterator[float]:
@@ -220,29 +147,4 @@ def placing() -> Iterator[float]:
     screenshot("6-placed")
 
 
-def finish() -> None:
-    outcome["blender"] = bpy.app.version_string
-    (FOLDER / "outcome.json").write_text(json.dumps(outcome, indent=1))
-    bpy.ops.wm.quit_blender()
-
-
-_run = steps()
-
-
-def advance() -> float | None:
-    """Timer: the next step, or the end."""
-    try:
-        return next(_run)
-    except StopIteration:
-        finish()
-    except Exception:  # whatever it was, the outcome must tell it and Blender must end
-        outcome["error"] = traceback.format_exc()
-        try:
-            screenshot("0-error")
-        finally:
-            finish()
-    return None
-
-
-bpy.context.preferences.view.show_splash = False
-bpy.app.timers.register(advance, first_interval=1.5)
+driving.run(steps())

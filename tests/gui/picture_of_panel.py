@@ -4,7 +4,7 @@
 ``blender --addons bl_ext.user_default.gaussian_wrapping_addon -P picture_of_panel.py`` with
 ``GW_PICTURE_RESULT`` (a result folder), ``GW_PICTURE_SOURCE`` (what to show as the photo folder)
 and ``GW_PICTURE`` (the file to write). ``GW_PICTURE_OPEN`` names the panels to open, such as
-``wrap,training`` (all others are closed); ``GW_PICTURE_ESTIMATE=1`` presses Estimate first;
+``train,train_advanced`` (all others are closed); ``GW_PICTURE_ESTIMATE=1`` waits for the estimate;
 ``GW_PICTURE_RUNNING=1`` shows a running job (of the worker that is set) instead of the result.
 """
 
@@ -48,7 +48,9 @@ def steps() -> Iterator[float]:
     panel = next(r for r in area.regions if r.type == "UI")
     panel.active_panel_category = "Gaussian Wrapping"
     scene = bpy.context.scene
-    scene.gwrap.source = os.environ["GW_PICTURE_SOURCE"]
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.gwrap.choose_input(filepath=os.environ["GW_PICTURE_SOURCE"])
+    yield 14.0 if os.environ.get("GW_PICTURE_ESTIMATE") else 2.0
     scene.gwrap.resolution = "EDGE_LENGTH"
     if os.environ.get("GW_PICTURE_RUNNING"):
         with bpy.context.temp_override(window=window, area=area, region=region):
@@ -59,7 +61,10 @@ def steps() -> Iterator[float]:
         yield 2.0
         return
     with bpy.context.temp_override(window=window, area=area, region=region):
-        bpy.ops.gwrap.import_result(directory=os.environ["GW_PICTURE_RESULT"])
+        result = Path(os.environ["GW_PICTURE_RESULT"])
+        bpy.ops.gwrap.import_result(directory=str(result))
+        if (result.parent / "job.json").exists():
+            bpy.ops.gwrap.find_job(directory=str(result.parent))
         space.shading.color_type = "TEXTURE"
         yield 0.5
     meshes = [o for o in bpy.data.objects if o.get("gwrap_kind") == "mesh"]
@@ -75,9 +80,6 @@ def steps() -> Iterator[float]:
         view.view_location += 0.22 * view.view_distance * (view.view_rotation @ Vector((1, 0, 0)))
         boxes = [o for o in bpy.data.objects if o.get("gwrap_kind") == "region"]
         bpy.ops.gwrap.select_region(name=boxes[0].name)
-    if os.environ.get("GW_PICTURE_ESTIMATE"):
-        bpy.ops.gwrap.estimate()
-        yield 12.0
     yield 1.5
     subprocess.run(["import", "-window", "root", os.environ["GW_PICTURE"]], check=True)
 

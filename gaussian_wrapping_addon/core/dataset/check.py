@@ -23,6 +23,8 @@ Severity = Literal["error", "warning", "fact"]
 
 _SHARE_OF_BAD = 0.2
 _MIN_GOOD_SIDE_PX = 200
+_SHORT = {"photos": "cameras to be solved", SPLAT: "splat without photos"}
+"""What is said of kinds whose name is no heading."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Finding:
     severity: Severity
     message: str
     hint: str = ""
+    short: str = ""
+    """What a heading says of it: joined, the short words of all findings name the input."""
 
 
 def check_input(source: Path) -> list[Finding]:
@@ -46,7 +50,13 @@ def check_input(source: Path) -> list[Finding]:
     try:
         source = Path(source).resolve()
         kind = source_kind(source)
-        findings.append(Finding("fact", f"The input is of kind: {kind.kind}."))
+        findings.append(
+            Finding(
+                "fact",
+                f"The input is of kind: {kind.kind}.",
+                short=_SHORT.get(kind.kind, kind.kind),
+            )
+        )
         if kind.kind == SPLAT:
             _check_splat(source, findings)
         elif kind.kind == "photos":
@@ -66,7 +76,11 @@ def _check_splat(path: Path, findings: list[Finding]) -> None:
         raise DatasetError(f"{path.name} holds no Gaussians.", "Export the splat again.")
     kind = "surfels" if header.axes == 2 else "Gaussians"
     findings.append(
-        Finding("fact", f"{header.count} {kind} with harmonics of degree {header.degree}.")
+        Finding(
+            "fact",
+            f"{header.count} {kind} with harmonics of degree {header.degree}.",
+            short=f"{header.count:,} {kind}",
+        )
     )
     findings.append(Finding("warning", WITHOUT_PHOTOS, WITH_PHOTOS))
 
@@ -161,7 +175,9 @@ def _check_files(
             Finding("fact", f"{unknown} photos are of a format that is only checked on loading.")
         )
     listed = ", ".join(f"{count} of {size}" for size, count in sizes.most_common(3))
-    findings.append(Finding("fact", f"{good} photos: {listed or 'sizes not known yet'}."))
+    message = f"{good} photos: {listed or 'sizes not known yet'}."
+    # Before the kind: "80 photos, COLMAP model".
+    findings.insert(0, Finding("fact", message, short=f"{good} photos"))
     masked = sum(find_mask(kind.mask_roots, name) is not None for name in names)
     if masked:
         findings.append(Finding("fact", f"{masked} of {len(names)} photos have a mask."))

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``blender --command gwrap ...``: the command line of ``batch.py``, from the installed add-on."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import bpy
+
+_logger = logging.getLogger(__name__)
+
+NAME = "gwrap"
+
+_handle: Any = None
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command and return its exit code; Blender calls this."""
+    from .. import batch
+
+    return batch.main(list(arguments))
+
+
+def register() -> None:
+    """Make the command known to Blender, once."""
+    global _handle
+    if _handle is None:
+        _handle = bpy.utils.register_cli_command(NAME, run)
+
+
+def unregister() -> None:
+    """Take the command out where it is known."""
+    global _handle
+    if _handle is not None:
+        bpy.utils.unregister_cli_command(_handle)
+        _handle = None

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Choose the photos in Blender's file browser; they are checked at once."""
+
+from pathlib import Path
+from typing import Final
+
+import bpy
+from bpy.props import BoolProperty, StringProperty
+
+from ..core.errors import UsageError
+from . import job_actions, job_timer, photo_check, training_estimate
+from .job_operators import no_job_runs
+from .reporting import ReportsErrors
+
+_INPUT_FILES: Final = (".ply", ".json")
+"""Files that are an input themselves; another file stands for its folder."""
+
+
+class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
+    bl_idname = "gwrap.choose_input"
+    bl_label = "Choose Photos"
+    bl_description = (
+        "Choose the folder of the photos, of a COLMAP project or with a transforms.json, or the "
+        "PLY of a splat; it is checked at once"
+    )
+    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's convention
+
+    filepath: StringProperty(name="Input", subtype="FILE_PATH", options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    filter_folder: BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_image: BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_glob: StringProperty(  # type: ignore[valid-type]
+        default="*.ply;*.json;*.jpg;*.jpeg;*.png;*.tif;*.tiff;*.webp;*.heic", options={"HIDDEN"}
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return no_job_runs(cls, context)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        source = context.scene.gwrap.source
+        if source:
+            self.filepath = source.rstrip("/\\") + ("" if Path(source).suffix else "/")
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        column = self.layout.column(align=True)
+        column.label(text="Open the folder with the photos,")
+        column.label(text="then press Choose Photos.")
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        if not self.filepath:
+            raise UsageError("No folder was chosen.", "Open the folder of the photos.")
+        path = Path(bpy.path.abspath(self.filepath))
+        if path.suffix.lower() not in _INPUT_FILES and not path.is_dir():
+            path = path.parent  # a photo was clicked, or a name that does not exist
+        if not path.exists():
+            raise UsageError(f"{path} does not exist.", "Choose another folder.")
+        properties = context.scene.gwrap
+        if properties.source and Path(bpy.path.abspath(properties.source)) != path:
+            if properties.output == properties.job_folder:
+                properties.output = ""  # it was made for the photos before
+            job_timer.detach(context.scene)
+        properties.source = str(path)
+        training_estimate.forget()
+        photo_check.start(context.scene, job_actions.worker_choice(context))
+        return {"FINISHED"}
+
+
+CLASSES: Final = (GWRAP_OT_choose_input,)

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Play the job timer, which never fires in background Blender, against the fake worker."""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+
+from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
+from gaussian_wrapping_addon.ops import job_timer, tags
+
+WAIT_S = float(os.environ.get("GW_WAIT_S", "40"))
+"""Longest wait for a state; more where the real worker is at work."""
+
+
+def write_fake_python(folder: Path) -> Path:
+    """Write a program that is the fake worker in the place of the worker's Python."""
+    script = folder / "fake-python"
+    fake = Path(__file__).with_name("fake_worker.py")
+    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{fake}" "$@"\n')
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    return script
+
+
+def start_wrap(photos: Path, scene: bpy.types.Scene | None = None) -> Path:
+    """Press Wrap Scene; return the job folder."""
+    scene = scene or bpy.context.scene
+    scene.gwrap.source = str(photos)
+    assert bpy.ops.gwrap.wrap_scene() == {"FINISHED"}
+    return Path(scene.gwrap.job_folder)
+
+
+def status_of(folder: Path) -> JobStatus:
+    """Return what the panel would show of a job."""
+    found = job_timer.status_of(str(folder))
+    assert found is not None, f"no job is watched in {folder}"
+    return found
+
+
+def play_until(holds: Callable[[], bool], what: str) -> None:
+    """Tick until something holds."""
+    end_s = time.monotonic() + WAIT_S
+    while time.monotonic() < end_s:
+        job_timer.poll_jobs()
+        if holds():
+            return
+        time.sleep(0.02)
+    raise AssertionError(f"{what}: {[(f, j.status) for f, j in job_timer._jobs.items()]}")
+
+
+def play_to(folder: Path, *states: str) -> JobStatus:
+    """Tick until a job is in one of these states."""
+    play_until(lambda: status_of(folder).state in states, f"never {states}")
+    return status_of(folder)
+
+
+def play_to_stage(folder: Path, stage: str) -> None:
+    """Tick until a job says that it is in a stage."""
+    play_until(lambda: status_of(folder).stage == stage, f"never in {stage}")
+
+
+def meshes() -> int:
+    """Count the meshes that were imported into the open scene."""
+    return len(list(tags.objects_of_kind(bpy.context.scene, "mesh")))

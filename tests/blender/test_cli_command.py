@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``blender --command gwrap``, and jobs that pass between the button and the command line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+import pytest
+
+import gaussian_wrapping_addon
+from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
+from gaussian_wrapping_addon.core.jobs.job_file import make_job, write_job
+from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder
+from gaussian_wrapping_addon.core.settings import preset
+from gaussian_wrapping_addon.ops import cli_command, job_timer, known_jobs
+from gaussian_wrapping_addon.ui import train_panel
+from tests.blender.fake_layout import draw
+from tests.blender.job_play import (
+    meshes,
+    play_to,
+    play_until,
+    start_wrap,
+    status_of,
+    write_fake_python,
+)
+
+BATCH = Path(gaussian_wrapping_addon.__file__).with_name("batch.py")
+
+
+@pytest.fixture
+def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.setattr(known_jobs, "_session", [])
+    monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
+    monkeypatch.setenv("GW_FAKE", "quick")
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    yield folder
+    for job in job_timer._jobs.values():
+        job.client.kill()
+    job_timer.forget_all()
+
+
+def batch(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(BATCH), *arguments],
+        env=dict(os.environ), capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+
+
+def test_the_command_is_known_while_the_addon_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    known: list[str] = []
+    real = bpy.utils.register_cli_command
+
+    def note(name: str, run: object) -> object:
+        known.append(name)
+        return real(name, run)
+
+    monkeypatch.setattr(bpy.utils, "register_cli_command", note)
+    for _ in range(2):
+        gaussian_wrapping_addon.register()
+        assert cli_command._handle is not None
+        gaussian_wrapping_addon.unregister()
+        assert cli_command._handle is None
+    assert known == ["gwrap", "gwrap"]
+
+
+def test_the_command_has_the_exit_codes_of_batch(tmp_path: Path) -> None:
+    assert cli_command.run(["no-such-command"]) == 2
+    assert cli_command.run(["resume", str(tmp_path / "missing")]) in (1, 2)
+    assert cli_command.run(["check", str(tmp_path)]) == 3
+
+
+def test_a_job_of_the_button_goes_on_in_batch(
+    addon: object, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GW_FAKE", "slow")
+    folder = start_wrap(photos)
+    play_until(lambda: status_of(folder).fraction == 0.25, "never at work")
+    refused = batch("resume", str(folder))
+    assert refused.returncode == 2
+    assert "A job is running in" in refused.stdout
+    bpy.ops.gwrap.cancel_job()
+    play_to(folder, "CANCELLED")
+    monkeypatch.setenv("GW_FAKE", "quick")
+    done = batch("resume", str(folder))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (folder / "result" / "scene.blend").is_file()
+    bpy.ops.gwrap.find_job(directory=str(folder))
+    assert status_of(folder).state == "DONE"
+
+
+def test_a_job_of_batch_is_opened_by_the_button(addon: object, photos: Path) -> None:
+    folder = photos.with_name("job")
+    target = JobFolder(folder)
+    target.create()
+    write_job(target.job_path, make_job("wrap", photos, preset("draft")))
+    done = batch("resume", str(folder), "--no-blend")
+    assert done.returncode == 0, done.stdout + done.stderr
+    bpy.ops.gwrap.find_job(directory=str(folder))
+    assert "Import Finished Result" in draw(train_panel.GWRAP_PT_train).texts
+    bpy.ops.gwrap.import_result(directory=job_timer.result_to_import(bpy.context.scene))
+    assert meshes() == 1
+    bpy.ops.gwrap.resume_job()  # and goes on from the button
+    play_to(folder, "DONE")
+    assert meshes() == 1

@@ -1,0 +1,486 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every panel in every state: what it says, which buttons it offers, which one is the next step."""
+
+from __future__ import annotations
+
+import builtins
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon import registration
+from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
+from gaussian_wrapping_addon.ops import (
+    job_timer,
+    panel_state,
+    photo_check,
+    tags,
+    training_estimate,
+)
+from gaussian_wrapping_addon.ops.panel_state import PRIMARY, Stage
+from gaussian_wrapping_addon.ops.report_data import ReportData, report_of
+from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.ops.training_choices import choices_key
+from gaussian_wrapping_addon.ops.training_estimate import Estimate
+from tests.blender.fake_layout import FakeLayout, draw
+from tests.blender.fake_worker import LIVE
+from tests.blender.synthetic_result import png_bytes, write_result
+
+pytestmark = pytest.mark.usefixtures("addon")
+
+PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel)]
+OPERATORS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Operator)]
+ORDER = ["Dataset", "Train", "Region", "Mesh", "Texture", "Result", "Scene Tools"]
+ANSWER = Estimate(
+    (
+        "3 photos, long side 320 px, camera poses still to be solved",
+        "Training (standard, 2 threads): 4 to 12 min",
+        "Memory: 1.2 GB",
+        "Not timed here: the first job compiles the renderer",
+    ),
+    ("The disk is nearly full.",),
+)
+ERROR, HINT = "The photos share nothing.", "Take more photos with overlap."
+
+
+class Client:
+    """Answers with one status."""
+
+    def __init__(self, status: JobStatus) -> None:
+        self.status = status
+
+    def poll(self) -> JobStatus:
+        return self.status
+
+
+@pytest.fixture(autouse=True)
+def _nothing_left() -> None:
+    job_timer.forget_all()
+    photo_check.stop()
+    training_estimate.forget()
+
+
+def choose_photos(folder: Path, count: int = 3) -> None:
+    photos = folder / "photos"
+    photos.mkdir(exist_ok=True)
+    for index in range(count):
+        pixels = np.full((240, 320, 3), index, np.uint8)
+        (photos / f"{index}.png").write_bytes(png_bytes(pixels))
+    bpy.context.scene.gwrap.source = str(photos)
+
+
+def job(folder: Path, state: str, command: str = "WRAP", **more: object) -> None:
+    bpy.context.scene.gwrap.job_command = command
+    status = JobStatus(state, "train", 0.25, "step", 90.0, **more)  # type: ignore[arg-type]
+    client = Client(status)
+    job_timer.watch(bpy.context.scene, folder / "job", client, imports=False)  # type: ignore[arg-type]
+
+
+def no_data(_folder: Path) -> None:
+    """As a new file is."""
+
+
+def not_checked(folder: Path) -> None:
+    choose_photos(folder)
+
+
+def checking(folder: Path) -> None:
+    choose_photos(folder)
+    photo_check._check.busy = True
+
+
+def checked(folder: Path) -> None:
+    choose_photos(folder)
+    bpy.ops.gwrap.check_photos()
+
+
+def bad_data(folder: Path) -> None:
+    choose_photos(folder, 1)
+    bpy.ops.gwrap.check_photos()
+
+
+def estimated(folder: Path) -> None:
+    checked(folder)
+    training_estimate._keep(choices_key(bpy.context.scene), ANSWER)
+
+
+def training(folder: Path) -> None:
+    checked(folder)
+    job(folder, "RUNNING", figures=LIVE)
+
+
+def cancelling(folder: Path) -> None:
+    checked(folder)
+    job(folder, "CANCELLING")
+
+
+def failed(folder: Path) -> None:
+    checked(folder)
+    job(folder, "FAILED", error=ERROR, hint=HINT)
+
+
+def lost(folder: Path) -> None:
+    checked(folder)
+    job(folder, "LOST", error=ERROR, hint=HINT)
+
+
+def cancelled(folder: Path) -> None:
+    checked(folder)
+    job(folder, "CANCELLED", hint="Resume continues from the last checkpoint.")
+
+
+def not_open(folder: Path) -> None:
+    checked(folder)
+    bpy.context.scene.gwrap.job_folder = str(folder / "job")
+
+
+def to_import(folder: Path) -> None:
+    checked(folder)
+    job(folder, "DONE", result=str(write_result(folder / "job")))
+
+
+def in_edit_mode(folder: Path) -> None:
+    to_import(folder)
+    bpy.ops.mesh.primitive_cube_add()
+    bpy.ops.object.mode_set(mode="EDIT")
+    job_timer._jobs[str(folder / "job")].waits_for_mode = True
+
+
+def done(folder: Path) -> None:
+    to_import(folder)
+    import_result(folder / "job" / "result", bpy.context.scene)
+    bpy.context.view_layer.update()
+
+
+def done_two_regions(folder: Path) -> None:
+    done(folder)
+    bpy.ops.gwrap.add_region_box()
+    for thing in bpy.context.selected_objects:
+        thing.select_set(False)
+
+
+def meshing(folder: Path) -> None:
+    done(folder)
+    job(folder, "RUNNING", "MESH")
+
+
+def mesh_failed(folder: Path) -> None:
+    done(folder)
+    job(folder, "DONE", "MESH", result=str(folder / "job" / "result"), error=ERROR, hint=HINT)
+
+
+State = Callable[[Path], None]
+STATES: dict[State, Stage] = {
+    no_data: Stage.NO_DATA, not_checked: Stage.READY, checking: Stage.READY,
+    checked: Stage.READY, bad_data: Stage.BAD_DATA, estimated: Stage.READY,
+    training: Stage.RUNNING, cancelling: Stage.RUNNING, failed: Stage.STOPPED,
+    lost: Stage.STOPPED, cancelled: Stage.STOPPED, not_open: Stage.NOT_OPEN,
+    to_import: Stage.IMPORTABLE, in_edit_mode: Stage.WAITING, done: Stage.FINISHED,
+    done_two_regions: Stage.FINISHED, meshing: Stage.RUNNING, mesh_failed: Stage.FINISHED,
+}  # fmt: skip
+every_state = pytest.mark.parametrize("state", STATES, ids=lambda s: s.__name__)
+
+
+def tab() -> dict[str, FakeLayout]:
+    """Draw what a person sees: panels with ``Parent / Child`` as their names."""
+    labels = {cls.__name__: cls.bl_label for cls in PANELS}
+    found = {}
+    for cls in PANELS:
+        if not getattr(cls, "poll", lambda _context: True)(bpy.context):
+            continue
+        parent = labels.get(getattr(cls, "bl_parent_id", ""), "")
+        found[f"{parent} / {cls.bl_label}" if parent else cls.bl_label] = draw(cls)
+    return found
+
+
+def can_run(operator: str) -> bool:
+    module, name = operator.split(".")
+    return bool(getattr(getattr(bpy.ops, module), name).poll())
+
+
+def buttons(layout: FakeLayout) -> list[str]:
+    """Return the buttons: ``*`` before the large one, ``-`` before greyed ones."""
+    return [
+        ("*" if b.large else "")
+        + ("" if b.enabled and can_run(b.operator) else "-")
+        + b.operator.removeprefix("gwrap.")
+        for b in layout.buttons
+    ]
+
+
+def words(layout: FakeLayout) -> str:
+    return " ".join(layout.texts.split())
+
+
+@every_state
+def test_every_state_has_one_large_button_and_that_is_its_next_step(
+    state: State, tmp_path: Path
+) -> None:
+    state(tmp_path)
+    assert panel_state.stage_of(bpy.context) is STATES[state]
+    panels = tab()
+    assert [name for name in panels if "/" not in name] == ORDER
+    large = [b for layout in panels.values() for b in layout.buttons if b.large]
+    assert [b.operator for b in large] == [PRIMARY[STATES[state]]]
+    if state not in (cancelling, done_two_regions):
+        assert large[0].enabled
+        assert can_run(large[0].operator)
+    for name, layout in panels.items():
+        assert layout.log, f"{name} is empty"
+        assert max(map(len, layout.texts.splitlines()), default=0) <= 60
+        assert len(layout.header) <= 20, "a header has no room for more"
+
+
+HEADERS = {
+    #                Dataset            Train          Mesh                  Result
+    no_data: ("No photos", "Not trained", "Needs a training", "No result"),
+    not_checked: ("Not checked", "Not trained", "Needs a training", "No result"),
+    checking: ("Checking…", "Not trained", "Needs a training", "No result"),
+    checked: ("3 photos", "Not trained", "Needs a training", "No result"),
+    bad_data: ("Cannot be used", "Not trained", "Needs a training", "No result"),
+    estimated: ("3 photos", "Not trained", "Needs a training", "No result"),
+    training: ("3 photos", "25 %", "Needs a training", "No result"),
+    cancelling: ("3 photos", "Cancelling", "Needs a training", "No result"),
+    failed: ("3 photos", "Failed", "Needs a training", "No result"),
+    lost: ("3 photos", "Failed", "Needs a training", "No result"),
+    cancelled: ("3 photos", "Cancelled", "Needs a training", "No result"),
+    not_open: ("3 photos", "Not open", "Needs a training", "No result"),
+    to_import: ("3 photos", "Not trained", "Needs a training", "No result"),
+    in_edit_mode: ("3 photos", "Not trained", "Needs a training", "No result"),
+    done: ("3 photos", "27.2 dB", "1 region", "1 mesh"),
+    done_two_regions: ("3 photos", "27.2 dB", "No region selected", "1 mesh"),
+    meshing: ("3 photos", "27.2 dB", "25 %", "1 mesh"),
+    mesh_failed: ("3 photos", "27.2 dB", "1 region", "1 mesh"),
+}
+
+
+def check_headers(state: State, panels: dict[str, FakeLayout]) -> None:
+    found = tuple(panels[name].header for name in ("Dataset", "Train", "Mesh", "Result"))
+    assert found == HEADERS[state]
+    assert panels["Texture"].header == "Automatic, photos"
+    count = sum(1 for _ in tags.objects_of_kind(bpy.context.scene, "region"))
+    words_of = {0: "No regions yet", 1: "1 region"}
+    assert panels["Region"].header == words_of.get(count, f"{count} regions")
+
+
+CHECKED = ["choose_input", "check_photos"]
+RESULT = ["set_shading", "set_shading", "export_meshes", "pack_images", "import_result"]
+RESULT += ["open_report"]
+NO_RESULT = ["-export_meshes", "import_result"]
+BUTTONS: dict[State, tuple[list[str], list[str], list[str], list[str]]] = {
+    no_data: (["*choose_input"], ["-wrap_scene"], ["-mesh_region"], NO_RESULT),
+    not_checked: (CHECKED, ["estimate", "*wrap_scene"], ["-mesh_region"], NO_RESULT),
+    checking: (
+        ["choose_input", "-check_photos"], ["estimate", "*wrap_scene"], ["-mesh_region"], NO_RESULT,
+    ),
+    checked: (CHECKED, ["estimate", "*wrap_scene"], ["-mesh_region"], NO_RESULT),
+    bad_data: (["*choose_input", "check_photos"], ["-wrap_scene"], ["-mesh_region"], NO_RESULT),
+    estimated: (CHECKED, ["*wrap_scene"], ["-mesh_region"], NO_RESULT),
+    training: (["-choose_input", "check_photos"], ["*cancel_job"], ["-mesh_region"], NO_RESULT),
+    cancelling: (["-choose_input", "check_photos"], ["*-cancel_job"], ["-mesh_region"], NO_RESULT),
+    failed: (CHECKED, ["*resume_job", "wrap_scene"], ["-mesh_region"], NO_RESULT),
+    lost: (CHECKED, ["*resume_job", "wrap_scene"], ["-mesh_region"], NO_RESULT),
+    cancelled: (CHECKED, ["*resume_job", "wrap_scene"], ["-mesh_region"], NO_RESULT),
+    not_open: (CHECKED, ["*resume_job", "find_job", "wrap_scene"], ["-mesh_region"], NO_RESULT),
+    to_import: (CHECKED, ["*import_result", "wrap_scene"], ["-mesh_region"], NO_RESULT),
+    in_edit_mode: (
+        CHECKED, ["*object.mode_set", "wrap_scene"], ["-mesh_region"],
+        ["-export_meshes", "-import_result"],
+    ),
+    done: (CHECKED, ["wrap_scene", "train_more"], ["*mesh_region"], RESULT),
+    done_two_regions: (CHECKED, ["wrap_scene", "train_more"], ["*-mesh_region"], RESULT),
+    meshing: (["-choose_input", "check_photos"], ["-wrap_scene"], ["*cancel_job"], RESULT),
+    mesh_failed: (CHECKED, ["wrap_scene", "train_more"], ["*mesh_region"], RESULT),
+}  # fmt: skip
+
+
+def check_buttons(state: State, panels: dict[str, FakeLayout]) -> None:
+    found = tuple(buttons(panels[name]) for name in ("Dataset", "Train", "Mesh", "Result"))
+    assert found == BUTTONS[state]
+    assert buttons(panels["Texture"]) == []
+    assert ("Result / Report" in panels) == (BUTTONS[state][3] == RESULT)
+
+
+SAID: dict[State, dict[str, str]] = {
+    no_data: {"Dataset": "Photos of one thing", "Mesh": "Needs a finished training."},
+    not_checked: {"Dataset": "Check Photos", "Train": "Estimate Time and Memory"},
+    checking: {"Dataset": "Checking…"},
+    checked: {"Dataset": "3 photos, cameras to be solved", "Dataset / Details": "no camera poses"},
+    bad_data: {"Dataset": "Add photos of the same thing from other places."},
+    estimated: {
+        "Train": "Training 4 to 12 min Memory 1.2 GB Not timed here: the first job compiles the "
+        "renderer The disk is nearly full."
+    },
+    training: {"Train": "Train · 25 % · 1 min 30 s left Cancel Iteration 750 of 3,000"},
+    cancelling: {"Train": "Cancelling…"},
+    failed: {"Train": f"{ERROR} {HINT}"},
+    lost: {"Train": f"{ERROR} {HINT}"},
+    cancelled: {"Train": "Cancelled at 25 %. Resume continues from the last checkpoint."},
+    not_open: {"Train": "This file has a job that is not open here."},
+    to_import: {"Train": "Import Finished Result"},
+    in_edit_mode: {"Train": "Finished. Leave Edit Mode to see the result. Leave Edit Mode"},
+    done: {"Train": "Trained: 4,321 Gaussians, 27.2 dB", "Mesh": "Region: auto region"},
+    done_two_regions: {"Mesh": "Select a region above, or add a region box. Mesh Region"},
+    meshing: {"Mesh": "Train · 25 % · 1 min 30 s left Cancel Step"},
+    mesh_failed: {"Mesh": f"{ERROR} {HINT}"},
+}
+
+
+def check_words(state: State, panels: dict[str, FakeLayout]) -> None:
+    for name, text in SAID[state].items():
+        assert text in words(panels[name])
+    for other in (ERROR, "Import Finished Result", "Cancelled at"):
+        told = [text for text in SAID[state].values() if other in text]
+        drawn = [layout for layout in panels.values() if other in words(layout)]
+        assert len(drawn) == len(told), "told once, and only where it belongs"
+
+
+def check_locks(state: State, panels: dict[str, FakeLayout]) -> None:
+    """Settings cannot be changed while a job runs."""
+    running = STATES[state] is Stage.RUNNING
+    names = ("Train", "Train / Advanced", "Mesh", "Mesh / Advanced", "Texture")
+    for name in names:
+        fields = panels[name].fields
+        assert fields
+        assert all(field.enabled != running for field in fields if field.name != "more_iterations")
+
+
+@every_state
+def test_what_every_panel_shows(state: State, tmp_path: Path) -> None:
+    state(tmp_path)
+    panels = tab()
+    check_headers(state, panels)
+    check_buttons(state, panels)
+    check_words(state, panels)
+    check_locks(state, panels)
+
+
+@every_state
+def test_every_greyed_button_says_why(state: State, tmp_path: Path) -> None:
+    state(tmp_path)
+    for cls in OPERATORS:
+        operator = getattr(bpy.ops.gwrap, cls.bl_idname.removeprefix("gwrap."))
+        if operator.poll():
+            continue
+        with pytest.raises(RuntimeError, match="poll") as refused:
+            operator()
+        reason = str(refused.value).partition("poll()")[2].strip()
+        assert "context is incorrect" not in reason, cls.bl_idname
+        assert len(reason.split()) >= 4, (cls.bl_idname, reason)
+        assert not reason.endswith(".")
+
+
+@every_state
+def test_drawing_and_polling_read_no_file(
+    state: State, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state(tmp_path)
+
+    def refuse(*_arguments: object, **_keywords: object) -> None:
+        raise AssertionError("the disk was read")
+
+    draw(PANELS[0])  # whatever is imported at the first drawing
+    with monkeypatch.context() as patch:
+        for name in ("stat", "lstat", "scandir", "listdir", "open"):
+            patch.setattr(os, name, refuse)
+        patch.setattr(builtins, "open", refuse)
+        tab()
+        for cls in OPERATORS:
+            can_run(cls.bl_idname)
+
+
+def play(function: Callable[[], float | None]) -> None:
+    """Play a timer, which never fires in background Blender."""
+    end_s = time.monotonic() + 30.0
+    while function() is not None:
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_choosing_photos_checks_them_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    monkeypatch.setattr(training_estimate, "start", lambda *arguments: asked.append(arguments))
+    choose_photos(tmp_path)
+    properties = bpy.context.scene.gwrap
+    folder, properties.source = properties.source, ""
+    assert bpy.ops.gwrap.choose_input(filepath=f"{folder}/") == {"FINISHED"}
+    assert properties.source == folder
+    assert tab()["Dataset"].header == "Checking…"
+    play(photo_check.show)
+    assert tab()["Dataset"].header == "3 photos"
+    assert len(asked) == 1, "the estimate follows by itself"
+    (tmp_path / "photos" / "0.png").unlink()
+    (tmp_path / "photos" / "1.png").unlink()
+    assert bpy.ops.gwrap.check_photos("INVOKE_DEFAULT") == {"FINISHED"}
+    play(photo_check.show)
+    assert tab()["Dataset"].header == "Cannot be used"
+    assert len(asked) == 1
+
+
+def test_a_clicked_photo_stands_for_its_folder_and_files_for_themselves(tmp_path: Path) -> None:
+    choose_photos(tmp_path)
+    properties = bpy.context.scene.gwrap
+    folder = Path(properties.source)
+    bpy.ops.gwrap.choose_input(filepath=str(folder / "1.png"))
+    assert properties.source == str(folder)
+    for name in ("transforms.json", "splat.PLY"):
+        (folder / name).write_text("x")
+        bpy.ops.gwrap.choose_input(filepath=str(folder / name))
+        assert properties.source == str(folder / name)
+    for wrong in ("", str(tmp_path / "nowhere" / "x")):
+        with pytest.raises(RuntimeError, match=r"chosen|does not exist"):
+            bpy.ops.gwrap.choose_input(filepath=wrong)
+    assert properties.source == str(folder / "splat.PLY")
+
+
+def test_other_photos_begin_anew_beside_the_earlier_result(tmp_path: Path) -> None:
+    done(tmp_path)
+    properties = bpy.context.scene.gwrap
+    properties.output = properties.job_folder
+    other = tmp_path / "other"
+    other.mkdir()
+    bpy.ops.gwrap.choose_input(filepath=str(other))
+    assert (properties.job_folder, properties.output) == ("", "")
+    job_timer.after_undo(bpy.context.scene)
+    assert properties.job_folder == "", "undo does not bring the job of other photos back"
+    assert panel_state.stage_of(bpy.context) is Stage.READY
+    assert tab()["Result"].header == "1 mesh"
+
+
+def test_a_check_of_photos_that_are_no_longer_chosen_is_dropped(tmp_path: Path) -> None:
+    choose_photos(tmp_path)
+    photo_check.start(bpy.context.scene)
+    bpy.context.scene.gwrap.source = str(tmp_path)
+    play(photo_check.show)
+    assert tab()["Dataset"].header == "Not checked"
+    assert len(bpy.context.scene.gwrap.findings) == 0
+
+
+def test_a_worker_that_cannot_estimate_says_why(tmp_path: Path) -> None:
+    checked(tmp_path)
+    error = UsageError("There is no worker.", "Set one up.")
+    training_estimate.answer_with(bpy.context.scene, error)
+    assert "There is no worker. Set one up." in words(tab()["Train"])
+
+
+def test_copying_the_report(tmp_path: Path) -> None:
+    assert not bpy.ops.gwrap.copy_report.poll()
+    done(tmp_path)
+    assert bpy.ops.gwrap.copy_report() == {"FINISHED"}
+    frame = tags.current_frame(bpy.context.scene, None)
+    report = report_of(tags.figures_of(frame))
+    text = report.as_text()
+    for name, value in (*report.rows, *report.stages, *report.regions[0].rows):
+        assert f"{name}: {value}" in text
+    assert all(warning in text for warning in report.warnings)
+    assert ReportData().training == ""
+    assert replace(report, rows=(("Gaussians", "5"),)).training == "5 Gaussians"

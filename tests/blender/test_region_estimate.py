@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Estimates of regions by the real worker: the answer, when it is stale, and ending early."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+import pytest
+
+from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.helper_process import child_command
+from gaussian_wrapping_addon.ops import estimate_child, region_estimate, tags
+from gaussian_wrapping_addon.ops.region_geometry import CUBE_CORNERS
+from gaussian_wrapping_addon.ops.region_objects import create_region
+
+pytestmark = pytest.mark.usefixtures("addon")
+
+WAIT_S = 120.0
+
+
+@pytest.fixture(autouse=True)
+def _no_questions() -> Iterator[None]:
+    yield
+    region_estimate.stop()
+
+
+def play_until(holds: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + WAIT_S
+    while not holds():
+        assert time.monotonic() < end_s
+        region_estimate.show()
+        time.sleep(0.05)
+
+
+def region_of(folder: Path) -> bpy.types.Object:
+    """Make a frame as an import does, and a box of half side 1.4 in it."""
+    collection = bpy.context.scene.collection
+    frame = bpy.data.objects.new("frame", None)
+    collection.objects.link(frame)
+    frame[tags.KIND], frame[tags.RESULT] = "frame", str(folder / "result")
+    frame[tags.WORLD_FROM_SCENE] = json.dumps(Similarity().to_json())
+    region = create_region("box", 1.4 * CUBE_CORNERS, frame, collection)
+    bpy.context.view_layer.update()
+    bpy.context.view_layer.objects.active = region
+    region.select_set(True)
+    return region
+
+
+def test_the_workers_answer_is_shown_until_something_changes(tmp_path: Path) -> None:
+    if importlib.util.find_spec("torch") is None:
+        pytest.skip("the worker of this test is this Python, which has no torch")
+    # In a process of its own: this one must not load torch.
+    code = (
+        "import sys; from pathlib import Path; sys.path.insert(0, sys.argv[1]);"
+        "from tests.core.jobs.finished_sphere import write_finished_sphere as write;"
+        "write(Path(sys.argv[2]))"
+    )
+    root = Path(__file__).resolve().parents[2]
+    subprocess.run([sys.executable, "-c", code, str(root), str(tmp_path / "job")], check=True)
+    region = region_of(tmp_path / "job" / "out")
+    scene = bpy.context.scene
+    assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
+    assert region_estimate.is_waiting(region)
+    assert not bpy.ops.gwrap.estimate_regions.poll()
+    play_until(lambda: not region_estimate.is_busy())
+    answer, holds = region_estimate.answer_for(scene, region)
+    assert answer is not None
+    assert holds
+    assert not answer.warnings, answer.warnings
+    assert answer.lines[0].startswith("Triangles: ")
+    assert any(line.startswith("Time: ") for line in answer.lines)
+
+    def still() -> bool:
+        bpy.context.view_layer.update()
+        return region_estimate.answer_for(scene, region)[1]
+
+    region.location.x += 0.5
+    assert not still()
+    region.location.x -= 0.5
+    assert still(), "back where it was"
+    region.parent.location.x += 3.0
+    assert still(), "the scene as a whole has moved"
+    scene.gwrap.resolution, scene.gwrap.points = "POINTS", 4321
+    assert not still()
+    scene.gwrap.resolution = "AUTOMATIC"
+    assert still()
+    region.gwrap.own_edge_length = True
+    assert not still()
+    region.gwrap.own_edge_length = False
+    method = scene.gwrap.method
+    scene.gwrap.method = "PIVOTS"
+    assert not still()
+    scene.gwrap.method = method
+    assert still()
+    region.gwrap.own_edge_length, region.gwrap.edge_length = True, 0.6  # of a diagonal of 4.85
+    assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
+    play_until(lambda: not region_estimate.is_busy())
+    answer, _ = region_estimate.answer_for(scene, region)
+    assert answer is not None
+    assert not answer.warnings
+    region.gwrap.edge_length = 1.0
+    assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
+    play_until(lambda: not region_estimate.is_busy())
+    answer, _ = region_estimate.answer_for(scene, region)
+    assert answer is not None
+    assert "reduced" in " ".join(answer.warnings)
+
+
+def test_disabling_the_addon_ends_the_process(
+    tmp_path: Path, addon: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "out"
+    region = region_of(folder)
+    slow = [sys.executable, "-c", "import time; time.sleep(100)"]
+    monkeypatch.setattr(region_estimate, "child_command", lambda *_, **__: slow)
+    region_estimate.start(bpy.context.scene, [region], folder, sys.executable)
+    play_until(lambda: region_estimate._state.process is not None)
+    process = region_estimate._state.process
+    assert process is not None
+    os.kill(process.pid, 0)
+    addon.unregister()
+    assert process.wait(10) != 0
+    assert not region_estimate.is_busy()
+    assert not bpy.app.timers.is_registered(region_estimate.show)
+    addon.register()
+    with pytest.raises(ProcessLookupError):
+        os.kill(process.pid, 0)
+
+
+def test_a_worker_that_says_nothing_is_an_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    region = region_of(tmp_path)
+    for command, words in (
+        ([sys.executable, "-c", "raise SystemExit('no torch here')"], "no torch here"),
+        (child_command(region_estimate.MODULE, "{", python=sys.executable), ""),
+        ([str(tmp_path / "nowhere")], "does not run"),
+    ):
+        monkeypatch.setattr(region_estimate, "child_command", lambda *_, c=command, **__: c)
+        region_estimate.start(bpy.context.scene, [region], tmp_path, sys.executable)
+        play_until(lambda: not region_estimate.is_busy())
+        answer, _ = region_estimate.answer_for(bpy.context.scene, region)
+        assert answer is not None
+        assert answer.warnings
+        assert words in " ".join(answer.warnings)
+    assert estimate_child.ask_child([sys.executable, "-c", "print(1)"], lambda _: True, 20)[0] == []

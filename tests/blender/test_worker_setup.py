@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The preferences' set-up in Blender: what is drawn and greyed in each state, and one real run."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import bpy
+import pytest
+
+from gaussian_wrapping_addon.core import worker_environment
+from gaussian_wrapping_addon.core.jobs import client as job_client
+from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
+from gaussian_wrapping_addon.core.setup.commands import SetupRequest
+from gaussian_wrapping_addon.core.setup.pythons import FoundPython, probe
+from gaussian_wrapping_addon.core.worker_environment import WorkerEnvironment
+from gaussian_wrapping_addon.ops import doctor, worker_setup, worker_setup_operators
+from gaussian_wrapping_addon.ui import dataset_panel, worker_setup_view
+from tests.blender.fake_layout import FakeLayout, draw
+from tests.core.setup.wheels import write_wheel
+
+pytestmark = pytest.mark.usefixtures("addon")
+
+PYTHON = FoundPython("/usr/bin/python3.12", (3, 12, 1))
+
+
+@pytest.fixture(autouse=True)
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty folder for the environment, and one Python that was found."""
+    folder = tmp_path / "worker"
+    # What a set-up has made is remembered here; no later test may take it for its worker.
+    monkeypatch.setenv(worker_environment.DATA_VARIABLE, str(tmp_path / "data"))
+    monkeypatch.setattr(worker_setup, "environment", lambda: WorkerEnvironment(folder))
+    monkeypatch.setattr(worker_setup, "_state", worker_setup._State(searched=True))
+    worker_setup._state.pythons = [PYTHON]
+    yield folder
+    worker_setup.stop()
+    doctor.stop()
+
+
+def drawn() -> FakeLayout:
+    layout = FakeLayout()
+    worker_setup_view.draw_setup(layout, bpy.context)
+    return layout
+
+
+def no_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(job_client.PYTHON_VARIABLE, raising=False)
+    monkeypatch.setattr(job_client, "_has_torch", lambda: False)
+    worker_setup.forget_answer()
+
+
+def test_without_a_worker_the_panel_leads_to_the_button(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert worker_setup.worker_ready(), "the Python of the tests has torch"
+    assert "gwrap.open_preferences" not in draw(dataset_panel.GWRAP_PT_dataset).operators
+    no_worker(monkeypatch)
+    assert not worker_setup.worker_ready()
+    first = draw(dataset_panel.GWRAP_PT_dataset)
+    assert first.operators[0] == "gwrap.open_preferences"
+    assert "No worker is set up yet." in first.texts
+    assert "Jobs need one" in drawn().texts
+
+
+def test_the_answer_is_kept_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(worker_setup, "worker_python", lambda p: asked.append(p) or "x")
+    worker_setup.forget_answer()
+    for _ in range(50):
+        assert worker_setup.worker_ready()
+    assert len(asked) == 1
+    worker_setup.forget_answer()
+    worker_setup.worker_ready()
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize("state", ["RUNNING", "DONE", "FAILED", "CANCELLED"])
+def test_every_state_draws(state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    worker_setup._state.status = JobStatus(
+        state, "install", 0.4, "torch: Collecting torch", error="It broke.", hint="Do that."
+    )
+    running = state == "RUNNING"
+    monkeypatch.setattr(worker_setup._state, "client", object() if running else None)
+    layout = drawn()
+    monkeypatch.setattr(worker_setup._state, "client", None)
+    assert ("gwrap.cancel_setup" in layout.operators) is running
+    assert ("Install · 40 %" in layout.texts) is running
+    assert ("It broke." in layout.texts) is (state in ("FAILED", "CANCELLED"))
+    assert ("The worker is ready" in layout.texts) is (state == "DONE")
+
+
+def test_a_half_environment_is_called_so(root: Path) -> None:
+    root.mkdir()
+    WorkerEnvironment(root).marker_path.write_text('{"made_by": "gaussian_wrapping_addon"}')
+    assert "only half set up" in drawn().texts.replace("\n", " ")
+
+
+def test_going_online_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    poll = bpy.ops.gwrap.set_up_worker.poll
+    assert not bpy.app.online_access, "the bpy module is offline"
+    assert not poll()
+    assert "Allow Online Access" in drawn().texts.replace("\n", " ")
+    monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
+    assert poll()
+    worker_setup._state.pythons = []
+    assert not poll()
+
+
+def test_repair_and_remove_need_what_we_made(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
+    assert not bpy.ops.gwrap.repair_worker.poll()
+    assert not bpy.ops.gwrap.remove_worker.poll()
+    root.mkdir()
+    WorkerEnvironment(root).marker_path.write_text('{"made_by": "gaussian_wrapping_addon"}')
+    assert bpy.ops.gwrap.repair_worker.poll()
+    assert bpy.ops.gwrap.remove_worker.poll()
+    assert bpy.ops.gwrap.remove_worker() == {"FINISHED"}
+    while worker_setup.is_busy():
+        worker_setup.tick()
+        time.sleep(0.02)
+    assert not root.exists()
+
+
+@pytest.mark.parametrize("cuda", [False, True])
+def test_the_dialog_shows_the_commands(
+    cuda: bool, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
+    worker_setup._state.has_cuda = cuda
+    layout = FakeLayout()
+    layout_prop = SimpleNamespace(properties={"python", "torch"})
+    fake = SimpleNamespace(layout=layout, python=PYTHON.path, torch="cpu", bl_rna=layout_prop)
+    worker_setup_operators.GWRAP_OT_set_up_worker.draw(fake, bpy.context)
+    text = " ".join(layout.texts.split())
+    assert f"{PYTHON.path} -I -m venv --clear {root / 'env'}" in text
+    assert "--no-index --find-links /wheels" in text
+    assert "torch==" in text
+    assert "gwrap.copy_setup_commands" in layout.operators
+    choices = [item[0] for item in worker_setup_operators._torch_items(None, None)]
+    assert choices == (["cpu", "cuda", "index"] if cuda else ["cpu", "index"])
+
+
+def test_a_set_up_from_start_to_end_in_blender(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Driven by the timer, as in a window; the doctor looks at the result by itself."""
+    write_wheel(tmp_path / "wheels", "gwalpha", "1.0")
+    requirements = tmp_path / "r.txt"
+    requirements.write_text("gwalpha==1.0\n")
+    real = probe(sys.executable)
+    request = SetupRequest(str(root), real.path, str(requirements), "cpu", str(tmp_path / "wheels"))
+    asked = []
+    monkeypatch.setattr(doctor, "start", asked.append)
+    no_worker(monkeypatch)
+    longest_s = 0.0
+    worker_setup.start(replace(request))
+    assert bpy.app.timers.is_registered(worker_setup.tick)
+    while worker_setup.is_busy():
+        begun_s = time.monotonic()
+        worker_setup.tick()
+        longest_s = max(longest_s, time.monotonic() - begun_s)
+        time.sleep(0.05)
+    status = worker_setup.status()
+    assert status is not None
+    assert status.state == "DONE", status
+    assert asked == [""]
+    assert worker_setup.worker_ready(), "found at once"
+    assert job_client.worker_python() == str(WorkerEnvironment(root).venv_python)
+    assert longest_s < 1.0, "a tick never waits for the set-up"
