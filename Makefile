@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 PY := .venv/bin/python
 
-.PHONY: demo test lint zip prepare clean
+.PHONY: demo test lint zip prepare blenders clean
 
 prepare:
 	@bash tools/prepare.sh
@@ -9,13 +9,16 @@ prepare:
 demo: prepare
 	$(PY) gaussian_wrapping_addon/batch.py wrap examples/bananas --out demo_out --preset draft
 
-test: lint
+test: lint blenders
 	$(PY) -m pytest
 
 lint: prepare
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+
+blenders: prepare
+	@bash tools/test_blenders.sh
 
 zip: prepare
 	$(PY) build_addon.py

@@ -41,7 +41,8 @@ from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.texture.depth_buffer import depth_buffer
-from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
+from gaussian_wrapping_addon.core.texture.file_checks import atlas_file
+from gaussian_wrapping_addon.core.texture.textured_mesh import AtlasMaps, TexturedMesh
 
 from .plan import THRESHOLD_SHARES
 
@@ -212,8 +213,12 @@ def read_textured(folder: Path) -> TexturedMesh:
     with np.load(folder / "mesh.npz", allow_pickle=False) as arrays:
         mesh = SurfaceMesh(arrays["vertices"], arrays["faces"])
         uvs = arrays["corner_uvs"]
-    with Image.open(folder / "albedo.png") as image:
-        return TexturedMesh(mesh, uvs, np.asarray(image.convert("RGB")))
+        owner = arrays["face_atlas"] if "face_atlas" in arrays.files else None
+    maps = []
+    for number in range(1 if owner is None else int(owner.max()) + 1):
+        with Image.open(folder / atlas_file("albedo", number)) as image:
+            maps.append(AtlasMaps(np.asarray(image.convert("RGB"))))
+    return TexturedMesh.of(mesh, uvs, owner, maps, {})
 
 
 def stage_folder(job: Path, name: str) -> Path:

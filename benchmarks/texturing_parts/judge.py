@@ -86,6 +86,19 @@ def steps_between_texels(textured: TexturedMesh, texels_apart: int) -> float:
     evened with anything. Of a thing of one colour that photos show in different brightness, this is
     how visible the borders are where the leading view changes.
     """
+    return float(np.percentile(_steps(textured, texels_apart), 99.9))
+
+
+def mean_of_largest_steps(textured: TexturedMesh, texels_apart: int, share: float) -> float:
+    """Return the mean of the largest of these differences, a share of them all.
+
+    A percentile of a texture of one colour is a whole number of its 255 steps; this is finer.
+    """
+    steps = np.sort(_steps(textured, texels_apart))
+    return float(steps[-max(1, int(share * len(steps))) :].mean())
+
+
+def _steps(textured: TexturedMesh, texels_apart: int) -> np.ndarray:
     size = len(textured.albedo)
     assert textured.views is not None
     good = raster_atlas(textured.corner_uvs, size, 2).inside & (textured.views >= 2)
@@ -94,7 +107,7 @@ def steps_between_texels(textured: TexturedMesh, texels_apart: int) -> float:
     for image, usable in ((grey, good), (grey.T, good.T)):
         step = image[texels_apart:] - image[:-texels_apart]
         steps.append(step[usable[texels_apart:] & usable[:-texels_apart]])
-    return float(np.percentile(np.abs(np.concatenate(steps)), 99.9))
+    return np.abs(np.concatenate(steps))
 
 
 def look_up(image: np.ndarray, uvs: np.ndarray) -> np.ndarray:

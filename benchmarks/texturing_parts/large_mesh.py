@@ -38,8 +38,14 @@ def bumpy_spot() -> SurfaceMesh:
     return SurfaceMesh(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int32))
 
 
-def main(threads: int) -> None:
-    """Measure once."""
+def main(threads: int, size_px: int = SIZE_PX) -> None:
+    """Measure once.
+
+    Parameters
+    ----------
+    size_px : int
+        Side of the texture.
+    """
     mesh = bumpy_spot()
     random = np.random.default_rng(1)
     coarse = random.integers(40, 215, (PHOTOS, HEIGHT // 8, WIDTH // 8, 3), np.uint8)
@@ -51,16 +57,19 @@ def main(threads: int) -> None:
     before_s = _cpu_s(own) + _cpu_s(helper)
     with tempfile.TemporaryDirectory() as folder:
         textured = texture_mesh(
-            mesh, photos.scene(), photos, TextureSettings(SIZE_PX), Path(folder), Progress(),
+            mesh, photos.scene(), photos, TextureSettings(size_px), Path(folder), Progress(),
             threads=threads,
         )  # fmt: skip
+    worker_kib = resource.getrusage(own).ru_maxrss
     peak_kib = resource.getrusage(own).ru_maxrss + resource.getrusage(helper).ru_maxrss
     figures = {
         "faces": len(mesh.faces),
+        "size_px": size_px,
         "photos": PHOTOS,
         "megapixels": WIDTH * HEIGHT / 1e6,
         "wall_s": time.monotonic() - begun_s,
         "cpu_s": _cpu_s(own) + _cpu_s(helper) - before_s,
+        "worker_peak_mib": worker_kib / 1024,
         "peak_mib": peak_kib / 1024,
         "unwrap": textured.statistics["unwrap"],
         "charts": textured.statistics["charts"],
@@ -76,4 +85,4 @@ def _cpu_s(who: int) -> float:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(*(int(argument) for argument in sys.argv[1:]))
