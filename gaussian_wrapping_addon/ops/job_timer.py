@@ -25,7 +25,8 @@ from ..core.errors import UsageError, WrapError
 from ..core.jobs.client import JobClient
 from ..core.jobs.job_folder import JobStatus
 from . import known_jobs, live_preview, tags
-from .result_reading import ResultReading
+from .in_background import InBackground
+from .result_files import ResultFiles, read_result
 from .scene_objects import import_result
 
 _logger = logging.getLogger(__name__)
@@ -47,7 +48,7 @@ class _Job:
     command: str = "WRAP"
     waits_for_mode: bool = False
     """Finished, but Blender is in a mode in which nothing can be imported."""
-    reading: ResultReading | None = None
+    reading: InBackground[ResultFiles] | None = None
     """The result while it is read, and until it can be imported."""
 
 
@@ -214,7 +215,7 @@ def _bring_in(folder: str, job: _Job) -> None:
         job.reading = None  # another file is open: opening the old one again imports it
         return
     if job.reading is None:
-        job.reading = ResultReading(Path(job.status.result))
+        job.reading = _reading(Path(job.status.result))
     if not job.reading.finished():
         job.status = replace(
             job.status, state="RUNNING", stage=IMPORT_STAGE, message="reading the result"
@@ -223,12 +224,18 @@ def _bring_in(folder: str, job: _Job) -> None:
     job.waits_for_mode = bpy.context.mode != "OBJECT"
     if not job.waits_for_mode:
         reading, job.imports, job.reading = job.reading, False, None
-        _import(folder, job, scene, reading)
+        _import(folder, job, scene, reading.answer)
 
 
-def _import(folder: str, job: _Job, scene: bpy.types.Scene, reading: ResultReading) -> None:
+def _reading(folder: Path) -> InBackground[ResultFiles]:
+    return InBackground(lambda: read_result(folder))
+
+
+def _import(
+    folder: str, job: _Job, scene: bpy.types.Scene, files: Callable[[], ResultFiles]
+) -> None:
     try:
-        import_result(Path(job.status.result), scene, reading.files())
+        import_result(Path(job.status.result), scene, files())
         _push_undo("Import Wrap Result")
     except WrapError as error:
         job.status = replace(job.status, state="FAILED", error=error.message, hint=error.hint)

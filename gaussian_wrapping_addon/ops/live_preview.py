@@ -3,11 +3,13 @@
 
 Panels draw often and must neither read the disk nor make anything: they ask :func:`icons_of`. The
 pictures lie in a preview collection, not in ``bpy.data``, so that no file is saved with them and
-undo does not know them.
+undo does not know them. Files are looked for and read in a thread, as bare pixels: to decode its
+first picture, Blender needs longer than its window may wait.
 """
 
 from __future__ import annotations
 
+import io
 import logging
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,23 +18,36 @@ from typing import Any
 import bpy.utils.previews
 import numpy as np
 
+from .in_background import InBackground
+
 _logger = logging.getLogger(__name__)
 
-PICTURE = "preview-training.png"
+PICTURE = "preview-training.npy"
 EVERY_S = 3.0
 """Between two looks at the folder."""
 MAX_BYTES = 8 * 2**20
-"""Larger files are not a preview; reading them would be felt."""
+"""Larger files are not a preview; drawing them would be felt."""
 
 _NEVER_S = float("-inf")
+
+Stamp = tuple[str, int, int]
+"""Path, time in ns and size in bytes of a file."""
 
 
 @dataclass
 class _Shown:
     looked_s: float = _NEVER_S
-    stamp: tuple[str, int, int] | None = None
+    stamp: Stamp | None = None
     names: tuple[str, ...] = ()
     icons: tuple[int, ...] = ()
+    reading: InBackground[_Read | None] | None = None
+
+
+@dataclass(frozen=True)
+class _Read:
+    stamp: Stamp
+    parts: tuple[np.ndarray, ...]
+    """Each (h, w, 4) float32, as Blender wants them: from the bottom up."""
 
 
 _shown: dict[str, _Shown] = {}
@@ -55,8 +70,8 @@ def path_of(folder: str) -> str:
     return shown.stamp[0] if shown and shown.stamp else ""
 
 
-def newest_picture(folder: Path) -> tuple[str, int, int] | None:
-    """Return path, time and size of the picture of the training that is under way, or None."""
+def newest_picture(folder: Path) -> Stamp | None:
+    """Return the file of the training that is under way, or None."""
     found = []
     for path in (folder / "stages").glob(f"train-*/{PICTURE}"):
         try:
@@ -73,27 +88,31 @@ def newest_picture(folder: Path) -> tuple[str, int, int] | None:
 
 
 def refresh(folder: str, now_s: float) -> bool:
-    """Look for a new picture, at most every few seconds; tell whether there is one.
+    """Look for a new picture, at most every few seconds; tell whether one is shown now.
 
-    The old picture stays until the new one has been read whole: one that is being written, or is
-    broken, changes nothing.
+    It is read in a thread and shown by a later call. The old picture stays until then: one that
+    is being written, or is broken, changes nothing.
     """
     shown = _shown.setdefault(folder, _Shown())
-    if now_s - shown.looked_s < EVERY_S:
+    if shown.reading is None:
+        if now_s - shown.looked_s >= EVERY_S:
+            shown.looked_s = now_s
+            known = shown.stamp
+            shown.reading = InBackground(lambda: _read(Path(folder), known))
         return False
-    shown.looked_s = now_s
+    if not shown.reading.finished():
+        return False
+    reading, shown.reading = shown.reading, None
     try:
-        stamp = newest_picture(Path(folder))
-    except OSError:
+        read = reading.answer()
+    except (OSError, ValueError, EOFError):
+        _logger.info("no picture of %s", folder, exc_info=True)
         return False
-    if stamp is None or stamp == shown.stamp or stamp[2] > MAX_BYTES:
-        return False
-    loaded = _load(stamp[0])
-    if loaded is None:
+    if read is None:
         return False
     _drop(shown.names)
-    shown.names, shown.icons = loaded
-    shown.stamp = stamp
+    shown.names, shown.icons = _load(read.parts)
+    shown.stamp = read.stamp
     return True
 
 
@@ -113,32 +132,37 @@ def stop() -> None:
         _pictures = None
 
 
-def _load(path: str) -> tuple[tuple[str, ...], tuple[int, ...]] | None:
-    """Read a picture; return names and icons, or None where it is not sound."""
+def _read(folder: Path, known: Stamp | None) -> _Read | None:
+    """Return the newest picture, cut in two where it is wide; None where there is nothing new.
+
+    Raises
+    ------
+    OSError, ValueError, EOFError
+        The file cannot be read, or holds no picture.
+    """
+    stamp = newest_picture(folder)
+    if stamp is None or stamp == known or stamp[2] > MAX_BYTES:
+        return None
+    data = Path(stamp[0]).read_bytes()  # whole: what is replaced meanwhile is not mapped
+    pixels = np.load(io.BytesIO(data), allow_pickle=False)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8 or not pixels.size:
+        raise ValueError(f"{stamp[0]} holds {pixels.dtype} of shape {pixels.shape}")
+    height, width, _ = pixels.shape
+    values = np.ones((height, width, 4), np.float32)
+    values[..., :3] = pixels[::-1] / np.float32(255.0)
+    if width < 2 * height:
+        return _Read(stamp, (values,))
+    return _Read(stamp, (values[:, : width // 2], values[:, -(width // 2) :]))
+
+
+def _load(parts: tuple[np.ndarray, ...]) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Make pictures of (h, w, 4) values; return names and icons."""
     global _pictures, _count
     if _pictures is None:
         _pictures = bpy.utils.previews.new()
-    _count += 1
-    name = str(_count)  # a new name each time: Blender keeps what it has drawn of an old one
-    try:
-        picture = _pictures.load(name, path, "IMAGE", force_reload=True)
-        width, height = picture.image_size[:]  # reads the file now, so that drawing does not
-        if not width or not height:
-            _drop((name,))
-            return None
-        if width < 2 * height:
-            return (name,), (picture.icon_id,)
-        pixels = np.empty((height, width, 4), np.float32)
-        picture.image_pixels_float.foreach_get(pixels.ravel())
-    except (KeyError, OSError, RuntimeError):
-        _logger.exception("cannot show %s", path)
-        return None
-    _drop((name,))
-    halves = {
-        f"{name} photo": pixels[:, : width // 2],
-        f"{name} rendering": pixels[:, -width // 2 :],
-    }
-    return tuple(halves), tuple(_new(part, values) for part, values in halves.items())
+    _count += 1  # new names each time: Blender keeps what it has drawn of an old one
+    names = tuple(f"{_count} {part}" for part in ("photo", "rendering")[: len(parts)])
+    return names, tuple(map(_new, names, parts))
 
 
 def _new(name: str, pixels: np.ndarray) -> int:

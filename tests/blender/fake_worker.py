@@ -24,7 +24,7 @@ from gaussian_wrapping_addon.core.jobs.job_folder import (
     JobStatus,
     process_start_ticks,
 )
-from tests.blender.synthetic_result import png_bytes, write_region_result, write_result
+from tests.blender.synthetic_result import npy_bytes, write_region_result, write_result
 
 LIVE = {
     "iteration": 750.0,
@@ -82,7 +82,7 @@ def main() -> int:
     if mode == "slow":
         trained = folder.stages / "train-now"
         trained.mkdir(exist_ok=True)
-        (trained / "preview-training.png").write_bytes(png_bytes(picture()))
+        (trained / "preview-training.npy").write_bytes(npy_bytes(picture()))
     while mode == "slow":
         time.sleep(0.02)
         if not folder.root.is_dir():

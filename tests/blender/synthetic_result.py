@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import struct
@@ -57,6 +58,13 @@ BOX_SCENE = (
     np.array([1.2, 0.9, 0.7]) * CUBE_CORNERS @ rotation_about((0, 0, 1), 0.3).T
     + np.array([0.2, -0.1, 0.4])
 )  # fmt: skip
+
+
+def npy_bytes(values: np.ndarray) -> bytes:
+    """Return an array as the bytes of a NumPy file."""
+    stream = io.BytesIO()
+    np.save(stream, values)
+    return stream.getvalue()
 
 
 def png_bytes(pixels: np.ndarray) -> bytes:

@@ -30,7 +30,7 @@ from gaussian_wrapping_addon.ops.scene_objects import import_result
 from gaussian_wrapping_addon.ui import train_advanced_panel, train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.fake_worker import LIVE, picture
-from tests.blender.synthetic_result import png_bytes, write_result
+from tests.blender.synthetic_result import npy_bytes, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
 
@@ -174,16 +174,25 @@ def test_live_rows(figures: object, rows: dict[str, str] | None) -> None:
 def write_picture(folder: Path, name: str = "train-now", data: bytes | None = None) -> Path:
     path = folder / "stages" / name / live_preview.PICTURE
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(png_bytes(picture()) if data is None else data)
+    path.write_bytes(npy_bytes(picture()) if data is None else data)
     return path
+
+
+def refreshed(key: str, now_s: float) -> bool:
+    """Look for a picture, wait until it is read, and show it."""
+    assert not live_preview.refresh(key, now_s), "it is read in a thread"
+    reading = live_preview._shown[key].reading
+    if reading is not None:
+        reading._thread.join()
+    return live_preview.refresh(key, now_s)
 
 
 def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> None:
     key = str(tmp_path)
-    assert not live_preview.refresh(key, 0.0), "no picture yet"
+    assert not refreshed(key, 0.0), "no picture yet"
     path = write_picture(tmp_path)
-    assert not live_preview.refresh(key, live_preview.EVERY_S - 0.1), "not yet time"
-    assert live_preview.refresh(key, 10.0)
+    assert not refreshed(key, live_preview.EVERY_S - 0.1), "not yet time"
+    assert refreshed(key, 10.0)
     assert live_preview.path_of(key) == str(path)
     assert len(live_preview.icons_of(key)) == 2, "photo and rendering"
     names = live_preview._shown[key].names
@@ -191,10 +200,11 @@ def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> N
     assert left.image_size[:] == right.image_size[:]
     colours = [np.array(p.image_pixels_float[:]).reshape(-1, 4).mean(0) for p in (left, right)]
     assert colours[1][:3] == pytest.approx(0.875 * colours[0][:3], abs=0.03)
-    assert not live_preview.refresh(key, 20.0), "nothing new"
-    for bad in (b"", b"no picture", png_bytes(picture())[:200]):
+    assert not refreshed(key, 20.0), "nothing new"
+    flat = npy_bytes(picture()[..., 0])
+    for bad in (b"", b"no picture", npy_bytes(picture())[:200], flat, npy_bytes(np.zeros(0))):
         write_picture(tmp_path, data=bad)
-        live_preview.refresh(key, live_preview._shown[key].looked_s + 10.0)
+        assert not refreshed(key, live_preview._shown[key].looked_s + 10.0)
         assert live_preview.icons_of(key)
     (path.parent / "done.json").write_text("{}")
     assert live_preview.newest_picture(tmp_path) is None, "a finished training is not under way"
@@ -210,6 +220,8 @@ def test_a_running_training_is_drawn_and_let_go(tmp_path: Path) -> None:
     running = JobStatus("RUNNING", "train", 0.3, "iteration 750/3000", 90.0, figures=LIVE)
     client = Client(running)
     job_timer.watch(bpy.context.scene, tmp_path, client, imports=False)  # type: ignore[arg-type]
+    job_timer.poll_jobs()
+    live_preview._shown[str(tmp_path)].reading._thread.join()
     job_timer.poll_jobs()
     layout = draw(train_panel.GWRAP_PT_train)
     assert "750 of 3,000" in layout.texts

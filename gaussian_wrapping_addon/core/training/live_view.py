@@ -27,6 +27,8 @@ from .photo_source import Photos
 _logger = logging.getLogger(__name__)
 
 PREVIEW_FILE = "preview-training.png"
+PIXELS_FILE = "preview-training.npy"
+"""The same picture as bare (h, w, 3) uint8 values, which need no decoder."""
 PREVIEW_PX = 640
 """Width of the whole picture: photo and render side by side."""
 
@@ -136,7 +138,7 @@ class LiveView:
         Views that are never trained on. The middle one is shown; the first view of all where
         there is none.
     folder : Path
-        Gets :data:`PREVIEW_FILE`, replaced atomically.
+        Gets :data:`PREVIEW_FILE` and :data:`PIXELS_FILE`, each replaced atomically.
     settings : TrainingSettings
         ``preview_every_s`` is the time between two looks; 0 never looks.
     threads : int
@@ -204,6 +206,7 @@ class LiveView:
         picture = side_by_side(self._photos.photo(self._shown, divisor), image)
         try:
             write_bytes(self._folder / PREVIEW_FILE, png(picture))
+            write_bytes(self._folder / PIXELS_FILE, npy(picture))
         except OSError as error:
             # The training does not need pictures; whether its checkpoints fit is told elsewhere.
             self._every_s = 0.0
@@ -215,6 +218,13 @@ def side_by_side(photo: np.ndarray, rendering: np.ndarray) -> np.ndarray:
     right = np.rint(255.0 * np.clip(np.nan_to_num(rendering), 0.0, 1.0)).astype(np.uint8)
     gap = np.zeros((photo.shape[0], GAP_PX, 3), np.uint8)
     return np.concatenate([photo, gap, right], axis=1)
+
+
+def npy(picture: np.ndarray) -> bytes:
+    """Return the bytes of a NumPy file of an array."""
+    stream = io.BytesIO()
+    np.save(stream, picture, allow_pickle=False)
+    return stream.getvalue()
 
 
 def png(picture: np.ndarray) -> bytes:

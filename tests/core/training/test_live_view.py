@@ -21,6 +21,7 @@ from gaussian_wrapping_addon.core.training import live_view
 from gaussian_wrapping_addon.core.training.cancelling import checked
 from gaussian_wrapping_addon.core.training.live_view import (
     GAP_PX,
+    PIXELS_FILE,
     PREVIEW_FILE,
     LiveView,
     measure_held_out,
@@ -45,8 +46,9 @@ def test_looks_only_when_due_and_writes_photo_and_render(tmp_path: Path) -> None
     assert live.look(gaussians, 8) is None
     now_s = 120.0
     assert live.look(gaussians, 9) is not None
-    assert [path.name for path in tmp_path.iterdir()] == [PREVIEW_FILE]
+    assert {path.name for path in tmp_path.iterdir()} == {PREVIEW_FILE, PIXELS_FILE}
     picture = np.asarray(Image.open(tmp_path / PREVIEW_FILE))
+    assert (np.load(tmp_path / PIXELS_FILE, allow_pickle=False) == picture).all()
     width = photos.camera(4).width
     assert picture.shape == (photos.camera(4).height, 2 * width + GAP_PX, 3)
     assert (picture[:, :width] == photos.photo(4)).all()
