@@ -32,8 +32,9 @@ class InBackground(Generic[Answer]):
         except Exception as failure:  # raised where somebody waits for it
             self._failure = failure
 
-    def finished(self) -> bool:
-        """Tell whether :meth:`answer` has one; never waits."""
+    def finished(self, wait_s: float = 0.0) -> bool:
+        """Tell whether :meth:`answer` has one, or gets one within a time."""
+        self._thread.join(wait_s)
         return not self._thread.is_alive()
 
     def answer(self) -> Answer:

@@ -32,6 +32,8 @@ from .scene_objects import import_result
 _logger = logging.getLogger(__name__)
 
 POLL_S = 0.3
+LOOK_WAIT_S = 0.02
+"""For the disk to tell of a job, usually in 1 ms; one that sleeps or is far away tells later."""
 IMPORT_STAGE = "import"
 """Shown as a stage of the job while its result is read."""
 
@@ -48,6 +50,8 @@ class _Job:
     command: str = "WRAP"
     waits_for_mode: bool = False
     """Finished, but Blender is in a mode in which nothing can be imported."""
+    look: InBackground[JobStatus] | None = None
+    """A look at the job's folder that the disk has not answered yet."""
     reading: InBackground[ResultFiles] | None = None
     """The result while it is read, and until it can be imported."""
 
@@ -189,10 +193,13 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
 
 
 def _poll(folder: str, job: _Job, now_s: float) -> None:
-    job.status = job.client.poll()
-    if job.status.state == "LOST":
-        # It may have written its last word between our look at the file and at the process.
-        job.status = job.client.poll()
+    if job.look is None:
+        client = job.client
+        job.look = InBackground(lambda: _looked(client))
+    if not job.look.finished(LOOK_WAIT_S):
+        return
+    look, job.look = job.look, None
+    job.status = look.answer()
     job.waits_for_mode = False
     if job.status.active:
         if job.cancel_asked_s is not None and now_s - job.cancel_asked_s > limits.CANCEL_GRACE_S:
@@ -206,6 +213,13 @@ def _poll(folder: str, job: _Job, now_s: float) -> None:
         job.status = replace(job.status, state="CANCELLED", error="", hint=hint)
     if job.status.state == "DONE" and job.imports:
         _bring_in(folder, job)
+
+
+def _looked(client: JobClient) -> JobStatus:
+    """Look at a job's folder; runs in a thread."""
+    status = client.poll()
+    # It may have written its last word between our look at the file and at the process.
+    return client.poll() if status.state == "LOST" else status
 
 
 def _bring_in(folder: str, job: _Job) -> None:

@@ -55,10 +55,13 @@ def _clean_file() -> Iterator[None]:
 
 
 @pytest.fixture
-def addon() -> Iterator[object]:
+def addon(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     """The add-on, registered for one test; leaving classes behind hangs some Blenders at exit."""
     import gaussian_wrapping_addon
+    from gaussian_wrapping_addon.ops import job_timer
 
+    # One look at a job is enough, however busy the machine is.
+    monkeypatch.setattr(job_timer, "LOOK_WAIT_S", 30.0)
     gaussian_wrapping_addon.register()
     try:
         yield gaussian_wrapping_addon

@@ -66,6 +66,9 @@ pytestmark = pytest.mark.usefixtures("addon")
 
 STAGES = ("cameras", "train", "texture", "import")
 STALL_S = 0.05
+LOOK_WAIT_S = job_timer.LOOK_WAIT_S
+"""As people have it; the fixture ``addon`` waits longer, so that one look is enough."""
+
 GRID = 317
 """Vertices a side of the typical mesh: 199 712 faces."""
 
@@ -75,8 +78,8 @@ class _HeldReading(in_background.InBackground):
 
     hold = threading.Event()
 
-    def finished(self) -> bool:
-        return self.hold.is_set() and super().finished()
+    def finished(self, wait_s: float = 0.0) -> bool:
+        return self.hold.is_set() and super().finished(wait_s)
 
 
 @pytest.fixture(autouse=True)
@@ -113,7 +116,9 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, st
 def hold(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Let the reading of results last until this is set."""
     monkeypatch.setattr(_HeldReading, "hold", threading.Event())
-    monkeypatch.setattr(job_timer, "InBackground", _HeldReading)
+    monkeypatch.setattr(
+        job_timer, "_reading", lambda folder: _HeldReading(lambda: read_result(folder))
+    )
     return _HeldReading.hold
 
 
@@ -446,6 +451,7 @@ def test_no_tick_blocks_blender(
     """With a long log and new pictures of the size that trainings write, at every look."""
     folder = job_in("train", photos, worker)
     monkeypatch.setattr(live_preview, "EVERY_S", 0.0)
+    monkeypatch.setattr(job_timer, "LOOK_WAIT_S", LOOK_WAIT_S)
     for name in ("log.txt", "worker-output.txt"):
         (folder / name).write_bytes(b"2026-01-01 12:00:00 INFO train 12.3 % a line\n" * 200_000)
     random = np.random.default_rng(0)
@@ -457,6 +463,29 @@ def test_no_tick_blocks_blender(
         longest_s.append(_longest_s(folder, 20))
     assert min(longest_s) < STALL_S, longest_s
     assert len(live_preview.icons_of(str(folder))) == 2, "pictures were shown meanwhile"
+
+
+def test_a_disk_that_does_not_answer_holds_nobody_up(
+    photos: Path, worker: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = job_in("train", photos, worker)
+    monkeypatch.setattr(job_timer, "LOOK_WAIT_S", LOOK_WAIT_S)
+    client = job_timer._jobs[str(folder)].client
+    answers = threading.Event()
+    told = replace(client.poll(), message="told late")
+
+    def poll() -> JobStatus:
+        assert answers.wait(60.0)
+        return told
+
+    monkeypatch.setattr(client, "poll", poll)
+    longest_s = [_longest_s(folder, 4) for _ in range(3)]
+    assert min(longest_s) < STALL_S, longest_s
+    assert status_of(folder).message != "told late"
+    answers.set()
+    job_timer._jobs[str(folder)].look.finished(60.0)
+    job_timer.poll_jobs()
+    assert status_of(folder).message == "told late"
 
 
 def test_bringing_in_a_typical_mesh_blocks_for_less_than_a_second(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +36,32 @@ class Stalls:
         self.waited_s: list[float] = []
         self.imports_s: list[float] = []
         self._timer.poll_jobs = self._measured
+        self.longest: list[dict[str, object]] = []
+        """The longest looks, each with what the job did and where the time went."""
+        self._parts_s: dict[str, float] = {}
+        for owner, name in (
+            (driving.module("core.jobs.client").JobClient, "poll"),
+            (driving.module("ops.live_preview"), "refresh"),
+            (self._timer, "_bring_in"),
+            (self._timer, "_redraw"),
+        ):
+            setattr(owner, name, self._timed(name, getattr(owner, name)))
+
+    def _timed(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*arguments: Any, **options: Any) -> Any:
+            began_s = time.perf_counter()
+            try:
+                return call(*arguments, **options)
+            finally:
+                took_s = time.perf_counter() - began_s
+                self._parts_s[name] = self._parts_s.get(name, 0.0) + took_s
+
+        return timed
 
     def _measured(self, *arguments: Any) -> bool:
         meshes = len(bpy.data.objects)
+        self._parts_s.clear()
+        spent_s = time.thread_time()
         began_s, waited_s = time.perf_counter(), queued_s()
         answer = self._poll(*arguments)
         took_s, waited_s = time.perf_counter() - began_s, queued_s() - waited_s
@@ -47,6 +70,13 @@ class Stalls:
         else:
             self.looks_s.append(took_s - waited_s)
             self.waited_s.append(waited_s)
+            look = {
+                "look_s": self.looks_s[-1],
+                "processor_s": time.thread_time() - spent_s,
+                "parts_s": dict(self._parts_s),
+                "stage": driving.job_status().stage,
+            }
+            self.longest = sorted([*self.longest, look], key=lambda l: -l["look_s"])[:5]
         return answer
 
 
@@ -100,7 +130,9 @@ def wrap() -> Iterator[float]:
         "looks": len(stalls.looks_s),
         "longest_look_s": max(stalls.looks_s),
         "longest_wait_for_a_processor_s": max(stalls.waited_s),
+        "median_look_s": sorted(stalls.looks_s)[len(stalls.looks_s) // 2],
         "imports_s": stalls.imports_s,
+        "longest": stalls.longest,
     }
     driving.frame_view(objects("mesh"))
     yield 1.0
