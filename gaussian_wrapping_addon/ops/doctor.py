@@ -10,6 +10,7 @@ from pathlib import Path
 import bpy
 
 from ..core.jobs.doctor import Diagnosis, find_and_diagnose
+from .redrawing import redraw
 
 POLL_S = 0.3
 
@@ -63,10 +64,7 @@ def show() -> float | None:
         return POLL_S
     _findings[:] = found
     _busy.clear()
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "PREFERENCES":
-                area.tag_redraw()
+    redraw("PREFERENCES")
     return None
 
 

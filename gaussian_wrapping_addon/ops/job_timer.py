@@ -26,6 +26,7 @@ from ..core.jobs.client import JobClient
 from ..core.jobs.job_folder import JobStatus
 from . import known_jobs, live_preview, tags
 from .in_background import InBackground
+from .redrawing import redraw
 from .result_files import ResultFiles, read_result
 from .scene_objects import import_result
 
@@ -188,7 +189,7 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
         busy = busy or job.status.active or job.waits_for_mode
         changed = changed or before != (job.status, job.waits_for_mode)
     if changed:
-        _redraw()
+        redraw()
     return busy
 
 
@@ -269,13 +270,6 @@ def _push_undo(message: str) -> None:
         return  # no undo without a window
     with bpy.context.temp_override(window=bpy.context.window or windows[0]):
         bpy.ops.ed.undo_push(message=message)
-
-
-def _redraw() -> None:
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
 
 
 def scene_of_uid(uid: int) -> bpy.types.Scene | None:

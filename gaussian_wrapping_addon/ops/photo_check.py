@@ -16,6 +16,7 @@ import bpy
 from ..core.errors import WrapError
 from . import panel_state, training_estimate
 from .job_actions import WorkerChoice, source_of
+from .redrawing import answers_in, redraw
 
 if TYPE_CHECKING:
     from ..core.dataset.check import Finding
@@ -96,11 +97,7 @@ def _look(number: int, check_input: Callable[[Path], list[Finding]], source: Pat
 
 def show() -> float | None:
     """Timer: keep the findings when they are there, and redraw."""
-    while True:
-        try:
-            number, found = _answers.get_nowait()
-        except queue.Empty:
-            break
+    for number, found in answers_in(_answers):
         if number != _check.number:
             continue  # of a check that a later one has replaced
         _check.busy = False
@@ -110,10 +107,7 @@ def show() -> float | None:
             _estimate(scene)
     if _check.busy:
         return POLL_S
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+    redraw()
     return None
 
 

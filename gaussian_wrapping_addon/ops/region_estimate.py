@@ -27,6 +27,7 @@ from ..core.jobs.client import worker_python
 from ..core.settings import MeshingSettings, to_json
 from . import region_watch, tags
 from .estimate_child import ask_child
+from .redrawing import answers_in, redraw
 from .region_objects import region_body
 from .region_resolution import checked_edge_length, edge_length_in_blender, world_per_blender
 from .training_estimate import Estimate, estimate_of
@@ -194,20 +195,13 @@ def _ask(number: int, question: _Question) -> Estimate:
 def show() -> float | None:
     """Timer: take the answers that are there, and redraw."""
     news = False
-    while True:
-        try:
-            number, uid, answer = _answers.get_nowait()
-        except queue.Empty:
-            break
+    for number, uid, answer in answers_in(_answers):
         if number == _state.number and uid in _state.waiting:
             _state.answers[uid] = answer
             _state.waiting.remove(uid)
             news = True
     if news:
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                if area.type == "VIEW_3D":
-                    area.tag_redraw()
+        redraw()
     return POLL_S if is_busy() else None
 
 

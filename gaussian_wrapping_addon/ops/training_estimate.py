@@ -18,6 +18,7 @@ from ..core.jobs.client import worker_python
 from ..core.jobs.job_file import make_job
 from .estimate_child import ask_child
 from .job_actions import WorkerChoice, source_of
+from .redrawing import answers_in, redraw
 from .training_choices import choices_key, job_settings
 
 MODULE = "jobs.estimate"
@@ -160,20 +161,13 @@ def _capital(text: str) -> str:
 
 def show() -> float | None:
     """Timer: take the answer when there is one, and redraw."""
-    while True:
-        try:
-            number, answer = _answers.get_nowait()
-        except queue.Empty:
-            break
+    for number, answer in answers_in(_answers):
         if number == _question.number:
             _question.answer, _question.process = answer, None
             _keep(_question.key, answer)
     if is_busy():
         return POLL_S
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+    redraw()
     return None
 
 

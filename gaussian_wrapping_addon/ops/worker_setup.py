@@ -30,6 +30,7 @@ from ..core.worker_environment import WorkerEnvironment
 from ..core.worker_requirements import requirements_file
 from . import doctor
 from .job_actions import worker_choice
+from .redrawing import redraw
 
 _logger = logging.getLogger(__name__)
 
@@ -231,7 +232,7 @@ def tick() -> float | None:
     if _state.client is not None:
         _poll(_state.client)
     if before != (_state.status, _state.search is None, _state.removing is None):
-        _redraw()
+        redraw("PREFERENCES", "VIEW_3D")
     return POLL_S if is_busy() or _state.search is not None else None
 
 
@@ -247,13 +248,6 @@ def _poll(client: SetupClient) -> None:
     if _state.status.state == "DONE":
         with contextlib.suppress(WrapError):
             doctor.start(worker_choice(bpy.context).python)
-
-
-def _redraw() -> None:
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in ("PREFERENCES", "VIEW_3D"):
-                area.tag_redraw()
 
 
 def stop() -> None:

@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ..ops.redrawing import redraw
 from ..ops.region_box import (
     as_columns,
     cage_frame,
@@ -91,10 +92,7 @@ def _end_later() -> float | None:
     """Timer: no undo step can be made while Blender draws."""
     if _drag.regions:
         # Nothing draws after the button is let go: only draw_prepare sees that the drag is over.
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                if area.type == "VIEW_3D":
-                    area.tag_redraw()
+        redraw()
         return _POLL_S
     end_drag()
     return None

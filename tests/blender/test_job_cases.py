@@ -24,10 +24,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import bpy
 import numpy as np
@@ -44,7 +43,7 @@ from gaussian_wrapping_addon.core.jobs.job_folder import (
     JobStatus,
     process_start_ticks,
 )
-from gaussian_wrapping_addon.ops import in_background, job_timer, known_jobs, live_preview
+from gaussian_wrapping_addon.ops import in_background, job_timer, live_preview
 from gaussian_wrapping_addon.ops.result_files import read_result
 from gaussian_wrapping_addon.ui import train_panel
 from tests.blender.fake_layout import draw
@@ -62,7 +61,7 @@ from tests.blender.synthetic_result import npy_bytes, png_bytes
 PREVIEW_PX = 640
 """Width of the pictures that trainings write (training/live_view.py)."""
 
-pytestmark = pytest.mark.usefixtures("addon")
+pytestmark = pytest.mark.usefixtures("ended_workers")
 
 STAGES = ("cameras", "train", "texture", "import")
 STALL_S = 0.05
@@ -80,16 +79,6 @@ class _HeldReading(in_background.InBackground):
 
     def finished(self, wait_s: float = 0.0) -> bool:
         return self.hold.is_set() and super().finished(wait_s)
-
-
-@pytest.fixture(autouse=True)
-def _private_state(addon: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """End the workers before ``addon`` is unregistered, which forgets them on purpose."""
-    monkeypatch.setattr(known_jobs, "_session", [])
-    yield
-    for job in job_timer._jobs.values():
-        job.client.kill()
-    job_timer.forget_all()
 
 
 @pytest.fixture
@@ -478,14 +467,15 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(
         assert answers.wait(60.0)
         return told
 
-    monkeypatch.setattr(client, "poll", poll)
-    longest_s = [_longest_s(folder, 4) for _ in range(3)]
-    assert min(longest_s) < STALL_S, longest_s
-    assert status_of(folder).message != "told late"
-    answers.set()
-    job_timer._jobs[str(folder)].look.finished(60.0)
-    job_timer.poll_jobs()
-    assert status_of(folder).message == "told late"
+    with monkeypatch.context() as slow:
+        slow.setattr(client, "poll", poll)
+        longest_s = [_longest_s(folder, 4) for _ in range(3)]
+        assert min(longest_s) < STALL_S, longest_s
+        assert status_of(folder).message != "told late"
+        answers.set()
+        job_timer._jobs[str(folder)].look.finished(60.0)
+        job_timer.poll_jobs()
+        assert status_of(folder).message == "told late"
 
 
 def test_bringing_in_a_typical_mesh_blocks_for_less_than_a_second(

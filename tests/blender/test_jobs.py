@@ -9,7 +9,7 @@ import signal
 import stat
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -27,19 +27,7 @@ from tests.blender.synthetic_result import BOX_SCENE, WORLD_FROM_SCENE
 
 HERE = Path(__file__).parent
 
-pytestmark = pytest.mark.usefixtures("addon")
-
-
-@pytest.fixture(autouse=True)
-def _private_state(addon: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """End the workers before ``addon`` is unregistered, which forgets them on purpose."""
-    monkeypatch.setattr(known_jobs, "_session", [])
-    yield
-    for job in job_timer._jobs.values():
-        if job.client.poll().active:
-            job.client.kill()
-            assert not job.client.poll().active, "a worker outlived its test"
-    job_timer.forget_all()
+pytestmark = pytest.mark.usefixtures("ended_workers")
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
@@ -14,7 +14,7 @@ import pytest
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.job_file import read_job
-from gaussian_wrapping_addon.ops import job_timer, known_jobs, tags
+from gaussian_wrapping_addon.ops import tags
 from gaussian_wrapping_addon.ops.region_hull import MOST_CANDIDATES, convex_hull
 from gaussian_wrapping_addon.ops.region_objects import is_convex, local_hull, region_from_object
 from tests.blender.job_play import (
@@ -26,19 +26,10 @@ from tests.blender.job_play import (
 )
 from tests.blender.synthetic_result import WORLD_FROM_SCENE
 
-pytestmark = pytest.mark.usefixtures("addon")
+pytestmark = pytest.mark.usefixtures("ended_workers")
 
 LIMIT_S = 60.0
 """Of processor time, for a mesh of a million faces; it took 4."""
-
-
-@pytest.fixture(autouse=True)
-def _private_state(addon: object, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(known_jobs, "_session", [])
-    yield
-    for job in job_timer._jobs.values():
-        job.client.kill()
-    job_timer.forget_all()
 
 
 @pytest.fixture

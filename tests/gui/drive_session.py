@@ -7,7 +7,9 @@ takes screenshots and ``outcome.json``; ``GW_GUI_WORKER`` is the worker's Python
 
 from __future__ import annotations
 
+import gc
 import os
+import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -31,21 +33,22 @@ class Stalls:
     def __init__(self) -> None:
         self._timer = driving.module("ops.job_timer")
         self._poll = self._timer.poll_jobs
+        self._timer.poll_jobs = self._measured
         self.looks_s: list[float] = []
         """Without waiting for a processor that others had."""
-        self.waited_s: list[float] = []
         self.imports_s: list[float] = []
-        self._timer.poll_jobs = self._measured
-        self.longest: list[dict[str, object]] = []
+        self.longest: list[dict[str, Any]] = []
         """The longest looks, each with what the job did and where the time went."""
         self._parts_s: dict[str, float] = {}
         for owner, name in (
             (driving.module("core.jobs.client").JobClient, "poll"),
             (driving.module("ops.live_preview"), "refresh"),
             (self._timer, "_bring_in"),
-            (self._timer, "_redraw"),
+            (self._timer, "redraw"),
         ):
             setattr(owner, name, self._timed(name, getattr(owner, name)))
+        gc.callbacks.append(self._collecting)
+        self._collection_began_s = 0.0
 
     def _timed(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*arguments: Any, **options: Any) -> Any:
@@ -53,36 +56,65 @@ class Stalls:
             try:
                 return call(*arguments, **options)
             finally:
-                took_s = time.perf_counter() - began_s
-                self._parts_s[name] = self._parts_s.get(name, 0.0) + took_s
+                self._add(name, time.perf_counter() - began_s)
 
         return timed
 
-    def _measured(self, *arguments: Any) -> bool:
-        meshes = len(bpy.data.objects)
-        self._parts_s.clear()
-        spent_s = time.thread_time()
-        began_s, waited_s = time.perf_counter(), queued_s()
-        answer = self._poll(*arguments)
-        took_s, waited_s = time.perf_counter() - began_s, queued_s() - waited_s
-        if len(bpy.data.objects) != meshes:
-            self.imports_s.append(took_s)
+    def _collecting(self, phase: str, _information: dict[str, int]) -> None:
+        if phase == "start":
+            self._collection_began_s = time.perf_counter()
         else:
-            self.looks_s.append(took_s - waited_s)
-            self.waited_s.append(waited_s)
-            look = {
-                "look_s": self.looks_s[-1],
-                "processor_s": time.thread_time() - spent_s,
-                "parts_s": dict(self._parts_s),
-                "stage": driving.job_status().stage,
-            }
-            self.longest = sorted([*self.longest, look], key=lambda l: -l["look_s"])[:5]
+            self._add("collecting garbage", time.perf_counter() - self._collection_began_s)
+
+    def _add(self, name: str, took_s: float) -> None:
+        self._parts_s[name] = self._parts_s.get(name, 0.0) + took_s
+
+    def _measured(self, *arguments: Any) -> bool:
+        things = len(bpy.data.objects)
+        self._parts_s.clear()
+        # The outer clocks may count what happens between them and the inner one, never less.
+        waited_s, stolen, spent_s = queued_s(), stolen_s(), time.thread_time()
+        began_s = time.perf_counter()
+        answer = self._poll(*arguments)
+        took_s = time.perf_counter() - began_s
+        spent_s = time.thread_time() - spent_s
+        waited_s, stolen = queued_s() - waited_s, stolen_s() - stolen
+        if len(bpy.data.objects) != things:
+            self.imports_s.append(took_s)
+            return answer
+        look = {
+            "look_s": max(0.0, took_s - waited_s - stolen),
+            "took_s": took_s,
+            "processor_s": spent_s,
+            "waited_for_a_processor_s": waited_s,
+            "stolen_s": stolen,
+            "parts_s": dict(self._parts_s),
+            "stage": driving.job_status().stage,
+        }
+        self.looks_s.append(look["look_s"])
+        by_length = sorted([*self.longest, look], key=lambda look: -float(look["took_s"]))
+        self.longest = by_length[:8]
         return answer
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures for ``outcome.json``."""
+        return {
+            "looks": len(self.looks_s),
+            "longest_look_s": max(self.looks_s),
+            "median_look_s": statistics.median(self.looks_s),
+            "imports_s": self.imports_s,
+            "longest": self.longest,
+        }
 
 
 def queued_s() -> float:
     """Return how long this thread has waited for a processor that others had, as Linux tells."""
     return int(Path("/proc/thread-self/schedstat").read_text().split()[1]) * 1e-9
+
+
+def stolen_s() -> float:
+    """Return how long the machine's host had its processors for others, in hundredths."""
+    return int(Path("/proc/stat").read_text().split(maxsplit=9)[8]) / os.sysconf("SC_CLK_TCK")
 
 
 def photos() -> Iterator[float]:
@@ -126,14 +158,7 @@ def wrap() -> Iterator[float]:
     check(seen == sorted(seen), "the bar never went back")
     check({"cameras", "train", "mesh", "texture"} <= set(stages), f"stages: {stages}")
     yield from until(lambda: objects("mesh") != [], "the result is imported")
-    driving.outcome["stalls"] = {
-        "looks": len(stalls.looks_s),
-        "longest_look_s": max(stalls.looks_s),
-        "longest_wait_for_a_processor_s": max(stalls.waited_s),
-        "median_look_s": sorted(stalls.looks_s)[len(stalls.looks_s) // 2],
-        "imports_s": stalls.imports_s,
-        "longest": stalls.longest,
-    }
+    driving.outcome["stalls"] = stalls.summary()
     driving.frame_view(objects("mesh"))
     yield 1.0
     screenshot("3-wrapped")

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Ask Blender to draw what has changed."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Iterator
+from typing import TypeVar
+
+import bpy
+
+Answer = TypeVar("Answer")
+
+
+def redraw(*kinds: str) -> None:
+    """Let all areas of these kinds be drawn again, of 3D views where none is named."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in (kinds or ("VIEW_3D",)):
+                area.tag_redraw()
+
+
+def answers_in(answers: queue.Queue[Answer]) -> Iterator[Answer]:
+    """Take out what threads have put into a queue so far; never waits."""
+    while not answers.empty():
+        yield answers.get_nowait()
