@@ -16,8 +16,11 @@ from pathlib import Path
 _logger = logging.getLogger("gaussian_wrapping")
 
 
-def main(arguments: list[str]) -> int:
-    """Run one command and return the exit code (0, 1, 2, 3, 4, 5: see the README)."""
+def main(arguments: list[str], program: str = "batch.py") -> int:
+    """Run one command and return the exit code (0, 1, 2, 3, 4, 5: see the README).
+
+    ``program`` is how help and usage call it.
+    """
     from .command_line.option_names import in_words_of_options
     from .command_line.parser import build_parser
     from .core.errors import EXIT_OTHER, NO_ROOM, SettingError, WrapError, cannot_be_written
@@ -25,7 +28,7 @@ def main(arguments: list[str]) -> int:
 
     _log_to_terminal()
     try:
-        options = build_parser().parse_args(arguments)
+        options = build_parser(program).parse_args(arguments)
         return int(options.run(options))
     except SettingError as error:
         _logger.error("error: %s", in_words_of_options(error))

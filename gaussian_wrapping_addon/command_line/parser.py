@@ -41,9 +41,9 @@ class Parser(ArgumentParser):
         )
 
 
-def build_parser() -> Parser:
+def build_parser(program: str = "batch.py") -> Parser:
     """Return a parser whose options have ``run``: the command, given the options."""
-    parser = Parser(prog="batch.py", description="Photos in, a textured mesh out.")
+    parser = Parser(prog=program, description="Photos in, a textured mesh out.")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
     for add in _COMMANDS:
         add(commands)

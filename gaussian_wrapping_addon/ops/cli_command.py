@@ -19,7 +19,7 @@ def run(arguments: list[str]) -> int:
     """Run one command and return its exit code; Blender calls this."""
     from .. import batch
 
-    return batch.main(list(arguments))
+    return batch.main(list(arguments), f"blender --command {NAME}")
 
 
 def register() -> None:

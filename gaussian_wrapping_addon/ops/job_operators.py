@@ -200,6 +200,9 @@ class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
         if not context.scene.gwrap.job_folder:
             cls.poll_message_set("This scene has no job; press Wrap Scene, or find its folder")
             return False
+        if job_timer.is_gone(context.scene.gwrap.job_folder):
+            cls.poll_message_set("The job's folder is gone; press Find Job where it was moved")
+            return False
         return no_job_runs(cls, context)
 
     def folder(self, context: bpy.types.Context) -> Path | None:

@@ -58,6 +58,8 @@ class _Job:
 
 
 _jobs: dict[str, _Job] = {}
+_gone: set[str] = set()
+"""Folders of this machine's jobs that were not there when their file was opened."""
 
 
 def key_of(folder: str) -> str:
@@ -77,6 +79,7 @@ def _show(scene: bpy.types.Scene, folder: Path, job: _Job) -> None:
     properties.job_folder = str(folder)
     job.command = properties.job_command
     key = key_of(properties.job_folder)
+    _gone.discard(key)
     _jobs.pop(key, None)  # the newest job of a scene is the last
     _jobs[key] = job
 
@@ -85,6 +88,11 @@ def status_of(folder: str) -> JobStatus | None:
     """Return the last known status of a scene's job folder; None where it is not watched."""
     job = _jobs.get(key_of(folder))
     return job.status if job else None
+
+
+def is_gone(folder: str) -> bool:
+    """Tell whether a scene's job folder was not to be found; reads nothing."""
+    return key_of(folder) in _gone
 
 
 def result_to_import(scene: bpy.types.Scene) -> str:
@@ -325,6 +333,10 @@ def attach_open_file() -> None:
             continue
         folder = find_job_folder(stored)
         if folder is None:
+            place = Path(key_of(stored))
+            # Folders that only the file names are not touched: they may be on anybody's network.
+            if stored and known_jobs.is_trusted(place) and not place.is_dir():
+                _gone.add(str(place))
             continue
         try:
             attach(scene, folder)

@@ -20,6 +20,7 @@ class Stage(enum.Enum):
     RUNNING = "a job runs"
     STOPPED = "a job was cancelled or has failed"
     NOT_OPEN = "the file names a job that is not watched"
+    GONE = "the file names a job whose folder is not there any more"
     WAITING = "finished, but Blender is in a mode in which nothing can be imported"
     IMPORTABLE = "finished, but the scene does not show it"
     FINISHED = "the scene shows a result"
@@ -32,6 +33,7 @@ PRIMARY: Final = {
     Stage.RUNNING: "gwrap.cancel_job",
     Stage.STOPPED: "gwrap.resume_job",
     Stage.NOT_OPEN: "gwrap.resume_job",
+    Stage.GONE: "gwrap.find_job",
     Stage.WAITING: "object.mode_set",
     Stage.IMPORTABLE: "gwrap.import_result",
     Stage.FINISHED: "gwrap.mesh_region",
@@ -47,7 +49,7 @@ def stage_of(context: bpy.types.Context) -> Stage:
     if properties.job_folder:
         status = job_timer.status_of(properties.job_folder)
         if status is None:
-            return Stage.NOT_OPEN
+            return Stage.GONE if job_timer.is_gone(properties.job_folder) else Stage.NOT_OPEN
         if status.active:
             return Stage.RUNNING
         if status.state != "DONE":

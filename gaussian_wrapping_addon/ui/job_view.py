@@ -22,7 +22,8 @@ def job_readiness(context: bpy.types.Context, command: str) -> Readiness | None:
         return None
     status = job_timer.status_of(properties.job_folder)
     if status is None:
-        return Readiness("Not open", "QUESTION")
+        gone = job_timer.is_gone(properties.job_folder)
+        return Readiness("Job is gone" if gone else "Not open", "QUESTION")
     if status.active:
         text = "Cancelling" if status.state == "CANCELLING" else f"{100 * status.fraction:.0f} %"
         return Readiness(text, "SORTTIME")
@@ -38,6 +39,11 @@ def draw_job(layout: Any, context: bpy.types.Context, command: str) -> bool:
         return False
     status = job_timer.status_of(properties.job_folder)
     characters = characters_of(context)
+    if status is None and job_timer.is_gone(properties.job_folder):
+        text = "The folder of this file's job is gone. Find it, or start anew with Wrap Scene."
+        wrapped_label(layout, text, characters, icon="QUESTION")
+        button(layout, context, "gwrap.find_job", icon="FILE_FOLDER")
+        return False
     if status is None:
         text = "This file has a job that is not open here. Resume it, or find its folder."
         wrapped_label(layout, text, characters, icon="QUESTION")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -69,8 +70,15 @@ def test_the_command_is_known_while_the_addon_is(monkeypatch: pytest.MonkeyPatch
     assert known == ["gwrap", "gwrap"]
 
 
-def test_the_command_has_the_exit_codes_of_batch(tmp_path: Path) -> None:
-    assert cli_command.run(["no-such-command"]) == 2
+def test_the_command_has_the_exit_codes_of_batch(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    logging.getLogger("gaussian_wrapping_addon.batch").addHandler(caplog.handler)
+    try:
+        assert cli_command.run(["no-such-command"]) == 2
+    finally:
+        logging.getLogger("gaussian_wrapping_addon.batch").removeHandler(caplog.handler)
+    assert "Usage: blender --command gwrap" in caplog.text
     assert cli_command.run(["resume", str(tmp_path / "missing")]) in (1, 2)
     assert cli_command.run(["check", str(tmp_path)]) == 3
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import stat
 import sys
@@ -364,6 +365,23 @@ def test_a_project_folder_that_was_moved_finds_its_job(
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved" / "work.blend"))
     assert status().state == "DONE"  # type: ignore[attr-defined]
     assert Path(bpy.context.scene.gwrap.job_folder) == tmp_path / "moved" / "job"
+
+
+def test_a_job_whose_folder_was_deleted_is_told_and_forgotten(
+    photos: Path, tmp_path: Path, worker: object
+) -> None:
+    start_wrap(photos)
+    wait_for("DONE")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
+    job_timer.forget_all()
+    shutil.rmtree(bpy.context.scene.gwrap.job_folder)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "work.blend"))
+    assert "is gone" in draw(train_panel.GWRAP_PT_train).texts
+    assert not bpy.ops.gwrap.resume_job.poll()
+    assert bpy.ops.gwrap.wrap_scene.poll()
+    start_wrap(photos)
+    wait_for("DONE")
+    assert "is gone" not in draw(train_panel.GWRAP_PT_train).texts
 
 
 @pytest.mark.parametrize("stored", ["{job}", "/", "//../../..", r"\\server\share\job", "//x\0y"])

@@ -141,6 +141,11 @@ def not_open(folder: Path) -> None:
     bpy.context.scene.gwrap.job_folder = str(folder / "job")
 
 
+def gone(folder: Path) -> None:
+    not_open(folder)
+    job_timer._gone.add(str(folder / "job"))
+
+
 def to_import(folder: Path) -> None:
     checked(folder)
     job(folder, "DONE", result=str(write_result(folder / "job")))
@@ -181,7 +186,7 @@ STATES: dict[State, Stage] = {
     no_data: Stage.NO_DATA, not_checked: Stage.READY, checking: Stage.READY,
     checked: Stage.READY, bad_data: Stage.BAD_DATA, estimated: Stage.READY,
     training: Stage.RUNNING, cancelling: Stage.RUNNING, failed: Stage.STOPPED,
-    lost: Stage.STOPPED, cancelled: Stage.STOPPED, not_open: Stage.NOT_OPEN,
+    lost: Stage.STOPPED, cancelled: Stage.STOPPED, not_open: Stage.NOT_OPEN, gone: Stage.GONE,
     to_import: Stage.IMPORTABLE, in_edit_mode: Stage.WAITING, done: Stage.FINISHED,
     done_two_regions: Stage.FINISHED, meshing: Stage.RUNNING, mesh_failed: Stage.FINISHED,
 }  # fmt: skip
@@ -252,6 +257,7 @@ HEADERS = {
     lost: ("3 photos", "Failed", "Needs a training", "No result"),
     cancelled: ("3 photos", "Cancelled", "Needs a training", "No result"),
     not_open: ("3 photos", "Not open", "Needs a training", "No result"),
+    gone: ("3 photos", "Job is gone", "Needs a training", "No result"),
     to_import: ("3 photos", "Not trained", "Needs a training", "No result"),
     in_edit_mode: ("3 photos", "Not trained", "Needs a training", "No result"),
     done: ("3 photos", "27.2 dB", "1 region", "1 mesh"),
@@ -289,6 +295,7 @@ BUTTONS: dict[State, tuple[list[str], list[str], list[str], list[str]]] = {
     lost: (CHECKED, ["*resume_job", "wrap_scene"], ["-mesh_region"], NO_RESULT),
     cancelled: (CHECKED, ["*resume_job", "wrap_scene"], ["-mesh_region"], NO_RESULT),
     not_open: (CHECKED, ["*resume_job", "find_job", "wrap_scene"], ["-mesh_region"], NO_RESULT),
+    gone: (CHECKED, ["*find_job", "wrap_scene"], ["-mesh_region"], NO_RESULT),
     to_import: (CHECKED, ["*import_result", "wrap_scene"], ["-mesh_region"], NO_RESULT),
     in_edit_mode: (
         CHECKED, ["*object.mode_set", "wrap_scene"], ["-mesh_region"],
@@ -324,6 +331,7 @@ SAID: dict[State, dict[str, str]] = {
     lost: {"Train": f"{ERROR} {HINT}"},
     cancelled: {"Train": "Cancelled at 25 %. Resume continues from the last checkpoint."},
     not_open: {"Train": "This file has a job that is not open here."},
+    gone: {"Train": "The folder of this file's job is gone. Find it,"},
     to_import: {"Train": "Import Finished Result"},
     in_edit_mode: {"Train": "Finished. Leave Edit Mode to see the result. Leave Edit Mode"},
     done: {"Train": "Trained: 4,321 Gaussians, 27.2 dB", "Mesh": "Region: auto region"},
