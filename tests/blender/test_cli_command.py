@@ -73,11 +73,11 @@ def test_the_command_is_known_while_the_addon_is(monkeypatch: pytest.MonkeyPatch
 def test_the_command_has_the_exit_codes_of_batch(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    logging.getLogger("gaussian_wrapping_addon.batch").addHandler(caplog.handler)
+    logging.getLogger("gaussian_wrapping").addHandler(caplog.handler)
     try:
         assert cli_command.run(["no-such-command"]) == 2
     finally:
-        logging.getLogger("gaussian_wrapping_addon.batch").removeHandler(caplog.handler)
+        logging.getLogger("gaussian_wrapping").removeHandler(caplog.handler)
     assert "Usage: blender --command gwrap" in caplog.text
     assert cli_command.run(["resume", str(tmp_path / "missing")]) in (1, 2)
     assert cli_command.run(["check", str(tmp_path)]) == 3
