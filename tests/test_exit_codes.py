@@ -54,6 +54,9 @@ def code_of(words: str) -> int:
         "evaluate empty --truth mesh.off",
         "estimate-mesh --out empty",
         "work-tiles empty",
+        "set-up-worker --dry-run --to trained",
+        "set-up-worker --dry-run --to file",
+        "set-up-worker --to new --find-links file",
     ],
 )
 def test_a_folder_that_is_no_job(place: Path, words: str) -> None:

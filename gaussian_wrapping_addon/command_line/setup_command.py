@@ -42,7 +42,7 @@ def add_set_up_worker(commands: Commands) -> None:
 
 def _set_up_worker(options: Namespace) -> int:
     from ..core.errors import EXIT_DONE, UsageError
-    from ..core.setup.commands import SetupRequest, all_steps
+    from ..core.setup.commands import SetupRequest, all_steps, check_folders
     from ..core.setup.install import remove, repair_request
     from ..core.setup.pythons import find_pythons, probe
     from ..core.worker_environment import default_root, known_environments
@@ -69,6 +69,8 @@ def _set_up_worker(options: Namespace) -> int:
         if not found:
             raise UsageError("No Python 3.11 or newer was found.", "Name one with --python.")
         request = SetupRequest(**{**request.to_json(), "python": found[0].path})
+    if options.dry_run:
+        check_folders(request)
     requirements = read_requirements(Path(request.requirements))
     for step in all_steps(request, probe(request.python), requirements):
         _logger.info("$ %s", step.line)

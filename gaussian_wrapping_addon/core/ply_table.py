@@ -124,29 +124,8 @@ def _property(
     return name, kind
 
 
-def read_vertices(path: Path, header: PlyHeader, hint: str) -> np.ndarray:
-    """Read the vertices, the first element of a file.
-
-    Nothing is allocated before the file is known to be as long as the header promises.
-
-    Parameters
-    ----------
-    path : Path
-    header : PlyHeader
-        Of that file.
-    hint : str
-        Next step of every error.
-
-    Returns
-    -------
-    (n,) structured array
-        One field per property; of an ASCII file all are float64.
-
-    Raises
-    ------
-    ParseError
-        Vertices do not come first, are too many, have lists, or the body is cut.
-    """
+def vertex_layout(path: Path, header: PlyHeader, hint: str) -> np.dtype:
+    """Return how the vertices of a file lie in it; parameters and errors of `read_vertices`."""
     if not header.elements or header.elements[0].name != "vertex":
         raise ParseError(path, "header", "the first element is not named vertex.", hint)
     vertex = header.elements[0]
@@ -170,6 +149,34 @@ def read_vertices(path: Path, header: PlyHeader, hint: str) -> np.ndarray:
         raise ParseError(
             path, f"byte {size_bytes}", f"cut off: the header promises {need_bytes} bytes.", hint
         )
+    return layout
+
+
+def read_vertices(path: Path, header: PlyHeader, hint: str) -> np.ndarray:
+    """Read the vertices, the first element of a file.
+
+    Nothing is allocated before the file is known to be as long as the header promises.
+
+    Parameters
+    ----------
+    path : Path
+    header : PlyHeader
+        Of that file.
+    hint : str
+        Next step of every error.
+
+    Returns
+    -------
+    (n,) structured array
+        One field per property; of an ASCII file all are float64.
+
+    Raises
+    ------
+    ParseError
+        Vertices do not come first, are too many, have lists, or the body is cut.
+    """
+    layout = vertex_layout(path, header, hint)
+    vertex, text = header.elements[0], header.encoding == "ascii"
     with path.open("rb") as stream:
         stream.seek(header.begin)
         if not text:

@@ -133,6 +133,10 @@ def _write_image(image: bpy.types.Image, path: Path) -> None:
         raise UsageError(
             f"The texture {source} is not there.", "Put it back, or import the result again."
         )
+    if not image.has_data and not _loads(image):
+        raise UsageError(
+            f"The texture {source} cannot be read.", "Put it back, or import the result again."
+        )
     try:
         if not _is_file(image) or image.file_format not in ("PNG", "JPEG"):
             _save_as_png(image, path)
@@ -144,6 +148,11 @@ def _write_image(image: bpy.types.Image, path: Path) -> None:
         raise ResourceError(
             f"{path} cannot be written: {error}.", "Choose another folder."
         ) from None
+
+
+def _loads(image: bpy.types.Image) -> bool:
+    """Tell whether there is a picture in it; Blender reads files when they are first looked at."""
+    return bool(image.size[0] * image.size[1] and len(image.pixels) and image.has_data)
 
 
 def _save_as_png(image: bpy.types.Image, path: Path) -> None:

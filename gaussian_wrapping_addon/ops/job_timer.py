@@ -202,6 +202,12 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
 
 
 def _poll(folder: str, job: _Job, now_s: float) -> None:
+    asked_s = job.cancel_asked_s if job.status.active else None
+    if asked_s is not None and now_s - asked_s > limits.CANCEL_GRACE_S:
+        _logger.warning("job in %s does not stop; ending it", folder)
+        job.cancel_asked_s = now_s
+        # It waits for the process to end, which Blender must not.
+        threading.Thread(target=job.client.kill, daemon=True).start()
     if job.look is None:
         client = job.client
         job.look = InBackground(lambda: _looked(client))
@@ -211,11 +217,6 @@ def _poll(folder: str, job: _Job, now_s: float) -> None:
     job.status = look.answer()
     job.waits_for_mode = False
     if job.status.active:
-        if job.cancel_asked_s is not None and now_s - job.cancel_asked_s > limits.CANCEL_GRACE_S:
-            _logger.warning("job in %s does not stop; ending it", folder)
-            job.cancel_asked_s = now_s
-            # It waits for the process to end, which Blender must not.
-            threading.Thread(target=job.client.kill, daemon=True).start()
         return
     if job.status.state == "LOST" and job.cancel_asked_s is not None:
         hint = "Resume continues from the last checkpoint."

@@ -105,13 +105,14 @@ def refresh(folder: str, now_s: float) -> bool:
     reading, shown.reading = shown.reading, None
     try:
         read = reading.answer()
-    except (OSError, ValueError, EOFError):
+        loaded = _load(read.parts) if read else None
+    except Exception:  # whatever the file holds: the job goes on without its picture
         _logger.info("no picture of %s", folder, exc_info=True)
         return False
-    if read is None:
+    if read is None or loaded is None:
         return False
     _drop(shown.names)
-    shown.names, shown.icons = _load(read.parts)
+    shown.names, shown.icons = loaded
     shown.stamp = read.stamp
     return True
 
@@ -137,14 +138,16 @@ def _read(folder: Path, known: Stamp | None) -> _Read | None:
 
     Raises
     ------
-    OSError, ValueError, EOFError
-        The file cannot be read, or holds no picture.
+    Exception
+        The file cannot be read, or holds no picture; NumPy raises many kinds.
     """
     stamp = newest_picture(folder)
     if stamp is None or stamp == known or stamp[2] > MAX_BYTES:
         return None
     data = Path(stamp[0]).read_bytes()  # whole: what is replaced meanwhile is not mapped
     pixels = np.load(io.BytesIO(data), allow_pickle=False)
+    if not isinstance(pixels, np.ndarray):
+        raise ValueError(f"{stamp[0]} holds several arrays")
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8 or not pixels.size:
         raise ValueError(f"{stamp[0]} holds {pixels.dtype} of shape {pixels.shape}")
     height, width, _ = pixels.shape

@@ -241,7 +241,9 @@ def _poll(client: SetupClient) -> None:
     if _state.status.active:
         asked_s = _state.cancel_asked_s
         if asked_s is not None and time.monotonic() - asked_s > limits.CANCEL_GRACE_S:
-            client.kill()
+            _state.cancel_asked_s = time.monotonic()
+            # It waits for the process to end, which Blender must not.
+            threading.Thread(target=client.kill, daemon=True).start()
         return
     _state.client = None
     forget_answer()

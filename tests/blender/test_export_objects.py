@@ -275,11 +275,18 @@ def test_what_cannot_be_done_is_said(
         export_objects(frame, [thing], ObjectExport("stl", tmp_path))
     with pytest.raises(UsageError, match="no mesh"):
         export_objects(frame, [], ObjectExport("glb", tmp_path))
-    monkeypatch.setitem(module._OPERATORS, "fbx", "export_scene.none_such")
-    with pytest.raises(UsageError, match="no FBX exporter"):
-        export_objects(frame, [thing], ObjectExport("fbx", tmp_path / "out"))
+    with monkeypatch.context() as patch:
+        patch.setitem(module._OPERATORS, "fbx", "export_scene.none_such")
+        with pytest.raises(UsageError, match="no FBX exporter"):
+            export_objects(frame, [thing], ObjectExport("fbx", tmp_path / "out"))
     assert not (tmp_path / "out").exists()
-    (tmp_path / "job" / "result" / "auto" / "albedo.png").unlink()
+    albedo = tmp_path / "job" / "result" / "auto" / "albedo.png"
+    albedo.write_bytes(albedo.read_bytes()[:20])
+    images_of(frame)[0].reload()
+    for format in ("glb", "obj", "fbx"):
+        with pytest.raises(UsageError, match=r"albedo\.png cannot be read"):
+            export_objects(frame, [thing], ObjectExport(format, tmp_path / "out"))
+    albedo.unlink()
     for format in ("glb", "obj"):
         with pytest.raises(UsageError, match=r"albedo\.png is not there"):
             export_objects(frame, [thing], ObjectExport(format, tmp_path / "out"))

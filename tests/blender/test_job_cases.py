@@ -454,30 +454,6 @@ def test_no_tick_blocks_blender(
     assert len(live_preview.icons_of(str(folder))) == 2, "pictures were shown meanwhile"
 
 
-def test_a_disk_that_does_not_answer_holds_nobody_up(
-    photos: Path, worker: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = job_in("train", photos, worker)
-    monkeypatch.setattr(job_timer, "LOOK_WAIT_S", LOOK_WAIT_S)
-    client = job_timer._jobs[str(folder)].client
-    answers = threading.Event()
-    told = replace(client.poll(), message="told late")
-
-    def poll() -> JobStatus:
-        assert answers.wait(60.0)
-        return told
-
-    with monkeypatch.context() as slow:
-        slow.setattr(client, "poll", poll)
-        longest_s = [_longest_s(folder, 4) for _ in range(3)]
-        assert min(longest_s) < STALL_S, longest_s
-        assert status_of(folder).message != "told late"
-        answers.set()
-        job_timer._jobs[str(folder)].look.finished(60.0)
-        job_timer.poll_jobs()
-        assert status_of(folder).message == "told late"
-
-
 def test_bringing_in_a_typical_mesh_blocks_for_less_than_a_second(
     photos: Path, worker: object, hold: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:

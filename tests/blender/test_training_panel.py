@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 import time
@@ -202,7 +203,12 @@ def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> N
     assert colours[1][:3] == pytest.approx(0.875 * colours[0][:3], abs=0.03)
     assert not refreshed(key, 20.0), "nothing new"
     flat = npy_bytes(picture()[..., 0])
-    for bad in (b"", b"no picture", npy_bytes(picture())[:200], flat, npy_bytes(np.zeros(0))):
+    several = io.BytesIO()
+    np.savez(several, picture=picture())
+    huge = npy_bytes(picture()).replace(b"(120, 324, 3)", b"(9999999999, 9999, 3)")
+    assert len(huge) != len(npy_bytes(picture()))
+    bad_ones = (b"", b"no picture", b"PK\x03\x04 no zip", several.getvalue(), huge, flat)
+    for bad in (*bad_ones, npy_bytes(picture())[:200], npy_bytes(np.zeros(0))):
         write_picture(tmp_path, data=bad)
         assert not refreshed(key, live_preview._shown[key].looked_s + 10.0)
         assert live_preview.icons_of(key)

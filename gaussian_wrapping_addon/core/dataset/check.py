@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import DatasetError, WrapError
 from ..limits import MIN_IMAGES
+from ..ply_table import vertex_layout
 from .normalisation import find_scene_frame
 from .photo_finder import PhotoIndex, find_mask, list_photos, photo_root
 from .photo_header import read_photo_header
@@ -72,6 +73,7 @@ def check_input(source: Path) -> list[Finding]:
 
 def _check_splat(path: Path, findings: list[Finding]) -> None:
     header = read_splat_header(path)
+    vertex_layout(path, header.ply, "Export or download the splat again.")
     if header.count == 0:
         raise DatasetError(f"{path.name} holds no Gaussians.", "Export the splat again.")
     kind = "surfels" if header.axes == 2 else "Gaussians"

@@ -16,6 +16,10 @@ from .photo_header import PHOTO_SUFFIXES
 
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
 MASK_FOLDERS = ("masks", "mask")
+UNDEVELOPED_SUFFIXES = (
+    ".heic", ".heif", ".avif",
+    ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2",
+)  # fmt: skip
 _MAX_DEPTH = 8
 
 
@@ -51,6 +55,15 @@ def list_photos(root: Path) -> list[Path]:
                 f"{root.name} holds more than {limits.MAX_IMAGES} photos.", "Choose a subfolder."
             )
     return sorted(found, key=lambda p: p.relative_to(root).as_posix())
+
+
+def count_undeveloped(root: Path) -> int:
+    """Count the files of cameras and phones under ``root`` that must be developed first."""
+    return sum(
+        PurePosixPath(name).suffix.lower() in UNDEVELOPED_SUFFIXES
+        for _, _, names in os.walk(root)
+        for name in names
+    )
 
 
 def photo_root(source: Path) -> Path:

@@ -61,8 +61,11 @@ def read_placement(path: Path, world_from_scene: Similarity) -> Similarity | Non
     ParseError
         The file holds no placement.
     """
-    values = read_json(path)
     hint = "Delete the file; the scene is then placed as it was trained."
+    try:
+        values = read_json(path)
+    except ParseError as error:
+        raise ParseError(path, "whole file", "not JSON.", hint) from error
     try:
         if values["version"] != VERSION:
             raise ValueError(f"version {values['version']!r} is not {VERSION}")

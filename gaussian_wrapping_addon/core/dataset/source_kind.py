@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..errors import DatasetError
 from .colmap_reader import find_models, read_colmap
-from .photo_finder import PHOTO_FOLDERS, list_photos, mask_roots_of, photo_root
+from .photo_finder import PHOTO_FOLDERS, count_undeveloped, list_photos, mask_roots_of, photo_root
 from .source_model import SourceModel
 from .splat_header import is_splat_path
 from .transforms_reader import find_transforms, read_transforms
@@ -79,7 +79,13 @@ def source_kind(source: Path) -> SourceKind:
         return SourceKind("COLMAP model", source.parent, find_transforms(source.parent))
     if list_photos(photo_root(source)):
         return SourceKind("photos", source, None)
-    raise DatasetError(f"{source.name or source} holds no photos.", _WANTED)
+    name, undeveloped = source.name or source, count_undeveloped(source)
+    if undeveloped:
+        raise DatasetError(
+            f"{name} holds no photo that can be read, but {undeveloped} HEIC or RAW files.",
+            "Export them as JPEG or PNG first.",
+        )
+    raise DatasetError(f"{name} holds no photos.", _WANTED)
 
 
 def read_poses(kind: SourceKind) -> SourceModel:

@@ -137,6 +137,8 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
         if wrong:
             raise UsageError(f"{wrong[0]!r} is not written here.", f"Use {', '.join(known)}.")
     frames = frames_of(request.result)
+    if "splat" in request.formats:
+        _splat_of(request.result)  # before anything is written
     if request.out.exists() and not request.out.is_dir():
         raise UsageError(f"{request.out} is a file.", "Give a folder for the exports.")
     with writing(request.out):
@@ -288,6 +290,13 @@ def _png(path: Path) -> bytes:
     return path.read_bytes()
 
 
+def _splat_of(result: Path) -> Path:
+    path = result / "gaussians.ply"
+    if not path.is_file():
+        raise DatasetError(f"{result} holds no gaussians.ply.", "Run the job again.")
+    return path
+
+
 def _write_splat(
     request: ExportRequest, world_from_scene: Similarity, blender_from_scene: Similarity
 ) -> Path:
@@ -295,10 +304,7 @@ def _write_splat(
     from ..texture.file_checks import writing
     from ..training.splat_motion import move_gaussians
 
-    source = request.result / "gaussians.ply"
-    if not source.is_file():
-        raise DatasetError(f"{request.result} holds no gaussians.ply.", "Run the job again.")
-    found = read_splat_ply(source)
+    found = read_splat_ply(_splat_of(request.result))
     target_from_scene = blender_from_scene if request.placed else world_from_scene
     offset = np.zeros(3)
     if not request.placed:

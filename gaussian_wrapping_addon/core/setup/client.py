@@ -17,7 +17,7 @@ from typing import IO, Any
 from ..errors import EXIT_OTHER, UsageError, WorkerError
 from ..helper_process import child_command, child_environment, kill_group
 from ..jobs.job_folder import JobFolder, JobStatus
-from .commands import SetupRequest, kind_for
+from .commands import SetupRequest, check_folders, kind_for
 from .pythons import probe
 
 LAST_WORDS_BYTES = 4000
@@ -53,6 +53,7 @@ class SetupClient:
         folder = JobFolder(Path(request.root))
         if folder.locked():
             raise UsageError(f"A set-up is running in {request.root}.", "Wait for it.")
+        check_folders(request)
         folder.cancel_path.unlink(missing_ok=True)
         options: dict[str, Any] = {"start_new_session": True}
         if sys.platform == "win32":

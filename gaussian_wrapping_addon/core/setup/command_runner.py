@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from ..errors import Cancelled, ResourceError, WorkerError
+from ..errors import EXIT_RESOURCES, Cancelled, ResourceError, WorkerError
 from ..helper_process import child_environment, kill_group
 
 HANG_S = 900.0
@@ -37,6 +37,8 @@ _UNREACHABLE = re.compile(
 
 class PackageError(WorkerError):
     """A package that cannot be had; ``package`` names it."""
+
+    exit_code = EXIT_RESOURCES
 
     def __init__(self, package: str, message: str, hint: str) -> None:
         super().__init__(message, hint)
@@ -134,7 +136,7 @@ def failure_of(code: int, last: list[str]) -> WorkerError | ResourceError:
     if "No space left" in words or "not enough space" in words:
         return ResourceError("The disk is full.", "Free several GiB, then press Repair.")
     if _UNREACHABLE.search(words):
-        return WorkerError(
+        return ResourceError(
             "The package index cannot be reached.",
             "Check the network and proxy, or give a folder with wheels.",
         )
@@ -146,8 +148,8 @@ def failure_of(code: int, last: list[str]) -> WorkerError | ResourceError:
             missing[1],
             f"No wheel of {missing[1]}{missing[2]} for Python {version} on {sys.platform} was"
             " found.",
-            "With a wheel folder: put it there (on a like machine: pip download -r"
-            " requirements-worker.txt -d FOLDER). Otherwise choose another Python 3.11 to 3.13.",
+            "With a wheel folder: put it there (the guide says how, under Without a network)."
+            " Otherwise choose another Python 3.11 to 3.13.",
         )
     errors = [line for line in last if line.lower().startswith("error")] or last
     return WorkerError(

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UsageError
-from ..worker_environment import PACKAGES, VENV, WorkerEnvironment
+from ..worker_environment import MARKER, PACKAGES, VENV, WorkerEnvironment
 from ..worker_requirements import Requirement
 from .pythons import FoundPython
 
@@ -170,6 +170,35 @@ def install_steps(
     rest = [r for r in wanted if r.name != "torch"]
     steps = [Step((*pip, *extra, *(r.text for r in torch)), tuple(torch))]
     return [*steps, Step((*pip, *(r.text for r in rest)), tuple(rest))] if rest else steps
+
+
+def check_folders(request: SetupRequest) -> None:
+    """Refuse folders that no set-up can work with; writes nothing.
+
+    Raises
+    ------
+    UsageError
+        Names the folder.
+    """
+    environment, root = request.environment, request.environment.root
+    if root.is_symlink() or (root.exists() and not root.is_dir()):
+        raise UsageError(f"{root} is no plain folder.", "Choose another folder.")
+    if root.is_dir() and not environment.is_ours():
+        try:
+            strange = [p for p in root.iterdir() if p.name != "lock.json"]
+        except OSError as error:
+            raise UsageError(
+                f"{root} cannot be read: {error.strerror}.", "Choose another folder."
+            ) from None
+        if strange:
+            raise UsageError(
+                f"{root} holds other files and no {MARKER}.", "Choose a new or empty folder."
+            )
+    if request.find_links and not Path(request.find_links).is_dir():
+        raise UsageError(
+            f"The wheel folder {request.find_links} does not exist.",
+            "Choose that with the wheels.",
+        )
 
 
 def all_steps(

@@ -44,7 +44,7 @@ from ..worker_environment import (
 )
 from ..worker_requirements import Requirement, plain_name, read_requirements
 from .command_runner import run_command
-from .commands import CUDA, SetupRequest, Step, install_steps, kind_for, venv_step
+from .commands import CUDA, SetupRequest, Step, check_folders, install_steps, kind_for, venv_step
 from .examine import BROKEN, GOOD, MISSING, PackageState, examine_worker
 from .pythons import FoundPython, probe
 
@@ -73,10 +73,6 @@ def set_up(request: SetupRequest, say: Say, is_cancelled: Callable[[], bool]) ->
     """
     environment = request.environment
     requirements = read_requirements(Path(request.requirements))
-    if request.find_links and not Path(request.find_links).is_dir():
-        raise UsageError(
-            f"The wheel folder {request.find_links} does not exist.", "Choose another folder."
-        )
     python = probe(request.python)
     request = replace(request, python=python.path)
     kind = kind_for(python)
@@ -111,21 +107,15 @@ def set_up(request: SetupRequest, say: Say, is_cancelled: Callable[[], bool]) ->
     return environment
 
 
-def _check_folder(environment: WorkerEnvironment) -> None:
-    root = environment.root
-    if root.is_symlink() or (root.exists() and not root.is_dir()):
-        raise UsageError(f"{root} is no plain folder.", "Choose another folder.")
+def _make_folder(request: SetupRequest) -> None:
+    check_folders(request)
+    root = request.environment.root
     try:
         root.mkdir(parents=True, exist_ok=True)
-        strange = [p for p in root.iterdir() if p.name != "lock.json"]
     except OSError as error:
         raise UsageError(
             f"{root} cannot be written: {error.strerror}.", "Choose another folder."
         ) from None
-    if strange and not environment.is_ours():
-        raise UsageError(
-            f"{root} holds other files and no {MARKER}.", "Choose a new or empty folder."
-        )
 
 
 def _check_disk(request: SetupRequest, requirements: list[Requirement]) -> None:
@@ -341,7 +331,7 @@ def main(arguments: list[str]) -> int:
 
     locked = False
     try:
-        _check_folder(request.environment)
+        _make_folder(request)
         folder.lock()
         locked = True
         folder.write_status(status)

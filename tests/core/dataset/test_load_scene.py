@@ -293,11 +293,15 @@ def test_refusals_come_at_once(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "texts").mkdir()
     (tmp_path / "texts" / "notes.txt").write_text("no photos here")
+    (tmp_path / "phone").mkdir()
+    for name in ("IMG_1.HEIC", "IMG_2.dng"):
+        (tmp_path / "phone" / name).write_bytes(b"compressed")
     (tmp_path / "a.txt").write_text("a file")
     cases = {
         "gone": "does not exist",
         "empty": "holds no photos",
         "texts": "holds no photos",
+        "phone": "no photo that can be read, but 2 HEIC or RAW files",
         "a.txt": "is a file, but not a transforms.json",
     }
     for name in ("one", "two"):

@@ -224,4 +224,8 @@ def test_broken_placement_files_are_refused(tmp_path: Path, change: dict) -> Non
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     with pytest.raises(ParseError, match=r"placement\.json") as caught:
         read_placement(path, Similarity())
-    assert caught.value.hint
+    assert "Delete the file" in caught.value.hint
+    path.write_text(path.read_text()[:20])
+    with pytest.raises(ParseError, match=r"placement\.json") as caught:
+        read_placement(path, Similarity())
+    assert "Delete the file" in caught.value.hint

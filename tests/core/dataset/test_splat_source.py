@@ -83,6 +83,15 @@ def test_the_check_tells_what_a_splat_holds_and_what_it_lacks(tmp_path: Path) ->
     assert "photos" in findings[2].hint
 
 
+def test_the_check_finds_a_file_that_is_cut_off(tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "a.ply", splat_columns(shell_of_discs(40, sh_degree=3)[0]))
+    path.write_bytes(path.read_bytes()[:-1])
+    finding = check_input(path)[-1]
+    assert finding.severity == "error"
+    assert "cut off" in finding.message
+    assert "again" in finding.hint
+
+
 @pytest.mark.parametrize("suffix", [".spz", ".splat"])
 def test_the_check_names_formats_that_are_not_read(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"

@@ -211,7 +211,8 @@ def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no mesh nose"):
         exported(replace(good, regions=("nose",)))
     with pytest.raises(DatasetError, match=r"no gaussians\.ply"):
-        exported(replace(good, formats=("splat",)))
+        exported(replace(good, formats=("glb", "splat")))
+    assert not list((tmp_path / "out").iterdir()), "half is easily taken for all"
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="is a file"):
         exported(replace(good, out=tmp_path / "file"))

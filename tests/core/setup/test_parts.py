@@ -144,7 +144,7 @@ def test_lists_that_are_refused(tmp_path: Path, text: str) -> None:
         ("ERROR: No matching distribution found for xatlas==0.0.11",
          command_runner.PackageError, "xatlas==0.0.11"),
         ("WARNING: NewConnectionError\nERROR: No matching distribution found for torch",
-         WorkerError, "cannot be reached"),
+         ResourceError, "cannot be reached"),
         (("    The user requested (constraint) igl==2\n    The user requested libigl==2.6.3\n"
          "ERROR: ResolutionImpossible: see"), command_runner.PackageError, "libigl==2.6.3"),
         ("ERROR: [Errno 28] No space left on device", ResourceError, "disk is full"),

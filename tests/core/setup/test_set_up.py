@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core import worker_environment
-from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.errors import EXIT_RESOURCES, UsageError
 from gaussian_wrapping_addon.core.helper_process import child_command
 from gaussian_wrapping_addon.core.jobs import client as job_client
 from gaussian_wrapping_addon.core.jobs.doctor import find_and_diagnose
@@ -164,6 +164,7 @@ def test_a_missing_wheel_is_named(quick: SetupRequest) -> None:
     assert status.state == "FAILED"
     assert "No wheel of gwbeta" in status.error
     assert "wheel folder" in status.hint
+    assert status.exit_code == EXIT_RESOURCES
     assert quick.environment.is_half()
     assert "gwbeta" in (Path(quick.root) / "log.txt").read_text()
 
@@ -209,9 +210,8 @@ def test_only_what_we_made_is_removed(request_: SetupRequest) -> None:
     (folder / "env" / "thesis.txt").write_text("mine")
     with pytest.raises(UsageError, match="not made by this add-on"):
         install.remove(request_.environment)
-    status = finish(request_)
-    assert status.state == "FAILED"
-    assert "holds other files" in status.error
+    with pytest.raises(UsageError, match="holds other files"):
+        SetupClient.start(request_)
     assert [p.name for p in folder.iterdir()] == ["env"], "nothing of ours is left there"
     assert (folder / "env" / "thesis.txt").read_text() == "mine"
 
@@ -231,8 +231,8 @@ def test_what_lies_beside_it_stays(request_: SetupRequest) -> None:
 
 
 def test_a_folder_of_wheels_that_is_not_there(request_: SetupRequest) -> None:
-    status = finish(replace(request_, find_links=request_.find_links + "x"))
-    assert "does not exist" in status.error
+    with pytest.raises(UsageError, match="does not exist"):
+        SetupClient.start(replace(request_, find_links=request_.find_links + "x"))
     assert not Path(request_.root).exists()
 
 
