@@ -25,7 +25,7 @@ from ..core.errors import UsageError, WrapError
 from ..core.jobs.client import JobClient
 from ..core.jobs.job_folder import JobStatus
 from . import known_jobs, live_preview, tags
-from .in_background import InBackground
+from .in_background import InBackground, Lane
 from .redrawing import redraw
 from .result_files import ResultFiles, read_result
 from .scene_objects import import_result
@@ -33,8 +33,8 @@ from .scene_objects import import_result
 _logger = logging.getLogger(__name__)
 
 POLL_S = 0.3
-LOOK_WAIT_S = 0.02
-"""For the disk to tell of a job, usually in 1 ms; one that sleeps or is far away tells later."""
+LOOK_WAIT_S = 0.0
+"""For the disk to tell of a job; what it has told is seen at the next look."""
 IMPORT_STAGE = "import"
 """Shown as a stage of the job while its result is read."""
 
@@ -57,6 +57,7 @@ class _Job:
     """The result while it is read, and until it can be imported."""
 
 
+_looks, _readings = Lane(), Lane()
 _jobs: dict[str, _Job] = {}
 _gone: set[str] = set()
 """Folders of this machine's jobs that were not there when their file was opened."""
@@ -153,10 +154,15 @@ def detach(scene: bpy.types.Scene) -> None:
 def forget_all() -> None:
     """Stop watching; workers go on, and are found again by :func:`attach_open_file`."""
     _jobs.clear()
+    _looks.stop()
+    _readings.stop()
 
 
 def start_timer() -> None:
     """Let Blender call :func:`tick`."""
+    _looks.start()
+    _readings.start()
+    live_preview.start()
     if not bpy.app.timers.is_registered(tick):
         bpy.app.timers.register(tick, first_interval=POLL_S, persistent=True)
 
@@ -210,7 +216,7 @@ def _poll(folder: str, job: _Job, now_s: float) -> None:
         threading.Thread(target=job.client.kill, daemon=True).start()
     if job.look is None:
         client = job.client
-        job.look = InBackground(lambda: _looked(client))
+        job.look = _looks.run(lambda: _looked(client))
     if not job.look.finished(LOOK_WAIT_S):
         return
     look, job.look = job.look, None
@@ -252,7 +258,7 @@ def _bring_in(folder: str, job: _Job) -> None:
 
 
 def _reading(folder: Path) -> InBackground[ResultFiles]:
-    return InBackground(lambda: read_result(folder))
+    return _readings.run(lambda: read_result(folder))
 
 
 def _import(

@@ -18,7 +18,7 @@ from typing import Any
 import bpy.utils.previews
 import numpy as np
 
-from .in_background import InBackground
+from .in_background import InBackground, Lane
 
 _logger = logging.getLogger(__name__)
 
@@ -50,6 +50,7 @@ class _Read:
     """Each (h, w, 4) float32, as Blender wants them: from the bottom up."""
 
 
+_readings = Lane()
 _shown: dict[str, _Shown] = {}
 _pictures: Any = None  # ImagePreviewCollection, made when the first picture is there
 _count = 0
@@ -98,7 +99,7 @@ def refresh(folder: str, now_s: float) -> bool:
         if now_s - shown.looked_s >= EVERY_S:
             shown.looked_s = now_s
             known = shown.stamp
-            shown.reading = InBackground(lambda: _read(Path(folder), known))
+            shown.reading = _readings.run(lambda: _read(Path(folder), known))
         return False
     if not shown.reading.finished():
         return False
@@ -124,10 +125,16 @@ def forget(folder: str) -> None:
         _drop(shown.names)
 
 
+def start() -> None:
+    """Make ready what the first picture would have to wait for."""
+    _readings.start()
+
+
 def stop() -> None:
     """Let go of everything; Blender complains about collections left behind."""
     global _pictures
     _shown.clear()
+    _readings.stop()
     if _pictures is not None:
         bpy.utils.previews.remove(_pictures)
         _pictures = None

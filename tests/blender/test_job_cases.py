@@ -77,6 +77,10 @@ class _HeldReading(in_background.InBackground):
 
     hold = threading.Event()
 
+    def __init__(self, folder: Path) -> None:
+        super().__init__(lambda: read_result(folder))
+        threading.Thread(target=self.run, daemon=True).start()
+
     def finished(self, wait_s: float = 0.0) -> bool:
         return self.hold.is_set() and super().finished(wait_s)
 
@@ -105,9 +109,7 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, st
 def hold(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Let the reading of results last until this is set."""
     monkeypatch.setattr(_HeldReading, "hold", threading.Event())
-    monkeypatch.setattr(
-        job_timer, "_reading", lambda folder: _HeldReading(lambda: read_result(folder))
-    )
+    monkeypatch.setattr(job_timer, "_reading", _HeldReading)
     return _HeldReading.hold
 
 
@@ -462,7 +464,7 @@ def test_bringing_in_a_typical_mesh_blocks_for_less_than_a_second(
     play_to_stage(folder, "import")
     result = folder / "result"
     _make_typical(result)
-    reading = _HeldReading(lambda: read_result(result))
+    reading = _HeldReading(result)
     hold.set()
     job_timer._jobs[str(folder)].reading = reading
     longest_s = 0.0

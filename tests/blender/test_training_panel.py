@@ -184,7 +184,7 @@ def refreshed(key: str, now_s: float) -> bool:
     assert not live_preview.refresh(key, now_s), "it is read in a thread"
     reading = live_preview._shown[key].reading
     if reading is not None:
-        reading._thread.join()
+        assert reading.finished(20.0)
     return live_preview.refresh(key, now_s)
 
 
@@ -227,7 +227,7 @@ def test_a_running_training_is_drawn_and_let_go(tmp_path: Path) -> None:
     client = Client(running)
     job_timer.watch(bpy.context.scene, tmp_path, client, imports=False)  # type: ignore[arg-type]
     job_timer.poll_jobs()
-    live_preview._shown[str(tmp_path)].reading._thread.join()
+    assert live_preview._shown[str(tmp_path)].reading.finished(20.0)
     job_timer.poll_jobs()
     layout = draw(train_panel.GWRAP_PT_train)
     assert "750 of 3,000" in layout.texts
