@@ -2,7 +2,7 @@
 """How many pixels a rasterizer has to evaluate, counted from the ellipses themselves.
 
 Nothing of the renderer's own culling is used: for each pair of tile and Gaussian, the part of each
-row of pixels with ``alpha >= 1/255`` is the solution of a quadratic in x (kernels.md 4.2).
+row of pixels with ``alpha >= 1/255`` is the solution of a quadratic in x.
 """
 
 from __future__ import annotations

@@ -2,8 +2,9 @@
 """Images and isosurface depth of a scene in float64, from Sigma, mu and the ray of each pixel.
 
 What the errors of the renderers are measured against. It shares no formula with the kernels: a
-Gaussian on a ray is evaluated in its own whitened frame, and the depth is bisected (method.md 1.1,
-2.2 and 2.4). Only the features (colour and normals) come from the torch reference in float64.
+Gaussian on a ray is evaluated in its own whitened frame, and the depth is bisected (docs/method.md,
+sections 2.2 to 2.4). Only the features (colour and normals) come from the torch reference in
+float64.
 """
 
 from __future__ import annotations

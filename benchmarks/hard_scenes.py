@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The scenes that must stay right: extreme opacities, sizes, shapes and places (design.md 9)."""
+"""The scenes that must stay right: extreme opacities, sizes, shapes and places."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Gaussians and camera that every timing of the renderer uses (kernels.md 2)."""
+"""The Gaussians and camera that every timing of the renderer uses."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// A hand-written rasterizer that the compiled kernels are measured against (kernels.md 4): nine
+// A hand-written rasterizer that the compiled kernels are measured against: nine
 // features and alpha, forward and backward, no depth. It reads and writes the buffers of the
 // kernels, so that results can be compared and both pay for the same traffic.
 //

@@ -14,7 +14,7 @@ from .limits import MAX_ATLASES, MAX_TILES
 
 PRESETS = ("draft", "standard", "fine")
 DECISIONS = ("auto", "on", "off")
-"""Of what a scene may need: ``"auto"`` lets the photos decide (design.md 6)."""
+"""Of what a scene may need: ``"auto"`` lets the photos decide (docs/method.md, section 4.4)."""
 SWITCH = ("off", "on")
 
 MASK_MODES = ("ignore", "background")
@@ -67,7 +67,10 @@ class TrainingSettings:
     """A quarter of the method's: with its 0.6, runs of a tenth of its iterations lose detail."""
     lambda_geometric: float = 0.02
     correlation: str = "signed"
-    """Of two patches: ``"signed"``, or ``"squared"``, where -1 is as good as 1 (method.md 3.4)."""
+    """Of two patches: ``"signed"``, or ``"squared"``, where -1 is as good as 1.
+
+    See docs/method.md, section 3.4.
+    """
     multi_view_until: float = 0.75
     """The multi-view terms end here: what noise in the photos has pulled about can settle."""
     multi_view_pixels: int = 4000
@@ -98,7 +101,7 @@ class TrainingSettings:
     mask_mode: str = "ignore"
     """What masks leave out: ``"ignore"``: anything may stand there; ``"background"``: nothing."""
     depth_from: float = 7 / 30
-    """Depth-normal loss and multi-view terms start here (method.md 3)."""
+    """Depth-normal loss and multi-view terms start here (docs/method.md, section 3)."""
     densify_from: float = 0.5 / 30
     densify_until: float = 0.5
     densify_every: int = 100
@@ -136,7 +139,7 @@ class MeshingSettings:
     """``"pam"``: primal adaptive meshing; ``"pivots"``: marching tetrahedra on pivots, as fine as
     the Gaussians lie: edge length, number of points do not apply."""
     pivots: int = 2
-    """Pivots of each Gaussian where they make the mesh (method.md 6.1)."""
+    """Pivots of each Gaussian where they make the mesh (docs/method.md, section 6.1)."""
     boundary: str = "closed"
     """Where the region cuts the solid: ``"closed"`` by faces on the region's planes; ``"open"``
     leaves those out."""
@@ -183,7 +186,7 @@ class JobSettings:
     threads: int = 0
     """0 uses every core this process may use."""
     regions: tuple[str, ...] = ("auto",)
-    """``"auto"``, ``"all"``, or the path of a region file (method.md 7.3)."""
+    """``"auto"``, ``"all"``, or the path of a region file (docs/method.md, section 7.3)."""
     export: tuple[str, ...] = ("glb",)
     start_splat: str = ""
     """PLY of Gaussians that training starts from; empty starts from the sparse points."""

@@ -23,7 +23,7 @@ STAGES = "stages"
 PHOTO_ALPHA = 0.7
 """Opacity of the photo behind the mesh, so that the viewport's grid stays visible."""
 
-# Ours looks along +z with y down, Blender's along -z with y up (conventions.md C.6).
+# Ours looks along +z with y down, Blender's along -z with y up.
 _CAM_FROM_BLENDER_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 
 

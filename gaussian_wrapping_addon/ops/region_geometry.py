@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Boxes and region files as plain arrays; the file format is method.md 7.3."""
+"""Boxes and region files as plain arrays; the file format is in docs/file-formats.md."""
 
 from __future__ import annotations
 

@@ -115,7 +115,10 @@ def test_the_true_mesh_has_the_best_scores(run: tuple[Path, Path]) -> None:
 
 
 def test_stages_are_judged_in_shares_of_the_diagonal(run: tuple[Path, Path]) -> None:
-    """The isosurface of such discs stands about two of their thicknesses outside (method.md 14)."""
+    """The isosurface of such discs stands about two of their thicknesses outside.
+
+    See docs/method.md, section 10.3.
+    """
     scene, folder = run
     scores = judge(folder / "mesh", scene, folder / "out", 1, stages=True)
     outside = 2.0 * THICKNESS / (2.0 * SIDE * math.sqrt(3.0))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Regions that people make by accident or on purpose: conventions D.5, case 36."""
+"""Regions that people make by accident or on purpose."""
 
 from __future__ import annotations
 

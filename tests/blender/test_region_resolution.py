@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Edge lengths of single regions: which decides, and what is refused (conventions D.5, case 37)."""
+"""Edge lengths of single regions: which decides, and what is refused."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Bounded reader of COLMAP's binary files: every count is checked against the bytes left.
 
-The common reader of the ecosystem loops for ever on a file cut inside a name and accepts NaN
-(conventions.md D.2), so the format is read here, straight from its description (C.6).
+The common reader of the ecosystem loops for ever on a file cut inside a name and accepts NaN,
+so the format is read here, straight from its description.
 """
 
 from __future__ import annotations

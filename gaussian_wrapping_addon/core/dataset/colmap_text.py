@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bounded reader of COLMAP's text files (conventions.md C.6)."""
+"""Bounded reader of COLMAP's text files."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Where the coordinates of an exported file lie: which frame, turned how, without which offset.
 
-Formats have an axis that their readers take for up (conventions.md C.6). Files of formats with Y
+Formats have an axis that their readers take for up. Files of formats with Y
 up hold (x, z, -y) of the coordinates that they were made of, as Blender's own exporters do.
 """
 

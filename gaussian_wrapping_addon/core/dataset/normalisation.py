@@ -13,7 +13,7 @@ from ..tolerances import SCENE_RADIUS
 from .similarity import Similarity
 
 RADIUS_MARGIN = 1.1
-"""The largest camera distance times this becomes ``SCENE_RADIUS`` (method.md 1.7)."""
+"""The largest camera distance times this becomes ``SCENE_RADIUS`` (docs/method.md, section 1.7)."""
 FAR_CAMERA_FACTOR = 30.0
 """A camera this many median distances from the median position was solved wrongly."""
 _SAME_PLACE = 1e-12

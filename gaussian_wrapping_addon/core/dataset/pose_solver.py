@@ -34,7 +34,7 @@ from .source_model import PosedPhoto, SourceModel
 MAX_SIFT_PX = 1600
 """Long side of the photos that features are searched in."""
 SHARE_OF_BAD_PHOTOS = 0.2
-"""More undecodable photos than this refuse the data set (conventions.md D.5, case 25)."""
+"""More undecodable photos than this refuse the data set."""
 _HELPER = "dataset.pose_solver_helper"
 _MEMORY_SHARE = 0.9
 _LEAST_MEMORY_BYTES = 8 << 30

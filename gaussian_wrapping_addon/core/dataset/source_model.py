@@ -40,7 +40,7 @@ LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
     "FISHEYE": ("fx", "fy", "cx", "cy"),
     "EUCM": ("fx", "fy", "cx", "cy", "alpha", "beta"),
 }
-"""COLMAP's lens models in the order of their numbers (conventions.md C.6)."""
+"""COLMAP's lens models in the order of their numbers."""
 
 LENS_NAMES = tuple(LENS_PARAMETERS)
 

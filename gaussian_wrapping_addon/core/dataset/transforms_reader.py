@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Read transforms.json of nerfstudio, instant-ngp and NeRF-synthetic (conventions.md C.6).
+"""Read transforms.json of nerfstudio, instant-ngp and NeRF-synthetic.
 
 World is the frame of the file's ``transform_matrix`` values as they are written. The matrices map
 OpenGL camera axes (x right, y up, z back) to world; ours map world to COLMAP axes.

@@ -32,8 +32,8 @@ TANKS_TOLERANCE = 1e-4
 """The same for the three stages: at an rmse of a third of the threshold, this is a change of 3e-5
 thresholds an iteration, which no share within the threshold shows."""
 TANKS_STAGES = ((1.0, 80.0), (0.5, 20.0), (0.0, 2.0))
-"""Voxel and largest distance of each refinement stage in thresholds (method.md 9.1); voxel 0 takes
-every k-th point instead."""
+"""Voxel and largest distance of each refinement stage in thresholds (docs/method.md, section 9.1);
+voxel 0 takes every k-th point instead."""
 TANKS_MAX_POINTS = 4_000_000
 """Points kept by the last stage's even thinning."""
 
@@ -345,7 +345,9 @@ def refine_as_tanks(
     iterations: int = ICP_ITERATIONS,
     threads: int = 1,
 ) -> TanksRefinement:
-    """Refine as Tanks and Temples does: ICP with scale in three stages (method.md 9.1).
+    """Refine as Tanks and Temples does: ICP with scale in three stages.
+
+    See docs/method.md, section 9.1.
 
     Both sets thinned to voxels of ``threshold`` and pairs up to 80 thresholds; half of it and 20;
     every k-th point and 2. Points outside of the crop take no part; which of the source's are

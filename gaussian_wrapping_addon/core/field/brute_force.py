@@ -16,7 +16,9 @@ PAIRS_PER_BLOCK = 2_000_000
 
 
 def log_transmittance(arrays: GaussianArrays, center: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the log transmittance between a camera centre and points (method.md 5.1).
+    """Return the log transmittance between a camera centre and points.
+
+    See docs/method.md, section 5.1.
 
     Far too slow for anything but tests and benchmarks: cost is Gaussians x points.
 
@@ -24,7 +26,7 @@ def log_transmittance(arrays: GaussianArrays, center: np.ndarray, points: np.nda
     ----------
     arrays : GaussianArrays
         All ``m`` Gaussians take part, also those beside or behind the camera (those contribute
-        their value at the camera, method.md 5.4).
+        their value at the camera, docs/method.md, section 5.4).
     center : (3,) float64
         Camera centre, scene frame.
     points : (n, 3) float64

@@ -54,7 +54,7 @@ def log_transmittance_gradient(
             ):
                 continue
             i = ids[row]
-            # Differences before whitening, where they are exact (method.md 5.4).
+            # Differences before whitening, where they are exact (docs/method.md, section 5.4).
             mx, my, mz = table[i, 0] - center[0], table[i, 1] - center[1], table[i, 2] - center[2]
             ma = table[i, 3] * mx + table[i, 4] * my + table[i, 5] * mz
             mb = table[i, 6] * mx + table[i, 7] * my + table[i, 8] * mz

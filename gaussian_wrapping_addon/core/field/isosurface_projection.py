@@ -35,7 +35,7 @@ longer than that to compute."""
 MAX_STEP_SIGMAS = 1.0
 MAX_INWARD_MARCH = 8
 BRACKET_END_SIGMAS = 1e-3
-"""A bracket this short is not cut any further (method.md 5.6)."""
+"""A bracket this short is not cut any further (docs/method.md, section 5.6)."""
 SLOPE_RATIO = 4.0
 """Newton trusts V's length within this factor, and corrects it by what the last step showed."""
 RESOLVED = (1e-4, SETTLED)
@@ -110,7 +110,7 @@ def project_to_isosurface(
     max_steps: int = MAX_ROUNDS,
     max_travel_sigmas: float = MAX_TRAVEL_SIGMAS,
 ) -> ProjectionResult:
-    """Move points onto the surface ``vacancy = 0.5`` (method.md 5.6).
+    """Move points onto the surface ``vacancy = 0.5`` (docs/method.md, section 5.6).
 
     Newton steps on ``log v`` along V, at most one local sigma long, are taken while they lessen
     ``|v - 0.5|`` and are halved once where they do not. As soon as two points on

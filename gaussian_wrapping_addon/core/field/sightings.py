@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Where the cameras see the isosurface: points of their depth maps, with what lies behind them.
 
-Pivots of the Gaussians alone (method.md 6.1) miss parts that are about as thin as a pixel: their
-Gaussians are small, half transparent and many, so that neither a centre nor an outer pivot need lie
-inside the solid that they make up together. Each camera's own isosurface finds it.
+Pivots of the Gaussians alone (docs/method.md, section 6.1) miss parts that are about as thin as a
+pixel: their Gaussians are small, half transparent and many, so that neither a centre nor an outer
+pivot need lie inside the solid that they make up together. Each camera's own isosurface finds it.
 """
 
 from __future__ import annotations

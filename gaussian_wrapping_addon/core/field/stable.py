@@ -19,7 +19,7 @@ def log_sigmoid(logits: np.ndarray) -> np.ndarray:
     Returns
     -------
     (...) float64, < 0
-        Accurate to a few ulp also where the opacity rounds to 1 (method.md 5.4).
+        Accurate to a few ulp also where the opacity rounds to 1 (docs/method.md, section 5.4).
     """
     logits = np.asarray(logits, np.float64)
     # Either branch alone loses digits or overflows on the other side of zero.
@@ -48,7 +48,7 @@ def log_one_minus(log_g: np.ndarray) -> np.ndarray:
     Returns
     -------
     (...) float64, <= 0
-        ``-inf`` where ``log_g`` is 0 (method.md 5.4).
+        ``-inf`` where ``log_g`` is 0 (docs/method.md, section 5.4).
     """
     log_g = np.asarray(log_g, np.float64)
     # Both forms are computed and one is chosen: where G is small, 1 - G rounds, and log1p does not
@@ -69,7 +69,7 @@ def odds(log_g: np.ndarray) -> np.ndarray:
     Returns
     -------
     (...) float64, >= 0
-        ``inf`` where ``log_g`` is 0, 0 where G underflows (method.md 5.4).
+        ``inf`` where ``log_g`` is 0, 0 where G underflows (docs/method.md, section 5.4).
     """
     with np.errstate(divide="ignore", over="ignore"):
         # abs, not minus: -0.0 would give minus infinity.

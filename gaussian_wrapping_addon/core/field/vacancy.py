@@ -63,14 +63,14 @@ def default_cache_bytes() -> int:
 class VacancyField:
     """``v(x) = max over cameras c that see x of prod_i (1 - G_i(o_c + min(t, t*_i) w))``.
 
-    The transmittance is that of training (method.md 2.4, 5.1): exact in three dimensions, with a
-    Gaussian dropped outside its footprint ``alpha >= 1/255``. Where the tails of m Gaussians that
-    were dropped overlap, vacancy is too large by at most ``1 - (1 - 1/255)^m``: on a dense shell by
-    0.0045 (median) to 0.012 (largest) near the surface, and up to 0.018 where vacancy is 0.9. In
-    depth, only tails below 1e-5 are dropped. Gaussians whose centre is not deeper than ``near_z``
-    do not count, as in training. A camera sees a point that lies in its image and deeper than
-    ``near_z``. Pixels and depths are float32: a Gaussian thinner than about 1e-6 of its distance
-    blurs to that.
+    The transmittance is that of training (docs/method.md, sections 2.4 and 5.1): exact in three
+    dimensions, with a Gaussian dropped outside its footprint ``alpha >= 1/255``. Where the tails of
+    m Gaussians that were dropped overlap, vacancy is too large by at most ``1 - (1 - 1/255)^m``: on
+    a dense shell by 0.0045 (median) to 0.012 (largest) near the surface, and up to 0.018 where
+    vacancy is 0.9. In depth, only tails below 1e-5 are dropped. Gaussians whose centre is not
+    deeper than ``near_z`` do not count, as in training. A camera sees a point that lies in its
+    image and deeper than ``near_z``. Pixels and depths are float32: a Gaussian thinner than about
+    1e-6 of its distance blurs to that.
 
     Results do not depend on ``threads``. They depend on earlier calls only where vacancy exceeds
     0.999, as cameras that won most often are asked first.
@@ -83,8 +83,9 @@ class VacancyField:
     threads : int
         0 uses every core.
     unseen : {"empty", "occupied", "invalid"}
-        Vacancy 1, 0 or NaN of points that no camera sees (method.md 5.3). Invalid points count as
-        empty where only a side is asked for, and ``unseen_evaluations`` says how many there were.
+        Vacancy 1, 0 or NaN of points that no camera sees (docs/method.md, section 5.3). Invalid
+        points count as empty where only a side is asked for, and ``unseen_evaluations`` says how
+        many there were.
     masks : sequence of (h, w) bool or None, optional
         One a camera, true where its photo counts, of any resolution.
     mask_mode : {"ignore", "background"}

@@ -148,7 +148,7 @@ def transmittance_of_cells(
     """
     near = np.empty(list_capacity, np.int32)
     # Rows of GROUP: x, y, depth, transmittance, value to beat. One array at constant offsets lets
-    # the compiler prove that nothing overlaps (kernels.md 4).
+    # the compiler prove that nothing overlaps.
     M = np.empty(5 * GROUP, np.float32)
     for cell in range(begin, end):
         first, last = cell_start[cell], cell_start[cell + 1]

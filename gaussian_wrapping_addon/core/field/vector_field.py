@@ -16,7 +16,7 @@ from ..parallel import default_threads, even_bounds, run_chunks
 from .box_grid import EMPTY_KEY, build_box_grid, cell_key, hash_key
 
 TAIL = 1e-4
-"""Gaussians whose value at a point is below this are left out (method.md 5.2)."""
+"""Gaussians whose value at a point is below this are left out (docs/method.md, section 5.2)."""
 MEDIAN_CAPACITY = 512
 """At most this many Gaussians at a point take part in the median of their thickness."""
 MIN_SLOPE = 1e-6
@@ -140,7 +140,9 @@ class VectorFieldResult:
 
 
 class VectorField:
-    """``V(x) = sum_i 1[n_i.(x - mu_i) >= 0] H_i(x) Sigma_i^-1 (x - mu_i)`` (method.md 5.1).
+    """``V(x) = sum_i 1[n_i.(x - mu_i) >= 0] H_i(x) Sigma_i^-1 (x - mu_i)``.
+
+    See docs/method.md, section 5.1.
 
     All Gaussians whose value at the point is at least :data:`TAIL` take part, however far their
     mean or large their body; each one left out would have added less than ``TAIL / (1 - TAIL)``

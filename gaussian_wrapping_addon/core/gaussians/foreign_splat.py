@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Splats of other programs: any 3D Gaussian splatting PLY as oriented Gaussians.
 
-Formats: conventions.md C.6 (Inria's code), gsplat and nerfstudio exports (with or without normals,
+Formats: that of the original code, gsplat and nerfstudio exports (with or without normals,
 or with plain colours), 2D Gaussian splatting (two scales), files with Mip-Splatting's
 ``filter_3D``, and our own with ``gaussian_features_*``.
 """

@@ -31,7 +31,7 @@ MAX_DISTANCE = 20.0 * tolerances.SCENE_RADIUS
 them on any photo: outliers of the reconstruction reach 1e6 units and would waste float32."""
 
 MIN_SPACING_SQ = 1e-7
-"""Squared distances between neighbours are clamped to this (method.md 1.3)."""
+"""Squared distances between neighbours are clamped to this (docs/method.md, section 1.3)."""
 
 MAX_SPACING_SHARE = 0.1
 """A first Gaussian is no larger than this share of its distance to the nearest camera."""
@@ -52,7 +52,7 @@ def initial_gaussians(
     sh_degree: int,
     seed: int,
 ) -> OrientedGaussians:
-    """Return the Gaussians that training starts from (method.md 1.3).
+    """Return the Gaussians that training starts from (docs/method.md, section 1.3).
 
     One per sparse point: round, as large as the mean distance to its three nearest neighbours,
     opacity 0.1, orientation zero. Where there are fewer than :data:`FEW_POINTS`, random pixels are

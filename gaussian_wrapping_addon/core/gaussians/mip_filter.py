@@ -14,9 +14,10 @@ from ..dataset.camera import Camera
 from ..parallel import default_threads, even_bounds, run_chunks
 
 FILTER_VARIANCE_PX = 0.05
-"""Variance of the filter in squared pixels of the closest camera. Method.md 1.5 has 0.2, which was
-measured to cost thin parts their opacity: a Gaussian as narrow as 0.4 pixels in two directions
-keeps 44 % of it, and spokes of three pixels stay half transparent; with this it keeps 76 %."""
+"""Variance of the filter in squared pixels of the closest camera. The usual 0.2 (docs/method.md,
+section 1.5) was measured to cost thin parts their opacity: a Gaussian as narrow as 0.4 pixels in
+two directions keeps 44 % of it, and spokes of three pixels stay half transparent; with this it
+keeps 76 %."""
 
 IMAGE_MARGIN = 0.15
 """The image is enlarged by this share on each side when asking which camera sees a Gaussian."""
@@ -47,7 +48,7 @@ def mip_filter(
     near_z: float = tolerances.NEAR_Z,
     threads: int = 0,
 ) -> np.ndarray:
-    """Return the filter's standard deviation of each Gaussian (method.md 1.5).
+    """Return the filter's standard deviation of each Gaussian (docs/method.md, section 1.5).
 
     ``f = z_min / focal_max * sqrt(0.2)``, with ``z_min`` the smallest z-depth over the cameras
     whose image, enlarged by 15 % on each side, holds the mean.

@@ -33,10 +33,12 @@ class GaussianArrays:
 
 @dataclass(frozen=True)
 class OrientedGaussians:
-    """Trained parameters before activation (method.md 1.3). All tensors share one dtype.
+    """Trained parameters before activation (docs/method.md, section 1.3).
+
+    All tensors share one dtype.
 
     The activated normal is ``tanh(s) * d / |d|`` for ``orientation = (d, s)``. ``filter_3d`` is a
-    constant between recomputations and never receives a gradient (method.md 1.5).
+    constant between recomputations and never receives a gradient (docs/method.md, section 1.5).
     """
 
     means: Tensor  # (n, 3) scene units
@@ -80,7 +82,7 @@ class OrientedGaussians:
         return torch.sqrt(torch.exp(2.0 * self.log_scales) + filter_sq)
 
     def log_opacities(self) -> Tensor:
-        """(n,) log of the effective opacity, in stable form (method.md 5.4)."""
+        """(n,) log of the effective opacity, in stable form (docs/method.md, section 5.4)."""
         loss = self.log_scales - torch.log(self.scales())  # (n, 3), <= 0
         return -torch.nn.functional.softplus(-self.opacity_logits) + loss.sum(1)
 

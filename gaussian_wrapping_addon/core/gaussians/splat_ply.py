@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Gaussians as PLY files: our native one, one for viewers, and a bounded reader of the native one.
 
-The order of the properties is that of the original 3D Gaussian splatting code (conventions.md C.6):
+The order of the properties is that of the original 3D Gaussian splatting code:
 positions, zero normals, harmonics channel by channel, opacity logit, log scales, quaternion wxyz;
 the native file appends ``filter_3D`` and ``gaussian_features_0..3`` (direction and sign).
 """

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A first, coarse surface of a region: two-pivot marching tetrahedra (method.md 6)."""
+"""A first, coarse surface of a region: two-pivot marching tetrahedra.
+
+See docs/method.md, section 6.
+"""
 
 from __future__ import annotations
 

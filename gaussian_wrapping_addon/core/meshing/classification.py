@@ -76,7 +76,7 @@ def classify(
     rng: np.random.Generator,
     progress: Progress,
 ) -> Classification:
-    """Label tetrahedra by the vacancy of interior points (method.md 7.5).
+    """Label tetrahedra by the vacancy of interior points (docs/method.md, section 7.5).
 
     A tetrahedron whose corners lie on one smooth sheet is flat: inside or outside, the surface
     stays the same up to the spacing squared. Those are labelled by the side of the sheet on which

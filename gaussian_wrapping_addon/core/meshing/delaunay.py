@@ -17,7 +17,7 @@ _logger = logging.getLogger(__name__)
 
 JITTER_SHARE = 1e-7
 """Shift, as a share of the extent, that breaks ties between cospherical or coplanar points. It
-decides connectivity only (kernels.md 9: without it shull needs minutes on lattices). With the far
+decides connectivity only (without it shull needs minutes on lattices). With the far
 points, which make the extent 15 times larger, it is about 1e-6 of the extent of the others."""
 
 HELPER_DEADLINE_S = 600.0
@@ -27,7 +27,7 @@ HELPER_BASE_BYTES = 4 << 30
 
 FAR_SHARE = 7.3
 FAR_SPREAD_SHARE = 0.1
-"""Distance of the far box points and their irregularity, in half extents (kernels.md 9)."""
+"""Distance of the far box points and their irregularity, in half extents."""
 
 
 def far_points(points: np.ndarray, seed: int) -> np.ndarray:

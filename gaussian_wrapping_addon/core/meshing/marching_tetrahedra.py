@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Marching tetrahedra on labelled points, and bisection of the crossing edges (method.md 6.3)."""
+"""Marching tetrahedra on labelled points, and bisection of the crossing edges.
+
+See docs/method.md, section 6.3.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshing by pivots: marching tetrahedra on the pivots of a region's Gaussians (method.md 6)."""
+"""Meshing by pivots: marching tetrahedra on the pivots of a region's Gaussians.
+
+See docs/method.md, section 6.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ _logger = logging.getLogger(__name__)
 
 BRACKET_SHARE = 0.02
 """A vertex is bracketed to this share of a pixel at its place, or of its edge where that is
-shorter: finer is below what the photos tell (method.md 6.4 [R])."""
+shorter: finer is below what the photos tell (docs/method.md, section 6.4)."""
 
 DEGENERATE_SHARE = 1e-3
 """Faces narrower than this share of the median edge are removed: the level passes close by some
@@ -55,7 +58,7 @@ def mesh_by_pivots(
 
     The tetrahedra of the pivots are cut by the region's planes before signs are asked for, so that
     the solid ends on these planes exactly, with sharp edges; every tetrahedron stays, hence the
-    mesh is closed and manifold (method.md 6.5 [R]).
+    mesh is closed and manifold (docs/method.md, section 6.5).
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pivots of oriented Gaussians: two, three or nine each (method.md 6.1)."""
+"""Pivots of oriented Gaussians: two, three or nine each (docs/method.md, section 6.1)."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _outer_steps(
 def nine_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
     """Return centre and the corners of the 3-sigma box of the Gaussians ``index`` on their axes.
 
-    As Gaussian Opacity Fields places them; orientation plays no part (method.md 6.1, "9p (GOF)").
+    As Gaussian Opacity Fields places them; orientation plays no part (docs/method.md, section 6.1).
 
     Returns
     -------

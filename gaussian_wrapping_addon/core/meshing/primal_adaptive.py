@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Primal adaptive meshing: a closed mesh of a region at any resolution (method.md 7)."""
+"""Primal adaptive meshing: a closed mesh of a region at any resolution.
+
+See docs/method.md, section 7.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bounding-volume JSON, version 1 (method.md 7.3): regions on disk, in world coordinates."""
+"""Regions on disk, in world coordinates: bounding-volume JSON, version 1.
+
+See docs/method.md, section 7.3.
+"""
 
 from __future__ import annotations
 

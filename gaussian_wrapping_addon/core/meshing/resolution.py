@@ -49,7 +49,7 @@ class Request:
 
 
 def checked_request(edge_length: float, points: int, region: Region) -> Request:
-    """Check a request before any work is done (conventions D.5, case 37).
+    """Check a request before any work is done.
 
     Raises
     ------

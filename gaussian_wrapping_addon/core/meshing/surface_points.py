@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Evenly spread points on the isosurface, made from a candidate surface (method.md 7.2, 1-5)."""
+"""Evenly spread points on the isosurface, made from a candidate surface.
+
+See docs/method.md, section 7.2.
+"""
 
 from __future__ import annotations
 

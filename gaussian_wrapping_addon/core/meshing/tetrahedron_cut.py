@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Tetrahedra cut by the planes of a region, face to face, so that a solid in them closes there.
 
-Dropping tetrahedra that reach beyond the region would leave a ragged boundary (method.md 6.5 [R]).
-Each that a plane crosses is divided instead: its part inside becomes up to three tetrahedra. Which
-diagonal divides a four-sided face follows from the numbers of its corners alone, so neighbours
-agree on it, whatever the rounding.
+Dropping tetrahedra that reach beyond the region would leave a ragged boundary (docs/method.md,
+section 6.5). Each that a plane crosses is divided instead: its part inside becomes up to three
+tetrahedra. Which diagonal divides a four-sided face follows from the numbers of its corners alone,
+so neighbours agree on it, whatever the rounding.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Isosurface depth and transmittance of a view at any sub-pixel positions, and their gradients.
 
-The depth is that of the image, at positions instead of pixel centres (method.md 2.4, 2.5 and 3.4):
+The depth is that of the image, at positions instead of pixel centres (docs/method.md, section 2.9):
 the multi-view terms follow a surface point into a neighbouring view and ask for the depth where it
 lands. That place moves with the Gaussians too, so the answers are differentiable with respect to
 the positions as well.
@@ -165,7 +165,7 @@ def add_query_gradients(
     """Add the gradient of ``sum grads * values`` to that on the view's ``screen.params``.
 
     The gradient of a depth is that of the implicit function, with the floored slope of
-    method.md 2.5. Bitwise the same for any number of threads.
+    docs/method.md, section 2.5. Bitwise the same for any number of threads.
 
     Parameters
     ----------

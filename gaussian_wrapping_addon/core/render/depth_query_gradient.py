@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Compiled gradients of ``log T`` at depths and positions: per pair of tile and Gaussian, summed.
 
-A depth's gradient is one of these over the slope of ``log T`` (method.md 2.5).
+A depth's gradient is one of these over the slope of ``log T`` (docs/method.md, section 2.5).
 """
 
 from __future__ import annotations

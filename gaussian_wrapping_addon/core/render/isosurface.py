@@ -2,9 +2,9 @@
 """Compiled solver of the 0.5-isosurface depth of a block of pixels, from its list of visits.
 
 Along a pixel's ray ``T(t) = prod_i (1 - min(0.99, alpha_i exp(-s_i max(t_i - t, 0)^2 / 2)))`` falls
-with t; the depth is where it crosses 0.5 (method.md 2.4). Each pixel keeps a bracket, starts where
-the Gaussian at which the blending crosses 0.5 would cross it alone, and takes Halley steps on
-log T; a step that leaves the bracket, or too many steps, is replaced by bisection.
+with t; the depth is where it crosses 0.5 (docs/method.md, section 2.4). Each pixel keeps a bracket,
+starts where the Gaussian at which the blending crosses 0.5 would cross it alone, and takes Halley
+steps on log T; a step that leaves the bracket, or too many steps, is replaced by bisection.
 """
 
 from __future__ import annotations

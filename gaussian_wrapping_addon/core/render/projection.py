@@ -151,7 +151,7 @@ def project_gaussians(
     options: RenderOptions,
     out: ScreenGaussians | None = None,
 ) -> ScreenGaussians:
-    """Activate and project raw Gaussians, in float64 (method.md 1.5, 2.2 and 5.4; kernels.md 4).
+    """Activate and project raw Gaussians, in float64 (docs/method.md, sections 1.5 and 2.3).
 
     Parameters
     ----------

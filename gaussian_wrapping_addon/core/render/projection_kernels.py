@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Compiled forward projection: Gaussians of any depth-to-size ratio onto one screen, in float64.
 
-Notation of method.md 1.1 with ``w0 = (u, v, 1)`` the ray through the mean (camera frame),
-``axis_k`` the Gaussian's axes and ``e_k = axis_k . w0``. The inverse covariance of the exact
-projection is written as a sum of squares,
+Notation of docs/method.md, section 2.3, with ``w0 = (u, v, 1)`` the ray through the mean (camera
+frame), ``axis_k`` the Gaussian's axes and ``e_k = axis_k . w0``. The inverse covariance of the
+exact projection is written as a sum of squares,
 
     Q = z^2 / a0 * sum_k (s_i s_j)^-2 g_k g_k^T,   (i, j) the other two axes,
 

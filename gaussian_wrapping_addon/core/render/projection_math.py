@@ -3,7 +3,7 @@
 
 Gaussians are projected in blocks of 8. Every value of a block is a *plane* of 8 float64 inside one
 scratch array; loops over a block have a constant trip count, constant offsets in that one array
-and no branches, which is what lets LLVM vectorise them (kernels.md 4.4 to 4.6). A block that is not
+and no branches, which is what lets LLVM vectorise them. A block that is not
 full is padded with copies of its last Gaussian, so that no value depends on its neighbours.
 
 No vector library is at hand, and one scalar call would undo the vectorisation, so the exponential

@@ -4,7 +4,7 @@
 Vectors run over the Gaussians of a cell, not over positions, so that one position costs no more
 than one of many. The Gaussians that reach a cell are laid out in *spans* of 32: 32 values of one
 column after those of another, all of a span inside one array at constant offsets, which is what
-lets LLVM vectorise (kernels.md 4.4).
+lets LLVM vectorise.
 """
 
 from __future__ import annotations

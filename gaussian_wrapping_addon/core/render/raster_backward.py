@@ -3,11 +3,11 @@
 
 One scalar per pixel replaces the list of contributors: with ``q_i`` the loss gradient along
 Gaussian i's features, ``remaining = sum_{j > i} w_j q_j + ...`` starts from the images and is
-used up on the way (kernels.md 4.8). The depth's gradient is that of the implicit function: each
-contributor adds ``g / a dlog(1 - G_i(t))`` (method.md 2.5). Per Gaussian and tile only moments of
-the gradient on ``num``, ``den`` and ``1 + p.d`` are summed over pixels; the gradient on the row of
-params follows from them (kernels.md 4.9). Each pair writes its own slot, so the sum per Gaussian
-has a fixed order. Blocks are visited as in the forward pass, a chunk of pairs at a time.
+used up on the way. The depth's gradient is that of the implicit function: each
+contributor adds ``g / a dlog(1 - G_i(t))`` (docs/method.md, section 2.5). Per Gaussian and tile
+only moments of the gradient on ``num``, ``den`` and ``1 + p.d`` are summed over pixels; the
+gradient on the row of params follows from them. Each pair writes its own slot, so the sum per
+Gaussian has a fixed order. Blocks are visited as in the forward pass, a chunk of pairs at a time.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 
 The contributors are three arrays, moved together: opacities before the cap of 0.99, z-depths of
 the peaks, sharpnesses 1 / sigma^2 along the ray. The crossing is solved by Newton steps on
-``log T`` inside a bracket (method.md 2.4).
+``log T`` inside a bracket (docs/method.md, section 2.4).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _NEWTON_STEPS = 8
 _MAX_STEPS = 80
 SLOPE_FLOOR = np.float32(tolerances.SLOPE_FLOOR)
 """Floor of -d(log T)/dt in shares of the 1/sigma along the ray of the Gaussian at which the
-blending crosses 0.5 (method.md 2.5)."""
+blending crosses 0.5 (docs/method.md, section 2.5)."""
 _THIRD, _FIFTH = np.float32(1.0 / 3.0), np.float32(0.2)
 # exp(-x / 2) is below 3e-7 beyond this x = sharpness d^2.
 NEGLIGIBLE = np.float32(30.0)

@@ -37,7 +37,7 @@ class _Hits:
 def render_reference(
     gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
 ) -> Render:
-    """Render by the definition (method.md 1.1, 2.2 to 2.5 with exact ray quantities).
+    """Render by the definition (docs/method.md, sections 2.1 to 2.5).
 
     On each pixel's ray the visible Gaussians are taken by increasing distance of their means
     (rounded to float32, ties by index). One contributes iff ``alpha >= 1/255`` and the
@@ -197,7 +197,10 @@ def _transmittance_before(alpha: Tensor) -> Tensor:
 
 
 def _depth(hits: _Hits, options: RenderOptions) -> Tensor:
-    """(p,) z-depth of the 0.5-isosurface; 0 where there is none (method.md 2.4 and 2.5)."""
+    """(p,) z-depth of the 0.5-isosurface; 0 where there is none.
+
+    See docs/method.md, sections 2.4 and 2.5.
+    """
     depth = torch.zeros_like(hits.final)
     limit = options.depth_valid_transmittance
     deep = torch.nonzero((hits.final <= limit) & (hits.final < tolerances.ISO_LEVEL))[:, 0]

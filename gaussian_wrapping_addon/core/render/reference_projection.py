@@ -27,7 +27,7 @@ class ReferenceScreen:
 def reference_projection(
     gaussians: OrientedGaussians, camera: Camera, options: RenderOptions
 ) -> ReferenceScreen:
-    """Activate and project Gaussians with torch (method.md 1.5, 2.2; kernels.md 4).
+    """Activate and project Gaussians with torch (docs/method.md, sections 1.5 and 2.3).
 
     Rows that are not usable hold zeros and carry no gradient.
     """
@@ -129,7 +129,10 @@ def _held_by_float32(rows: Tensor, distance: Tensor, camera: Camera) -> Tensor:
 
 
 def _colors(gaussians: OrientedGaussians, camera: Camera, options: RenderOptions) -> Tensor:
-    """(n, 3) harmonics at the direction camera -> mean, + 0.5, clamped at 0 (method.md 2.1)."""
+    """(n, 3) harmonics at the direction camera -> mean, + 0.5, clamped at 0.
+
+    See docs/method.md, section 2.1.
+    """
     degree = used_degree(gaussians.sh.shape[1], options)
     center = gaussians.means.new_tensor(camera.center)
     offset = gaussians.means - center

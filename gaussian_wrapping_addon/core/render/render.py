@@ -37,7 +37,7 @@ def render(
     options: RenderOptions | None = None,
     buffers: RenderBuffers | None = None,
 ) -> Render:
-    """Render by the definition of :func:`~.reference.render_reference`, in float32 (kernels.md 4).
+    """Render by the definition of :func:`~.reference.render_reference`, in float32.
 
     Differentiable with respect to every tensor of ``gaussians`` except ``filter_3d``. Images and
     gradients are bitwise the same for any number of threads.

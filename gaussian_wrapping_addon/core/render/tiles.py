@@ -270,7 +270,7 @@ def bin_gaussians(
     threads: int = 0,
     store: ArrayStore | None = None,
 ) -> TileLists:
-    """Sort the visible Gaussians by distance and scatter them into tile lists (kernels.md 8).
+    """Sort the visible Gaussians by distance and scatter them into tile lists.
 
     One radix sort of the distances and one counting sort into tiles; the order within each tile
     is that of a stable sort, whatever the number of threads. In tiles at the corners of a box that

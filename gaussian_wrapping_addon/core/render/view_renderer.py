@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Rendering without autograd: images in reused memory, gradients of the seen Gaussians only.
 
-What grows with the (tile, Gaussian) pairs exists for one band of tiles at a time (kernels.md 4.10):
+What grows with the (tile, Gaussian) pairs exists for one band of tiles at a time:
 its lists, and on the way back the gradients of its pairs, which are added to the Gaussians' rows
 before the next band. The bands follow from the scene and the budget alone, so gradients do not
 depend on the number of threads.

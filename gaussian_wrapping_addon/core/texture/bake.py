@@ -132,7 +132,7 @@ def bake(
     -----
     A view's weight is (cosine x useful pixels per texel)^2, faded near silhouettes and the
     image border. The best ``KEPT_VIEWS`` are kept; with three or more, those far from their
-    median are dropped (method.md 8).
+    median are dropped (docs/method.md, section 8.2).
     """
     plans, exposure = survey.plans, survey.exposure
     colors = np.zeros((len(points), 3), np.uint8)

@@ -12,7 +12,7 @@ from ..compiled import kernel
 from .face_graph import FaceGraph
 
 MAX_CHUNK_FACES = 1500
-"""xatlas 0.0.11 crashes on 82k faces at once and is fast and stable at 1-2k (conventions D.2)."""
+"""xatlas 0.0.11 crashes on 82k faces at once and is fast and stable at 1-2k."""
 SMALL_CHUNK_SHARE = 0.125
 MERGED_CHUNK_SHARE = 1.3
 NORMAL_COST = 1.5

@@ -17,7 +17,7 @@ MIN_ALPHA = 0.5
 
 
 class GaussianPhotos:
-    """The diffuse colour of Gaussians from the cameras of photos (method.md 8).
+    """The diffuse colour of Gaussians from the cameras of photos (docs/method.md, section 8.4).
 
     Harmonics of degree 0 alone: highlights and what else changes with the direction is left out,
     and so is what stood in single photos only. Detail is that of the Gaussians. Only the last

@@ -45,7 +45,7 @@ def texture_mesh(
     free_bytes: int = 0,
     unwrapped: Unwrap | None = None,
 ) -> TexturedMesh:
-    """Unwrap a mesh and bake its texture from the photos (method.md 8).
+    """Unwrap a mesh and bake its texture from the photos (docs/method.md, section 8).
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def _spread(raster: AtlasRaster, used: int, wanted: int) -> SurfacePoints:
 
 
 def check_mesh(mesh: SurfaceMesh) -> None:
-    """Refuse what cannot be unwrapped or written (conventions.md D.5, 46 and 49)."""
+    """Refuse what cannot be unwrapped or written."""
     hint = "Mesh the region again, or send the job folder's log.txt with a bug report."
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if len(faces) == 0 or len(vertices) == 0:

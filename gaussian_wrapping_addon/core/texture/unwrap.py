@@ -84,7 +84,7 @@ def unwrap(
 
     Notes
     -----
-    xatlas crashes, hangs or answers NaN on some meshes (conventions.md D.2). Whatever it does, a
+    xatlas crashes, hangs or answers NaN on some meshes. Whatever it does, a
     box projection takes its place, with a warning and ``method = "box"``.
     """
     graph = face_graph(mesh.vertices, mesh.faces)

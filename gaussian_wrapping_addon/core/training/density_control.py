@@ -12,7 +12,10 @@ from ..render.types import RenderStatistics
 from .optimizer import Adam
 
 GRADIENT_THRESHOLD = 2e-4
-"""Average loss gradient per half image from which a Gaussian is doubled (method.md 4.1)."""
+"""Average loss gradient per half image from which a Gaussian is doubled.
+
+See docs/method.md, section 4.1.
+"""
 
 LOWEST_SCORE = 0.3
 """Where the budget has room for more than qualify, those with at least this share of the threshold
@@ -24,7 +27,7 @@ CLONE_SIZE = 0.01 * tolerances.SCENE_RADIUS
 SPLIT_FACTOR = 1.6
 MIN_OPACITY = 0.02
 """Gaussians with a smaller raw opacity are removed. Between 0.05 and 0.005 of the two published
-codes (method.md 4.1): short runs hardly recover what 0.05 removes."""
+codes (docs/method.md, section 4.1): short runs hardly recover what 0.05 removes."""
 
 RESET_OPACITY = 0.01
 
@@ -85,8 +88,8 @@ def densify_and_prune(
     """Clone small and split large Gaussians with high gradients; remove transparent ones.
 
     A Gaussian qualifies by its average gradient, or by its average absolute gradient above the
-    quantile that selects the same share (method.md 4.1). Where more qualify than ``limit`` has
-    room for, those with the highest gradients are taken.
+    quantile that selects the same share (docs/method.md, section 4.1). Where more qualify than
+    ``limit`` has room for, those with the highest gradients are taken.
 
     Parameters
     ----------
@@ -156,7 +159,10 @@ def _offsets(adam: Adam, rows: np.ndarray, random: np.random.Generator) -> np.nd
 
 
 def reset_opacity(adam: Adam) -> None:
-    """Cap all effective opacities at 0.01 (method.md 1.5) and forget their moments."""
+    """Cap all effective opacities at 0.01 and forget their moments.
+
+    See docs/method.md, section 4.1.
+    """
     gaussians = adam.gaussians().detached()
     log_factor = (gaussians.log_scales - gaussians.scales().log()).sum(1).numpy()  # (n,) <= 0
     log_cap = np.minimum(np.log(RESET_OPACITY) - log_factor, np.log1p(-1e-6))

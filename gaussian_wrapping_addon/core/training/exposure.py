@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trained exposure of each photo: a gain and an offset per colour channel (method.md 1.6).
+"""Trained exposure of each photo: a gain and an offset per colour channel.
+
+See docs/method.md, section 1.6.
 
 The method's ``exp(a) I + b`` has one gain and one offset per photo. Cameras on automatic change the
 white balance too, so here every channel has its own. The offset is not a luxury: with the sRGB
@@ -36,7 +38,7 @@ its contrast, and Adam, which scales every value alone, need not creep along the
 them. Middle grey is also what the pinned means leave in place."""
 
 REFERENCE_RATE = 1e-3
-"""Learning rate of method.md 1.4."""
+"""Learning rate of docs/method.md, section 1.4."""
 
 TRAVEL = 1.5
 """A short run's first rate would let a value move by this much in all of its photo's turns; as the

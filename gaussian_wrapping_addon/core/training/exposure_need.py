@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Evidence, before any training, of whether photos differ in exposure (design.md 6).
+"""Evidence, before any training, of whether photos differ in exposure.
+
+See docs/method.md, section 4.4.
 
 Every sparse point's colour is read in every photo that may see it. Which photos do is not known, so
 that points behind others are left out by a coarse depth buffer, and what this misses (occlusion,

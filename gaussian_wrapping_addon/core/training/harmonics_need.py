@@ -2,10 +2,10 @@
 """Does the next degree of spherical harmonics explain what the surface shows?
 
 Training twice would tell, but costs two trainings. The degree is fitted in closed form instead
-(:mod:`.harmonics_trial`) and judged by photos that took no part (design.md 6). A gain of whole
-photos does not tell gloss from errors of shape, which any further unknown lowers a little in many
-places. Gloss is local and the same in all photos: so the errors are told apart by the place on the
-surface, and what counts is how much of it gains clearly.
+(:mod:`.harmonics_trial`) and judged by photos that took no part (docs/method.md, section 4.4). A
+gain of whole photos does not tell gloss from errors of shape, which any further unknown lowers a
+little in many places. Gloss is local and the same in all photos: so the errors are told apart by
+the place on the surface, and what counts is how much of it gains clearly.
 """
 
 from __future__ import annotations

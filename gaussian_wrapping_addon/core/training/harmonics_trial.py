@@ -3,7 +3,7 @@
 
 Colours enter an image linearly: the residuals of a photo, sent backwards, give the mean residual of
 each Gaussian in it, and a small regression over the viewing directions its coefficients
-(design.md 6). What that tells of a scene is judged in :mod:`.harmonics_need`.
+(docs/method.md, section 4.4). What that tells of a scene is judged in :mod:`.harmonics_need`.
 """
 
 from __future__ import annotations

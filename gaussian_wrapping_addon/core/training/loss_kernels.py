@@ -45,7 +45,9 @@ def _cross(a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: Any) -> Any:
 
 @kernel(fast=False)
 def normal_rows(begin, end, depth, camera, max_jump, normals, valid):  # type: ignore[no-untyped-def]
-    """Camera-frame normals of the surface z = depth, rows [begin, end) (method.md 2.8).
+    """Camera-frame normals of the surface z = depth, rows [begin, end).
+
+    See docs/method.md, section 2.8.
 
     Parameters
     ----------

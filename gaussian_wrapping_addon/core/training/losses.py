@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The losses of training, with their gradients on the images of a render (method.md 3)."""
+"""The losses of training, with their gradients on the images of a render.
+
+See docs/method.md, section 3.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +49,9 @@ def color_loss(
     threads: int = 0,
     store: ArrayStore | None = None,
 ) -> tuple[float, np.ndarray, ColorFigures]:
-    """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and figures (method.md 3.1).
+    """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and figures.
+
+    See docs/method.md, section 3.1.
 
     Parameters
     ----------
@@ -86,7 +91,7 @@ def color_loss(
 def normals_from_depth(
     depth: np.ndarray, camera: Camera, *, max_jump: float = 0.0, threads: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit normals of a depth map, facing the camera (method.md 2.8).
+    """Return unit normals of a depth map, facing the camera (docs/method.md, section 2.8).
 
     The cross product of central differences of the back-projected depth.
 
@@ -134,7 +139,9 @@ def normal_losses(
     threads: int = 0,
     store: ArrayStore | None = None,
 ) -> tuple[float, ImageGradients, NormalFigures]:
-    """Return ``lambda_DN L_DN + lambda_N L_N``, gradients and both means (method.md 3.2 and 3.3).
+    """Return ``lambda_DN L_DN + lambda_N L_N``, gradients and both means.
+
+    See docs/method.md, sections 3.2 and 3.3.
 
     ``L_DN = mean(valid (1 - n_geo / alpha . n_depth))`` and ``L_N = mean(valid (1 - N . n_depth))``
     over all pixels of the image (of the mask), with the normals of

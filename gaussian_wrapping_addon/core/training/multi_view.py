@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Losses between two views, with gradients on both (method.md 3.4, recommended variants).
+"""Losses between two views, with gradients on both (docs/method.md, section 3.4).
 
 Some pixels of the rendered view are lifted to its isosurface and followed into another view.
 *Geometric*: the depth of the other view there, brought back, should meet the pixel again.
@@ -136,10 +136,10 @@ def multi_view_losses(
     """Compare a rendered view with another photo and with the depth seen from there.
 
     ``weight (lambda_photometric mean(w (1 - ncc)) + lambda_geometric mean(w noise))`` with
-    ``w = exp(-noise)`` held constant (method.md 3.4). A pixel is valid where both depths exist,
-    both masks keep it and the noise is below one pixel; its patch is kept where the plane is not
-    seen edge-on, all samples are inside both images and masks, neither patch is flat, and
-    ``1 - ncc < 0.9``.
+    ``w = exp(-noise)`` held constant (docs/method.md, section 3.4). A pixel is valid where both
+    depths exist, both masks keep it and the noise is below one pixel; its patch is kept where the
+    plane is not seen edge-on, all samples are inside both images and masks, neither patch is flat,
+    and ``1 - ncc < 0.9``.
 
     Parameters
     ----------

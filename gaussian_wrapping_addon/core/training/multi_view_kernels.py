@@ -3,8 +3,9 @@
 
 Everything is float64 but the images, the depths and the places that are looked up. Derivatives are
 written out by hand. With ``r_p`` the ray of the reference pixel, ``r_o`` that of a sample of its
-patch, depth z and any multiple n of the plane's normal, the homography of method.md 3.4 takes
-``r_o`` to ``R r_o + s t`` with ``s = (n . r_o) / (z n . r_p)``; only s depends on z and n.
+patch, depth z and any multiple n of the plane's normal, the homography of docs/method.md,
+section 3.4, takes ``r_o`` to ``R r_o + s t`` with ``s = (n . r_o) / (z n . r_p)``; only s depends
+on z and n.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ MIN_NOISE_PX = 1e-9
 
 MIN_SPREAD = SAMPLES * 0.012**2
 """Smallest sum of squared deviations in a patch, of grey in [0, 1]: contrast of three grey levels.
-Method.md 3.4 has 5e-6, which is far below the noise of photos: such patches agree by chance, pull
-the surface about at random, and a surface that is pulled about recedes."""
+The usual 5e-6 (docs/method.md, section 3.4) is far below the noise of photos: such patches agree by
+chance, pull the surface about at random, and a surface that is pulled about recedes."""
 SPREAD_PRODUCT = 1e-8
 """Added to the product of two such sums: patches of weak contrast correlate less."""
 MAX_ERROR = 0.9
 """Patches that agree less than this show different things."""
 MIN_NORMAL = 0.3
-"""Shortest mean normal that stands for a plane (method.md 11, row 9)."""
+"""Shortest mean normal that stands for a plane (docs/method.md, section 3.4)."""
 MIN_FACING = 0.1
 """Least cosine between normal and ray (84 degrees): a plane seen more edge-on has no patch."""
 MAX_RISE = 4.0

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What a scene needs: decisions with their evidence, and the rules that need no rendering.
 
-design.md 6: more model than needed costs time and invites error, so each part of the model is
-switched on by what the photos say, says why, and can be overridden by a setting.
+docs/method.md, section 4.4: more model than needed costs time and invites error, so each part of
+the model is switched on by what the photos say, says why, and can be overridden by a setting.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def decide(
 
 
 def multi_view_need(neighbours: Sequence[np.ndarray], setting: str = "auto") -> Decision:
-    """Decide whether the multi-view terms are used (method.md 3.4).
+    """Decide whether the multi-view terms are used (docs/method.md, section 3.4).
 
     They compare a photo with one taken from a similar place, and are on as soon as any photo has
     such a neighbour: photos without one skip them and cost nothing. Without any neighbour they stay
@@ -181,7 +181,7 @@ def wrapping_need(errors: np.ndarray, weights: np.ndarray, setting: str = "auto"
 
     Behind a thin part the orientation of its Gaussians is seen from the wrong side. Such Gaussians
     disagree with the depth's normals in about half of their views, those of a solid hardly
-    anywhere: the share of them on what is shown is the evidence (method.md 4.2).
+    anywhere: the share of them on what is shown is the evidence (docs/method.md, section 4.2).
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which cameras are compared with which by the multi-view terms (method.md 3.4)."""
+"""Which cameras are compared with which by the multi-view terms (docs/method.md, section 3.4)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class NeighbourLimits:
 
 
 FIXED_LIMITS = NeighbourLimits(max_distance=0.3 * tolerances.SCENE_RADIUS, min_overlap=0.0)
-"""The limits of method.md 3.4, tuned on captures of hundreds of photos."""
+"""The limits of docs/method.md, section 3.4, tuned on captures of hundreds of photos."""
 
 
 def find_neighbours(
@@ -49,7 +49,7 @@ def find_neighbours(
     *,
     points: np.ndarray | None = None,
 ) -> list[np.ndarray]:
-    """Return the cameras that each camera is compared with (method.md 3.4).
+    """Return the cameras that each camera is compared with (docs/method.md, section 3.4).
 
     Candidates look in about the same direction from about the same place, and see part of the same
     sparse points. The nearest come first, ties by angle, then by index. One camera's choice does

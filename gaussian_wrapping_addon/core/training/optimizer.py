@@ -16,7 +16,10 @@ from ..render.types import VisibleGradients
 from .adam_kernels import BETA1, BETA2, COLUMNS, LANES, SH_COLUMN, adam_rows
 
 TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
-"""Tensors that receive gradients; ``filter_3d`` is recomputed instead (method.md 1.5)."""
+"""Tensors that receive gradients; ``filter_3d`` is recomputed instead.
+
+See docs/method.md, section 1.5.
+"""
 
 _TABLE_STEPS = 20_000
 """Both bias corrections are 1 within float32 from here on."""

@@ -14,7 +14,7 @@ from ..render.render import render
 from ..render.types import RenderOptions
 
 FIRST_SIGN = 0.5
-"""Size of the sign parameter after the cameras' vote (method.md 1.3)."""
+"""Size of the sign parameter after the cameras' vote (docs/method.md, section 1.3)."""
 
 
 def voted_orientation(
@@ -24,7 +24,7 @@ def voted_orientation(
 
     The direction is the shortest axis. Each camera votes with the Gaussian's blending weight for
     the side that it sees; the sign parameter is +-0.5, or 0 where no camera sees the Gaussian
-    (method.md 1.3).
+    (docs/method.md, section 1.3).
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from .. import tolerances
 from ..settings import TrainingSettings
 
 POSITION_RATE = (1.6e-4, 1.6e-6)
-"""First and last learning rate of the means per scene radius (method.md 1.4)."""
+"""First and last learning rate of the means per scene radius (docs/method.md, section 1.4)."""
 
 RATES = {
     "sh_dc": 2.5e-3,
@@ -22,13 +22,13 @@ RATES = {
     "quats": 1e-3,
     "orientation": 0.025,
 }
-"""Learning rates of method.md 1.4, for :data:`REFERENCE_ITERATIONS` iterations."""
+"""Learning rates of docs/method.md, section 1.4, for :data:`REFERENCE_ITERATIONS` iterations."""
 
 REFERENCE_ITERATIONS = 30_000
 
 SHORT_RUN_POWER = 0.4
 """Rates of a run of n iterations grow by ``(30 000 / n) ** 0.4``. Measured on two photo sets (600
-iterations, 240 px) the rates of method.md 1.4 alone cost 5 to 6 dB on held-out photos."""
+iterations, 240 px) the rates above alone cost 5 to 6 dB on held-out photos."""
 
 RATE_POWERS = {
     "means": 0.5,
@@ -65,7 +65,8 @@ PRUNE_AT = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 grows, so that others take their room, and twice after that, where an iteration costs most."""
 
 RESET_EVERY = 3000
-"""Iterations between opacity resets (method.md 4.1); a run too short for recovery has none."""
+"""Iterations between opacity resets (docs/method.md, section 4.1); a run too short for recovery has
+none."""
 
 FILTER_EVERY = 100
 """Iterations between two computations of the 3D filter."""

@@ -57,7 +57,10 @@ class TrainingState:
         return cls(Adam(gaussians), DensityStatistics.zeros(len(gaussians)), random)
 
     def next_view(self, views: list[int]) -> int:
-        """Draw the next view: all of them in random order, then again (method.md 1.4)."""
+        """Draw the next view: all of them in random order, then again.
+
+        See docs/method.md, section 1.4.
+        """
         if not self.order:
             self.order = self.random.permutation(views).tolist()
         return self.order.pop()

@@ -24,7 +24,7 @@ SHIFT = 0.1
 
 MIN_VIEWS = 2
 """The error of a Gaussian is averaged over at least this many views, so that one bad view of a
-rarely seen Gaussian does not win (method.md 4.2)."""
+rarely seen Gaussian does not win (docs/method.md, section 4.2)."""
 
 _SATURATED = 20.0
 """tanh of this is 1 in float32: normals of unit length."""
@@ -43,7 +43,8 @@ def start_orientation(adam: Adam, views: Iterable[WrapView], *, threads: int = 0
     """Set the direction to the shortest axis and let the views vote for the sign.
 
     Each view votes with the Gaussian's blending weight for the side that it sees; the sign
-    parameter becomes +-0.5, or stays 0 where no view sees the Gaussian (method.md 1.3).
+    parameter becomes +-0.5, or stays 0 where no view sees the Gaussian (docs/method.md,
+    section 1.3).
     """
     cameras = (view.camera for view in views)
     adam.array("orientation")[:] = voted_orientation(adam.gaussians(), cameras, threads=threads)
@@ -53,7 +54,7 @@ def start_orientation(adam: Adam, views: Iterable[WrapView], *, threads: int = 0
 def normal_errors(
     gaussians: OrientedGaussians, views: Iterable[WrapView], *, threads: int = 0
 ) -> np.ndarray:
-    """Return (n,) mean normal error of each Gaussian over the views (method.md 4.2).
+    """Return (n,) mean normal error of each Gaussian over the views (docs/method.md, section 4.2).
 
     ``1 - N . n_depth`` with normals of unit length; each pixel counts for the Gaussian with the
     largest blending weight there.
@@ -84,7 +85,9 @@ def normal_errors(
 
 
 def wrap(adam: Adam, errors: np.ndarray, share: float, limit: int) -> int:
-    """Clone the Gaussians of largest error with the opposite orientation (method.md 4.2).
+    """Clone the Gaussians of largest error with the opposite orientation.
+
+    See docs/method.md, section 4.2.
 
     Both are shrunk along the normal to half the volume and moved apart by 0.1 standard deviations
     along it, the clone to the back. Gaussians without orientation are left alone.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""COLMAP models: the convention, every cut, every lie a file can tell (conventions.md C.6, D.5)."""
+"""COLMAP models: the convention, every cut, every lie a file can tell."""
 
 from __future__ import annotations
 

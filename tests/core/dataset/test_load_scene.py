@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Loading whole inputs: every kind, every repair, every refusal (conventions.md D.5)."""
+"""Loading whole inputs: every kind, every repair, every refusal."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""transforms.json: axes, intrinsics, start points, and what is refused (conventions.md D.5)."""
+"""transforms.json: axes, intrinsics, start points, and what is refused."""
 
 from __future__ import annotations
 

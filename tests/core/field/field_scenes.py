@@ -72,7 +72,7 @@ def random_arrays(
 def shell_arrays(
     alpha: float, *, sigma_n: float = 0.005, count: int = 2000, scale: float = 1.0
 ) -> GaussianArrays:
-    """Return the shell of flat Gaussians of method.md 14.13, times ``scale``."""
+    """Return the shell of flat Gaussians of docs/method.md, section 10.3, times ``scale``."""
     outward = unit_sphere(count)
     first = np.cross(outward, [0.3, 0.5, 0.8])
     first /= np.linalg.norm(first, axis=1)[:, None]

@@ -89,7 +89,7 @@ def check_bookkeeping(result: ProjectionResult, tolerance: float) -> None:
 
 
 def half_gaussian(sigma: float, alpha: float = 0.95) -> LineField:
-    """Return the field of one wall whose outward side is +x (method.md 14.12)."""
+    """Return the field of one wall whose outward side is +x (docs/method.md, section 10.3)."""
 
     def vacancy(x: np.ndarray) -> np.ndarray:
         return 1.0 - alpha * np.exp(-0.5 * (np.maximum(x, 0.0) / sigma) ** 2)
@@ -211,7 +211,7 @@ def test_single_gaussian_gives_its_sphere(sigma: float) -> None:
 
 @pytest.mark.parametrize(("alpha", "offset"), [(0.6, 1.76), (0.9, 2.09), (0.99, 2.17)])
 def test_shell_lies_outside_its_centres(alpha: float, offset: float) -> None:
-    """The known offsets of method.md 14.13, in thicknesses of the Gaussians."""
+    """The known offsets of docs/method.md, section 10.3, in thicknesses of the Gaussians."""
     arrays = shell_arrays(alpha)
     field, vectors = VacancyField(arrays, cameras_around(16)), VectorField(arrays)
     starts = around_shell(1500, 0.01)

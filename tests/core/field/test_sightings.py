@@ -22,7 +22,7 @@ SIGMA, ALPHA = 0.4, 0.95
 
 
 def one_ball() -> OrientedGaussians:
-    """Return one round Gaussian; its isosurface is a sphere (method.md 14.1)."""
+    """Return one round Gaussian; its isosurface is a sphere (docs/method.md, section 10.3)."""
     return OrientedGaussians(
         means=torch.zeros(1, 3),
         log_scales=torch.full((1, 3), float(np.log(SIGMA))),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The stable forms against 160-digit arithmetic (method.md 14.6)."""
+"""The stable forms against 160-digit arithmetic (docs/method.md, section 5.4)."""
 
 from __future__ import annotations
 

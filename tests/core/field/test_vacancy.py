@@ -50,7 +50,10 @@ def difference(field: VacancyField, points: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def test_brute_force_is_the_integral_of_the_attenuation() -> None:
-    """T is exp of minus the integral of |w . grad log(1 - G)| up to the peak (method.md 5.1)."""
+    """T is exp of minus the integral of |w . grad log(1 - G)| up to the peak.
+
+    See docs/method.md, section 5.1.
+    """
     arrays = random_arrays(30, seed=3, scale=(0.1, 0.4))
     origin, point = np.array([0.3, -4.0, 0.2]), np.array([0.1, 0.4, -0.2])
     whiten = arrays.rotations.transpose(0, 2, 1) / arrays.scales[:, :, None]

@@ -117,7 +117,7 @@ def test_short_normals_are_not_oriented() -> None:
 
 
 def test_integral_over_one_gaussian_is_parallel_to_its_normal() -> None:
-    """Integrating G 1[..] Sigma^-1 (x - mu) gives c n / sigma_n (method.md 5.1)."""
+    """Integrating G 1[..] Sigma^-1 (x - mu) gives c n / sigma_n (docs/method.md, section 5.1)."""
     normal = np.array([0.5, 0.1, np.sqrt(1.0 - 0.26)])
     scales = np.array([0.3, 0.2, 0.05])
     arrays = make_arrays(np.zeros(3), scales, 0.5, normals=0.9 * normal[None])
@@ -130,7 +130,7 @@ def test_integral_over_one_gaussian_is_parallel_to_its_normal() -> None:
 
 
 def test_large_body_with_a_far_mean_is_found_among_tiny_clusters() -> None:
-    """The nearest means alone would miss it (method.md 5.2)."""
+    """The nearest means alone would miss it (docs/method.md, section 5.2)."""
     cluster = 0.01 * unit_sphere(300)
     means = np.concatenate([cluster, [[3.0, 0.0, 0.0]]])
     scales = np.concatenate([np.full((300, 3), 1e-4), [[3.0, 0.2, 0.2]]])

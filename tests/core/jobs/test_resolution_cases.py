@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Impossible resolutions through the real worker (conventions D.5, case 37)."""
+"""Impossible resolutions through the real worker."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Depth surfaces known in closed form (method.md 14.1 to 14.4)."""
+"""Depth surfaces known in closed form (docs/method.md, section 10.3)."""
 
 from __future__ import annotations
 

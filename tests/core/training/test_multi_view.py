@@ -80,7 +80,7 @@ def definition(
     options: MultiViewOptions,
     photo: np.ndarray,
 ) -> torch.Tensor:
-    """Return the loss of method.md 3.4 with its homography, differentiable by autograd."""
+    """Return the loss of docs/method.md, section 3.4, with its homography, for autograd."""
     image = render(gaussians, REFERENCE, RenderOptions(sh_degree=0))
     row, column = (torch.from_numpy(v) for v in np.divmod(pixels.astype(np.int64), REFERENCE.width))
     depth = image.depth[row, column].double()

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scans of the DTU data set as their owners have them: read, aligned and scored (method.md 9.2).
+"""Scans of the DTU data set as their owners have them: read, aligned and scored.
+
+See docs/method.md, section 9.2.
 
 The folder holds ``Points/stl/stl024_total.ply``, ``ObsMask/ObsMask24_10.mat`` and
 ``ObsMask/Plane24.mat`` (itself or in a folder ``MVS Data``), and the true cameras: either

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scenes of Tanks and Temples as their owners have them: read, aligned and scored (method.md 9.1).
+"""Scenes of Tanks and Temples as their owners have them: read, aligned and scored.
+
+See docs/method.md, section 9.1.
 
 A folder holds ``<Scene>.ply`` (the scanned cloud), ``<Scene>.json`` (crop volume),
 ``<Scene>_trans.txt`` (4x4, truth from the log's frame) and ``<Scene>_COLMAP_SfM.log`` (for every
@@ -36,7 +38,7 @@ THRESHOLDS = {
     "barn": 0.01, "caterpillar": 0.005, "courthouse": 0.025, "ignatius": 0.003,
     "meetingroom": 0.01, "truck": 0.005,
 }  # fmt: skip
-"""Distance that counts as met, by scene (method.md 9.1)."""
+"""Distance that counts as met, by scene (docs/method.md, section 9.1)."""
 RANSAC_DISTANCE = 0.2
 RANSAC_ITERATIONS = 100_000
 MIN_AGREEING_SHARE = 0.5
@@ -255,7 +257,9 @@ def photo_numbers(names: Sequence[str], log_numbers: np.ndarray) -> np.ndarray:
 
 
 def align_to_log(cameras: Sequence[Camera], scene: TanksScene, *, seed: int) -> RansacResult:
-    """Return ``truth_from_job`` from the camera centres (RANSAC with scale, method.md 9.1).
+    """Return ``truth_from_job`` from the camera centres by RANSAC with scale.
+
+    See docs/method.md, section 9.1.
 
     Raises
     ------

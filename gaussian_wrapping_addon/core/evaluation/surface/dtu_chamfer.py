@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Accuracy, completeness and Chamfer distance in the manner of the DTU data set (method.md 9.2)."""
+"""Accuracy, completeness and Chamfer distance in the manner of the DTU data set.
+
+See docs/method.md, section 9.2.
+"""
 
 from __future__ import annotations
 

@@ -71,7 +71,9 @@ def depth_errors(
     *,
     threads: int = 0,
 ) -> DepthErrors:
-    """Compare the 0.5-isosurface depth (method.md 2.4) with the first hit of each pixel's ray.
+    """Compare the 0.5-isosurface depth with the first hit of each pixel's ray.
+
+    See docs/method.md, section 2.4.
 
     Parameters
     ----------

@@ -62,7 +62,7 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
 def sample_uniformly(
     vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int
 ) -> SurfaceSamples:
-    """Spread points evenly over the area of a mesh (method.md 9.1, "uniform sampling").
+    """Spread points evenly over the area of a mesh (docs/method.md, section 9.1).
 
     One point is drawn from each of ``count`` equal parts of the area, counted along the list of
     faces; where many fall on one face, they follow a low-discrepancy sequence over it. The number
@@ -112,7 +112,7 @@ def sample_uniformly(
 
 
 def sample_legacy(vertices: np.ndarray, faces: np.ndarray) -> SurfaceSamples:
-    """Return all vertices that faces use and all face centres (method.md 9.1, "legacy").
+    """Return all vertices that faces use and all face centres (docs/method.md, section 9.1).
 
     The number on a part of the surface depends on its tessellation: the bias that the other ways
     avoid. Vertices have no normal here, centres that of their face.
@@ -141,7 +141,7 @@ def scan_virtually(
     threads: int = 1,
     step_px: float = 1.0,
 ) -> SurfaceSamples:
-    """Collect what cameras see of a mesh: first hits of all pixels (method.md 9.1, "scanning").
+    """Collect what cameras see of a mesh: first hits of all pixels (docs/method.md, section 9.1).
 
     No near plane, no culling of back faces: a side that shows hides what is behind it. Points lie
     on their faces to float64 precision, also at world coordinates of millions. Normals are those

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How close a reconstructed surface is to the true one: F1, Chamfer, normals (method.md 9.1)."""
+"""How close a reconstructed surface is to the true one: F1, Chamfer, normals.
+
+See docs/method.md, section 9.1.
+"""
 
 from __future__ import annotations
 
@@ -208,7 +211,7 @@ def score_protocols(
     step_px: float | None = None,
     min_cameras: int = MIN_CAMERAS,
 ) -> dict[str, SurfaceScore]:
-    """Judge a mesh by several protocols (method.md 9.1).
+    """Judge a mesh by several protocols (docs/method.md, section 9.1).
 
     - ``uniform``: ``count`` samples spread evenly over the mesh; recall is measured against the
       mesh itself, so it does not depend on their density. Inner sides and hidden parts count.
@@ -295,7 +298,9 @@ def score_clouds(
     voxel: float | None,
     threads: int = 1,
 ) -> CloudScore:
-    """Compare clouds as Tanks and Temples does (method.md 9.1), after alignment and crop.
+    """Compare clouds as Tanks and Temples does, after alignment and crop.
+
+    See docs/method.md, section 9.1.
 
     Parameters
     ----------

@@ -116,7 +116,7 @@ def read_truth(folder: Path) -> Truth:
     ``truth.npz`` holds ``vertices`` (v, 3) and ``faces`` (f, 3) of the closed true surface,
     outward, in the world frame of the cameras; ``points`` and unit ``normals`` (n, 3); ``thin``
     (n,) bool; ``seen`` (n,) int32, the number of training cameras that see a sample. ``crop.json``
-    is a bounding volume (method.md 7.3) in the same frame.
+    is a bounding volume (docs/method.md, section 7.3) in the same frame.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Mesh-based rendering: how close the textured mesh, seen from a camera, comes to a photo.
 
-Unlike the measure of the same name in the papers (method.md 9.3), no colour field is trained on the
-mesh: what is judged is the mesh with the texture that a person gets.
+Unlike the measure of the same name in the papers (docs/method.md, section 9.3), no colour field is
+trained on the mesh: what is judged is the mesh with the texture that a person gets.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from ...compiled import inline, kernel, part
 from .window_runs import LANES, RING, TAPS, filter_run, filter_two_runs
 
 WINDOW = TAPS
-"""Side of the Gaussian window, pixels; sigma is 1.5 (method.md 3.1)."""
+"""Side of the Gaussian window, pixels; sigma is 1.5 (docs/method.md, section 3.1)."""
 RADIUS = WINDOW // 2
 SIGMA_PX = 1.5
 REACH = WINDOW - 1

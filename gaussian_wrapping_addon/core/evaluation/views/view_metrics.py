@@ -90,7 +90,7 @@ def psnr(image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -
 def ssim(
     image: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None, *, threads: int = 1
 ) -> float:
-    """Return the mean structural similarity (method.md 3.1); see :func:`compare`.
+    """Return the mean structural similarity (docs/method.md, section 3.1); see :func:`compare`.
 
     The image is clamped to [0, 1] as a display would.
     """

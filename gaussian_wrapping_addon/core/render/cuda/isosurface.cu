@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// z-depth where the transmittance along each pixel's ray crosses 0.5 (method.md 2.4, 2.5).
+// z-depth where the transmittance along each pixel's ray crosses 0.5
+// (docs/method.md, sections 2.4 and 2.5).
 //
 // A warp solves its 8 x 4 pixels alone, walking the tile's list again for every Newton step: no
 // lists per pixel, whose length has no bound, and no barrier. The masks of the blending jump over

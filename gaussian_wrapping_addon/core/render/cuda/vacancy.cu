@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Transmittance from one camera to points anywhere (method.md 5.1): formulas, lists and cut-offs of
-// core/field/vacancy_kernels.py, where they are explained.
+// Transmittance from one camera to points anywhere (docs/method.md, section 5.3): formulas,
+// lists and cut-offs of vacancy_kernels.py, where they are explained.
 //
 // A warp takes 32 points of one tile that lie close together on the screen. It looks through the
 // tile's list 32 Gaussians at a time, a lane each, and evaluates those whose footprint reaches the

@@ -24,7 +24,10 @@ from tests.poses import look_at_pose
 
 ALPHA, SIGMA = 0.9, 0.4
 RADIUS = SIGMA * math.sqrt(2.0 * math.log(2.0 * ALPHA))
-"""One round Gaussian's isosurface is a sphere of this radius from everywhere (method.md 14.1)."""
+"""One round Gaussian's isosurface is a sphere of this radius from everywhere.
+
+See docs/method.md, section 10.3.
+"""
 THRESHOLDS = (0.005, 0.02)
 
 
