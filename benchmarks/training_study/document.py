@@ -27,7 +27,7 @@ from .tables import (
 )
 
 STUDY, ACCEPTANCE = "training", "training-acceptance"
-"""Names of the two pages; each has a hand-written ``NAME-reading.md`` beside it."""
+"""Names of the two pages; each has a hand-written ``*-reading.md`` beside it."""
 
 
 def write_study(out: Path, outcome: Outcome, facts: dict[str, Any]) -> Path:

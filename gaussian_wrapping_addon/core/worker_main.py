@@ -40,7 +40,7 @@ def _load_package() -> None:
 if __name__ == "__main__":
     if len(sys.argv) < 2 or not re.fullmatch(r"[a-z_]+(\.[a-z_]+)*", sys.argv[1]):
         sys.exit(2)
-    # The folder of this file would shadow the standard library (``core/types.py`` and the like).
+    # The folder of this file would shadow the standard library (a module named ``types``, say).
     sys.path[:] = [
         p for p in sys.path if p and Path(p).resolve() != Path(__file__).resolve().parent
     ]

@@ -54,7 +54,7 @@ class VirtualScreen:
 
 @dataclass(frozen=True)
 class CameraBins:
-    """What :func:`..vacancy_kernels.transmittance_of_cells` reads for one camera."""
+    """What :func:`.vacancy_kernels.transmittance_of_cells` reads for one camera."""
 
     rows: np.ndarray
     """(m, 16) float32, nearest first."""

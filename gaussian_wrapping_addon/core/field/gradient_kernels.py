@@ -22,7 +22,7 @@ def log_transmittance_gradient(
 ):  # fmt: skip
     """Write log T and its gradient for ``rows[begin:end]`` of ``points``, as one camera sees them.
 
-    ``row_table`` are the packed rows of :class:`..camera_bins.CameraBins`, ``ids`` the Gaussian of
+    ``row_table`` are the packed rows of :class:`.camera_bins.CameraBins`, ``ids`` the Gaussian of
     each; ``table (n, 14)`` as above. With s = L (x - o), m = L (mu - o) and the foot k = m.s / s.s,
     q = |m - min(k, 1) s|^2; its derivative by k is 0 where k < 1, so that in both cases
     ``dq/dx = -2 min(k, 1) L^T (m - min(k, 1) s)``.

@@ -57,7 +57,7 @@ def run_in_worker(
     ----------
     request : dict
         ``mesh`` (path of a mesh or a job folder), ``region``, ``cameras``, ``out``, and the
-        entries of :class:`~..evaluation.command.EvaluationRequest`; plain JSON values.
+        entries of :class:`~.command.EvaluationRequest`; plain JSON values.
     python : str
         The worker's interpreter.
     module, what : str

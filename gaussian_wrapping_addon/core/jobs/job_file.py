@@ -221,7 +221,7 @@ def refuse_other_regions(result: Path, folders: dict[str, str]) -> None:
 
 
 def read_region_body(path: Path) -> Any:
-    """Read the content of a region file, which :func:`parse_region` takes.
+    """Read the content of a region file, which :func:`~.region_file.parse_region` takes.
 
     Raises
     ------

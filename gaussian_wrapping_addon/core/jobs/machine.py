@@ -56,7 +56,7 @@ def _memory_bytes() -> int:
 def peak_memory_bytes() -> dict[str, int]:
     """Return the largest resident size so far of this process and of its largest helper.
 
-    Empty where the system does not tell; see :mod:`~..peak_memory`.
+    Empty where the system does not tell; see :mod:`~.peak_memory`.
     """
     own_bytes = own_peak_bytes()
     return {"worker": own_bytes, "largest_helper": largest_helper_bytes()} if own_bytes else {}

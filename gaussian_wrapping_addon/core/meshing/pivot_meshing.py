@@ -74,7 +74,7 @@ def mesh_by_pivots(
         ``pivots``, the number for each Gaussian, and ``min_component_share`` are read. An edge
         length or a number of points does not apply; the provenance says so.
     sightings : Sightings, optional
-        Where the cameras see the isosurface in the region (:func:`~..field.sightings`).
+        Where the cameras see the isosurface in the region (:mod:`.sightings`).
 
     Returns
     -------

@@ -89,7 +89,7 @@ def mesh_region(
         Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices
         as that one. 0 leaves it to ``settings.points``.
     sightings : Sightings, optional
-        Where the cameras see the isosurface in the region (:func:`~..field.sightings`).
+        Where the cameras see the isosurface in the region (:mod:`.sightings`).
 
     Returns
     -------

@@ -127,7 +127,7 @@ def solve_transmittances(view: QueryView, positions: np.ndarray, depths: np.ndar
 
     ``T(t) = prod_i (1 - G_i(t))``, over the same contributors and with the same cap of 0.99 as the
     isosurface, so that T is 0.5 at the depth of :func:`solve_depths`. The vacancy of
-    :class:`~...field.vacancy.VacancyField` is the largest T of several cameras, with two
+    :class:`~.vacancy.VacancyField` is the largest T of several cameras, with two
     differences: it counts all Gaussians with ``alpha >= 1/255`` and calls a product below 1e-4
     zero, where this leaves out what lies behind 1e-4 and can be slightly above 0; and it does not
     cap G, so this is larger by up to 1 % of T per Gaussian whose G exceeds 0.99. Around the

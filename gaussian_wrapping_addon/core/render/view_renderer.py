@@ -101,7 +101,7 @@ class ViewPass:
     ----------
     color, normal, geometric_normal : (h, w, 3) float32
     alpha, depth : (h, w) float32
-        The images of :class:`Render`. They must not be written to before :meth:`backward`.
+        The images of :class:`~.types.Render`. They must not be written to before :meth:`backward`.
     gaussians, screen : RawArrays, ScreenGaussians
         What was rendered, and its projection.
     ids : (v,) int32

@@ -44,7 +44,7 @@ COARSE_LONG_SIDE_PX = 480
 
 
 class Photos(Protocol):
-    """What baking needs of :class:`~..dataset.photos.PhotoStore`."""
+    """What baking needs of :class:`~.photos.PhotoStore`."""
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
         """Camera of a photo at a level."""

@@ -38,7 +38,7 @@ def check_face_atlas(face_atlas: np.ndarray, faces: int) -> np.ndarray:
     Raises
     ------
     ValueError
-        Not one for each face, no integers, or more than :data:`~..limits.MAX_ATLASES`.
+        Not one for each face, no integers, or more than :data:`~.limits.MAX_ATLASES`.
     """
     if face_atlas.shape != (faces,) or face_atlas.dtype.kind not in "iu":
         raise ValueError("face_atlas is not one integer for each face")

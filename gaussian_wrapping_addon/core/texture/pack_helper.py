@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Helper process in which xatlas packs charts; see :mod:`.chart_packing` for the caller."""
+"""Helper process in which xatlas packs charts; see :func:`~.charts.pack_charts` for the caller."""
 
 from __future__ import annotations
 

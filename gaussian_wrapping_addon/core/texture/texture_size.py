@@ -85,7 +85,7 @@ def plan_textures(wanted: float, size_px: int, max_atlases: int) -> tuple[int, i
     max_atlases : int
         As many textures as hold what one of side ``wanted`` would, up to this. 0 means one, but
         where one of 8192 would not do and no smaller size was asked for:
-        :data:`~..limits.MAX_AUTOMATIC_ATLASES`.
+        :data:`~.limits.MAX_AUTOMATIC_ATLASES`.
     """
     side = size_px or _power_of_two(wanted)
     most = max_atlases

@@ -51,11 +51,11 @@ class CheckedPhotos:
         return self._photos.camera(index, divisor)
 
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return (h, w, 3) uint8, or raise :class:`Cancelled`."""
+        """Return (h, w, 3) uint8, or raise :class:`~.errors.Cancelled`."""
         self._progress.check()
         return self._photos.photo(index, divisor)
 
     def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """Return (h, w) bool or ``None``, or raise :class:`Cancelled`."""
+        """Return (h, w) bool or ``None``, or raise :class:`~.errors.Cancelled`."""
         self._progress.check()
         return self._photos.mask(index, divisor)

@@ -35,7 +35,7 @@ class Decision:
     """One thing that was decided for a scene, and why."""
 
     name: str
-    """Which; the setting's name of :class:`~..settings.TrainingSettings` where there is one."""
+    """Which; the setting's name of :class:`~.settings.TrainingSettings` where there is one."""
     setting: str
     """What was asked for: ``"auto"``, ``"on"`` or ``"off"``."""
     chosen: str

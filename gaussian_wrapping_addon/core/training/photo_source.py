@@ -13,7 +13,7 @@ from ..dataset.camera import Camera
 class Photos(Protocol):
     """Cameras, photos and masks of the scene's views at sizes divided by whole numbers.
 
-    :class:`~..dataset.photos.PhotoStore` is one.
+    :class:`~.photos.PhotoStore` is one.
     """
 
     def camera(self, index: int, divisor: int = 1) -> Camera:

@@ -38,7 +38,7 @@ def needs_lines(training: dict[str, Any]) -> list[str]:
     ----------
     training : dict
         The report's training figures; its entry ``decisions`` holds what
-        :meth:`~...training.needs.Needs.to_json` wrote. Entries of newer versions are shown as they
+        :meth:`~.needs.Needs.to_json` wrote. Entries of newer versions are shown as they
         are.
     """
     decisions = [part(entry) for entry in items(training.get("decisions"))]

@@ -42,7 +42,7 @@ _HEAT = np.array([(0, 0, 0), (74, 20, 120), (196, 42, 80), (250, 150, 30), (255,
 
 
 class Photos(Protocol):
-    """What is asked of :class:`~..dataset.photos.PhotoStore`."""
+    """What is asked of :class:`~.photos.PhotoStore`."""
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
         """Return the camera of a level."""

@@ -223,7 +223,7 @@ def resample_mesh(vertices: np.ndarray, faces: np.ndarray, density: float) -> np
     MeshingError
         A vertex is not finite.
     ResourceError
-        More than :data:`~..limits.MAX_POINTS` points would be needed.
+        More than :data:`~.limits.MAX_POINTS` points would be needed.
     """
     if not (math.isfinite(density) and density > 0):
         raise UsageError(f"A density of {density} cannot be used.", "Give a length > 0.")

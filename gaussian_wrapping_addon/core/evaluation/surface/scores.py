@@ -234,14 +234,14 @@ def score_protocols(
     thresholds : sequence of float
         Distances > 0.
     count, seed
-        See :func:`~.surface_samples.sample_uniformly`.
+        See :func:`~.samples.sample_uniformly`.
     threads : int
         Threads to use, 0 for every core; the result does not depend on it. The distances to meshes
         take every core whatever is said here (see :func:`~.distance.distances_to_mesh`).
     protocols : sequence of str
         Out of :data:`PROTOCOLS`.
     step_px : float, optional
-        See :func:`~.surface_samples.scan_virtually`; the smallest with :data:`SCAN_RAYS` rays in
+        See :func:`~.samples.scan_virtually`; the smallest with :data:`SCAN_RAYS` rays in
         all unless given.
 
     Returns

@@ -36,7 +36,7 @@ delaunay.JITTER_SHARE with its far points. Tiles must agree on it."""
 
 @dataclass(frozen=True)
 class Field:
-    """Where surface points come from; duck-typed as in :func:`..primal_adaptive.mesh_region`."""
+    """Where surface points come from; duck-typed as in :func:`.primal_adaptive.mesh_region`."""
 
     vacancy: Any
     vectors: Any
@@ -65,7 +65,7 @@ class TilePlan:
     """Of the uniform mesh that the request stands for."""
     target: int
     share: float
-    """Vertices that stay, as for :func:`..primal_adaptive.selected`: 0 and 1 keep all."""
+    """Vertices that stay, as for :func:`.primal_adaptive.selected`: 0 and 1 keep all."""
     sightings: int = 0
 
     @property

@@ -141,7 +141,7 @@ def mesh_in_tiles(
     edge_length_scene: float = 0.0,
     sightings: Sightings | None = None,
 ) -> SurfaceMesh:
-    """Mesh a region tile by tile in this process alone; see :func:`~..primal_adaptive.mesh_region`.
+    """Mesh a region tile by tile in this process alone; see :func:`~.primal_adaptive.mesh_region`.
 
     The mesh is one closed 2-manifold. Of another number of tiles it differs as of another seed.
     """

@@ -43,7 +43,7 @@ def render_cuda(
     *,
     budget_bytes: int = 0,
 ) -> Render:
-    """Render on the GPU that holds the Gaussians; see :func:`~..render.render`.
+    """Render on the GPU that holds the Gaussians; see :func:`~.render.render`.
 
     Bitwise the same in every run on the same GPU.
 
