@@ -38,6 +38,10 @@ _CITATION = re.compile(
 )
 _UNNAMED = re.compile(r"\bmethod\.md,?\s+(?!sections?\b)§?\s*\d")
 _OWN = re.compile(rf"\bsections?\s+({_NUMBER}(?:(?:,|,?\s+and|\s+to)\s+{_NUMBER})*)")
+_DOTTED = re.compile(r"(?<![\w./-])(?:gaussian_wrapping_addon|benchmarks|tests)(?:\.[A-Za-z_]\w*)+")
+_PLACE = re.compile(
+    r"(?<![\w./-])(?:gaussian_wrapping_addon|benchmarks|docs|tests)(?:/[\w-]+)+(?![\w./*-])"
+)
 _ROLE = re.compile(r":(mod|func|class|meth|data|attr|exc):`([^`]+)`")
 _HEADING = re.compile(r"^(#{1,6})\s+(.*?)\s*#*$", re.MULTILINE)
 _FENCE = re.compile(r"^(```|~~~).*?^\1[^\n]*$", re.MULTILINE | re.DOTALL)
@@ -77,6 +81,10 @@ class Files:
         if "*" in mention:
             return bool(fnmatch.filter(self._endings, mention.lstrip("/")))
         return mention in self._endings
+
+    def has_place(self, mention: str) -> bool:
+        """Tell whether a path from the root names a folder, or a file without its suffix."""
+        return any(path.startswith((f"{mention}/", f"{mention}.")) for path in self.paths)
 
     @cached_property
     def _endings(self) -> frozenset[str]:
@@ -172,7 +180,7 @@ class Names:
         if target.startswith("."):
             return target.lstrip(".") in self._all
         own = self.modules.get(module, Module())
-        if target in own.names | own.members:
+        if target in own.names | own.members or target in self.modules:
             return True
         if "." not in target:
             return any(member.split(".")[1] == target for member in own.members)
@@ -264,6 +272,13 @@ def check_sources(text: str, near: str, files: Files) -> list[str]:
         for mention in sorted(set(_SOURCE.findall(_without_urls(text))))
         if mention.split("/")[-1] not in GENERATED and not files.has(mention, near)
     ]
+
+
+def check_places(text: str, near: str, files: Files, names: Names) -> list[str]:
+    """Return folders (``tests/gui``) and dotted modules (``tests.references``) not there."""
+    places = [m for m in _PLACE.findall(text) if not files.has_place(m)]
+    places += [m for m in _DOTTED.findall(text) if not names.has(m, "")]
+    return [f"{near}: there is no {mention}" for mention in sorted(set(places))]
 
 
 def check_citations(text: str, near: str, sections: set[str]) -> list[str]:

@@ -19,6 +19,7 @@ from tests.references import (
     check_citations,
     check_links,
     check_pages,
+    check_places,
     check_roles,
     check_sources,
     comments_and_docstrings,
@@ -90,11 +91,21 @@ def assert_none(complaints: list[str]) -> None:
 
 
 def test_pages_that_are_named_exist() -> None:
-    assert_none([c for path, text in spoken().items() for c in check_pages(text, path, files())])
+    texts = dict(spoken())
+    for path in below(CODE[:1], ".py"):  # messages send people to pages, too
+        texts[path] = (ROOT / path).read_text(encoding="utf-8")
+    assert_none([c for path, text in texts.items() for c in check_pages(text, path, files())])
 
 
 def test_sources_that_are_named_exist() -> None:
     assert_none([c for path, text in spoken().items() for c in check_sources(text, path, files())])
+
+
+def test_places_that_are_named_exist() -> None:
+    names = modules()[1]
+    assert_none(
+        [c for path, text in spoken().items() for c in check_places(text, path, files(), names)]
+    )
 
 
 def test_sections_of_the_method_exist() -> None:
@@ -159,6 +170,23 @@ def test_missing_pages_are_noticed(text: str, wrong: int) -> None:
 )
 def test_missing_sources_are_noticed(text: str, wrong: int) -> None:
     assert len(check_sources(text, "docs/guide.md", SMALL)) == wrong
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("benchmarks/scenes and benchmarks/scenes/, `python -m benchmarks.scenes all`", 0),
+        ("benchmarks.scenes.make, docs/guide", 0),
+        ("tests/core", 1),
+        ("benchmarks/scene", 1),
+        ("python -m benchmarks.cuda", 1),
+        ("benchmarks.scenes.draw", 1),
+    ],
+)
+def test_missing_places_are_noticed(text: str, wrong: int) -> None:
+    there = Files(SMALL.paths | {"benchmarks/scenes/__main__.py", "benchmarks/scenes/__init__.py"})
+    names = Names({"benchmarks.scenes": Module.of(ast.parse("def make(): ..."))})
+    assert len(check_places(text, "docs/guide.md", there, names)) == wrong
 
 
 @pytest.mark.parametrize(
