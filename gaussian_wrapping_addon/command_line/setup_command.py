@@ -88,20 +88,21 @@ def _follow(request: SetupRequest) -> int:
     task = SetupTask(request)
     task.start()
     shown_s, shown = 0.0, ""
-    while task.is_alive():
+    while (status := task.status).active:
         try:
-            status = task.status
-            if status.stage != shown or time.monotonic() - shown_s > LINE_EVERY_S:
+            if status.message and (
+                status.stage != shown or time.monotonic() - shown_s > LINE_EVERY_S
+            ):
                 shown, shown_s = status.stage, time.monotonic()
                 _logger.info(
                     "[%5.1f %%] %-11s %s", 100 * status.fraction, status.stage, status.message
                 )
-            task.join(POLL_S)
+            time.sleep(POLL_S)
         except KeyboardInterrupt:
             _logger.info("cancelling")
             task.cancel()
-    if task.status.state == "DONE":
+    if status.state == "DONE":
         _logger.info("ready: %s", request.environment.worker())
     else:
-        _logger.error("error: %s %s", task.status.error, task.status.hint)
-    return EXIT_OTHER if task.status.exit_code is None else task.status.exit_code
+        _logger.error("error: %s %s", status.error, status.hint)
+    return EXIT_OTHER if status.exit_code is None else status.exit_code

@@ -126,7 +126,7 @@ def start(request: SetupRequest, *, removes: bool = False) -> None:
     UsageError
         One is at work.
     """
-    if state.task is not None and state.task.is_alive():
+    if state.task is not None and state.task.status.active:
         raise UsageError("A set-up is running.", "Cancel it or wait for it.")
     state.task, state.is_busy = SetupTask(request, removes=removes), True
     state.task.start()
@@ -142,7 +142,7 @@ def tick() -> float | None:
     """Timer: redraw, and go on while something is at work."""
     if state.search is not None and state.searched:
         state.search = None
-    if state.is_busy and state.task is not None and not state.task.is_alive():
+    if state.is_busy and state.task is not None and not state.task.status.active:
         state.is_busy = False
         forget_answer()
         if state.task.status.state == "DONE" and not state.task.removes:

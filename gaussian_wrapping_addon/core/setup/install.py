@@ -20,7 +20,6 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -46,7 +45,7 @@ from ..worker_environment import (
     remember,
 )
 from ..worker_requirements import read_requirements
-from .commands import CUDA, SetupRequest, all_commands, as_line, check_folders
+from .commands import CUDA, Command, SetupRequest, all_commands, as_line, check_folders
 from .pythons import probe
 
 _logger = logging.getLogger(__name__)
@@ -64,13 +63,11 @@ _STEERING = ("PIP_USER", "PIP_TARGET", "PIP_PREFIX", "PIP_ROOT", "PIP_REQUIREMEN
 _FAILURES = (
     (r"No space left|not enough space|quota exceeded", "The disk is full.",
      "Free several GiB, then press Set Up Worker."),
-    (r"NewConnectionError|[Nn]ame ?[Rr]esolution|ProxyError|ConnectTimeout|Read timed out|SSLError|"
-     r"getaddrinfo failed|No route to host|Max retries exceeded",
+    (r"NewConnection|[Nn]ame ?[Rr]esolution|Proxy|Timeout|timed out|SSLError|Max retries|No route",
      "The package index cannot be reached.",
      "Check the network and proxy, or give a folder with wheels."),
     (r"No matching distribution found for (\S+)", "No wheel of {} for this Python was found.",
-     "With a wheel folder: put it there (the guide says how, under Without a network)."
-     " Otherwise choose another Python 3.11 to 3.13."),
+     "Put it into the wheel folder, if you use one; or choose another Python 3.11 to 3.13."),
 )  # fmt: skip
 
 
@@ -81,8 +78,12 @@ class SetupTask(threading.Thread):
         super().__init__(daemon=True)
         self.request = request
         self.removes = removes
+        self.is_cancelling = False
         self.status = JobStatus("RUNNING", "remove" if removes else "environment")
-        self._stop_asked = threading.Event()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._last: deque[str] = deque(maxlen=40)
+        self._named = 0
+        """Packages that pip has named so far."""
 
     def run(self) -> None:
         """Work until the end, which ``status`` tells as well."""
@@ -90,95 +91,98 @@ class SetupTask(threading.Thread):
             if self.removes:
                 remove(self.request.environment)
             else:
-                set_up(self.request, self._say, self._stop_asked)
+                self._set_up()
             self.status = JobStatus("DONE", self.status.stage, 1.0, exit_code=EXIT_DONE)
         except WrapError as error:
-            state = "CANCELLED" if isinstance(error, Cancelled) else "FAILED"
-            self._end(state, error)
+            self._end("CANCELLED" if isinstance(error, Cancelled) else "FAILED", error)
         except OSError as error:
             self._end("FAILED", cannot_be_written(error.filename or self.request.root, error))
         except Exception as error:  # without an end, its user would wait for ever
             _logger.exception("set-up")
             self._end("FAILED", WorkerError(f"{type(error).__name__}: {error}.", _SEE_LOG))
 
-    def _say(self, stage: str, fraction: float, message: str) -> None:
-        self.status = JobStatus("RUNNING", stage, fraction, message)
-
     def _end(self, state: str, told: WrapError) -> None:
         self.status = JobStatus(state, error=told.message, hint=told.hint, exit_code=told.exit_code)
 
     def cancel(self) -> None:
         """Ask it to stop; it deletes what it has begun."""
-        self._stop_asked.set()
+        self.is_cancelling = True
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()
 
-    @property
-    def is_cancelling(self) -> bool:
-        """Whether it was asked to stop."""
-        return self._stop_asked.is_set()
-
-
-def set_up(
-    request: SetupRequest, say: Callable[[str, float, str], None], stop: threading.Event
-) -> None:
-    """Make the environment; one that is there is replaced in the end.
-
-    Parameters
-    ----------
-    say : callable
-        Gets stage, fraction and message.
-
-    Raises
-    ------
-    WrapError
-        The Python, the folder or a package cannot be used, there is no room, or the user stopped.
-    OSError
-        The folder cannot be written.
-    """
-    environment = request.environment
-    names = [r.name for r in read_requirements(Path(request.requirements))]
-    python = probe(request.python)
-    commands = all_commands(request, python)
-    folder = environment.next_folder()
-    marker = {
-        "made_by": "gaussian_wrapping_addon",
-        "kind": VENV if python.has_venv else PACKAGES,
-        "python": python.path,
-        "version": python.version_text,
-        "torch": request.torch,
-        "folder": folder.name,
-    }
-    check_folders(request)
-    environment.root.mkdir(parents=True, exist_ok=True)
-    if "torch" in names:
-        _check_disk(environment.root, NEEDED_CUDA_GIB if request.torch == CUDA else NEEDED_GIB)
-    if not environment.is_ours():
-        write_json(environment.marker_path, marker)
-    lock = JobFolder(environment.root)
-    lock.lock()
-    try:
-        _delete_unused(environment)
-        temporary = environment.root / _TEMPORARY
-        temporary.mkdir()
-        with (environment.root / "log.txt").open("a", encoding="utf-8") as log:
-            log.write(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')} {platform.platform()}\n")
-            tell = _teller(2 * len(names), say)
-            for command in commands:
-                log.write(f"$ {as_line(command)}\n")
-                tell(as_line(command))
-                leashed = child_command("setup.install", *command, python=python.path)
-                run_command(leashed, temporary, log, tell, stop)
-        sites = [*folder.glob("lib/python3*/site-packages"), *folder.glob("Lib/site-packages")]
-        found = importlib.metadata.distributions(path=[str(p) for p in sites or [folder]])
-        versions = {d.metadata["Name"]: d.version for d in found}
-        write_json(environment.marker_path, marker)
-        write_json(environment.ready_path, versions)
-        remember(environment.root)
-    finally:
-        with contextlib.suppress(OSError):  # the next set-up deletes what is left
+    def _set_up(self) -> None:
+        """Make the environment; one that is there is replaced in the end."""
+        request, environment = self.request, self.request.environment
+        names = [r.name for r in read_requirements(Path(request.requirements))]
+        python = probe(request.python)
+        commands = all_commands(request, python)
+        folder = environment.next_folder()
+        marker = {
+            "made_by": "gaussian_wrapping_addon",
+            "kind": VENV if python.has_venv else PACKAGES,
+            "python": python.path,
+            "version": python.version_text,
+            "torch": request.torch,
+            "folder": folder.name,
+        }
+        check_folders(request)
+        environment.root.mkdir(parents=True, exist_ok=True)
+        if "torch" in names:
+            _check_disk(environment.root, NEEDED_CUDA_GIB if request.torch == CUDA else NEEDED_GIB)
+        if not environment.is_ours():
+            write_json(environment.marker_path, marker)
+        lock = JobFolder(environment.root)
+        lock.lock()
+        try:
             _delete_unused(environment)
-        lock.unlock()
-        if stop.is_set() and not environment.is_ready():
-            remove(environment)
+            (environment.root / _TEMPORARY).mkdir()
+            with (environment.root / "log.txt").open("a", encoding="utf-8") as log:
+                log.write(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')} {platform.platform()}\n")
+                for command in commands:
+                    self._run_command(command, python.path, log, 2 * len(names))
+            sites = [*folder.glob("lib/python3*/site-packages"), *folder.glob("Lib/site-packages")]
+            found = importlib.metadata.distributions(path=[str(p) for p in sites or [folder]])
+            versions = {d.metadata["Name"]: d.version for d in found}
+            write_json(environment.marker_path, marker)
+            write_json(environment.ready_path, versions)
+            remember(environment.root)
+        finally:
+            with contextlib.suppress(OSError):  # the next set-up deletes what is left
+                _delete_unused(environment)
+            lock.unlock()
+            if self.is_cancelling and not environment.is_ready():
+                remove(environment)
+
+    def _run_command(self, command: Command, python: str, log: IO[str], expected: int) -> None:
+        """Run a command to its end; ``expected`` packages are all the progress."""
+        log.write(f"$ {as_line(command)}\n")
+        self._process = process = start_process(
+            child_command("setup.install", *command, python=python),
+            self.request.environment.root / _TEMPORARY,
+        )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        if self.is_cancelling:  # before there was a process to tell
+            process.stdin.close()
+        try:
+            for raw in process.stdout:
+                line = raw.decode("utf-8", "replace").rstrip()
+                log.write(line + "\n")
+                log.flush()
+                self._last.append(line)
+                self._named += line.startswith(("Collecting ", "Processing "))
+                stage = "install" if self._named else "environment"
+                self.status = JobStatus(
+                    "RUNNING", stage, min(self._named / expected, 0.9), line.strip()[:160]
+                )
+        finally:
+            process.stdin.close()
+            process.wait()
+            process.stdout.close()
+        if self.is_cancelling:
+            raise Cancelled("The set-up was cancelled.", "Press Set Up Worker to start again.")
+        if process.returncode != 0:
+            raise failure_of(process.returncode, list(self._last))
 
 
 def _check_disk(root: Path, needed_gib: int) -> None:
@@ -190,69 +194,14 @@ def _check_disk(root: Path, needed_gib: int) -> None:
         )
 
 
-def _teller(expected: int, say: Callable[[str, float, str], None]) -> Callable[[str], None]:
-    """Return what turns pip's lines into progress, by the number of packages it has named."""
-    named = 0
-
-    def tell(line: str) -> None:
-        nonlocal named
-        named += line.startswith(("Collecting ", "Processing "))
-        stage = "install" if named else "environment"
-        say(stage, min(named / expected, 0.9), line.strip()[:160])
-
-    return tell
-
-
-def run_command(
-    command: Sequence[str],
-    temporary: Path,
-    log: IO[str],
-    said: Callable[[str], None],
-    stop: threading.Event,
-) -> None:
-    """Run a command of :func:`main` to its end, which it finds at once when ``stop`` is set.
-
-    Parameters
-    ----------
-    temporary : Path
-        Its working folder, also for its temporary files.
-    said : callable
-        Gets each line of its output.
+def start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes]:
+    """Start :func:`main` in a process that leads its own group, with its files in ``temporary``.
 
     Raises
     ------
-    Cancelled, ResourceError, WorkerError
-        It was stopped; the disk, the network or a package is missing; it failed.
+    WorkerError
+        It does not start.
     """
-    process = _start(command, temporary)
-    assert process.stdin is not None
-    assert process.stdout is not None
-    release = process.stdin.close
-
-    def watch() -> None:
-        while process.poll() is None and not stop.wait(0.1):
-            pass
-        release()
-
-    threading.Thread(target=watch, daemon=True).start()
-    last: deque[str] = deque(maxlen=40)
-    try:
-        for raw in process.stdout:
-            last.append(raw.decode("utf-8", "replace").rstrip())
-            log.write(last[-1] + "\n")
-            log.flush()
-            said(last[-1])
-    finally:
-        release()
-        process.wait()
-        process.stdout.close()
-    if stop.is_set():
-        raise Cancelled("The set-up was cancelled.", "Press Set Up Worker to start again.")
-    if process.returncode != 0:
-        raise failure_of(process.returncode, list(last))
-
-
-def _start(command: Sequence[str], temporary: Path) -> subprocess.Popen[bytes]:
     kept = {k: v for k, v in child_environment().items() if k.upper() not in _STEERING}
     places = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
     options: dict[str, Any] = {"start_new_session": True}

@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -142,6 +143,23 @@ def test_a_cancelled_set_up_keeps_the_one_that_is_there(quick: SetupRequest) -> 
     assert imported(quick, "gwalpha") == "1.2"
 
 
+def test_ctrl_c_cancels_the_command(request_: SetupRequest) -> None:
+    batch = Path(install.__file__).parents[2] / "batch.py"
+    options = ["--find-links", request_.find_links, "--requirements", request_.requirements]
+    command = [sys.executable, str(batch), "set-up-worker", "--to", request_.root, *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    end_s = time.monotonic() + 30
+    while not request_.environment.folder.exists():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    words, _ = process.communicate(timeout=20)
+    assert process.returncode == EXIT_CANCELLED, words
+    assert "-m venv --clear" in words.splitlines()[0]
+    assert "The set-up was cancelled." in words
+    assert not Path(request_.root).exists()
+
+
 @pytest.mark.parametrize("end", ["cancelled", "asker killed"])
 def test_no_command_outlives_the_one_who_asked(tmp_path: Path, end: str) -> None:
     """Nor does what the command has started itself."""
@@ -151,14 +169,13 @@ def test_no_command_outlives_the_one_who_asked(tmp_path: Path, end: str) -> None
     starter = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {sleeper!r}])"
     asker_code = (
         f"import sys; sys.path.insert(0, {str(Path(install.__file__).parents[3])!r})\n"
-        "import io, pathlib, threading, time\n"
-        "from gaussian_wrapping_addon.core.helper_process import child_command\n"
-        "from gaussian_wrapping_addon.core.setup import install\n"
-        "stop = threading.Event()\n"
-        "threading.Thread(target=lambda: sys.stdin.read() or stop.set(), daemon=True).start()\n"
-        f"command = child_command('setup.install', sys.executable, '-c', {starter!r})\n"
-        f"folder = pathlib.Path({str(tmp_path)!r})\n"
-        "install.run_command(command, folder, io.StringIO(), lambda line: None, stop)\n"
+        "import io, pathlib, threading\n"
+        "from gaussian_wrapping_addon.core.setup import commands, install\n"
+        f"root = pathlib.Path({str(tmp_path)!r}); (root / 'tmp').mkdir()\n"
+        "task = install.SetupTask(commands.SetupRequest(str(root), '', ''))\n"
+        "threading.Thread(target=lambda: sys.stdin.read() or task.cancel(), daemon=True).start()\n"
+        f"command = (sys.executable, '-c', {starter!r})\n"
+        "task._run_command(command, sys.executable, io.StringIO(), 1)\n"
     )
     asker = subprocess.Popen(
         [sys.executable, "-c", asker_code], stdin=subprocess.PIPE, stderr=subprocess.PIPE
