@@ -8,12 +8,11 @@ The state outlives the preferences' window.
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import sys
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
@@ -30,8 +29,6 @@ from . import doctor
 from .job_actions import worker_choice
 from .redrawing import redraw
 
-_logger = logging.getLogger(__name__)
-
 POLL_S = 0.3
 READY_FOR_S = 2.0
 """For so long an answer of :func:`worker_ready` is taken as it was."""
@@ -41,10 +38,10 @@ READY_FOR_S = 2.0
 class State:
     """What was found, and what is at work in this session; others only read it."""
 
-    pythons: list[FoundPython] = field(default_factory=list)
+    pythons: list[FoundPython] | None = None
+    """None while they are not looked for yet."""
     has_cuda: bool = False
     search: threading.Thread | None = None
-    searched: bool = False
     task: SetupTask | None = None
     is_busy: bool = False
     """Whether the task's end is still to be dealt with."""
@@ -91,7 +88,7 @@ def forget_answer() -> None:
 
 def look_around() -> None:
     """Look for Pythons once, in a thread; drawing may call this."""
-    if not state.searched and state.search is None:
+    if state.search is None:
         state.search = threading.Thread(target=_search, args=(sys.executable,), daemon=True)
         state.search.start()
         _start_timer()
@@ -99,11 +96,8 @@ def look_around() -> None:
 
 def _search(own: str) -> None:
     """Thread: touches nothing of Blender."""
-    try:
-        state.pythons, state.has_cuda = find_pythons(own), cuda_present()
-    except Exception:  # without an answer the search would never end
-        _logger.exception("looking for Pythons")
-    state.searched = True
+    state.has_cuda = cuda_present()
+    state.pythons = find_pythons(own)
 
 
 def request_for(python: str, torch: str, wheel_folder: str) -> SetupRequest:
@@ -140,8 +134,6 @@ def _start_timer() -> None:
 
 def tick() -> float | None:
     """Timer: redraw, and go on while something is at work."""
-    if state.search is not None and state.searched:
-        state.search = None
     if state.is_busy and state.task is not None and not state.task.status.active:
         state.is_busy = False
         forget_answer()
@@ -149,7 +141,8 @@ def tick() -> float | None:
             with contextlib.suppress(WrapError):
                 doctor.start(worker_choice(bpy.context).python)
     redraw("PREFERENCES", "VIEW_3D")
-    return POLL_S if state.is_busy or state.search is not None else None
+    searching = state.search is not None and state.search.is_alive()
+    return POLL_S if state.is_busy or searching else None
 
 
 def stop() -> None:

@@ -28,9 +28,8 @@ def wheel_folder(context: bpy.types.Context) -> str:
 
 def _python_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
     found = []
-    for python in state.pythons:
+    for python in state.pythons or ():
         notes = [] if python.has_wheels else ["some packages may have no wheels for it"]
-        notes += ["Blender's own; it stays as it is"] if python.is_own else []
         if not python.has_venv:
             lacks = "has no venv: packages go into a folder"
             notes.append(lacks if python.can_install else "has neither venv nor pip")
@@ -60,8 +59,8 @@ def command_lines(context: bpy.types.Context, path: str, torch: str) -> list[str
         The Python or the choice cannot be used.
     """
     request = worker_setup.request_for(path, torch, wheel_folder(context))
-    python = next(p for p in state.pythons if p.path == path)
-    return [as_line(command) for command in all_commands(request, python)]
+    found = [p for p in state.pythons or () if p.path == path]
+    return [as_line(command) for p in found for command in all_commands(request, p)]
 
 
 class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
@@ -89,7 +88,7 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
                 "Blender may not go online: turn on Allow Online Access in Preferences, System, "
                 "or choose a Wheel Folder"
             )
-        elif not state.searched:
+        elif state.pythons is None:
             worker_setup.look_around()
             reason = "Looking for Pythons"
         elif not state.pythons:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,7 +38,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     # What a set-up has made is remembered here; no later test may take it for its worker.
     monkeypatch.setenv(worker_environment.DATA_VARIABLE, str(tmp_path / "data"))
     monkeypatch.setattr(worker_setup, "environment", lambda: WorkerEnvironment(folder))
-    fresh = worker_setup.State(searched=True, pythons=[PYTHON])
+    fresh = worker_setup.State(pythons=[PYTHON], search=threading.Thread())
     for name, value in vars(fresh).items():
         monkeypatch.setattr(worker_setup.state, name, value)
     yield folder

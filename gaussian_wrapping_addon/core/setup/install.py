@@ -81,7 +81,6 @@ class SetupTask(threading.Thread):
         self.is_cancelling = False
         self.status = JobStatus("RUNNING", "remove" if removes else "environment")
         self._process: subprocess.Popen[bytes] | None = None
-        self._last: deque[str] = deque(maxlen=40)
         self._named = 0
         """Packages that pip has named so far."""
 
@@ -151,11 +150,13 @@ class SetupTask(threading.Thread):
                 _delete_unused(environment)
             lock.unlock()
             if self.is_cancelling and not environment.is_ready():
-                remove(environment)
+                with contextlib.suppress(OSError):
+                    remove(environment)
 
     def _run_command(self, command: Command, python: str, log: IO[str], expected: int) -> None:
         """Run a command to its end; ``expected`` packages are all the progress."""
         log.write(f"$ {as_line(command)}\n")
+        last: deque[str] = deque(maxlen=40)
         self._process = process = start_process(
             child_command("setup.install", *command, python=python),
             self.request.environment.root / _TEMPORARY,
@@ -169,7 +170,7 @@ class SetupTask(threading.Thread):
                 line = raw.decode("utf-8", "replace").rstrip()
                 log.write(line + "\n")
                 log.flush()
-                self._last.append(line)
+                last.append(line)
                 self._named += line.startswith(("Collecting ", "Processing "))
                 stage = "install" if self._named else "environment"
                 self.status = JobStatus(
@@ -182,7 +183,7 @@ class SetupTask(threading.Thread):
         if self.is_cancelling:
             raise Cancelled("The set-up was cancelled.", "Press Set Up Worker to start again.")
         if process.returncode != 0:
-            raise failure_of(process.returncode, list(self._last))
+            raise failure_of(process.returncode, list(last))
 
 
 def _check_disk(root: Path, needed_gib: int) -> None:

@@ -28,7 +28,7 @@ _PROBE = (
     "import os, sys, json, pathlib, importlib.util as u;"
     "has = lambda n: u.find_spec(n) is not None;"
     "nt = lambda: any(pathlib.Path(u.find_spec('venv').origin).parent.glob('scripts/nt/*.exe'));"
-    "print(json.dumps(dict(version=sys.version_info[:3], bits=64 if sys.maxsize > 2**32 else 32,"
+    "print(json.dumps(dict(version=sys.version_info[:3], is_64_bit=sys.maxsize > 2**32,"
     " base=getattr(sys, '_base_executable', '') or sys.executable, pip=has('pip'),"
     " ensurepip=has('ensurepip'),"
     " venv=has('venv') and has('ensurepip') and (os.name != 'nt' or nt()))))"
@@ -58,8 +58,6 @@ class FoundPython:
     """``venv`` with all that it needs."""
     pip: tuple[str, ...] = ("-m", "pip")
     """Arguments that run a pip with it outside of a venv; empty for none."""
-    is_own: bool = False
-    """Whether it is the one that Blender (or this command) runs on."""
 
     @property
     def version_text(self) -> str:
@@ -77,7 +75,7 @@ class FoundPython:
         return self.version[:2] <= NEWEST_WITH_WHEELS
 
 
-def probe(path: str, own: str = "") -> FoundPython:
+def probe(path: str) -> FoundPython:
     """Ask an interpreter what it is.
 
     Raises
@@ -97,7 +95,7 @@ def probe(path: str, own: str = "") -> FoundPython:
         major, minor, micro = (int(n) for n in said["version"])
     except (OSError, subprocess.TimeoutExpired, ValueError, KeyError, TypeError):
         raise UsageError(f"{path} is no Python that runs.", other) from None
-    if (major, minor) < OLDEST or said["bits"] != 64:
+    if (major, minor) < OLDEST or not said["is_64_bit"]:
         wrong = "which is too old" if (major, minor) < OLDEST else "but a 32-bit one"
         raise UsageError(f"{path} is Python {major}.{minor}.{micro}, {wrong}.", other)
     bundled = ("-c", _BUNDLED_PIP) if said["ensurepip"] else ()
@@ -107,14 +105,13 @@ def probe(path: str, own: str = "") -> FoundPython:
         (major, minor, micro),
         bool(said["venv"]),
         ("-m", "pip") if said["pip"] else bundled,
-        bool(own) and os.path.realpath(path) == os.path.realpath(own),
     )
 
 
 def candidates(own: str = "") -> list[str]:
     """Return paths that may be a Python, the likely ones first; nothing is started but ``py``."""
     names = [f"python3.{minor}" for minor in range(11, 15)] + ["python3", "python"]
-    found = [own, *(shutil.which(name) or "" for name in names)]
+    found = [shutil.which(name) or "" for name in names]
     if sys.platform == "darwin":
         found += [path for place in _MAC_PLACES for path in sorted(glob.glob(place))]
     launcher = shutil.which("py") if sys.platform == "win32" else None
@@ -126,7 +123,7 @@ def candidates(own: str = "") -> list[str]:
             )  # fmt: skip
             found += paths_of_launcher(done.stdout.decode(errors="replace"))
     # Neither Blender itself nor the program of the Microsoft Store (it opens the shop) is a Python.
-    usable = (p for p in found if p and "WindowsApps" not in p and not _is_blender(p))
+    usable = (p for p in [*found, own] if p and "WindowsApps" not in p and not _is_blender(p))
     return list(dict.fromkeys(usable))
 
 
@@ -144,11 +141,8 @@ def find_pythons(own: str = "", paths: Iterable[str] | None = None) -> list[Foun
     found: dict[str, FoundPython] = {}
     for path in candidates(own) if paths is None else paths:
         with contextlib.suppress(UsageError):
-            python = probe(path, own)
-            key = os.path.realpath(python.path)
-            if key not in found or python.is_own:
-                found[key] = python
+            python = probe(path)
+            found.setdefault(os.path.realpath(python.path), python)
     return sorted(
-        found.values(),
-        key=lambda p: (not p.can_install, not p.has_wheels, not p.has_venv, p.is_own),
+        found.values(), key=lambda p: (not p.can_install, not p.has_wheels, not p.has_venv)
     )

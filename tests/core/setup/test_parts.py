@@ -20,8 +20,9 @@ from gaussian_wrapping_addon.core.worker_requirements import Requirement, read_r
 
 def fake_python(folder: Path, version: str, name: str = "python3", bits: int = 64) -> str:
     path = folder / name
+    is_64_bit = "true" if bits == 64 else "false"
     words = (
-        f'{{"version": {version}, "executable": "{path}", "base": "{path}", "bits": {bits},'
+        f'{{"version": {version}, "base": "{path}", "is_64_bit": {is_64_bit},'
         ' "venv": true, "pip": true, "ensurepip": true}'
     )
     path.write_text(f"#!/bin/sh\necho '{words}'\n")
@@ -50,9 +51,8 @@ def test_blender_is_no_python(tmp_path: Path) -> None:
 
 def test_pythons_with_wheels_come_first(tmp_path: Path) -> None:
     paths = [fake_python(tmp_path, f"[3, {n}, 0]", f"python3.{n}") for n in (14, 11, 13, 10)]
-    found = pythons.find_pythons(own=paths[1], paths=paths)
-    assert [p.version[1] for p in found] == [13, 11, 14], "the own one after others, 3.14 last"
-    assert [p.is_own for p in found] == [False, True, False]
+    found = pythons.find_pythons(paths=paths)
+    assert [p.version[1] for p in found] == [11, 13, 14], "3.14 last, 3.10 not at all"
 
 
 def test_the_running_python_is_found() -> None:
