@@ -32,7 +32,7 @@ ALLOWED = {
 # Blender's own process has only the standard library and numpy: what it loads may import no more.
 BLENDER_SIDE = (
     "core.jobs.client", "core.jobs.evaluate", "core.jobs.job_file", "core.dataset.check",
-    "core.settings", "core.setup.client", "core.worker_environment",
+    "core.settings", "core.setup.install", "core.worker_environment",
 )  # fmt: skip
 HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl")
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Where the private environment of workers lies, whether it is whole, and how it is started.
 
-Layout of its folder: the marker (written first: only what carries it is ever removed), ``env/`` (a
-venv) or ``packages/`` (where a Python has no venv), ``status.json``, ``log.txt``, ``cancel`` and
-``ready.json``, written last: an environment without it is half made and is not used.
+Its folder holds the marker (only a folder with it is ever removed), ``log.txt``, one folder with a
+venv, or with packages where a Python cannot make a venv, and ``ready.json``, without which no job
+uses it. The marker names the folder in use; a set-up builds another one beside it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ READY = "ready.json"
 VENV = "venv"
 PACKAGES = "packages"
 """The two kinds of environment."""
+FOLDERS = ("env", "env-2", "packages")
+"""Names that the folder in use may have; the last one was used by 0.1.0."""
 
 DATA_VARIABLE = "GAUSSIAN_WRAPPING_DATA"
 """Names the folder for data of the user that belongs to no Blender."""
@@ -40,39 +42,32 @@ class WorkerEnvironment:
     root: Path
 
     @property
-    def venv(self) -> Path:
-        """Folder of the venv."""
-        return self.root / "env"
-
-    @property
-    def packages(self) -> Path:
-        """Folder of packages, where no venv could be made."""
-        return self.root / "packages"
-
-    @property
     def marker_path(self) -> Path:
-        """Says that we made this folder, from which Python, and of which kind it is."""
+        """Says that we made this folder, from which Python, its kind and the folder in use."""
         return self.root / MARKER
 
     @property
     def ready_path(self) -> Path:
-        """Written last."""
+        """Names the installed packages and their versions."""
         return self.root / READY
 
     @property
-    def venv_python(self) -> Path:
-        """Interpreter of the venv."""
-        if sys.platform == "win32":
-            return self.venv / "Scripts" / "python.exe"
-        return self.venv / "bin" / "python"
+    def folder(self) -> Path:
+        """Folder in use of the venv or the packages."""
+        marker = self.marker()
+        name = marker.get("folder")
+        if name not in FOLDERS:  # made by 0.1.0
+            name = "packages" if marker.get("kind") == PACKAGES else "env"
+        return self.root / str(name)
+
+    def next_folder(self) -> Path:
+        """Return the folder that the next set-up builds in; never the one in use."""
+        in_use = self.is_ready() and self.folder.name == FOLDERS[0]
+        return self.root / FOLDERS[1 if in_use else 0]
 
     def is_ours(self) -> bool:
         """Tell whether the folder carries our marker."""
         return bool(self.marker())
-
-    def is_half(self) -> bool:
-        """Tell whether it was begun and not finished."""
-        return self.is_ours() and not self.is_ready()
 
     def is_ready(self) -> bool:
         """Tell whether it was finished and its interpreter is there."""
@@ -87,10 +82,17 @@ class WorkerEnvironment:
 
         That is the venv's interpreter, or this folder where a plain Python is given its packages.
         """
-        if self.marker().get("kind") == PACKAGES:
-            present = self.packages.is_dir() and Path(str(self.marker()["python"])).exists()
+        marker, python = self.marker(), venv_python(self.folder)
+        if marker.get("kind") == PACKAGES:
+            present = self.folder.is_dir() and Path(str(marker["python"])).exists()
             return str(self.root) if present else ""
-        return str(self.venv_python) if self.venv_python.exists() else ""
+        return str(python) if python.exists() else ""
+
+
+def venv_python(folder: Path) -> Path:
+    """Return the interpreter of a venv."""
+    windows = sys.platform == "win32"
+    return folder / "Scripts" / "python.exe" if windows else folder / "bin" / "python"
 
 
 def _object(path: Path, key: str, value: str | None = None) -> dict[str, Any]:
@@ -109,8 +111,8 @@ def interpreter_of(worker: str) -> tuple[str, str]:
     if environment.root.is_dir():
         marker = environment.marker()
         if marker.get("kind") == PACKAGES:
-            return str(marker["python"]), str(environment.packages)
-        return str(environment.venv_python), ""
+            return str(marker["python"]), str(environment.folder)
+        return str(venv_python(environment.folder)), ""
     return worker, ""
 
 

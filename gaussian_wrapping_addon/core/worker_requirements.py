@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import operator
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +11,11 @@ from pathlib import Path
 from .errors import UsageError
 
 FILE_NAME = "requirements-worker.txt"
-MAX_FILE_BYTES = 100_000
-
-_LINE = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]*)\s*((?:[<>=!~]=?=?[^,;\s]+(?:\s*,\s*)?)*)$")
+_LINE = re.compile(r"^([A-Za-z0-9][\w.-]*)[^\S\n]*([^#;\n]*)", re.MULTILINE)
+_COMPARE = {
+    "==": operator.eq, "!=": operator.ne, ">=": operator.ge, "<=": operator.le,
+    ">": operator.gt, "<": operator.lt,
+}  # fmt: skip
 _PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -24,41 +27,16 @@ class Requirement:
     versions: str
     """Such as ``==2.13.0`` or ``>=1.26,<3``; empty for any."""
 
-    @property
-    def text(self) -> str:
-        """As pip wants it."""
-        return f"{self.name}{self.versions}"
-
     def allows(self, version: str) -> bool:
         """Tell whether an installed version does; a local part (``+cpu``) does not count."""
-        return all(
-            _allows(clause.strip(), version) for clause in self.versions.split(",") if clause
-        )
-
-
-def plain_name(name: str) -> str:
-    """Return a package's name as package indexes compare names."""
-    return re.sub(r"[-_.]+", "-", name).lower()
+        clauses = re.findall(r"([<>=!]=|[<>])([^,]+)", self.versions)
+        return all(_COMPARE[sign](_numbers(version), _numbers(wanted)) for sign, wanted in clauses)
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    numbers = [int(n) for n in re.findall(r"\d+", re.split(r"[+a-zA-Z]", version)[0])]
-    while numbers and numbers[-1] == 0:
-        numbers.pop()
-    return tuple(numbers)
-
-
-def _allows(clause: str, version: str) -> bool:
-    match = re.match(r"(==|>=|<=|!=|~=|<|>)(.*)", clause)
-    if match is None:
-        return True
-    wanted, has = _numbers(match[2]), _numbers(version)
-    answers = {
-        "==": has == wanted, "!=": has != wanted, ">=": has >= wanted, "<=": has <= wanted,
-        ">": has > wanted, "<": has < wanted,
-        "~=": has >= wanted and has[: max(len(wanted) - 1, 1)] == wanted[: max(len(wanted) - 1, 1)],
-    }  # fmt: skip
-    return answers[match[1]]
+    """Return the numbers of a version without zeros at its end: 2.13.0 is 2.13."""
+    text = re.sub(r"(\.0+)+$", "", re.split(r"[+a-zA-Z]", version)[0])
+    return tuple(int(n) for n in re.findall(r"\d+", text))
 
 
 def requirements_file() -> Path:
@@ -76,31 +54,20 @@ def requirements_file() -> Path:
 
 
 def read_requirements(path: Path) -> list[Requirement]:
-    """Return the packages of a list.
+    """Return the packages of a list; pip judges whether its lines are right.
 
     Raises
     ------
     UsageError
-        It cannot be read, is empty, or a line is no plain ``name==version``.
+        It cannot be read or names no package.
     """
     try:
-        data = path.read_bytes()
+        text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise UsageError(
             f"{path} cannot be read: {error.strerror}.", "Give another list."
         ) from None
-    if len(data) > MAX_FILE_BYTES:
-        raise UsageError(f"{path} is too large.", "Give a list of packages.")
-    found = []
-    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
-        text = line.split("#")[0].strip()
-        match = _LINE.match(text)
-        if text and match is None:
-            raise UsageError(
-                f"{path.name}, line {number}: {text} is no package.", "Write name==version."
-            )
-        if match is not None:
-            found.append(Requirement(match[1], match[2].replace(" ", "")))
+    found = [Requirement(m[1], m[2].replace(" ", "")) for m in _LINE.finditer(text)]
     if not found:
         raise UsageError(f"{path} names no package.", "Give a list of packages.")
     return found

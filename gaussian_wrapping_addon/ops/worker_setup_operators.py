@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the preferences page that set up, repair and remove the worker."""
+"""Operators of the preferences page that set up and remove the worker."""
 
 import textwrap
 from typing import Any, Final
@@ -8,10 +8,10 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ..core.errors import WrapError
-from ..core.setup.commands import Step, all_steps
-from ..core.worker_requirements import read_requirements, requirements_file
+from ..core.setup.commands import all_commands, as_line
 from . import worker_setup
 from .reporting import ReportsErrors
+from .worker_setup import state
 
 _LINE_CHARACTERS: Final = 84
 _DIALOG_PX: Final = 600
@@ -26,29 +26,13 @@ def wheel_folder(context: bpy.types.Context) -> str:
     return str(preferences.wheel_folder) if preferences is not None else ""
 
 
-def may_install(cls: type, context: bpy.types.Context) -> bool:
-    """Tell whether packages can be had; the tooltip says why a button is grey."""
-    if worker_setup.is_busy():
-        cls.poll_message_set("A set-up is running; cancel it or wait for it")  # type: ignore[attr-defined]
-        return False
-    if not wheel_folder(context) and not bpy.app.online_access:
-        cls.poll_message_set(  # type: ignore[attr-defined]
-            "Blender may not go online: turn on Allow Online Access in Preferences, System, "
-            "or choose a Wheel Folder"
-        )
-        return False
-    return True
-
-
 def _python_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
     found = []
-    for python in worker_setup.pythons():
+    for python in state.pythons or ():
         notes = [] if python.has_wheels else ["some packages may have no wheels for it"]
-        notes += ["Blender's own; it stays as it is"] if python.is_own else []
-        if not python.can_install:
-            notes.append("has neither venv nor pip")
-        elif not python.has_venv:
-            notes.append("has no venv: packages go into a folder")
+        if not python.has_venv:
+            lacks = "has no venv: packages go into a folder"
+            notes.append(lacks if python.can_install else "has neither venv nor pip")
         words = f" ({', '.join(notes)})" if notes else ""
         found.append((python.path, f"{python.version_text}  {python.path}{words}", python.path))
     _items["python"] = found or [("", "None found", "No Python 3.11 or newer was found")]
@@ -56,40 +40,35 @@ def _python_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
 
 
 def _torch_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
-    found = [
+    cuda = ("cuda", "NVIDIA GPU (CUDA)", "Several GiB more; an NVIDIA driver was found")
+    _items["torch"] = [
         ("cpu", "Processor (Default)", "The small build; what jobs use today on every system"),
-    ]
-    if worker_setup.has_cuda():
-        found.append(("cuda", "NVIDIA GPU (CUDA)", "Several GiB more; an NVIDIA driver was found"))
-    found.append(
+        *([cuda] if state.has_cuda else []),
         ("index", "As in pip's Own Index",
          "For mirrors. On Linux pip's index has the CUDA build, elsewhere the processor's"),
-    )  # fmt: skip
-    _items["torch"] = found
-    return found
+    ]  # fmt: skip
+    return _items["torch"]
 
 
-def commands_of(context: bpy.types.Context, python: str, torch: str) -> list[Step]:
+def command_lines(context: bpy.types.Context, path: str, torch: str) -> list[str]:
     """Return the commands that a set-up with these choices runs.
 
     Raises
     ------
-    WrapError
+    UsageError
         The Python or the choice cannot be used.
     """
-    request = worker_setup.request_for(python, torch, wheel_folder(context))
-    found = next((p for p in worker_setup.pythons() if p.path == python), None)
-    if found is None:
-        return []
-    return all_steps(request, found, read_requirements(requirements_file()))
+    request = worker_setup.request_for(path, torch, wheel_folder(context))
+    found = [p for p in state.pythons or () if p.path == path]
+    return [as_line(command) for p in found for command in all_commands(request, p)]
 
 
 class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.set_up_worker"
     bl_label = "Set Up Worker"
     bl_description = (
-        "Make a private environment with torch and the other packages that jobs need; "
-        "shows the commands first and changes nothing in Blender"
+        "Make a private environment with torch and the other packages that jobs need, in place of "
+        "the one that is there; shows the commands first and changes nothing in Blender"
     )
 
     python: EnumProperty(  # type: ignore[valid-type]
@@ -101,16 +80,21 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not may_install(cls, context):
-            return False
-        if worker_setup.is_searching():
+        reason = ""
+        if state.is_busy:
+            reason = "A set-up is running; cancel it or wait for it"
+        elif not wheel_folder(context) and not bpy.app.online_access:
+            reason = (
+                "Blender may not go online: turn on Allow Online Access in Preferences, System, "
+                "or choose a Wheel Folder"
+            )
+        elif state.pythons is None:
             worker_setup.look_around()
-            cls.poll_message_set("Looking for Pythons")
-            return False
-        if not worker_setup.pythons():
-            cls.poll_message_set("No Python 3.11 or newer was found: install one from python.org")
-            return False
-        return True
+            reason = "Looking for Pythons"
+        elif not state.pythons:
+            reason = "No Python 3.11 or newer was found: install one from python.org"
+        cls.poll_message_set(reason)
+        return not reason
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=_DIALOG_PX)
@@ -123,63 +107,35 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
         column = layout.box().column(align=True)
         column.scale_y = 0.8
         try:
-            steps = commands_of(context, self.python, self.torch)
+            lines = command_lines(context, self.python, self.torch)
         except WrapError as error:
-            for line in textwrap.wrap(str(error), _LINE_CHARACTERS):
-                column.label(text=line, icon="ERROR", translate=False)
-            return
-        for step in steps:
-            for line in textwrap.wrap(
-                step.line, _LINE_CHARACTERS, subsequent_indent="      ", break_on_hyphens=False
+            lines = [str(error)]
+        for line in lines:
+            for part in textwrap.wrap(
+                line, _LINE_CHARACTERS, subsequent_indent="      ", break_on_hyphens=False
             ):
-                column.label(text=line, translate=False)
-        row = layout.row()
-        copy = row.operator("gwrap.copy_setup_commands", icon="COPYDOWN")
-        copy.python, copy.torch = self.python, self.torch
-        layout.label(
-            text="About 2 GiB on the disk; several minutes. Blender stays free meanwhile"
-            if self.torch == "cpu"
-            else "Up to 10 GiB on the disk; many minutes. Blender stays free meanwhile",
-            icon="INFO",
-        )
+                column.label(text=part, translate=False)
+        copy = layout.row().operator("gwrap.copy_setup_commands", icon="COPYDOWN")
+        copy.text = "\n".join(lines)
+        size = "About 2 GiB on the disk; several" if self.torch == "cpu" else "Up to 10 GiB; many"
+        layout.label(text=f"{size} minutes. Blender stays free meanwhile", icon="INFO")
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        python = self.python or worker_setup.pythons()[0].path
+        python = self.python or state.pythons[0].path
         request = worker_setup.request_for(python, self.torch or "cpu", wheel_folder(context))
         worker_setup.start(request)
         return {"FINISHED"}
 
 
-class GWRAP_OT_copy_setup_commands(ReportsErrors, bpy.types.Operator):
+class GWRAP_OT_copy_setup_commands(bpy.types.Operator):
     bl_idname = "gwrap.copy_setup_commands"
     bl_label = "Copy Commands"
     bl_description = "Copy the commands, to run them by hand or to ask somebody about them"
 
-    python: StringProperty(options={"SKIP_SAVE"})  # type: ignore[valid-type]
-    torch: StringProperty(default="cpu", options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    text: StringProperty(options={"SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> set[str]:
-        steps = commands_of(context, self.python, self.torch)
-        context.window_manager.clipboard = "\n".join(step.line for step in steps)
-        return {"FINISHED"}
-
-
-class GWRAP_OT_repair_worker(ReportsErrors, bpy.types.Operator):
-    bl_idname = "gwrap.repair_worker"
-    bl_label = "Repair"
-    bl_description = (
-        "Look at every package of the worker and install again what is missing or broken"
-    )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not worker_setup.environment().is_ours():
-            cls.poll_message_set("No worker has been set up here")
-            return False
-        return may_install(cls, context)
-
-    def work(self, context: bpy.types.Context) -> set[str]:
-        worker_setup.repair(wheel_folder(context))
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        context.window_manager.clipboard = self.text
         return {"FINISHED"}
 
 
@@ -190,39 +146,30 @@ class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        if worker_setup.is_busy():
-            cls.poll_message_set("A set-up is running; cancel it or wait for it")
-            return False
-        if not worker_setup.environment().is_ours():
-            cls.poll_message_set("No worker has been set up here")
-            return False
-        return True
+        reason = "" if worker_setup.environment().is_ours() else "No worker has been set up here"
+        reason = "A set-up is running; cancel it or wait for it" if state.is_busy else reason
+        cls.poll_message_set(reason)
+        return not reason
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_confirm(self, event)
 
     def work(self, _context: bpy.types.Context) -> set[str]:
-        worker_setup.start_removing()
+        worker_setup.start(worker_setup.request_for("", "cpu", ""), removes=True)
         return {"FINISHED"}
 
 
 class GWRAP_OT_cancel_setup(bpy.types.Operator):
     bl_idname = "gwrap.cancel_setup"
     bl_label = "Cancel"
-    bl_description = "Stop the set-up; pressing Set Up Worker again goes on with it"
+    bl_description = "Stop the set-up and delete what it has begun"
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        if not worker_setup.is_busy():
-            cls.poll_message_set("No set-up is running")
-            return False
-        if worker_setup.is_cancelling():
-            cls.poll_message_set("The set-up is stopping")
-            return False
-        return True
+        return state.is_busy and state.task is not None and not state.task.is_cancelling
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        worker_setup.cancel()
+        state.task.cancel()
         return {"FINISHED"}
 
 
@@ -243,7 +190,6 @@ class GWRAP_OT_open_preferences(bpy.types.Operator):
 CLASSES: Final = (
     GWRAP_OT_set_up_worker,
     GWRAP_OT_copy_setup_commands,
-    GWRAP_OT_repair_worker,
     GWRAP_OT_remove_worker,
     GWRAP_OT_cancel_setup,
     GWRAP_OT_open_preferences,

@@ -7,7 +7,9 @@ from typing import Any
 
 import bpy
 
+from ..core.setup.install import SetupTask
 from ..ops import doctor, worker_setup
+from ..ops.worker_setup import state
 from .text import characters_of, wrapped_label
 
 
@@ -17,22 +19,16 @@ def draw_setup(layout: Any, context: Any) -> None:
     characters = characters_of(context)
     environment = worker_setup.environment()
     if environment.is_ready():
-        text = f"A worker is set up in {environment.root}"
-        wrapped_label(layout, text, characters, icon="CHECKMARK")
-    elif worker_setup.is_busy():
-        pass
-    elif environment.is_half():
-        text = "The worker is only half set up and is not used. Set Up Worker goes on with it."
-        wrapped_label(layout, text, characters, icon="ERROR")
+        text, icon = f"A worker is set up in {environment.root}", "CHECKMARK"
     elif worker_setup.worker_ready():
-        layout.label(text="Jobs use a Python that was set up by hand", icon="INFO")
+        text, icon = "Jobs use a Python that was set up by hand", "INFO"
     else:
-        text = "No worker is set up yet. Jobs need one: a private Python with torch."
-        wrapped_label(layout, text, characters, icon="ERROR")
-    _draw_status(layout, characters)
+        text, icon = "No worker is set up yet. Jobs need one: a private Python with torch.", "ERROR"
+    wrapped_label(layout, text, characters, icon=icon)
+    if state.task is not None:
+        _draw_status(layout, characters, state.task)
     row = layout.row()
     row.operator("gwrap.set_up_worker", text="Set Up Worker…", icon="IMPORT")
-    row.operator("gwrap.repair_worker", icon="TOOL_SETTINGS")
     row.operator("gwrap.remove_worker", icon="TRASH")
     if not bpy.app.online_access:
         text = (
@@ -42,29 +38,21 @@ def draw_setup(layout: Any, context: Any) -> None:
         wrapped_label(layout, text, characters, icon="INTERNET_OFFLINE")
 
 
-def _draw_status(layout: Any, characters: int) -> None:
-    status = worker_setup.status()
-    if status is None:
-        return
+def _draw_status(layout: Any, characters: int, task: SetupTask) -> None:
+    status = task.status
     if status.active:
-        layout.progress(
-            factor=min(max(status.fraction, 0.0), 1.0),
-            text=f"{(status.stage or 'starting').capitalize()} · {100 * status.fraction:.0f} %",
-            type="BAR",
-        )
-        if status.message:
-            wrapped_label(layout, status.message, characters)
-        if status.stage != "remove":
-            text = "Cancelling…" if worker_setup.is_cancelling() else "Cancel"
+        text = f"{status.stage.capitalize()} · {100 * status.fraction:.0f} %"
+        layout.progress(factor=status.fraction, text=text, type="BAR")
+        wrapped_label(layout, status.message, characters)
+        if not task.removes:
+            text = "Cancelling…" if task.is_cancelling else "Cancel"
             layout.operator("gwrap.cancel_setup", text=text, icon="X")
     elif status.state == "DONE":
-        done = "removed" if status.stage == "remove" else "ready"
-        layout.label(text=f"The worker is {done}", icon="CHECKMARK")
+        text = f"The worker is {'removed' if task.removes else 'ready'}"
+        layout.label(text=text, icon="CHECKMARK")
     else:
         icon = "PAUSE" if status.state == "CANCELLED" else "ERROR"
-        wrapped_label(layout, status.error, characters, icon=icon)
-        if status.hint:
-            wrapped_label(layout, status.hint, characters, icon="BLANK1")
+        wrapped_label(layout, f"{status.error} {status.hint}", characters, icon=icon)
 
 
 def draw_doctor(layout: Any, context: Any) -> None:
@@ -88,6 +76,6 @@ def draw_worker_missing(layout: Any, characters: int) -> None:
     if worker_setup.worker_ready():
         return
     box = layout.box()
-    text = "Setting up the worker…" if worker_setup.is_busy() else "No worker is set up yet."
-    wrapped_label(box, text, characters - 4, icon="TIME" if worker_setup.is_busy() else "ERROR")
+    text = "Setting up the worker…" if state.is_busy else "No worker is set up yet."
+    wrapped_label(box, text, characters - 4, icon="TIME" if state.is_busy else "ERROR")
     box.operator("gwrap.open_preferences", text="Set Up Worker…", icon="PREFERENCES")

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,8 +17,10 @@ from gaussian_wrapping_addon.core import worker_environment
 from gaussian_wrapping_addon.core.jobs import client as job_client
 from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
 from gaussian_wrapping_addon.core.setup.commands import SetupRequest
+from gaussian_wrapping_addon.core.setup.install import SetupTask
 from gaussian_wrapping_addon.core.setup.pythons import FoundPython, probe
 from gaussian_wrapping_addon.core.worker_environment import WorkerEnvironment
+from gaussian_wrapping_addon.core.worker_requirements import requirements_file
 from gaussian_wrapping_addon.ops import doctor, worker_setup, worker_setup_operators
 from gaussian_wrapping_addon.ui import dataset_panel, worker_setup_view
 from tests.blender.fake_layout import FakeLayout, draw
@@ -36,8 +38,9 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     # What a set-up has made is remembered here; no later test may take it for its worker.
     monkeypatch.setenv(worker_environment.DATA_VARIABLE, str(tmp_path / "data"))
     monkeypatch.setattr(worker_setup, "environment", lambda: WorkerEnvironment(folder))
-    monkeypatch.setattr(worker_setup, "_state", worker_setup._State(searched=True))
-    worker_setup._state.pythons = [PYTHON]
+    fresh = worker_setup.State(pythons=[PYTHON], search=threading.Thread())
+    for name, value in vars(fresh).items():
+        monkeypatch.setattr(worker_setup.state, name, value)
     yield folder
     worker_setup.stop()
     doctor.stop()
@@ -78,25 +81,19 @@ def test_the_answer_is_kept_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(asked) == 2
 
 
-@pytest.mark.parametrize("state", ["RUNNING", "DONE", "FAILED", "CANCELLED"])
-def test_every_state_draws(state: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    worker_setup._state.status = JobStatus(
-        state, "install", 0.4, "torch: Collecting torch", error="It broke.", hint="Do that."
+@pytest.mark.parametrize("name", ["RUNNING", "DONE", "FAILED", "CANCELLED"])
+def test_every_state_draws(name: str, root: Path) -> None:
+    task = SetupTask(SetupRequest(str(root), PYTHON.path, ""))
+    task.status = JobStatus(
+        name, "install", 0.4, "torch: Collecting torch", error="It broke.", hint="Do that."
     )
-    running = state == "RUNNING"
-    monkeypatch.setattr(worker_setup._state, "client", object() if running else None)
+    worker_setup.state.task = task
     layout = drawn()
-    monkeypatch.setattr(worker_setup._state, "client", None)
+    running = name == "RUNNING"
     assert ("gwrap.cancel_setup" in layout.operators) is running
     assert ("Install · 40 %" in layout.texts) is running
-    assert ("It broke." in layout.texts) is (state in ("FAILED", "CANCELLED"))
-    assert ("The worker is ready" in layout.texts) is (state == "DONE")
-
-
-def test_a_half_environment_is_called_so(root: Path) -> None:
-    root.mkdir()
-    WorkerEnvironment(root).marker_path.write_text('{"made_by": "gaussian_wrapping_addon"}')
-    assert "only half set up" in drawn().texts.replace("\n", " ")
+    assert ("It broke. Do that." in layout.texts) is (name in ("FAILED", "CANCELLED"))
+    assert ("The worker is ready" in layout.texts) is (name == "DONE")
 
 
 def test_going_online_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,23 +103,21 @@ def test_going_online_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "Allow Online Access" in drawn().texts.replace("\n", " ")
     monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
     assert poll()
-    worker_setup._state.pythons = []
+    worker_setup.state.pythons = []
     assert not poll()
 
 
-def test_repair_and_remove_need_what_we_made(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
-    assert not bpy.ops.gwrap.repair_worker.poll()
+def test_only_what_we_made_can_be_removed(root: Path) -> None:
     assert not bpy.ops.gwrap.remove_worker.poll()
     root.mkdir()
     WorkerEnvironment(root).marker_path.write_text('{"made_by": "gaussian_wrapping_addon"}')
-    assert bpy.ops.gwrap.repair_worker.poll()
     assert bpy.ops.gwrap.remove_worker.poll()
     assert bpy.ops.gwrap.remove_worker() == {"FINISHED"}
-    while worker_setup.is_busy():
+    while worker_setup.state.is_busy:
         worker_setup.tick()
         time.sleep(0.02)
     assert not root.exists()
+    assert "The worker is removed" in drawn().texts
 
 
 @pytest.mark.parametrize("cuda", [False, True])
@@ -130,7 +125,7 @@ def test_the_dialog_shows_the_commands(
     cuda: bool, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(worker_setup_operators, "wheel_folder", lambda _context: "/wheels")
-    worker_setup._state.has_cuda = cuda
+    worker_setup.state.has_cuda = cuda
     layout = FakeLayout()
     layout_prop = SimpleNamespace(properties={"python", "torch"})
     fake = SimpleNamespace(layout=layout, python=PYTHON.path, torch="cpu", bl_rna=layout_prop)
@@ -138,7 +133,7 @@ def test_the_dialog_shows_the_commands(
     text = " ".join(layout.texts.split())
     assert f"{PYTHON.path} -I -m venv --clear {root / 'env'}" in text
     assert "--no-index --find-links /wheels" in text
-    assert "torch==" in text
+    assert f"-r {requirements_file()}" in text
     assert "gwrap.copy_setup_commands" in layout.operators
     choices = [item[0] for item in worker_setup_operators._torch_items(None, None)]
     assert choices == (["cpu", "cuda", "index"] if cuda else ["cpu", "index"])
@@ -157,17 +152,17 @@ def test_a_set_up_from_start_to_end_in_blender(
     monkeypatch.setattr(doctor, "start", asked.append)
     no_worker(monkeypatch)
     longest_s = 0.0
-    worker_setup.start(replace(request))
+    worker_setup.start(request)
     assert bpy.app.timers.is_registered(worker_setup.tick)
-    while worker_setup.is_busy():
+    while worker_setup.state.is_busy:
         begun_s = time.monotonic()
         worker_setup.tick()
         longest_s = max(longest_s, time.monotonic() - begun_s)
         time.sleep(0.05)
-    status = worker_setup.status()
-    assert status is not None
-    assert status.state == "DONE", status
+    task = worker_setup.state.task
+    assert task is not None
+    assert task.status.state == "DONE", task.status
     assert asked == [""]
     assert worker_setup.worker_ready(), "found at once"
-    assert job_client.worker_python() == str(WorkerEnvironment(root).venv_python)
+    assert job_client.worker_python() == WorkerEnvironment(root).worker()
     assert longest_s < 1.0, "a tick never waits for the set-up"

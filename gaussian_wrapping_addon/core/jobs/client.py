@@ -17,7 +17,7 @@ from typing import Any
 
 from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, cannot_be_written
 from ..helper_process import child_command, child_environment, kill_group
-from ..worker_environment import known_environments, ready_worker
+from ..worker_environment import ready_worker
 from .earlier_job import keep_finished
 from .job_file import JobFile, read_job, write_job
 from .job_folder import JobFolder, JobStatus, process_alive
@@ -56,9 +56,8 @@ def worker_python(preference: str = "") -> str:
         )
     found = chosen or ready_worker() or (sys.executable if _has_torch() else "")
     if not found:
-        half = any(e.is_half() for e in known_environments())
         raise UsageError(
-            "The worker is only half set up." if half else "No worker is set up.",
+            "No worker is set up.",
             "Press Set Up Worker in the add-on's preferences, run batch.py set-up-worker, or name"
             f" a Python that has the packages in {PYTHON_VARIABLE}.",
         )

@@ -15,7 +15,6 @@ from typing import Any
 
 from ..errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError, WrapError
 from ..helper_process import child_command, child_environment, emit
-from ..worker_environment import known_environments
 from ..worker_requirements import read_requirements, requirements_file
 
 MIN_PYTHON = (3, 11)
@@ -71,7 +70,7 @@ def _packages() -> list[Diagnosis]:
     found = []
     for requirement in read_requirements(requirements_file()):
         name = requirement.name
-        hint = f"Press Repair, or: pip install {requirement.text}"
+        hint = f"Press Set Up Worker, or: pip install {name}{requirement.versions}"
         try:
             module = importlib.import_module(modules.get(name, name))
             version = importlib.metadata.version(name)
@@ -145,7 +144,7 @@ def diagnose_worker(python: str) -> list[Diagnosis]:
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise WorkerError(
-            f"{python} does not run: {error}.", "Press Repair, or choose another Python."
+            f"{python} does not run: {error}.", "Press Set Up Worker, or choose another Python."
         ) from None
     findings: list[Diagnosis] = []
     for line in done.stdout.decode(errors="replace").splitlines():
@@ -158,7 +157,7 @@ def diagnose_worker(python: str) -> list[Diagnosis]:
         words = done.stderr.decode(errors="replace").strip().splitlines()
         raise WorkerError(
             f"{python} gave no answer: {words[-1] if words else 'no output'}.",
-            "Press Repair, or choose a Python 3.11 or newer with the worker's packages.",
+            "Press Set Up Worker, or choose a Python 3.11 or newer with the worker's packages.",
         )
     return findings
 
@@ -167,19 +166,7 @@ def find_and_diagnose(preference: str = "") -> list[Diagnosis]:
     """Examine the interpreter that jobs would use; where there is none, say what to do."""
     from .client import worker_python
 
-    half = [e for e in known_environments() if e.is_half()]
-    found = [
-        Diagnosis(
-            "Environment",
-            False,
-            f"half made, not used: {e.root}",
-            "Press Set Up Worker to go on, or Remove.",
-        )
-        for e in half
-    ]
     try:
-        python = worker_python(preference)
-        found += diagnose_worker(python)
+        return diagnose_worker(worker_python(preference))
     except WrapError as error:
-        return [*found, Diagnosis("Worker", False, error.message, error.hint)]
-    return found
+        return [Diagnosis("Worker", False, error.message, error.hint)]

@@ -44,8 +44,8 @@ def quick(request_: SetupRequest, tmp_path: Path) -> SetupRequest:
     real = probe(sys.executable).path
     launcher = tmp_path / "python3"
     said = {
-        "version": list(sys.version_info[:3]), "executable": str(launcher), "base": str(launcher),
-        "bits": 64, "venv": False, "pip": True, "ensurepip": True,
+        "version": list(sys.version_info[:3]), "base": str(launcher),
+        "is_64_bit": True, "venv": False, "pip": True, "ensurepip": True,
     }  # fmt: skip
     launcher.write_text(
         f"#!/bin/sh\ncase \"$*\" in *_base_executable*) echo '{json.dumps(said)}'; exit;; esac\n"

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Set-up without network from tiny wheels: whole, cancelled, repaired, removed, refused."""
+"""Set-up without network from tiny wheels: whole, cancelled, replaced, removed, refused."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
 import os
-import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -15,28 +15,30 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core import worker_environment
-from gaussian_wrapping_addon.core.errors import EXIT_RESOURCES, UsageError
+from gaussian_wrapping_addon.core.errors import (
+    EXIT_CANCELLED,
+    EXIT_RESOURCES,
+    EXIT_USAGE,
+    UsageError,
+)
 from gaussian_wrapping_addon.core.helper_process import child_command
 from gaussian_wrapping_addon.core.jobs import client as job_client
 from gaussian_wrapping_addon.core.jobs.doctor import find_and_diagnose
-from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus, process_alive
+from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus, process_alive
 from gaussian_wrapping_addon.core.setup import install, pythons
-from gaussian_wrapping_addon.core.setup.client import SetupClient
 from gaussian_wrapping_addon.core.setup.commands import SetupRequest
-from gaussian_wrapping_addon.core.setup.examine import GOOD, examine_worker
+from gaussian_wrapping_addon.core.setup.install import SetupTask
+from gaussian_wrapping_addon.core.worker_environment import WorkerEnvironment, interpreter_of
 from tests.core.setup.wheels import write_wheel
 
 DEADLINE_S = 100.0
 
 
 def finish(request: SetupRequest) -> JobStatus:
-    return SetupClient.start(request).wait(DEADLINE_S)
-
-
-def site_packages(request: SetupRequest) -> Path:
-    (found,) = request.environment.venv.glob("[Ll]ib/**/site-packages")
-    return found
+    task = SetupTask(request)
+    task.start()
+    task.join(DEADLINE_S)
+    return task.status
 
 
 def own_packages() -> dict[str, float]:
@@ -63,49 +65,51 @@ def imported(request: SetupRequest, module: str) -> str:
 
 @pytest.mark.slow
 def test_a_whole_life(request_: SetupRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Set up offline, find, break, repair, remove; the own Python stays as it is."""
+    """Set up offline, find, replace, remove; the own Python stays as it is."""
     before = own_packages()
-    client = SetupClient.start(request_)
+    task = SetupTask(request_)
     seen = []
-    while (status := client.poll()).active:
-        seen.append((status.stage, status.fraction))
+    task.start()
+    while task.is_alive():
+        seen.append((task.status.stage, task.status.fraction))
         time.sleep(0.02)
-    assert status.state == "DONE", status
+    assert task.status.state == "DONE", task.status
     fractions = [f for _, f in seen]
     assert fractions == sorted(fractions)
     assert {"environment", "install"} <= {stage for stage, _ in seen}
     environment = request_.environment
     assert environment.is_ready()
-    assert json.loads(environment.ready_path.read_text()) == {"gwalpha": "1.2", "gwbeta": "0.9"}
+    versions = json.loads(environment.ready_path.read_text())
+    assert {k: v for k, v in versions.items() if k.startswith("gw")} == {
+        "gwalpha": "1.2", "gwbeta": "0.9", "gwgamma": "1.0",
+    }  # fmt: skip
     assert imported(request_, "gwalpha") == "1.2"
     assert imported(request_, "gwgamma") == "1.0", "what a package needs came too"
-    assert not (environment.root / "tmp").exists()
+    names = {"env", "log.txt", "ready.json", "gaussian-wrapping-worker.json"}
+    assert {p.name for p in environment.root.iterdir()} == names
     assert own_packages() == before
 
     # It is found, after a preference and the variable, and before the own Python.
     monkeypatch.delenv(job_client.PYTHON_VARIABLE, raising=False)
-    assert job_client.worker_python() == str(environment.venv_python)
+    worker = environment.worker()
+    assert job_client.worker_python() == worker
     assert job_client.worker_python(sys.executable) == sys.executable
     monkeypatch.setenv(job_client.PYTHON_VARIABLE, sys.executable)
     assert job_client.worker_python() == sys.executable
     monkeypatch.delenv(job_client.PYTHON_VARIABLE)
 
-    # A file of one package and the whole of another go: the set-up mends both.
-    packages = site_packages(request_)
-    (packages / "gwalpha" / "data.txt").unlink()
-    shutil.rmtree(packages / "gwbeta")
-    shutil.rmtree(next(packages.glob("gwbeta-*.dist-info")))
-    states = examine_worker(environment.worker(), Path(request_.requirements))
-    assert [s.state for s in states] == ["broken", "missing"]
-    repair = install.repair_request(replace(request_, python="", torch="cuda"))
-    assert (repair.torch, repair.repair) == ("cpu", True)
-    assert os.path.realpath(repair.python) == os.path.realpath(
-        json.loads(environment.marker_path.read_text())["python"]
-    )
-    assert finish(repair).state == "DONE"
-    assert (packages / "gwalpha" / "data.txt").is_file()
-    states = examine_worker(environment.worker(), Path(request_.requirements))
-    assert {s.state for s in states} == {GOOD}
+    # A package of which a needed one has another version does not get through pip check.
+    write_wheel(Path(request_.find_links), "gwalpha", "1.2", "gwgamma>=2")
+    status = finish(request_)
+    assert status.state == "FAILED"
+    assert "gwgamma" in status.error
+    assert job_client.worker_python() == worker, "the one that was there stays in use"
+    write_wheel(Path(request_.find_links), "gwgamma", "2.0")
+    assert finish(request_).state == "DONE"
+    assert environment.folder.name == "env-2"
+    assert not (environment.root / "env").exists()
+    assert imported(request_, "gwgamma") == "2.0"
+    assert job_client.worker_python() == environment.worker() != worker
 
     install.remove(environment)
     assert not environment.root.exists()
@@ -113,49 +117,130 @@ def test_a_whole_life(request_: SetupRequest, monkeypatch: pytest.MonkeyPatch) -
     assert own_packages() == before
 
 
-def test_a_cancelled_set_up_is_not_believed_and_goes_on(
+def test_a_cancelled_set_up_leaves_nothing(request_: SetupRequest) -> None:
+    task = SetupTask(request_)
+    task.start()
+    while not request_.environment.folder.exists():
+        assert task.is_alive()
+        time.sleep(0.02)
+    begun_s = time.monotonic()
+    task.cancel()
+    task.join(20)
+    assert time.monotonic() - begun_s < 5
+    assert (task.status.state, task.status.exit_code) == ("CANCELLED", EXIT_CANCELLED)
+    assert not Path(request_.root).exists()
+
+
+def test_a_cancelled_set_up_keeps_the_one_that_is_there(quick: SetupRequest) -> None:
+    assert finish(quick).state == "DONE"
+    before = sorted(Path(quick.root).rglob("*"))
+    task = SetupTask(quick)
+    task.cancel()
+    task.start()
+    task.join(20)
+    assert task.status.state == "CANCELLED"
+    assert sorted(Path(quick.root).rglob("*")) == before
+    assert imported(quick, "gwalpha") == "1.2"
+
+
+def test_ctrl_c_cancels_the_command(request_: SetupRequest) -> None:
+    batch = Path(install.__file__).parents[2] / "batch.py"
+    options = ["--find-links", request_.find_links, "--requirements", request_.requirements]
+    command = [sys.executable, str(batch), "set-up-worker", "--to", request_.root, *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    end_s = time.monotonic() + 30
+    while not request_.environment.folder.exists():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    words, _ = process.communicate(timeout=20)
+    assert process.returncode == EXIT_CANCELLED, words
+    assert "-m venv --clear" in words.splitlines()[0]
+    assert "The set-up was cancelled." in words
+    assert not Path(request_.root).exists()
+
+
+@pytest.mark.parametrize("end", ["cancelled", "asker killed"])
+def test_no_command_outlives_the_one_who_asked(tmp_path: Path, end: str) -> None:
+    """Nor does what the command has started itself."""
+    pid_file = tmp_path / "pid"
+    sleeper = f"import os, time; open({str(pid_file)!r}, 'w').write(str(os.getpid()))"
+    sleeper += "; time.sleep(60)"
+    starter = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {sleeper!r}])"
+    asker_code = (
+        f"import sys; sys.path.insert(0, {str(Path(install.__file__).parents[3])!r})\n"
+        "import io, pathlib, threading\n"
+        "from gaussian_wrapping_addon.core.setup import commands, install\n"
+        f"root = pathlib.Path({str(tmp_path)!r}); (root / 'tmp').mkdir()\n"
+        "task = install.SetupTask(commands.SetupRequest(str(root), '', ''))\n"
+        "threading.Thread(target=lambda: sys.stdin.read() or task.cancel(), daemon=True).start()\n"
+        f"command = (sys.executable, '-c', {starter!r})\n"
+        "task._run_command(command, sys.executable, io.StringIO(), 1)\n"
+    )
+    asker = subprocess.Popen(
+        [sys.executable, "-c", asker_code], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    end_s = time.monotonic() + 30
+    while not (pid_file.exists() and pid_file.read_text()):
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+    pid = int(pid_file.read_text())
+    assert process_alive(pid, 0)
+    if end == "cancelled":
+        _, words = asker.communicate(timeout=20)
+        assert b"The set-up was cancelled." in words
+    else:
+        asker.kill()
+        asker.communicate()
+    while process_alive(pid, 0):
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_a_half_made_one_is_not_believed(
     quick: SetupRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    client = SetupClient.start(quick)
-    while not quick.environment.marker_path.exists():
-        assert client.poll().active
-        time.sleep(0.02)
-    client.cancel()
-    status = client.wait(20)
-    assert status.state == "CANCELLED", status
-    assert quick.environment.is_half()
-    worker_environment.remember(Path(quick.root))
+    """As a set-up leaves it that was killed."""
+    assert finish(quick).state == "DONE"
+    quick.environment.ready_path.unlink()
     monkeypatch.delenv(job_client.PYTHON_VARIABLE, raising=False)
     monkeypatch.setattr(job_client, "_has_torch", lambda: False)
-    with pytest.raises(UsageError, match=r"only half set up.*Set Up Worker"):
+    with pytest.raises(UsageError, match=r"No worker is set up.*Set Up Worker"):
         job_client.worker_python()
-    assert [d.subject for d in find_and_diagnose()] == ["Environment", "Worker"]
+    assert [d.subject for d in find_and_diagnose()] == ["Worker"]
     assert finish(quick).state == "DONE"
     assert job_client.worker_python() == quick.root
 
 
-def test_a_set_up_ends_with_the_one_who_asked(request_: SetupRequest) -> None:
-    """Quitting Blender in the middle leaves neither a process nor a believed environment."""
-    code = (
-        "import sys, json, time, pathlib\n"
-        f"sys.path.insert(0, {str(Path(install.__file__).parents[3])!r})\n"
-        "from gaussian_wrapping_addon.core.setup.client import SetupClient\n"
-        "from gaussian_wrapping_addon.core.setup.commands import SetupRequest\n"
-        "request = SetupRequest(**json.loads(sys.argv[1]))\n"
-        "client = SetupClient.start(request)\n"
-        "while not request.environment.marker_path.exists(): time.sleep(0.01)\n"
-    )
-    subprocess.run([sys.executable, "-c", code, json.dumps(request_.to_json())], check=True)
-    end_s = time.monotonic() + 20
-    path = Path(request_.root) / "status.json"
-    while (status := json.loads(path.read_text()))["state"] == "RUNNING":
-        assert time.monotonic() < end_s
-        time.sleep(0.05)
-    assert status["state"] == "CANCELLED"
-    while process_alive(status["pid"], status["pid_started"]):
-        assert time.monotonic() < end_s
-        time.sleep(0.05)
-    assert request_.environment.is_half()
+@pytest.mark.parametrize("kind", ["venv", "packages"])
+def test_one_that_0_1_0_made_is_used_and_replaced(quick: SetupRequest, kind: str) -> None:
+    """Its marker names no folder: that was given by the kind."""
+    environment = quick.environment
+    old = environment.root / ("env" if kind == "venv" else "packages")
+    python = old / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.touch()
+    marker = {
+        "made_by": "gaussian_wrapping_addon", "kind": kind, "python": sys.executable,
+        "version": "3.11.7", "torch": "cpu",
+    }  # fmt: skip
+    environment.marker_path.write_text(json.dumps(marker))
+    assert not environment.is_ready()
+    environment.ready_path.write_text('{"torch": "2.13.0"}')
+    assert environment.is_ready()
+    expected = (str(python), "") if kind == "venv" else (sys.executable, str(old))
+    assert interpreter_of(environment.worker()) == expected
+    assert finish(quick).state == "DONE"
+    assert environment.is_ready()
+    assert not old.exists()
+    assert imported(quick, "gwbeta") == "0.9"
+
+
+def test_a_marker_from_elsewhere_names_no_other_folder(tmp_path: Path) -> None:
+    environment = WorkerEnvironment(tmp_path)
+    marker = {"made_by": "gaussian_wrapping_addon", "kind": "venv", "folder": "../x"}
+    environment.marker_path.write_text(json.dumps(marker))
+    assert environment.folder == tmp_path / "env"
 
 
 def test_a_missing_wheel_is_named(quick: SetupRequest) -> None:
@@ -165,18 +250,17 @@ def test_a_missing_wheel_is_named(quick: SetupRequest) -> None:
     assert "No wheel of gwbeta" in status.error
     assert "wheel folder" in status.hint
     assert status.exit_code == EXIT_RESOURCES
-    assert quick.environment.is_half()
     assert "gwbeta" in (Path(quick.root) / "log.txt").read_text()
+    assert not quick.environment.folder.exists()
 
 
-def test_another_version_is_replaced(quick: SetupRequest) -> None:
-    """Where no venv can be made (Blender's own Python on Windows), only the child sees packages."""
+def test_without_a_venv_only_the_child_sees_packages(quick: SetupRequest) -> None:
+    """Where no venv can be made (Blender's own Python on Windows)."""
     assert finish(quick).state == "DONE"
     environment = quick.environment
     assert environment.marker()["kind"] == "packages"
     assert environment.is_ready()
     assert environment.worker() == quick.root
-    assert not environment.venv.exists()
     assert child_command("jobs.doctor", python=quick.root)[:2] == [quick.python, "-I"]
     assert imported(quick, "gwalpha") == "1.2"
     plain = subprocess.run(
@@ -185,8 +269,6 @@ def test_another_version_is_replaced(quick: SetupRequest) -> None:
     assert plain.returncode != 0
     write_wheel(Path(quick.find_links), "gwalpha", "1.3")
     Path(quick.requirements).write_text("gwalpha==1.3\ngwbeta\n")
-    (state, _) = examine_worker(environment.worker(), Path(quick.requirements))
-    assert state.state == "wrong version"
     assert finish(quick).state == "DONE"
     assert imported(quick, "gwalpha") == "1.3"
 
@@ -195,13 +277,26 @@ def test_the_pip_that_ensurepip_carries_will_do(
     request_: SetupRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = pythons.probe(sys.executable)
-    if not real.has_ensurepip:
-        pytest.skip("this Python has no ensurepip")
-    bare = replace(real, has_venv=False, has_pip=False)
-    Path(request_.root).mkdir()
+    bundled = ("-c", pythons._BUNDLED_PIP)
+    bare = replace(real, has_venv=False, pip=bundled)
     monkeypatch.setattr(install, "probe", lambda _path: bare)
-    install.set_up(request_, lambda *_words: None, lambda: False)
+    assert finish(request_).state == "DONE"
     assert imported(request_, "gwbeta") == "0.9"
+
+
+def test_settings_of_pip_cannot_lead_elsewhere(
+    quick: SetupRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PIP_PREFIX", str(tmp_path / "elsewhere"))
+    monkeypatch.setenv("PIP_DRY_RUN", "1")
+    # pip is isolated where it has a wheel folder: it would not look at the variables.
+    links = quick.find_links
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", Path(links).as_uri())
+    request = replace(quick, find_links="", torch="index")
+    assert finish(request).state == "DONE"
+    assert imported(request, "gwalpha") == "1.2"
+    assert not (tmp_path / "elsewhere").exists()
 
 
 def test_only_what_we_made_is_removed(request_: SetupRequest) -> None:
@@ -210,8 +305,9 @@ def test_only_what_we_made_is_removed(request_: SetupRequest) -> None:
     (folder / "env" / "thesis.txt").write_text("mine")
     with pytest.raises(UsageError, match="not made by this add-on"):
         install.remove(request_.environment)
-    with pytest.raises(UsageError, match="holds other files"):
-        SetupClient.start(request_)
+    status = finish(request_)
+    assert "holds other files" in status.error
+    assert status.exit_code == EXIT_USAGE
     assert [p.name for p in folder.iterdir()] == ["env"], "nothing of ours is left there"
     assert (folder / "env" / "thesis.txt").read_text() == "mine"
 
@@ -224,25 +320,35 @@ def test_what_lies_beside_it_stays(request_: SetupRequest) -> None:
     elsewhere = folder.parent / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "kept.txt").touch()
-    request_.environment.venv.symlink_to(elsewhere, target_is_directory=True)
+    (folder / "env").symlink_to(elsewhere, target_is_directory=True)
     install.remove(request_.environment)
     assert [p.name for p in folder.iterdir()] == ["notes.txt"]
     assert (elsewhere / "kept.txt").is_file()
 
 
 def test_a_folder_of_wheels_that_is_not_there(request_: SetupRequest) -> None:
-    with pytest.raises(UsageError, match="does not exist"):
-        SetupClient.start(replace(request_, find_links=request_.find_links + "x"))
+    status = finish(replace(request_, find_links=request_.find_links + "x"))
+    assert "does not exist" in status.error
     assert not Path(request_.root).exists()
 
 
-def test_two_set_ups_at_once(request_: SetupRequest) -> None:
-    first = SetupClient.start(request_)
-    while not (Path(request_.root) / "lock.json").exists():
-        time.sleep(0.02)
-    with pytest.raises(UsageError, match="is running"):
-        SetupClient.start(request_)
-    with pytest.raises(UsageError, match=r"is running|not made by"):
-        install.remove(request_.environment)
-    first.cancel()
-    assert first.wait(20).state == "CANCELLED"
+def test_two_set_ups_at_once(quick: SetupRequest) -> None:
+    """The other one runs in another process."""
+    assert finish(quick).state == "DONE"
+    folder = str(JobFolder(Path(quick.root)).lock_path)
+    code = (
+        "import json, sys, time, os\n"
+        "ticks = int(open('/proc/self/stat').read().rsplit(')', 1)[1].split()[19])\n"
+        f"json.dump({{'pid': os.getpid(), 'started': ticks}}, open({folder!r}, 'w'))\n"
+        "print(flush=True); time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        try:
+            assert "is working in" in finish(quick).error
+            with pytest.raises(UsageError, match="is running"):
+                install.remove(quick.environment)
+        finally:
+            other.kill()
+    assert quick.environment.is_ready()
