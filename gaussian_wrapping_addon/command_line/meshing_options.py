@@ -72,9 +72,10 @@ def region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
     UsageError
         An option is given that the method ignores, or a text cannot be read.
     """
-    values = {f"meshing.{name}": value for name, value in method_settings(options).items()}
-    values |= {entry.path: entry.default for entry in declared_options("region")}
-    values |= given_settings(options, "region")
+    given = given_settings(options, "region")
+    values = {entry.path: entry.default for entry in declared_options("region")}
+    values |= {f"meshing.{name}": value for name, value in method_settings(options).items()}
+    values |= given
     if options.threads is not None:
         values["threads"] = options.threads
     return with_values(settings, values)
