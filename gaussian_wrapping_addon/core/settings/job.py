@@ -63,14 +63,14 @@ class JobSettings:
         0,
         help="Seed of all random numbers.",
         check=Range(0, 2**31 - 1),
-        option=Option("--seed", help="of all random numbers", scope="training"),
+        option=Option("--seed", help="seed of all random numbers", scope="training"),
     )
     threads: int = setting(
         0,
         help="Processor threads; 0 uses every core this process may use.",
         check=Range(0, 1024),
         unit="threads",
-        option=Option("--threads", help="0 uses every core", scope="training"),
+        option=Option("--threads", help="processor threads; 0 uses every core", scope="training"),
         panel=PanelProperty(
             "Threads",
             "Processor threads for jobs; 0 uses all",
@@ -97,7 +97,7 @@ class JobSettings:
         check=Subset(EXPORT_FORMATS),
         option=Option(
             "--export",
-            help=f"comma separated, of {','.join(EXPORT_FORMATS)}",
+            help=f"file formats, comma separated, of {','.join(EXPORT_FORMATS)}",
             scope="region",
             parse=_formats,
         ),

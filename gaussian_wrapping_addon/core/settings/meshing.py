@@ -31,7 +31,11 @@ class MeshingSettings:
         check=Range(0.0, math.inf, words="a positive length"),
         unit="world units",
         option=Option(
-            "--edge-length", "X", "world units of the input", scope="method", exclusive="resolution"
+            "--edge-length",
+            "X",
+            "target edge length, world units of the input",
+            scope="method",
+            exclusive="resolution",
         ),
         panel=PanelProperty(
             "Edge Length",
@@ -47,7 +51,11 @@ class MeshingSettings:
         check=Range(0, 5_000_000),
         unit="points",
         option=Option(
-            "--points", "N", "number of surface points", scope="method", exclusive="resolution"
+            "--points",
+            "N",
+            "target number of surface points",
+            scope="method",
+            exclusive="resolution",
         ),
         panel=PanelProperty(
             "Points",
@@ -62,18 +70,18 @@ class MeshingSettings:
         "the photos resolve; uniform: the same edge length everywhere.",
         check=Choices(SPACINGS),
         option=Option(
-            "--spacing", help="of the mesh's vertices (default: adaptive)", scope="method"
+            "--spacing", help="spacing of the mesh's vertices (default: adaptive)", scope="method"
         ),
         panel=PanelProperty(
             "Spacing",
-            "Where vertices stand",
+            "Distribution of the vertices",
             items=(
                 Item(
                     "adaptive",
                     "Adaptive",
-                    "Vertices where the shape needs them: as true with half as many",
+                    "Dense where the shape needs it: as accurate with half as many vertices",
                 ),
-                Item("uniform", "Uniform", "Vertices evenly spread: even triangles"),
+                Item("uniform", "Uniform", "The same edge length everywhere: even triangles"),
             ),
             order=50,
             shown_if=("method", "PAM"),
@@ -87,7 +95,7 @@ class MeshingSettings:
         option=Option(
             "--tiles",
             "auto|off|N",
-            "parts that a large region is meshed in, so that memory stays bounded (default: auto)",
+            "tiles that a large region is meshed in to bound memory (default: auto)",
             scope="method",
         ),
     )
@@ -110,7 +118,7 @@ class MeshingSettings:
                 Item(
                     "pivots",
                     "Pivots",
-                    "Marching tetrahedra on the Gaussians' pivots: as fine as they lie",
+                    "Marching tetrahedra on the Gaussians' pivots: as fine as the Gaussians",
                 ),
             ),
             order=30,
@@ -122,7 +130,9 @@ class MeshingSettings:
         check=Choices(PIVOT_COUNTS),
         unit="points",
         option=Option(
-            "--pivots", help="of each Gaussian, with --method pivots (default: 2)", scope="method"
+            "--pivots",
+            help="pivots of each Gaussian, with --method pivots (default: 2)",
+            scope="method",
         ),
         panel=PanelProperty(
             "Pivots",
@@ -143,7 +153,7 @@ class MeshingSettings:
         check=Choices(BOUNDARIES),
         option=Option(
             "--boundary",
-            help="of the region where it cuts a solid: faces close the mesh, or it stays open",
+            help="where the region cuts the solid: closed by faces, or open",
         ),
         panel=PanelProperty(
             "Boundary",
@@ -152,7 +162,7 @@ class MeshingSettings:
                 Item(
                     "closed",
                     "Closed",
-                    "Flat faces close the mesh where the region cuts through things",
+                    "Flat faces close the mesh where the region cuts through objects",
                 ),
                 Item("open", "Open", "The mesh ends there with an open edge"),
             ),
@@ -165,10 +175,10 @@ class MeshingSettings:
         option=Option("--unseen", help="space that no camera sees: empty, or occupied"),
         panel=PanelProperty(
             "Unseen",
-            "What stands where no camera looks",
+            "Space that no camera sees",
             items=(
-                Item("empty", "Empty", "Nothing stands where no camera looks"),
-                Item("occupied", "Occupied", "Something stands there: closes the backs of things"),
+                Item("empty", "Empty", "Space that no camera sees is empty"),
+                Item("occupied", "Occupied", "It is solid: closes the backs of objects"),
             ),
         ),
     )
@@ -190,7 +200,7 @@ class MeshingSettings:
         help="The mesh is decimated to this number of faces; 0 keeps all.",
         check=Range(4, 20_000_000, zero="all"),
         unit="faces",
-        option=Option("--faces", "N", "decimate the mesh to N faces; 0 leaves all"),
+        option=Option("--faces", "N", "decimate the mesh to N faces; 0 keeps all"),
         panel=PanelProperty(
             "Faces",
             "Number of triangles that the mesh is decimated to",
@@ -203,10 +213,10 @@ class MeshingSettings:
         help="Steps of volume-preserving smoothing; 0 smooths nothing.",
         check=Range(0, 1000),
         unit="steps",
-        option=Option("--smooth", "N", "steps of smoothing that keeps the volume; 0 for none"),
+        option=Option("--smooth", "N", "steps of volume-preserving smoothing; 0 for none"),
         panel=PanelProperty(
             "Smooth Steps",
-            "Steps of smoothing that keeps the volume; 0 leaves the surface as measured",
+            "Steps of volume-preserving smoothing; 0 leaves the surface as measured",
             soft_high=20,
             order=20,
         ),

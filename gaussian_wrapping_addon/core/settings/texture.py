@@ -39,7 +39,7 @@ class TextureSettings:
             "Side of the texture",
             name="texture_size",
             items=(
-                Item(0, "Automatic", "As many pixels as the photos hold"),
+                Item(0, "Automatic", "As many pixels as the photos provide"),
                 *(Item(s, str(s), f"{s} pixels each way") for s in (1024, 2048, 4096, 8192)),
             ),
             order=10,
@@ -59,30 +59,30 @@ class TextureSettings:
         "on: always, flat where none were removed; off: none.",
         check=Choices(DECISIONS),
         option=Option(
-            "--normal-map", help="of the dense mesh's detail; auto bakes it where --faces removed "
-            "faces"
+            "--normal-map",
+            help="normal map with the dense mesh's detail; auto: where --faces removed faces",
         ),
         panel=PanelProperty(
             "Normal Map",
             "Detail of the mesh before its faces were limited, as a texture",
             items=(
                 Item(
-                    "auto", "Automatic", "Where the faces are limited: what they no longer show"
+                    "auto", "Automatic", "Where the faces are limited: the detail that was removed"
                 ),
-                Item("on", "On", "Always; flat where no face was taken away"),
+                Item("on", "On", "Always; flat where no face was removed"),
                 Item("off", "Off", "No normal map"),
             ),
             order=40,
         ),
-    )  # fmt: skip
+    )
     ambient_occlusion: str = setting(
         "off",
         help="Ambient occlusion map of the dense mesh.",
         check=Choices(SWITCH),
-        option=Option("--ambient-occlusion", help="bake how open the surface is", flag="on"),
+        option=Option("--ambient-occlusion", help="bake ambient occlusion", flag="on"),
         panel=PanelProperty(
             "Ambient Occlusion",
-            "Write how open the surface is as a texture, for glTF and game engines",
+            "Bake ambient occlusion as a texture, for glTF and game engines",
             order=50,
         ),
     )
@@ -107,7 +107,7 @@ class TextureSettings:
         check=Choices(TEXTURE_SOURCES),
         option=Option(
             "--texture-source",
-            help="colours of the photos, or of the Gaussians without what changes with direction",
+            help="colours of the photos, or the view-independent colours of the Gaussians",
         ),
         panel=PanelProperty(
             "Texture From",
@@ -118,8 +118,7 @@ class TextureSettings:
                 Item(
                     "gaussians",
                     "Gaussians",
-                    "What the Gaussians have learned, without highlights and passers-by: even, "
-                    "but softer",
+                    "Colours of the Gaussians, without highlights and passers-by: even, but softer",
                 ),
             ),
             order=30,
@@ -141,7 +140,7 @@ class TextureSettings:
         panel=PanelProperty(
             "Max Textures",
             "Textures that a mesh may be spread over where the photos show more than one holds; "
-            "0 decides by itself",
+            "0 chooses the number",
             order=20,
         ),
     )

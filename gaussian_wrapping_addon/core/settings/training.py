@@ -40,7 +40,7 @@ class TrainingSettings:
         help="Iterations added to a finished training, at its last learning rates.",
         check=Range(0, 10**6),
         unit="iterations",
-        option=Option("--iterations", "N", "to be added", scope="more"),
+        option=Option("--iterations", "N", "iterations to be added", scope="more"),
     )
     max_gaussians: int = setting(
         80_000,
@@ -48,10 +48,10 @@ class TrainingSettings:
         check=Range(100, 20_000_000),
         unit="Gaussians",
         presets={"draft": 40_000, "fine": 120_000},
-        option=Option("--max-gaussians", "N", "cap instead of the preset's"),
+        option=Option("--max-gaussians", "N", "cap of Gaussians instead of the preset's"),
         panel=PanelProperty(
             "Gaussians, Max",
-            "Most Gaussians there may be; fewer need less time and memory. "
+            "Largest number of Gaussians; fewer need less time and memory. "
             "0 takes the preset's number",
             preset_if_zero=True, soft_high=1_000_000, step=1000,
         ),
@@ -89,7 +89,7 @@ class TrainingSettings:
         help="Every n-th photo, sorted by name, is held out for measuring; 0 holds out none.",
         check=Range(0, 10**6, words="0 or more"),
         unit="photos",
-        option=Option("--holdout", "N", "keep each n-th photo for measuring; 0 keeps none"),
+        option=Option("--holdout", "N", "hold out each n-th photo for measuring; 0 holds out none"),
     )
     lambda_dssim: float = setting(0.2, help="Weight of the D-SSIM term of the colour loss.")
     lambda_depth_normal: float = setting(0.05, help="Weight of the depth-normal loss.")
@@ -132,11 +132,11 @@ class TrainingSettings:
         option=Option("--harmonics", help="colour that depends on the direction"),
         panel=PanelProperty(
             "Reflections",
-            "Colours that change with the side one looks from: gloss, metal, glass",
+            "Colours that change with the viewing direction: gloss, metal, glass",
             items=_selection(
-                "Only as much as makes photos that were kept back look better",
+                "Only as much as lowers the error of held-out photos",
                 "As much as the preset allows, whether it helps or not",
-                "Every point has one colour from all sides; fastest, right for matte things",
+                "One colour from all directions; fastest, right for matte surfaces",
             ),
         ),
     )
@@ -166,8 +166,8 @@ class TrainingSettings:
             "Compare Photos",
             "Check each surface in neighbouring photos while training (multi-view terms)",
             items=_selection(
-                "Where photos have neighbours that see the same from nearly the same side",
-                "Always compare; takes more time, gives smoother and truer surfaces",
+                "Where photos have neighbours with nearly the same view",
+                "Always compare; slower, gives smoother and more accurate surfaces",
                 "Never compare; faster",
             ),
         ),
@@ -180,9 +180,9 @@ class TrainingSettings:
         option=Option("--wrapping", help="orientation, and clones of opposite orientation"),
         panel=PanelProperty(
             "Wrap Thin Parts",
-            "Learn where outside is, and give thin things a front and a back",
+            "Learn orientations, and give thin parts a front and a back",
             items=_selection(
-                "Where the surface's direction still shows errors, such as on thin parts",
+                "Where the normals still show errors, such as on thin parts",
                 "Always; thin parts such as wires, spokes and leaves get a front and a back",
                 "Never; faster, but thin parts may be lost",
             ),
@@ -202,7 +202,7 @@ class TrainingSettings:
             "Add Gaussians",
             "Whether more Gaussians are added where detail is missing",
             items=_selection(
-                "Add Gaussians until more of them gain little",
+                "Add Gaussians while they lower the error",
                 "Add Gaussians up to the limit",
                 "Keep the number that training starts with",
             ),
@@ -249,21 +249,21 @@ class TrainingSettings:
         "there; background: the space behind them is empty.",
         check=Choices(MASK_MODES),
         option=Option(
-            "--mask-mode", help="what is where masks leave out: anything (ignore), or nothing"
+            "--mask-mode", help="masked pixels: ignore them, or treat them as empty background"
         ),
         panel=PanelProperty(
             "Masks",
-            "What the masked parts of the photos mean; without masks it changes nothing",
+            "Meaning of the masked parts of the photos; no effect without masks",
             items=(
                 Item(
                     "ignore",
                     "Ignore",
-                    "Masked parts of the photos teach nothing; anything may stand there",
+                    "Masked pixels are not trained on; anything may be there",
                 ),
                 Item(
                     "background",
                     "Background",
-                    "Nothing stands in masked parts: only the subject is modelled",
+                    "Masked pixels show empty space: only the subject is modelled",
                 ),
             ),
         ),
@@ -301,7 +301,7 @@ class TrainingSettings:
         check=Range(0, 20),
         presets={"draft": 2, "fine": 4},
         unit="rounds",
-        option=Option("--wrap-rounds", "N", "rounds of clones; 0 trains orientation alone"),
+        option=Option("--wrap-rounds", "N", "rounds of clones; 0 trains the orientation alone"),
     )
     wrap_from: float = setting(22 / 30, help="First round of clones.", unit="share of iterations")
     wrap_until: float = setting(26 / 30, help="Last round of clones.", unit="share of iterations")
