@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 PY := .venv/bin/python
 
-.PHONY: demo test lint zip prepare blenders clean
+.PHONY: demo test lint zip prepare blenders settings-table clean
 
 prepare:
 	@bash tools/prepare.sh
@@ -19,6 +19,9 @@ lint: prepare
 
 blenders: prepare
 	@bash tools/test_blenders.sh
+
+settings-table: prepare
+	$(PY) -m tools.settings_table
 
 zip: prepare
 	$(PY) build_addon.py

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,12 +12,13 @@ import pytest
 
 from gaussian_wrapping_addon.command_line import export_command
 from gaussian_wrapping_addon.command_line.meshing_options import method_settings, region_settings
-from gaussian_wrapping_addon.command_line.option_names import option_of
 from gaussian_wrapping_addon.command_line.parser import build_parser
-from gaussian_wrapping_addon.command_line.training_options import NEEDS, training_settings
+from gaussian_wrapping_addon.command_line.setting_options import option_of
+from gaussian_wrapping_addon.command_line.training_options import training_settings
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs import evaluate
 from gaussian_wrapping_addon.core.settings import (
+    MODEL_SELECTION,
     PRESETS,
     JobSettings,
     MeshingSettings,
@@ -51,8 +51,8 @@ def test_without_options_the_preset_stands(name: str) -> None:
         ("--holdout", "0", "holdout_every", 0),
         ("--preview-every", "2.5", "preview_every_s", 2.5),
         ("--mask-mode", "background", "mask_mode", "background"),
-        *((f"--{n.replace('_', '-')}", "off", n, "off") for n in NEEDS),
-        *((f"--{n.replace('_', '-')}", "on", n, "on") for n in NEEDS),
+        *((f"--{n.replace('_', '-')}", "off", n, "off") for n in MODEL_SELECTION),
+        *((f"--{n.replace('_', '-')}", "on", n, "on") for n in MODEL_SELECTION),
     ],
 )
 def test_an_option_changes_its_setting_alone(
@@ -132,9 +132,9 @@ def test_map_options_become_texture_settings(command: str) -> None:
 
 
 @pytest.mark.parametrize(("word", "wanted"), [("auto", "auto"), ("all", "on"), ("none", "off")])
-def test_needs_sets_all_five_and_a_single_option_wins(word: str, wanted: str) -> None:
+def test_needs_sets_the_model_selection_and_a_single_option_wins(word: str, wanted: str) -> None:
     training = settings_of("--needs", word).training
-    assert {getattr(training, name) for name in NEEDS} == {wanted}
+    assert {getattr(training, name) for name in MODEL_SELECTION} == {wanted}
     other = "off" if wanted == "on" else "on"
     for arguments in (
         ("--needs", word, "--exposure", other),
@@ -142,7 +142,7 @@ def test_needs_sets_all_five_and_a_single_option_wins(word: str, wanted: str) ->
     ):
         training = settings_of(*arguments).training
         assert training.exposure == other
-        assert {getattr(training, n) for n in NEEDS if n != "exposure"} == {wanted}
+        assert {getattr(training, n) for n in MODEL_SELECTION if n != "exposure"} == {wanted}
 
 
 @pytest.mark.parametrize(
@@ -153,9 +153,12 @@ def test_other_words_are_refused(arguments: tuple[str, str]) -> None:
         settings_of(*arguments)
 
 
-def test_every_need_is_a_setting() -> None:
-    names = {field.name for field in dataclasses.fields(preset("draft").training)}
-    assert set(NEEDS) <= names
+def test_model_selection_has_an_option_each() -> None:
+    assert MODEL_SELECTION == (
+        "harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size",
+    )  # fmt: skip
+    for name in MODEL_SELECTION:
+        assert option_of(f"training.{name}") == "--" + name.replace("_", "-")
 
 
 def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
@@ -169,7 +172,7 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
     wrap = set(build_parser()._subparsers._group_actions[0].choices["wrap"]._option_string_actions)
     assert set(known.values()) <= wrap
     assert wrap - set(known.values()) == {
-        "-h", "--help", "--needs", "--start-splat", "--out", "--no-blend",
+        "-h", "--help", "--needs", "--out", "--no-blend",
     }  # fmt: skip
     for name in ("preset", "meshing.min_component_share", "training.holdout_every"):
         assert name in known

@@ -7,6 +7,9 @@ from argparse import ArgumentParser
 from pathlib import Path
 from typing import Any, Protocol
 
+from ..core.settings import declared
+from .setting_options import add_option
+
 
 class Commands(Protocol):
     """The list of commands that a parser has."""
@@ -22,7 +25,8 @@ def add_out(parser: ArgumentParser) -> None:
 
 def add_threads(parser: ArgumentParser) -> None:
     """Add how many threads may work."""
-    parser.add_argument("--threads", type=int, default=0, help="0 uses every core")
+    threads = declared("threads")
+    add_option(parser, threads, default=threads.default)
 
 
 def add_no_blend(parser: ArgumentParser) -> None:

@@ -8,9 +8,11 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
+from ..core.settings import declared
 from .common import Commands, add_no_blend, add_out
 from .follow import follow, require_bpy
 from .meshing_options import add_method_options, add_region_options, region_settings
+from .setting_options import add_option
 from .training_options import add_training_options, training_settings
 
 _logger = logging.getLogger("gaussian_wrapping")
@@ -51,7 +53,8 @@ def add_more(commands: Commands) -> None:
     """Add ``more``."""
     parser = commands.add_parser("more", help="train a finished job further, and mesh it again")
     add_out(parser)
-    parser.add_argument("--iterations", type=int, required=True, metavar="N", help="to be added")
+    entry = declared("training.extra_iterations")
+    add_option(parser, entry, dest="iterations", required=True)
     add_no_blend(parser)
     parser.set_defaults(run=_more)
 
@@ -72,9 +75,8 @@ def add_resume(commands: Commands) -> None:
     """Add ``resume``."""
     parser = commands.add_parser("resume", help="continue a job that was stopped")
     parser.add_argument("out", type=Path, metavar="DIR")
-    parser.add_argument(
-        "--max-gaussians", type=int, metavar="N", help="train anew with another cap"
-    )
+    entry = declared("training.max_gaussians")
+    add_option(parser, entry, dest="max_gaussians", help="train anew with another cap")
     add_no_blend(parser)
     parser.set_defaults(run=_resume)
 

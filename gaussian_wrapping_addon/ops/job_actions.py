@@ -21,10 +21,11 @@ from ..core.jobs.job_file import (
 from ..core.jobs.job_folder import JobFolder
 from ..core.jobs.more import job_with_more
 from ..core.jobs.stages import read_done
+from ..core.settings import with_values
 from . import job_timer, tags
 from .region_objects import export_region
 from .region_resolution import own_lengths, world_per_blender
-from .training_choices import job_settings, texture_choices
+from .training_choices import job_settings, meshing_choices, texture_choices
 
 
 @dataclass(frozen=True)
@@ -146,8 +147,6 @@ def start_mesh(
     earlier = finished_job(JobFolder(folder))
     _refuse_linked(regions)
     properties = scene.gwrap
-    by_length = properties.resolution == "EDGE_LENGTH"
-    edge_length = properties.edge_length * world_per_blender(frame) if by_length else 0.0
     own = own_lengths(scene, regions, frame)
     requests = []
     for region in regions:
@@ -155,23 +154,14 @@ def start_mesh(
         path.parent.mkdir(exist_ok=True)
         export_region(region, path, _result_name(region, frame))
         requests.append(str(path))
-    settings = replace(
+    settings = with_values(
         earlier.settings,
-        threads=choice.threads,
-        regions=tuple(requests),
-        meshing=replace(
-            earlier.settings.meshing,
-            edge_length=edge_length,
-            points=properties.points if properties.resolution == "POINTS" else 0,
-            method=properties.method.lower(),
-            spacing=properties.spacing.lower(),
-            pivots=int(properties.pivots),
-            boundary=properties.boundary.lower(),
-            unseen=properties.unseen.lower(),
-            target_faces=properties.target_faces if properties.decimate else 0,
-            smooth_steps=properties.smooth_steps,
-        ),
-        texture=replace(earlier.settings.texture, **texture_choices(scene)),
+        {
+            "threads": choice.threads,
+            "regions": tuple(requests),
+            **meshing_choices(scene, world_per_blender(frame)),
+            **texture_choices(scene),
+        },
     )
     lengths = {
         request: length for request, length in zip(requests, own, strict=True) if length is not None

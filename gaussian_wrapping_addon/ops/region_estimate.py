@@ -30,6 +30,7 @@ from .estimate_child import ask_child
 from .redrawing import answers_in, redraw
 from .region_objects import region_body
 from .region_resolution import checked_edge_length, edge_length_in_blender, world_per_blender
+from .training_choices import method_choices
 from .training_estimate import Estimate, estimate_of
 
 MODULE = "jobs.mesh_estimate"
@@ -109,11 +110,11 @@ def asked_of(scene: bpy.types.Scene, region: bpy.types.Object) -> Asked:
         if scale > 0.0:
             matrix = np.linalg.solve(of_frame, matrix)
     length = edge_length_in_blender(scene, region) / (scale or 1.0)
-    properties = scene.gwrap
-    points = properties.points if not length and properties.resolution == "POINTS" else 0
-    own = (properties.method, properties.spacing, properties.pivots)
+    choices = method_choices(scene) | {"edge_length": f"{length:.5g}"}
+    if length:
+        choices["points"] = 0
     shape = region_watch.shape_key(region)
-    return Asked(matrix, (folder, f"{length:.5g}", points, *own, *shape))
+    return Asked(matrix, (folder, *choices.values(), *shape))
 
 
 def start(
@@ -150,15 +151,11 @@ def _question(
 ) -> _Question:
     frame = tags.frame_of(region)
     assert frame is not None  # whoever starts has found the job folder by it
-    properties = scene.gwrap
     length = checked_edge_length(scene, region) * world_per_blender(frame)
-    meshing = MeshingSettings(
-        edge_length=length,
-        points=properties.points if not length and properties.resolution == "POINTS" else 0,
-        method=properties.method.lower(),
-        spacing=properties.spacing.lower(),
-        pivots=int(properties.pivots),
-    )
+    values = {**method_choices(scene), "edge_length": length}
+    if length:
+        values["points"] = 0
+    meshing = MeshingSettings(**values)
     request = {"out": str(folder), "meshing": to_json(meshing), "threads": 0}
     return _Question(region.session_uid, region_body(region), request, python)
 

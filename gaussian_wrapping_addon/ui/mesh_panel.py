@@ -9,6 +9,7 @@ from ..ops import job_timer, tags
 from ..ops.job_operators import selected_regions
 from .job_view import draw_job, job_readiness
 from .panel_base import CATEGORY, Readiness, TabPanel, button, plain
+from .setting_properties import draw_settings, settings_in
 from .text import characters_of, wrapped_label
 
 
@@ -33,10 +34,7 @@ class GWRAP_PT_mesh(TabPanel, bpy.types.Panel):
         column = layout.column()
         column.enabled = not job_timer.is_running(properties.job_folder)
         column.prop(properties, "resolution")
-        if properties.resolution == "EDGE_LENGTH":
-            column.prop(properties, "edge_length")
-        elif properties.resolution == "POINTS":
-            column.prop(properties, "points")
+        draw_settings(column, properties, settings_in("mesh"))
         if draw_job(layout, context, "MESH"):
             return
         characters = characters_of(context)
@@ -67,16 +65,7 @@ class GWRAP_PT_mesh_advanced(bpy.types.Panel):
         column = layout.column()
         column.enabled = not job_timer.is_running(properties.job_folder)
         column.prop(properties, "decimate")
-        if properties.decimate:
-            column.prop(properties, "target_faces")
-        column.prop(properties, "smooth_steps")
-        column.prop(properties, "method")
-        if properties.method == "PIVOTS":
-            column.prop(properties, "pivots")
-        else:
-            column.prop(properties, "spacing")
-        column.prop(properties, "boundary")
-        column.prop(properties, "unseen")
+        draw_settings(column, properties, settings_in("mesh_advanced"))
 
 
 CLASSES: Final = (GWRAP_PT_mesh, GWRAP_PT_mesh_advanced)

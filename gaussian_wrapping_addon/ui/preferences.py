@@ -4,8 +4,10 @@
 from typing import Final
 
 import bpy
-from bpy.props import BoolProperty, IntProperty, StringProperty
+from bpy.props import BoolProperty, StringProperty
 
+from ..core.settings import declared
+from .setting_properties import property_of
 from .worker_setup_view import draw_doctor, draw_setup
 
 
@@ -28,13 +30,7 @@ class GWRAP_preferences(bpy.types.AddonPreferences):
         ),
         subtype="DIR_PATH",
     )
-    threads: IntProperty(  # type: ignore[valid-type]
-        name="Threads",
-        description="Processor threads for jobs; 0 uses all",
-        default=0,
-        min=0,
-        max=1024,
-    )
+    threads: property_of(declared("threads"))  # type: ignore[valid-type]
     keep_running: BoolProperty(  # type: ignore[valid-type]
         name="Keep Jobs Running After Blender Closes",
         description="Jobs go on when Blender ends; opening the file again finds them",

@@ -4,7 +4,10 @@
 from typing import Final
 
 import bpy
-from bpy.props import BoolProperty, FloatProperty
+from bpy.props import BoolProperty
+
+from ..core.settings import declared
+from .setting_properties import property_of
 
 
 class GWRAP_PG_region(bpy.types.PropertyGroup):
@@ -18,15 +21,9 @@ class GWRAP_PG_region(bpy.types.PropertyGroup):
         description="This region has an edge length of its own, whatever the Mesh panel says",
         default=False,
     )
-    edge_length: FloatProperty(  # type: ignore[valid-type]
-        name="Edge Length",
+    edge_length: property_of(  # type: ignore[valid-type]
+        declared("meshing.edge_length"),
         description="Length of this region's triangle edges, as seen in Blender",
-        default=0.05,
-        min=1e-5,
-        soft_max=1.0,
-        precision=4,
-        subtype="DISTANCE",
-        unit="LENGTH",
     )
 
 

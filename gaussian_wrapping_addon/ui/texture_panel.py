@@ -7,6 +7,7 @@ import bpy
 
 from ..ops import job_timer
 from .panel_base import Readiness, TabPanel, plain
+from .setting_properties import draw_settings, settings_in
 from .text import characters_of, wrapped_label
 
 
@@ -24,12 +25,7 @@ class GWRAP_PT_texture(TabPanel, bpy.types.Panel):
         plain(layout)
         column = layout.column()
         column.enabled = not job_timer.is_running(properties.job_folder)
-        column.prop(properties, "texture_size", text="Size")
-        column.prop(properties, "max_atlases")
-        column.row().prop(properties, "texture_source", text="Colors From", expand=True)
-        column.prop(properties, "normal_map")
-        column.prop(properties, "ambient_occlusion")
-        column.prop(properties, "lods")
+        draw_settings(column, properties, settings_in("texture"))
         text = "Counts for the next Wrap Scene or Mesh Region."
         wrapped_label(layout, text, characters_of(context), icon="INFO")
 

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The sub-panel "Advanced" of "Train": what the scene needs, limits, where to start."""
+"""The sub-panel "Advanced" of "Train": model selection, limits, start."""
 
 from typing import Final
 
 import bpy
 
+from ..core.settings.declaration import JOB
 from ..ops import job_timer
-from ..ops.training_choices import DECISIONS, NUMBERS, preset_lines
+from ..ops.training_choices import preset_lines
 from .panel_base import CATEGORY, plain
+from .setting_properties import draw_settings, settings_in
 from .text import characters_of, wrapped_label
 
 
@@ -25,19 +27,22 @@ class GWRAP_PT_train_advanced(bpy.types.Panel):
         training = properties.training
         column = self.layout.column()
         column.enabled = not job_timer.is_running(properties.job_folder)
-        column.label(text="What the Scene Needs")
-        for name in DECISIONS:
-            column.row().prop(training, name, expand=True)
+        shown = settings_in("train_advanced")
+        selection = [d for d in shown if d.model_selection]
+        limits = [d for d in shown if d.panel is not None and d.panel.preset_if_zero]
+        start = [d for d in shown if d.group == JOB]
+        others = [d for d in shown if d not in (*selection, *limits, *start)]
+        column.label(text="Model Selection")
+        for declared in selection:
+            column.row().prop(training, declared.property_name, expand=True)
         column.separator()
-        column.prop(training, "mask_mode")
+        draw_settings(column, properties, others)
         column.separator()
-        limits = column.column(align=True)
-        for name in NUMBERS:
-            limits.prop(training, name)
+        draw_settings(column.column(align=True), properties, limits)
         for line in preset_lines(properties.preset):
             wrapped_label(column, line, characters_of(context))
         column.separator()
-        column.prop(training, "start_splat")
+        draw_settings(column, properties, start)
         column.operator("gwrap.reset_training", icon="LOOP_BACK")
 
 

@@ -18,7 +18,13 @@ from gaussian_wrapping_addon.core.errors import UsageError, WorkerError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE, JobClient
 from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_job, write_job
 from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.settings import DECISIONS, MASK_MODES, preset, to_json
+from gaussian_wrapping_addon.core.settings import (
+    DECISIONS,
+    MASK_MODES,
+    MODEL_SELECTION,
+    preset,
+    to_json,
+)
 from gaussian_wrapping_addon.ops import (
     job_timer,
     known_jobs,
@@ -67,7 +73,7 @@ def test_untouched_choices_are_the_preset() -> None:
     for name in ("draft", "standard", "fine"):
         bpy.context.scene.gwrap.preset = name.upper()
         assert training_choices.job_settings(bpy.context.scene, 3) == preset(name, threads=3)
-    for name in training_choices.DECISIONS:
+    for name in MODEL_SELECTION:
         assert choices_of(name) == set(DECISIONS)
     assert choices_of("mask_mode") == set(MASK_MODES)
 
@@ -77,7 +83,7 @@ def test_each_choice_changes_its_setting_and_no_other(tmp_path: Path) -> None:
     splat.write_bytes(b"ply")
     base = to_json(preset("standard"))
     changes = {
-        **dict.fromkeys(training_choices.DECISIONS, "OFF"),
+        **dict.fromkeys(MODEL_SELECTION, "OFF"),
         "mask_mode": "BACKGROUND",
         "iterations": 77,
         "max_gaussians": 7777,

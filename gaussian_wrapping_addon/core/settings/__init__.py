@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Settings of a job: one declaration each, shared by panel, command line and worker.
+
+In: words and numbers from the command line, from Blender's properties and from ``job.json``. Out:
+frozen dataclasses whose values are checked. Standard library only, so that Blender can load it.
+"""
+
+from .choices import (
+    BOUNDARIES,
+    CORRELATIONS,
+    DECISIONS,
+    EXPORT_FORMATS,
+    MASK_MODES,
+    MAX_LODS,
+    MESH_METHODS,
+    PIVOT_COUNTS,
+    PRESETS,
+    SPACINGS,
+    SWITCH,
+    TEXTURE_SOURCES,
+    UNSEEN,
+)
+from .declaration import Declaration, declarations, with_values
+from .job import JobSettings, declared, preset
+from .json_values import from_json, to_json
+from .meshing import MeshingSettings
+from .texture import TextureSettings
+from .training import MODEL_SELECTION, RESULT_FREE, TrainingSettings
+
+__all__ = [
+    "BOUNDARIES",
+    "CORRELATIONS",
+    "DECISIONS",
+    "EXPORT_FORMATS",
+    "MASK_MODES",
+    "MAX_LODS",
+    "MESH_METHODS",
+    "MODEL_SELECTION",
+    "PIVOT_COUNTS",
+    "PRESETS",
+    "RESULT_FREE",
+    "SPACINGS",
+    "SWITCH",
+    "TEXTURE_SOURCES",
+    "UNSEEN",
+    "Declaration",
+    "JobSettings",
+    "MeshingSettings",
+    "TextureSettings",
+    "TrainingSettings",
+    "declarations",
+    "declared",
+    "from_json",
+    "preset",
+    "to_json",
+    "with_values",
+]

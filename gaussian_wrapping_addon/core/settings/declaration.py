@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The declaration of a setting: one field of a settings class says all that is known about it.
+
+Validation, command line, Blender properties, panels, job file and ``docs/settings.md`` are made
+from these declarations. To add a setting, add one field::
+
+    smoothness: float = setting(
+        0.5,
+        help="Weight of the smoothness term.",
+        check=Range(0.0, 1.0),
+        option=Option("--smoothness", metavar="W"),
+        panel=PanelProperty("Smoothness", "How strongly neighbouring vertices hold each other"),
+    )
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from .checks import Check, Choices
+from .choices import SWITCH
+
+_KEY = "setting"
+
+Scope = Literal["training", "method", "region", "more"]
+"""Options that belong together on the command line: how the Gaussians are trained; by which method
+and how finely a mesh is made (all that an estimate needs); everything else about a region; the
+command ``more``."""
+
+Owner = Literal["scene", "training", "preferences"]
+"""Who has a property in Blender: ``Scene.gwrap``, ``Scene.gwrap.training``, or the add-on."""
+
+Place = Literal["train", "train_advanced", "mesh", "mesh_advanced", "texture", "preferences"]
+"""A panel in Blender."""
+
+JOB = "job"
+"""Group of the settings that stand directly in the job's settings."""
+
+_SCOPES: Mapping[str, Scope] = {"training": "training", "meshing": "region", "texture": "region"}
+_PLACES: Mapping[str, Place] = {
+    "training": "train_advanced", "meshing": "mesh_advanced", "texture": "texture",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Option:
+    """How a setting is given on the command line."""
+
+    name: str
+    """With its dashes."""
+    metavar: str = ""
+    help: str = ""
+    """Takes the place of the setting's help."""
+    scope: Scope | None = None
+    """``None``: by the setting's group."""
+    exclusive: str = ""
+    """Options with the same word here exclude each other."""
+    flag: str = ""
+    """An option without a value; giving it sets the setting to this word."""
+    many: bool = False
+    """It takes several words, and may be given several times."""
+    parse: Callable[[Any], Any] | None = None
+    """From the text (``many``: list of texts) to the setting's value; may raise ``UsageError``."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """One entry of an enum in Blender."""
+
+    value: Any
+    label: str
+    description: str
+
+
+@dataclass(frozen=True)
+class PanelProperty:
+    """How a setting is shown in Blender. Property names and identifiers are stored in .blend files.
+
+    Blender stores the index of an enum's entry: ``items`` may only be added at the end.
+    """
+
+    label: str
+    description: str
+    name: str = ""
+    """Of the property; empty takes the setting's."""
+    items: tuple[Item, ...] = ()
+    """Entries of an enum; identifiers are the values in upper case."""
+    default: Any = None
+    """Of the property, where it differs from the setting's."""
+    preset_if_zero: bool = False
+    """Whether 0, the property's default, leaves the number to the preset."""
+    low: float | None = None
+    """Smallest number, where it differs from the smallest that the check allows."""
+    soft_low: float | None = None
+    soft_high: float | None = None
+    """Ends of the slider; larger numbers can be typed."""
+    step: int | None = None
+    precision: int | None = None
+    subtype: str = ""
+    unit: str = ""
+    """Blender's subtype and unit, such as ``"DISTANCE"`` and ``"LENGTH"``."""
+    owner: Owner | None = None
+    """``None``: by the setting's group."""
+    place: Place | None = None
+    """The panel; ``None``: by the setting's group."""
+    order: int = 100
+    """Place within the panel; equal numbers stand in the order of declaration."""
+    drawn_label: str = ""
+    """Shorter label in the panel, where its title says the rest."""
+    expand: bool = False
+    """Whether all entries of an enum are shown side by side."""
+    shown_if: tuple[str, str | bool] | None = None
+    """Property of the scene and the value of it with which this one is shown."""
+    default_if_hidden: bool = False
+    """Whether the setting has its default while the property is not shown."""
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """All that is known about one setting."""
+
+    default: Any
+    help: str
+    """What it does, in sentences."""
+    check: Check | None = None
+    unit: str = ""
+    presets: Mapping[str, Any] = field(default_factory=dict)
+    """Values of presets that differ from the default."""
+    option: Option | None = None
+    panel: PanelProperty | None = None
+    model_selection: bool = False
+    """Whether it switches a part of the model: ``--needs`` sets all of these."""
+    affects_result: bool = True
+    """Whether the result depends on it; if not, it is left out of stage keys."""
+    path: str = ""
+    """Dotted, within the job's settings, such as ``"training.iterations"``."""
+    kind: Any = None
+    """The type: ``int``, ``float``, ``str`` or ``tuple[str, ...]``."""
+
+    @property
+    def name(self) -> str:
+        """The field's name."""
+        return self.path.rpartition(".")[2]
+
+    @property
+    def group(self) -> str:
+        """The group of settings it belongs to, such as ``"training"``."""
+        return self.path.rpartition(".")[0] or JOB
+
+    @property
+    def choices(self) -> tuple[Any, ...]:
+        """The values it is chosen from, empty where there is no such list."""
+        return self.check.values if isinstance(self.check, Choices) else ()
+
+    @property
+    def is_switch(self) -> bool:
+        """Whether it is on or off, without ``"auto"``."""
+        return self.choices == SWITCH
+
+    @property
+    def scope(self) -> Scope:
+        """The scope of its option."""
+        assert self.option is not None
+        return self.option.scope or _SCOPES[self.group]
+
+    @property
+    def property_name(self) -> str:
+        """The name of its property in Blender."""
+        assert self.panel is not None
+        return self.panel.name or self.name
+
+    @property
+    def property_owner(self) -> Owner:
+        """Who has its property in Blender."""
+        assert self.panel is not None
+        return self.panel.owner or ("training" if self.group == "training" else "scene")
+
+    @property
+    def place(self) -> Place:
+        """The panel that shows it."""
+        assert self.panel is not None
+        return self.panel.place or _PLACES[self.group]
+
+    def in_panel(self, value: Any) -> Any:
+        """Return what a property holds for a value of the setting."""
+        assert self.panel is not None
+        if self.is_switch:
+            return value == "on"
+        return str(value).upper() if self.panel.items else value
+
+    def from_panel(self, stored: Any) -> Any:
+        """Return the setting's value for what a property holds.
+
+        Raises
+        ------
+        KeyError
+            The enum has no such entry.
+        """
+        assert self.panel is not None
+        if self.is_switch:
+            return "on" if stored else "off"
+        if not self.panel.items:
+            return stored
+        return {self.in_panel(item.value): item.value for item in self.panel.items}[stored]
+
+
+def setting(
+    default: Any,
+    *,
+    help: str,
+    check: Check | None = None,
+    unit: str = "",
+    presets: Mapping[str, Any] | None = None,
+    option: Option | None = None,
+    panel: PanelProperty | None = None,
+    model_selection: bool = False,
+    affects_result: bool = True,
+) -> Any:
+    """Declare a setting as a field of a settings class; see :class:`Declaration`."""
+    declared = Declaration(
+        default, help, check, unit, presets or {}, option, panel, model_selection, affects_result
+    )
+    return field(default=default, metadata={_KEY: declared})
+
+
+@functools.cache
+def declarations(kind: type) -> tuple[Declaration, ...]:
+    """Return the declarations of a settings class in order, those of its groups included.
+
+    Raises
+    ------
+    TypeError
+        A field is neither declared by :func:`setting` nor a group of settings.
+    """
+    return tuple(_walk(kind, ""))
+
+
+def _walk(kind: type, prefix: str) -> Iterable[Declaration]:
+    hints = typing.get_type_hints(kind)
+    for entry in dataclasses.fields(kind):
+        hint, path = hints[entry.name], f"{prefix}{entry.name}"
+        declared = entry.metadata.get(_KEY)
+        if dataclasses.is_dataclass(hint):
+            yield from _walk(typing.cast(type, hint), f"{path}.")
+        elif isinstance(declared, Declaration):
+            yield dataclasses.replace(declared, path=path, kind=hint)
+        else:
+            raise TypeError(f"{kind.__name__}.{entry.name} is not declared by setting()")
+
+
+def value_at(settings: Any, path: str) -> Any:
+    """Return the value of a setting by its path."""
+    return functools.reduce(getattr, path.split("."), settings)
+
+
+def with_values(settings: Any, values: Mapping[str, Any]) -> Any:
+    """Return settings in which these values, by path, take the place of the present ones."""
+    changes: dict[str, Any] = {p: value for p, value in values.items() if "." not in p}
+    for group in dict.fromkeys(path.partition(".")[0] for path in values if "." in path):
+        inside = {
+            path.partition(".")[2]: value
+            for path, value in values.items()
+            if path.startswith(f"{group}.")
+        }
+        changes[group] = with_values(getattr(settings, group), inside)
+    return dataclasses.replace(settings, **changes)

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""All settings of one job, and its presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..errors import UsageError
+from .checks import Choices, Condition, Range, Subset
+from .choices import EXPORT_FORMATS, PRESETS
+from .declaration import (
+    Declaration,
+    Item,
+    Option,
+    PanelProperty,
+    declarations,
+    setting,
+    with_values,
+)
+from .meshing import MeshingSettings
+from .texture import TextureSettings
+from .training import TrainingSettings
+from .validation import validate
+
+
+def _formats(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(word for word in text.split(",") if word))
+
+
+def _distinct(words: list[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(words))
+
+
+@dataclass(frozen=True)
+class JobSettings:
+    """All settings of one job."""
+
+    preset: str = setting(
+        "standard",
+        help="Quality against time: sets the numbers of the training that have no value of their "
+        "own.",
+        check=Choices(PRESETS),
+        option=Option("--preset", help="quality against time", scope="training"),
+        panel=PanelProperty(
+            "Preset",
+            "Quality against time",
+            items=(
+                Item("draft", "Draft", "A first look: small images, few Gaussians"),
+                Item("standard", "Standard", "For most scenes"),
+                Item(
+                    "fine",
+                    "Fine",
+                    "Larger images and more Gaussians; needs several times as long",
+                ),
+            ),
+            place="train",
+            expand=True,
+        ),
+    )
+    seed: int = setting(
+        0,
+        help="Seed of all random numbers.",
+        check=Range(0, 2**31 - 1),
+        option=Option("--seed", help="seed of all random numbers", scope="training"),
+    )
+    threads: int = setting(
+        0,
+        help="Processor threads; 0 uses every core this process may use.",
+        check=Range(0, 1024),
+        unit="threads",
+        option=Option("--threads", help="processor threads; 0 uses every core", scope="training"),
+        panel=PanelProperty(
+            "Threads",
+            "Processor threads for jobs; 0 uses all",
+            owner="preferences",
+            place="preferences",
+        ),
+    )
+    regions: tuple[str, ...] = setting(
+        ("auto",),
+        help="What is meshed: auto, all, or the paths of region files.",
+        check=Condition(lambda value: len(value) > 0, "at least one region"),
+        option=Option(
+            "--region",
+            "auto|all|REGION.json",
+            "what is meshed (default: auto)",
+            scope="region",
+            many=True,
+            parse=_distinct,
+        ),
+    )
+    export: tuple[str, ...] = setting(
+        ("glb",),
+        help="File formats that the meshes are written in.",
+        check=Subset(EXPORT_FORMATS),
+        option=Option(
+            "--export",
+            help=f"file formats, comma separated, of {','.join(EXPORT_FORMATS)}",
+            scope="region",
+            parse=_formats,
+        ),
+    )
+    start_splat: str = setting(
+        "",
+        help="PLY of Gaussians that training starts from; empty starts from the sparse points.",
+        option=Option(
+            "--start-splat",
+            "FILE.ply",
+            "Gaussians that training starts from, instead of the sparse points",
+            scope="training",
+            parse=lambda text: str(Path(text)),
+        ),
+        panel=PanelProperty(
+            "Start from Splat",
+            "PLY of a Gaussian splat of the same photos and cameras, made here or elsewhere; "
+            "empty starts from the points of the cameras",
+            subtype="FILE_PATH",
+            owner="training",
+            place="train_advanced",
+        ),
+    )
+    training: TrainingSettings = field(default_factory=TrainingSettings)
+    meshing: MeshingSettings = field(default_factory=MeshingSettings)
+    texture: TextureSettings = field(default_factory=TextureSettings)
+
+    def validated(self) -> JobSettings:
+        """Return self, or raise :class:`SettingError` naming the first setting out of range."""
+        validate(self)
+        return self
+
+
+def preset(name: str, **overrides: Any) -> JobSettings:
+    """Return the settings of ``"draft"``, ``"standard"`` or ``"fine"``.
+
+    Raises
+    ------
+    UsageError
+        There is no such preset.
+    """
+    if name not in PRESETS:
+        raise UsageError(f"There is no preset {name!r}.", f"Choose one of {', '.join(PRESETS)}.")
+    own = {d.path: d.presets[name] for d in declarations(JobSettings) if name in d.presets}
+    return with_values(JobSettings(preset=name, **overrides), own)
+
+
+def declared(path: str) -> Declaration:
+    """Return the declaration of a setting by its path, such as ``"training.iterations"``.
+
+    Raises
+    ------
+    KeyError
+        There is no such setting.
+    """
+    return {entry.path: entry for entry in declarations(JobSettings)}[path]

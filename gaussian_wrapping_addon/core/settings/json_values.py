@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Settings as JSON values and back, as they stand in ``job.json``."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from typing import Any
+
+from ..errors import UsageError
+
+
+def to_json(settings: Any) -> dict[str, Any]:
+    """Turn a settings dataclass into plain JSON values."""
+    return dataclasses.asdict(settings)
+
+
+def from_json(kind: type, values: Any, place: str = "settings") -> Any:
+    """Build a settings dataclass from JSON values; unknown keys and wrong types are refused.
+
+    Raises
+    ------
+    UsageError
+        Names the place and what was expected.
+    """
+    if not isinstance(values, dict):
+        raise UsageError(f"{place} must be an object.", "Write it as {...}.")
+    hints = typing.get_type_hints(kind)
+    fields = {f.name for f in dataclasses.fields(kind)}
+    unknown = sorted(set(values) - fields)
+    if unknown:
+        raise UsageError(f"{place} has an unknown entry {unknown[0]!r}.", "Remove it.")
+    arguments = {}
+    for name, value in values.items():
+        wanted = hints[name]
+        where = f"{place}.{name}"
+        if dataclasses.is_dataclass(wanted):
+            arguments[name] = from_json(typing.cast(type, wanted), value, where)
+        elif wanted is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+            arguments[name] = float(value)
+        elif wanted in (int, str) and type(value) is wanted:
+            arguments[name] = value
+        elif typing.get_origin(wanted) is tuple and isinstance(value, (list, tuple)):
+            if not all(isinstance(v, str) for v in value):
+                raise UsageError(f"{where} must hold only text.", "Use strings.")
+            arguments[name] = tuple(value)
+        else:
+            raise UsageError(f"{where} has the wrong type.", f"Expected {wanted}.")
+    return kind(**arguments)

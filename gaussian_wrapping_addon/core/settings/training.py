@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Settings of the training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .checks import Choices, Range
+from .choices import CORRELATIONS, DECISIONS, MASK_MODES
+from .declaration import Item, Option, PanelProperty, declarations, setting
+
+_COUNT = Range(1, 10**6)
+_SECONDS = Range(0.0, words="a number of seconds, 0 or more")
+
+
+def _selection(automatic: str, on: str, off: str) -> tuple[Item, ...]:
+    """Return the entries Auto, On and Off with their tooltips."""
+    return (Item("auto", "Auto", automatic), Item("on", "On", on), Item("off", "Off", off))
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How the Gaussians are trained. Milestones are fractions of ``iterations``."""
+
+    iterations: int = setting(
+        3000,
+        help="Training iterations.",
+        check=_COUNT,
+        unit="iterations",
+        presets={"draft": 1500, "fine": 4000},
+        option=Option("--iterations", "N", "training iterations instead of the preset's"),
+        panel=PanelProperty(
+            "Iterations",
+            "Steps of the training; 0 takes the preset's number",
+            preset_if_zero=True, soft_high=30_000, step=100,
+        ),
+    )  # fmt: skip
+    extra_iterations: int = setting(
+        0,
+        help="Iterations added to a finished training, at its last learning rates.",
+        check=Range(0, 10**6),
+        unit="iterations",
+        option=Option("--iterations", "N", "iterations to be added", scope="more"),
+    )
+    max_gaussians: int = setting(
+        80_000,
+        help="Largest number of Gaussians.",
+        check=Range(100, 20_000_000),
+        unit="Gaussians",
+        presets={"draft": 40_000, "fine": 120_000},
+        option=Option("--max-gaussians", "N", "cap of Gaussians instead of the preset's"),
+        panel=PanelProperty(
+            "Gaussians, Max",
+            "Largest number of Gaussians; fewer need less time and memory. "
+            "0 takes the preset's number",
+            preset_if_zero=True, soft_high=1_000_000, step=1000,
+        ),
+    )  # fmt: skip
+    max_image_px: int = setting(
+        640,
+        help="Long side of the finest training image.",
+        check=Range(32, 16384),
+        unit="pixels",
+        presets={"draft": 480, "fine": 1024},
+        option=Option("--max-image-px", "N", "training image size instead of the preset's"),
+        panel=PanelProperty(
+            "Photo Size, Max",
+            "Photos are trained at no more than this length of their long side, in pixels. "
+            "0 takes the preset's number",
+            preset_if_zero=True, soft_high=4096, step=100, subtype="PIXEL",
+        ),
+    )  # fmt: skip
+    pixels_per_iteration: int = setting(
+        80_000,
+        help="An iteration trains on a window of a photo with at most about this many pixels.",
+        check=Range(1000, 10**9),
+        unit="pixels",
+    )
+    sh_degree: int = setting(
+        2,
+        help="Highest degree of the spherical harmonics; `harmonics` selects how much of it is "
+        "used.",
+        check=Range(0, 3),
+        presets={"draft": 1, "fine": 3},
+        option=Option("--sh-degree", "0..3", "highest degree of the spherical harmonics"),
+    )
+    holdout_every: int = setting(
+        8,
+        help="Every n-th photo, sorted by name, is held out for measuring; 0 holds out none.",
+        check=Range(0, 10**6, words="0 or more"),
+        unit="photos",
+        option=Option("--holdout", "N", "hold out each n-th photo for measuring; 0 holds out none"),
+    )
+    lambda_dssim: float = setting(0.2, help="Weight of the D-SSIM term of the colour loss.")
+    lambda_depth_normal: float = setting(0.05, help="Weight of the depth-normal loss.")
+    lambda_normal: float = setting(0.03, help="Weight of the normal loss.")
+    lambda_photometric: float = setting(
+        0.15,
+        help="Weight of the multi-view photometric loss, a quarter of the method's: with its 0.6, "
+        "runs with a tenth of its iterations lose detail.",
+    )
+    lambda_geometric: float = setting(0.02, help="Weight of the multi-view geometric loss.")
+    correlation: str = setting(
+        "signed",
+        help="Correlation of two patches: signed, or squared, where -1 is as good as 1.",
+        check=Choices(CORRELATIONS),
+    )
+    multi_view_until: float = setting(
+        0.75,
+        help="End of the multi-view terms. What noise in the photos has displaced can settle after "
+        "it.",
+        unit="share of iterations",
+    )
+    multi_view_pixels: int = setting(
+        4000,
+        help="Pixels of an iteration at which the multi-view terms are evaluated.",
+        check=_COUNT,
+        unit="pixels",
+    )
+    multi_view_every: int = setting(
+        1,
+        help="The multi-view terms are evaluated in every n-th iteration, with n times the weight.",
+        check=Range(1, 1000),
+        unit="iterations",
+    )
+    harmonics: str = setting(
+        "auto",
+        help="View-dependent colour. auto: only degrees that lower the error of held-out photos; "
+        "on: all of them; off: degree 0.",
+        check=Choices(DECISIONS),
+        model_selection=True,
+        option=Option("--harmonics", help="colour that depends on the direction"),
+        panel=PanelProperty(
+            "Reflections",
+            "Colours that change with the viewing direction: gloss, metal, glass",
+            items=_selection(
+                "Only as much as lowers the error of held-out photos",
+                "As much as the preset allows, whether it helps or not",
+                "One colour from all directions; fastest, right for matte surfaces",
+            ),
+        ),
+    )
+    exposure: str = setting(
+        "auto",
+        help="Gain and offset per photo.",
+        check=Choices(DECISIONS),
+        model_selection=True,
+        option=Option("--exposure", help="gain and offset per photo"),
+        panel=PanelProperty(
+            "Exposure",
+            "Brightness and tint that differ from photo to photo",
+            items=_selection(
+                "Where the same points differ in brightness from photo to photo",
+                "Always learn a brightness and a tint for each photo",
+                "All photos were taken with the same settings and light",
+            ),
+        ),
+    )
+    multi_view: str = setting(
+        "auto",
+        help="Loss terms that compare neighbouring photos.",
+        check=Choices(DECISIONS),
+        model_selection=True,
+        option=Option("--multi-view", help="terms that compare neighbouring photos"),
+        panel=PanelProperty(
+            "Compare Photos",
+            "Check each surface in neighbouring photos while training (multi-view terms)",
+            items=_selection(
+                "Where photos have neighbours with nearly the same view",
+                "Always compare; slower, gives smoother and more accurate surfaces",
+                "Never compare; faster",
+            ),
+        ),
+    )
+    wrapping: str = setting(
+        "auto",
+        help="Orientation of the Gaussians, its loss, and clones of opposite orientation.",
+        check=Choices(DECISIONS),
+        model_selection=True,
+        option=Option("--wrapping", help="orientation, and clones of opposite orientation"),
+        panel=PanelProperty(
+            "Wrap Thin Parts",
+            "Learn orientations, and give thin parts a front and a back",
+            items=_selection(
+                "Where the normals still show errors, such as on thin parts",
+                "Always; thin parts such as wires, spokes and leaves get a front and a back",
+                "Never; faster, but thin parts may be lost",
+            ),
+        ),
+    )
+    growth: str = setting(
+        "auto",
+        help="Densification. auto: it stops where more Gaussians gain little, and Gaussians that "
+        "contribute little are kept small (`overlap_price`) and pruned (`prune_share`); on: only "
+        "the cap stops it; off: none are added.",
+        check=Choices(DECISIONS),
+        model_selection=True,
+        option=Option(
+            "--growth", help="more Gaussians: while they lower the error, up to the cap, or none"
+        ),
+        panel=PanelProperty(
+            "Add Gaussians",
+            "Whether more Gaussians are added where detail is missing",
+            items=_selection(
+                "Add Gaussians while they lower the error",
+                "Add Gaussians up to the limit",
+                "Keep the number that training starts with",
+            ),
+        ),
+    )
+    full_size: str = setting(
+        "auto",
+        help="Training image size. auto: photos that show nothing finer than half their size are "
+        "trained on at half size; on: always full size; off: half size.",
+        check=Choices(DECISIONS),
+        model_selection=True,
+        option=Option(
+            "--full-size", help="photos at their full size, also where half size shows as much"
+        ),
+        panel=PanelProperty(
+            "Full Photo Size",
+            "Train on photos at their full size, within the limit below",
+            items=_selection(
+                "At half size where the photos show nothing finer",
+                "Always at full size, even where half size shows as much",
+                "Always at half size; faster, with less memory",
+            ),
+        ),
+    )
+    region_weight: float = setting(
+        1.0,
+        help="Gaussians inside the job's regions count this many times where their number is "
+        "limited.",
+        check=Range(1.0, 1000.0),
+        option=Option(
+            "--region-weight",
+            "W",
+            "Gaussians inside the regions count this many times where their number is limited",
+        ),
+    )
+    focus: str = setting(
+        "",
+        help="JSON list of the job's region bodies, world coordinates. Written when a job that "
+        "trains is made with a region weight; other regions are meshed from the same training.",
+    )
+    mask_mode: str = setting(
+        "ignore",
+        help="What masks exclude. ignore: these pixels are not trained on, and anything may be "
+        "there; background: the space behind them is empty.",
+        check=Choices(MASK_MODES),
+        option=Option(
+            "--mask-mode", help="masked pixels: ignore them, or treat them as empty background"
+        ),
+        panel=PanelProperty(
+            "Masks",
+            "Meaning of the masked parts of the photos; no effect without masks",
+            items=(
+                Item(
+                    "ignore",
+                    "Ignore",
+                    "Masked pixels are not trained on; anything may be there",
+                ),
+                Item(
+                    "background",
+                    "Background",
+                    "Masked pixels show empty space: only the subject is modelled",
+                ),
+            ),
+        ),
+    )
+    depth_from: float = setting(
+        7 / 30,
+        help="Start of the depth-normal loss and the multi-view terms.",
+        unit="share of iterations",
+    )
+    densify_from: float = setting(
+        0.5 / 30, help="Start of densification.", unit="share of iterations"
+    )
+    densify_until: float = setting(0.5, help="End of densification.", unit="share of iterations")
+    densify_every: int = setting(100, help="Interval of densification.", unit="iterations")
+    overlap_price: float = setting(
+        2e-5,
+        help="Footprint regulariser: cost, in the unit of the loss, of one more Gaussian over "
+        "every pixel.",
+        check=Range(0.0, 1.0),
+    )
+    prune_share: float = setting(
+        0.005,
+        help="Gaussians that together contribute less than this share of all blending weights are "
+        "pruned at intervals; 0 prunes none.",
+        check=Range(0.0, 0.5, below_high=True),
+        unit="share",
+    )
+    orient_from: float = setting(
+        20 / 30, help="Start of the orientation loss.", unit="share of iterations"
+    )
+    wrap_rounds: int = setting(
+        3,
+        help="Rounds in which clones of opposite orientation are added; 0 trains the orientation "
+        "alone.",
+        check=Range(0, 20),
+        presets={"draft": 2, "fine": 4},
+        unit="rounds",
+        option=Option("--wrap-rounds", "N", "rounds of clones; 0 trains the orientation alone"),
+    )
+    wrap_from: float = setting(22 / 30, help="First round of clones.", unit="share of iterations")
+    wrap_until: float = setting(26 / 30, help="Last round of clones.", unit="share of iterations")
+    wrap_share: float = setting(
+        0.05, help="Share of the Gaussians that a round may clone.", unit="share"
+    )
+    checkpoint_every_s: float = setting(
+        60.0,
+        help="Time between two checkpoints.",
+        check=_SECONDS,
+        unit="seconds",
+        affects_result=False,
+    )
+    preview_every_s: float = setting(
+        20.0,
+        help="Time between two preview pictures of a running training; 0 writes none.",
+        check=_SECONDS,
+        unit="seconds",
+        affects_result=False,
+        option=Option(
+            "--preview-every",
+            "S",
+            "seconds between two preview pictures of the training; 0 writes none",
+        ),
+    )
+
+
+MODEL_SELECTION = tuple(d.name for d in declarations(TrainingSettings) if d.model_selection)
+"""Settings that switch a part of the model; ``"auto"`` decides by what the photos show."""
+
+RESULT_FREE = tuple(d.name for d in declarations(TrainingSettings) if not d.affects_result)
+"""Settings that the result does not depend on."""

@@ -1,0 +1,18 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Validation of settings by their declarations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..errors import SettingError
+from .declaration import declarations, value_at
+
+
+def validate(settings: Any) -> None:
+    """Raise :class:`SettingError` naming the first setting whose value is out of range."""
+    kind: type = type(settings)
+    for declared in declarations(kind):
+        check = declared.check
+        if check is not None and not check.holds(value_at(settings, declared.path)):
+            raise SettingError(declared.path, check.wanted)

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Blender properties are made from the declarations, and .blend files keep their values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import pytest
+
+from gaussian_wrapping_addon.core.settings import JobSettings, declarations, declared
+from gaussian_wrapping_addon.ui import (
+    mesh_panel,
+    preferences,
+    texture_panel,
+    train_advanced_panel,
+    train_panel,
+)
+from tests.blender.fake_layout import draw
+from tests.fake_setting import GROUPS, copy_with_fake_setting, said_by
+
+# As in 0.1.0: .blend files hold the names of the properties and the indices of the entries.
+STORED = {
+    "preset": ["DRAFT", "STANDARD", "FINE"],
+    "resolution": ["AUTOMATIC", "EDGE_LENGTH", "POINTS"],
+    "edge_length": None,
+    "points": None,
+    "method": ["PAM", "PIVOTS"],
+    "spacing": ["ADAPTIVE", "UNIFORM"],
+    "pivots": ["2", "3", "9"],
+    "boundary": ["CLOSED", "OPEN"],
+    "unseen": ["EMPTY", "OCCUPIED"],
+    "decimate": None,
+    "target_faces": None,
+    "smooth_steps": None,
+    "texture_size": ["0", "1024", "2048", "4096", "8192"],
+    "normal_map": ["AUTO", "ON", "OFF"],
+    "ambient_occlusion": None,
+    "lods": None,
+    "max_atlases": None,
+    "texture_source": ["PHOTOS", "GAUSSIANS"],
+    "training.harmonics": ["AUTO", "ON", "OFF"],
+    "training.exposure": ["AUTO", "ON", "OFF"],
+    "training.multi_view": ["AUTO", "ON", "OFF"],
+    "training.wrapping": ["AUTO", "ON", "OFF"],
+    "training.growth": ["AUTO", "ON", "OFF"],
+    "training.mask_mode": ["IGNORE", "BACKGROUND"],
+    "training.iterations": None,
+    "training.max_gaussians": None,
+    "training.max_image_px": None,
+    "training.start_splat": None,
+    "training.more_iterations": None,
+}
+
+
+def property_at(path: str) -> bpy.types.Property:
+    owner = bpy.context.scene.gwrap
+    if path.startswith("training."):
+        owner = owner.training
+    return owner.bl_rna.properties[path.removeprefix("training.")]
+
+
+@pytest.mark.usefixtures("addon")
+@pytest.mark.parametrize("path", STORED)
+def test_files_keep_their_values(path: str) -> None:
+    found, entries = property_at(path), STORED[path]
+    assert (found.type == "ENUM") == (entries is not None)
+    if entries is not None:
+        assert [item.identifier for item in found.enum_items] == entries
+        assert [item.value for item in found.enum_items] == list(range(len(entries)))
+
+
+@pytest.mark.usefixtures("addon")
+def test_numbers_have_the_limits_of_their_checks() -> None:
+    limits = {
+        path: (found.default, found.hard_min, found.hard_max, found.soft_max)
+        for path in STORED
+        if (found := property_at(path)).type == "INT"
+    }
+    assert limits == {
+        "points": (50_000, 100, 5_000_000, 500_000),
+        "target_faces": (20_000, 4, 20_000_000, 1_000_000),
+        "smooth_steps": (0, 0, 1000, 20),
+        "lods": (0, 0, 8, 8),
+        "max_atlases": (0, 0, 16, 16),
+        "training.iterations": (0, 0, 1_000_000, 30_000),
+        "training.max_gaussians": (0, 0, 20_000_000, 1_000_000),
+        "training.max_image_px": (0, 0, 16_384, 4096),
+        "training.more_iterations": (1000, 1, 1_000_000, 10_000),
+    }
+    for kind, name in ((bpy.types.Scene, "scene"), (bpy.types.Object, "object")):
+        pointer = kind.bl_rna.properties["gwrap"].fixed_type.properties["edge_length"]
+        assert (pointer.subtype, pointer.unit, pointer.soft_max) == ("DISTANCE", "LENGTH", 1.0), (
+            name
+        )
+        assert pointer.hard_min == pytest.approx(1e-5)
+
+
+@pytest.mark.usefixtures("addon")
+def test_every_declared_property_is_there_and_drawn() -> None:
+    properties = bpy.context.scene.gwrap
+    drawn: set[str] = set(preferences.GWRAP_preferences.__annotations__)
+    for method, resolution in (("PAM", "EDGE_LENGTH"), ("PIVOTS", "POINTS")):
+        properties.method, properties.resolution, properties.decimate = method, resolution, True
+        for panel in (
+            train_panel.GWRAP_PT_train,
+            train_advanced_panel.GWRAP_PT_train_advanced,
+            mesh_panel.GWRAP_PT_mesh,
+            mesh_panel.GWRAP_PT_mesh_advanced,
+            texture_panel.GWRAP_PT_texture,
+        ):
+            drawn |= {field.name for field in draw(panel).fields}
+    shown = [entry for entry in declarations(JobSettings) if entry.panel is not None]
+    assert {entry.property_name for entry in shown} <= drawn
+
+
+@pytest.mark.usefixtures("addon")
+def test_full_size_is_chosen_with_the_other_parts_of_the_model() -> None:
+    names = [field.name for field in draw(train_advanced_panel.GWRAP_PT_train_advanced).fields]
+    assert names[:6] == [
+        "harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size",
+    ]  # fmt: skip
+    assert property_at("training.full_size").default == "AUTO"
+    assert declared("training.full_size").from_panel("AUTO") == "auto"
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_new_setting_needs_its_declaration_only(tmp_path: Path, group: str) -> None:
+    folder = copy_with_fake_setting(tmp_path, group)
+    found = said_by("tests.blender.fake_setting_play", folder, group)
+    assert found["rna"] == ["Fake Number", "A number that only the test knows", 3, 1, 9]
+    assert "fake_number" in found["drawn"]
+    assert found["chosen"] == [3, 7]
