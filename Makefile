@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 PY := .venv/bin/python
+DOCS_PY := .venv-docs/bin/python
 
-.PHONY: demo test lint zip prepare blenders clean
+# Processes that tests run in: one for each core, at most four (a process takes up to 2 GB).
+PARALLEL := -n auto --maxprocesses 4 --dist loadgroup
+
+.PHONY: demo test quick lint docs zip prepare blenders clean
 
 prepare:
 	@bash tools/prepare.sh
@@ -9,8 +13,13 @@ prepare:
 demo: prepare
 	$(PY) gaussian_wrapping_addon/batch.py wrap examples/bananas --out demo_out --preset draft
 
+# The tests in a real Blender run alone: they measure how long Blender stands still.
 test: lint blenders
-	$(PY) -m pytest
+	$(PY) -m pytest $(PARALLEL) -m "not gui"
+	$(PY) -m pytest -m gui
+
+quick: lint
+	$(PY) -m pytest $(PARALLEL) -q -m "not slow and not gui"
 
 lint: prepare
 	.venv/bin/ruff check .
@@ -20,8 +29,16 @@ lint: prepare
 blenders: prepare
 	@bash tools/test_blenders.sh
 
+docs: $(DOCS_PY)
+	$(DOCS_PY) -m mkdocs build --strict
+
+$(DOCS_PY): requirements-docs.txt
+	python3 -m venv .venv-docs
+	$(DOCS_PY) -m pip install -q --disable-pip-version-check -r requirements-docs.txt
+	@touch $(DOCS_PY)
+
 zip: prepare
 	$(PY) build_addon.py
 
 clean:
-	rm -rf demo_out dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf demo_out dist site .pytest_cache .mypy_cache .ruff_cache

@@ -17,7 +17,7 @@ _logger = logging.getLogger("gaussian_wrapping")
 
 
 def main(arguments: list[str], program: str = "batch.py") -> int:
-    """Run one command and return the exit code (0, 1, 2, 3, 4, 5: see the README).
+    """Run one command and return the exit code (0 to 5, see ``docs/command-line.md``).
 
     ``program`` is how help and usage call it.
     """
@@ -49,6 +49,11 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
             return full.exit_code
         _logger.error("error: %s", error)
         return EXIT_OTHER
+
+
+def console_entry() -> int:
+    """Run the ``gaussian-wrapping`` command of an installed package and return the exit code."""
+    return main(sys.argv[1:], "gaussian-wrapping")
 
 
 def _log_to_terminal() -> None:
