@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 PY := .venv/bin/python
-DOCS_PY := .venv-docs/bin/python
 
 # Processes that tests run in: one for each core, at most four (a process takes up to 2 GB).
 PARALLEL := -n auto --maxprocesses 4 --dist loadgroup
@@ -29,13 +28,13 @@ lint: prepare
 blenders: prepare
 	@bash tools/test_blenders.sh
 
-docs: $(DOCS_PY)
-	$(DOCS_PY) -m mkdocs build --strict
+docs: .venv-docs/requirements.stamp
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/python -m mkdocs build --strict
 
-$(DOCS_PY): requirements-docs.txt
+.venv-docs/requirements.stamp: requirements-docs.txt
 	python3 -m venv .venv-docs
-	$(DOCS_PY) -m pip install -q --disable-pip-version-check -r requirements-docs.txt
-	@touch $(DOCS_PY)
+	.venv-docs/bin/python -m pip install -q --disable-pip-version-check -r requirements-docs.txt
+	@cp requirements-docs.txt $@
 
 zip: prepare
 	$(PY) build_addon.py
