@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 PY := .venv/bin/python
 
-# Processes that tests run in: one for each core, at most four (a process takes up to 2 GB).
-PARALLEL := -n auto --maxprocesses 4 --dist loadgroup
+# One process of tests for each core, at most four; each file stays in one (tests/conftest.py).
+PARALLEL := -n auto --maxprocesses 4 --dist loadgroup --no-loadscope-reorder
 
 .PHONY: demo test quick lint docs zip prepare blenders clean
 
