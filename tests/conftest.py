@@ -42,12 +42,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     of_file: Counter[str] = Counter()
     for name, value in seconds.items():
         of_file[name.partition("::")[0]] += value
+    parallel = "PYTEST_XDIST_WORKER" in os.environ
     for item in items:
         file = item.path.relative_to(_ROOT).as_posix()
         test = f"{file}::{getattr(item, 'originalname', item.name)}"
         if file in seconds or test in seconds:
             item.add_marker(pytest.mark.slow)
-        if item.get_closest_marker("xdist_group") is None:
+        if parallel and item.get_closest_marker("xdist_group") is None:
             item.add_marker(pytest.mark.xdist_group(file))
-    if "PYTEST_XDIST_WORKER" in os.environ:
+    if parallel:
         items.sort(key=lambda item: -of_file[item.path.relative_to(_ROOT).as_posix()])

@@ -35,9 +35,10 @@ def broken_links(page: Path) -> list[str]:
             continue
         place, _, anchor = link.partition("#")
         target = (page.parent / place).resolve() if place else page
-        if not target.is_file():
-            broken.append(link)
-        elif anchor and anchor not in anchors_of(target.read_text(encoding="utf-8")):
+        known = (
+            anchors_of(target.read_text(encoding="utf-8")) if anchor and target.is_file() else {""}
+        )
+        if not target.is_file() or anchor not in known:
             broken.append(link)
     return broken
 
