@@ -35,6 +35,9 @@ def broken_links(page: Path) -> list[str]:
             continue
         place, _, anchor = link.partition("#")
         target = (page.parent / place).resolve() if place else page
+        if not target.is_file():
+            broken.append(link)
+            continue
         known = (
             anchors_of(target.read_text(encoding="utf-8")) if anchor and target.is_file() else {""}
         )

@@ -21,7 +21,8 @@ from pathlib import Path
 TARGET = Path(__file__).resolve().parents[1] / "tests" / "slow_tests.txt"
 HEADER = """\
 # Left out of `make quick` (marker `slow`): seconds, file or file::test.
-# Made by tools/slow_tests.py: tests of more than {limit:g} s, and files with a fixture of more than {setup:g} s.
+# Made by tools/slow_tests.py: tests of more than {limit:g} s,
+# and files with a fixture of more than {setup:g} s.
 """
 _LINE = re.compile(r"\s*([0-9.]+)s (call|setup|teardown)\s+(tests/[^:]+\.py)::([^\[\s]+)")
 
