@@ -39,7 +39,8 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith(__name__.partition(".")[0]):
             raise
-        worker = interpreter_of(ready_worker())[0] or "that of Blender, or of the worker"
+        ready = ready_worker()
+        worker = interpreter_of(ready)[0] if ready else "that of Blender, or of the worker"
         _logger.error("error: This Python lacks %s. Use another one: %s", error.name, worker)
         return EXIT_OTHER
     except OSError as error:

@@ -28,11 +28,11 @@ def entry() -> tuple[str, str]:
 
 
 def run_entry(
-    entry: tuple[str, str], *arguments: str, place: Path = ROOT
+    entry: tuple[str, str], *arguments: str, place: Path = ROOT, prelude: str = ""
 ) -> subprocess.CompletedProcess[str]:
     """Run the command as an installer's script does, with the package that lies in ``place``."""
     module, function = entry
-    text = f"import sys\nfrom {module} import {function}\nsys.exit({function}())"
+    text = f"import sys\n{prelude}\nfrom {module} import {function}\nsys.exit({function}())"
     return subprocess.run(
         [sys.executable, "-P", "-c", text, *arguments],
         env={**os.environ, "PYTHONPATH": str(place)},
@@ -59,6 +59,13 @@ def test_help_and_usage_errors_call_it_by_its_name(entry: tuple[str, str]) -> No
     wrong = run_entry(entry, "no-such-command")
     assert wrong.returncode == 2
     assert f"{NAME} [-h]" in wrong.stdout + wrong.stderr
+
+
+def test_a_python_without_numpy_is_told_what_to_use(entry: tuple[str, str]) -> None:
+    lacking = run_entry(entry, "check", "photos", prelude="sys.modules['numpy'] = None")
+    assert lacking.returncode == 1
+    assert "This Python lacks numpy" in lacking.stdout
+    assert lacking.stdout.rstrip().endswith("Use another one: that of Blender, or of the worker")
 
 
 def test_the_wheel_is_complete(entry: tuple[str, str], tmp_path: Path) -> None:
