@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 PY := .venv/bin/python
 
-.PHONY: demo test lint zip prepare blenders settings-table clean
+# One process of tests for each core, at most four; each file stays in one (tests/conftest.py).
+PARALLEL := -n auto --maxprocesses 4 --dist loadgroup --no-loadscope-reorder
+
+.PHONY: demo test quick lint docs settings-table zip prepare blenders clean
 
 prepare:
 	@bash tools/prepare.sh
@@ -9,8 +12,13 @@ prepare:
 demo: prepare
 	$(PY) gaussian_wrapping_addon/batch.py wrap examples/bananas --out demo_out --preset draft
 
+# The tests in a real Blender run alone: they measure how long Blender stands still.
 test: lint blenders
-	$(PY) -m pytest
+	$(PY) -m pytest $(PARALLEL) -m "not gui"
+	$(PY) -m pytest -m gui
+
+quick: lint
+	$(PY) -m pytest $(PARALLEL) -q -m "not slow and not gui"
 
 lint: prepare
 	.venv/bin/ruff check .
@@ -23,8 +31,16 @@ blenders: prepare
 settings-table: prepare
 	$(PY) -m tools.settings_table
 
+docs: .venv-docs/requirements.stamp
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/python -m mkdocs build --strict
+
+.venv-docs/requirements.stamp: requirements-docs.txt
+	python3 -m venv .venv-docs
+	.venv-docs/bin/python -m pip install -q --disable-pip-version-check -r requirements-docs.txt
+	@cp requirements-docs.txt $@
+
 zip: prepare
 	$(PY) build_addon.py
 
 clean:
-	rm -rf demo_out dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf demo_out dist site .pytest_cache .mypy_cache .ruff_cache

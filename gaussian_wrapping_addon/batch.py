@@ -17,7 +17,7 @@ _logger = logging.getLogger("gaussian_wrapping")
 
 
 def main(arguments: list[str], program: str = "batch.py") -> int:
-    """Run one command and return the exit code (0, 1, 2, 3, 4, 5: see the README).
+    """Run one command and return the exit code (0 to 5, see ``docs/command-line.md``).
 
     ``program`` is how help and usage call it.
     """
@@ -39,7 +39,8 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith(__name__.partition(".")[0]):
             raise
-        worker = interpreter_of(ready_worker())[0] or "that of Blender, or of the worker"
+        ready = ready_worker()
+        worker = interpreter_of(ready)[0] if ready else "that of Blender, or of the worker"
         _logger.error("error: This Python lacks %s. Use another one: %s", error.name, worker)
         return EXIT_OTHER
     except OSError as error:
@@ -49,6 +50,11 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
             return full.exit_code
         _logger.error("error: %s", error)
         return EXIT_OTHER
+
+
+def console_entry() -> int:
+    """Run the ``gaussian-wrapping`` command of an installed package and return the exit code."""
+    return main(sys.argv[1:], "gaussian-wrapping")
 
 
 def _log_to_terminal() -> None:

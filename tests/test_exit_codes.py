@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Exit codes of the README's table: what goes wrong has one code, whichever command meets it."""
+"""Exit codes of ``docs/command-line.md``: one code for one kind of failure."""
 
 from __future__ import annotations
 

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-# Before the first import of bpy: no test may touch the profile of the person who runs it.
-if "BLENDER_USER_RESOURCES" not in os.environ:
+# Before the first import of bpy: no test may touch the profile of the person who runs it. The
+# processes of pytest-xdist may inherit the variable, but each needs a profile of its own.
+if "BLENDER_USER_RESOURCES" not in os.environ or "PYTEST_XDIST_WORKER" in os.environ:
     _profile = tempfile.mkdtemp(prefix="gwrap-profile-")
     os.environ["BLENDER_USER_RESOURCES"] = _profile
     atexit.register(shutil.rmtree, _profile, ignore_errors=True)

@@ -55,7 +55,7 @@ LOW, HIGH = 0.75, 1.95
 
 MESH_AND_TEXTURE_SHARE = (0.2, 0.9)
 """What meshing and texture took, as a share of the training before them: from 17 to 94 % in the
-jobs of README.md and of benchmarks/scenes, with one region of about 50 thousand faces. Long
+jobs of docs/figures.md and of benchmarks/scenes, with one region of about 50 thousand faces. Long
 trainings have the small shares."""
 
 ROUND_GROWTH = 1.8
