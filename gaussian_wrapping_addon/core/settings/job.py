@@ -126,7 +126,7 @@ class JobSettings:
     texture: TextureSettings = field(default_factory=TextureSettings)
 
     def validated(self) -> JobSettings:
-        """Return self, or raise :class:`SettingError` naming the first setting out of range."""
+        """Return self, or raise :class:`~..errors.SettingError` naming the first setting out of range."""
         validate(self)
         return self
 
