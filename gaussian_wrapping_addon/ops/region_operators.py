@@ -10,15 +10,15 @@ import numpy as np
 from bpy.props import EnumProperty, StringProperty
 
 from ..core.errors import UsageError
+from ..core.regions.box import CUBE_CORNERS
+from ..core.regions.region_file import read_region_file
 from . import tags
-from .region_geometry import CUBE_CORNERS
 from .region_objects import (
     box_around,
     create_region,
     export_region,
     hull_in_blender,
     is_convex,
-    read_region_vertices,
     scene_from_blender,
     transformed,
 )
@@ -181,7 +181,7 @@ class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> set[str]:
         path = Path(bpy.path.abspath(self.filepath))
-        vertices = read_region_vertices(path)
+        vertices = read_region_file(path).vertices
         frame, collection = _target(context)
         if frame is not None:
             vertices = tags.world_from_scene(frame).inverse().points(vertices)

@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 
-from ..files import is_reserved_name
+from ..names import is_reserved_name
 
 MAX_STEM_BYTES = 120
 """With endings, and what atomic writing adds, it stays below the 255 bytes of file systems."""

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import re
@@ -13,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DatasetError, ParseError, SettingError, UsageError
-from ..files import is_reserved_name, read_json, write_json
+from ..files import read_json, write_json
+from ..names import is_reserved_name
+from ..regions.region_file import parse_region_file, read_region_body
 from ..settings import JobSettings, MeshingSettings, from_json, to_json
 from .stages import stage_key
 
@@ -120,7 +121,7 @@ def make_job(
         path = Path(region)
         name = str(path.resolve())
         bodies[name] = read_region_body(path)
-        _check_region(bodies[name], path)
+        parse_region_file(bodies[name], path)
         names.append(name)
         lengths |= {name: own[region]} if region in own else {}
     names = list(dict.fromkeys(names))
@@ -218,34 +219,6 @@ def refuse_other_regions(result: Path, folders: dict[str, str]) -> None:
                     f"kept in a folder {name}.",
                     "Give it another name.",
                 )
-
-
-def read_region_body(path: Path) -> Any:
-    """Read the content of a region file, which :func:`parse_region` takes.
-
-    Raises
-    ------
-    DatasetError
-        There is no file, or it cannot be read.
-    """
-    if path.is_dir():
-        raise DatasetError(f"{path} is a folder, not a region file.", "Give a file in it.")
-    if not path.is_file():
-        raise DatasetError(f"Region file {path} does not exist.", "Check the path.")
-    try:
-        return read_json(path)
-    except OSError as error:
-        raise DatasetError(
-            f"Region file {path} cannot be read: {error.strerror}.", "Check its permissions."
-        ) from None
-
-
-def _check_region(body: Any, path: Path) -> None:
-    """Refuse a bad region before anything starts; Blender may lack scipy, then the worker does."""
-    if importlib.util.find_spec("scipy") is not None:
-        from ..meshing.region import parse_region
-
-        parse_region(body, path)
 
 
 def read_job(path: Path) -> JobFile:
