@@ -15,15 +15,16 @@ CORE = PACKAGE / "core"
 
 # Each part may import the parts named, and the plain files of core/.
 ALLOWED = {
+    "ply": set(),
     "regions": set(),
-    "dataset": set(),
-    "gaussians": {"dataset"},
+    "dataset": {"ply"},
+    "gaussians": {"dataset", "ply"},
     "render": {"dataset", "gaussians"},
     "training": {"dataset", "gaussians", "render", "evaluation"},
     "field": {"dataset", "gaussians", "render"},
     "meshing": {"dataset", "gaussians", "render", "field", "regions"},
     "texture": {"dataset", "gaussians", "render", "field", "meshing"},
-    "evaluation": {"dataset", "gaussians", "render", "field", "meshing", "texture"},
+    "evaluation": {"ply", "dataset", "gaussians", "render", "field", "meshing", "texture"},
     "setup": {"jobs"},
     "jobs": {
         "dataset", "gaussians", "render", "training", "field", "meshing", "texture", "evaluation",
