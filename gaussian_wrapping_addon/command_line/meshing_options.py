@@ -126,7 +126,7 @@ def clean_up_settings(options: Namespace) -> dict[str, Any]:
 
 def add_region_options(parser: ArgumentParser) -> None:
     """Add what ``wrap`` and ``mesh`` share: regions, the field, clean-up, texture, files."""
-    from ..core.settings import EXPORT_FORMATS
+    from ..core.export_formats import JOB_FORMATS
 
     parser.add_argument("--region", nargs="+", action="extend", metavar="auto|all|REGION.json")
     add_boundary_options(parser)
@@ -134,7 +134,7 @@ def add_region_options(parser: ArgumentParser) -> None:
     parser.add_argument("--texture-size", default="auto", metavar="auto|N")
     add_texture_options(parser)
     parser.add_argument(
-        "--export", default="glb", help=f"comma separated, of {','.join(EXPORT_FORMATS)}"
+        "--export", default="glb", help=f"comma separated, of {','.join(JOB_FORMATS)}"
     )
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .errors import SettingError, UsageError
+from .export_formats import JOB_FORMATS
 from .limits import MAX_ATLASES, MAX_TILES
 
 PRESETS = ("draft", "standard", "fine")
@@ -26,8 +27,6 @@ BOUNDARIES = ("closed", "open")
 UNSEEN = ("empty", "occupied")
 MAX_LODS = 8
 TEXTURE_SOURCES = ("photos", "gaussians")
-EXPORT_FORMATS = ("glb", "obj", "ply", "usd")
-
 
 RESULT_FREE = ("checkpoint_every_s", "preview_every_s")
 """Training settings that the result does not depend on."""
@@ -200,8 +199,8 @@ class JobSettings:
             ("regions", len(self.regions) > 0, "at least one region"),
             (
                 "export",
-                set(self.export) <= set(EXPORT_FORMATS),
-                f"among {', '.join(EXPORT_FORMATS)}",
+                set(self.export) <= set(JOB_FORMATS),
+                f"among {', '.join(JOB_FORMATS)}",
             ),
             ("training.iterations", 1 <= self.training.iterations <= 10**6, "from 1 to 1000000"),
             (

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MeshingError
+from ..export_formats import RESULT_FORMATS
 from ..files import write_json
 from ..parallel import default_threads
 from ..progress import Progress, ProgressEvent
@@ -356,7 +357,7 @@ def _run_texture(
             textured, dense, texture, stage_folder, progress.span(coarse_from, 0.9),
             threads=threads, region=region.transformed(scene.world_from_scene.inverse()),
         )  # fmt: skip
-        formats = tuple(f for f in job.settings.export if f != "usd")
+        formats = tuple(f for f in job.settings.export if f in RESULT_FORMATS)
         offset = file_offset(scene.world_from_scene.points(mesh.vertices))
         for number, level in enumerate([textured, *levels]):
             folder = stage_folder / "files" / (f"lod{number}" if number else "")
