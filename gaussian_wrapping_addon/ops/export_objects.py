@@ -21,8 +21,8 @@ import numpy as np
 from ..core.dataset.file_frame import FileFrame, file_offset
 from ..core.errors import ResourceError, UsageError
 from ..core.export_formats import EXPORT_FORMATS, MESH_FORMATS
-from ..core.jobs.file_stems import file_stems
 from ..core.jobs.sidecar import write_sidecar
+from ..core.names import file_stems
 from ..core.texture.file_checks import check_mesh, writing
 from ..core.texture.mesh_ply import vertex_colors, write_mesh_ply
 from . import tags

@@ -11,16 +11,11 @@ import bpy
 from ..core.errors import UsageError, WrapError
 from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.earlier_job import finished_job
-from ..core.jobs.job_file import (
-    AUTOMATIC_REGIONS,
-    make_job,
-    read_job,
-    region_name,
-    region_names,
-)
+from ..core.jobs.job_file import make_job, read_job
 from ..core.jobs.job_folder import JobFolder
 from ..core.jobs.more import job_with_more
 from ..core.jobs.stages import read_done
+from ..core.names import AUTOMATIC_REGIONS, region_name, region_names
 from . import job_timer, tags
 from .region_objects import export_region
 from .region_resolution import own_lengths, world_per_blender

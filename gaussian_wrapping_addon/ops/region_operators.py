@@ -10,6 +10,7 @@ import numpy as np
 from bpy.props import EnumProperty, StringProperty
 
 from ..core.errors import UsageError
+from ..core.names import file_stem
 from ..core.regions.box import CUBE_CORNERS
 from ..core.regions.region_file import read_region_file
 from . import tags
@@ -154,7 +155,7 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
         return True
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        name = bpy.path.clean_name(context.view_layer.objects.active.name)
+        name = file_stem(context.view_layer.objects.active.name, 0)
         self.filepath = str(Path(self.filepath).parent / f"{name}.json")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}

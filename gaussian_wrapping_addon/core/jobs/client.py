@@ -19,7 +19,7 @@ from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, cannot
 from ..helper_process import child_command, child_environment, kill_group
 from ..worker_environment import known_environments, ready_worker
 from .earlier_job import keep_finished
-from .job_file import JobFile, read_job, write_job
+from .job_file import JobFile, read_job, refuse_replacing, write_job
 from .job_folder import JobFolder, JobStatus, process_alive
 from .smaller import killed_hint, killed_mesh_hint
 
@@ -121,6 +121,7 @@ class JobClient:
         target.create()
         if target.locked():
             raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
+        refuse_replacing(target.result, job)
         with _writing(target.root):
             keep_finished(target, job)
             write_job(target.job_path, job)

@@ -22,9 +22,9 @@ from ..dataset.similarity import Similarity
 from ..errors import DatasetError, ParseError, UsageError
 from ..export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
 from ..files import read_json, write_bytes
+from ..names import SPLAT_STEM, file_stems
 from ..texture.file_checks import atlas_file
 from .answer import answer
-from .file_stems import SPLAT_STEM, file_stems
 from .job_folder import MARKER
 from .sidecar import write_sidecar
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,17 +12,12 @@ from typing import Any
 
 from ..errors import DatasetError, ParseError, SettingError, UsageError
 from ..files import read_json, write_json
-from ..names import is_reserved_name
+from ..names import AUTOMATIC_REGIONS, region_name, region_names
 from ..regions.region_file import parse_region_file, read_region_body
 from ..settings import JobSettings, MeshingSettings, from_json, to_json
-from .stages import stage_key
 
 SCHEMA_VERSION = 1
 COMMANDS = ("wrap", "mesh", "more")
-AUTOMATIC_REGIONS = ("auto", "all")
-NAME_CHARACTERS = 40
-PICTURES = "report"
-"""Folder of a result in which the report's pictures lie: no region's."""
 
 
 @dataclass(frozen=True)
@@ -154,39 +148,29 @@ def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:
     return {name: float(value) for name, value in values.items()}
 
 
-def region_name(request: str, body: Any) -> str:
-    """Return the folder name of a requested region: ASCII, short, never empty."""
-    if request in AUTOMATIC_REGIONS:
-        return request
-    text = _wanted_name(request, body)
-    clean = re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_")[:NAME_CHARACTERS]
-    if not clean or clean.lower() in AUTOMATIC_REGIONS:
-        return f"region_{stage_key(request)[:6]}"
-    taken = clean.lower() == PICTURES or is_reserved_name(clean)
-    return f"region_{clean}" if taken else clean
+def refuse_replacing(result: Path, job: JobFile) -> None:
+    """Refuse a job of which a region would replace the result of another region.
 
+    A region of the same name is the same region, meshed again.
 
-def _wanted_name(request: str, body: Any) -> str:
-    wanted = body.get("blender_object_name") if isinstance(body, dict) else None
-    return wanted if isinstance(wanted, str) and wanted.strip() else Path(request).stem
-
-
-def region_names(requests: Sequence[str], bodies: dict[str, Any]) -> list[str]:
-    """Return the folder names of all requested regions.
+    Parameters
+    ----------
+    result : Path
+        The result folder of the job, which may be missing.
 
     Raises
     ------
     UsageError
-        Two have one name, or names that are one where case does not count: the result of one
-        would replace that of the other.
+        Names both: two regions of the job, or one of it and one that was meshed before.
+    ParseError
+        A region in the job file is broken.
     """
-    names = [region_name(request, bodies.get(request)) for request in requests]
-    for index, name in enumerate(names):
-        if name.lower() in (other.lower() for other in names[:index]):
-            raise UsageError(
-                f"Two regions have the same name, {name}.", "Give each region its own name."
-            )
-    return names
+    region_names(job.settings.regions, job.region_bodies)
+    folders = {
+        parse_region_file(body, Path(request)).name: region_name(request, body)
+        for request, body in job.region_bodies.items()
+    }
+    refuse_other_regions(result, folders)
 
 
 def refuse_other_regions(result: Path, folders: dict[str, str]) -> None:

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MeshingError, UsageError
+from ..names import AUTOMATIC_REGIONS
 from ..parallel import default_threads
 from ..progress import Progress
 from ..settings import MeshingSettings, from_json
 from .answer import answer
-from .job_file import AUTOMATIC_REGIONS
 from .job_folder import JobFolder
 from .more import no_finished_training
 from .region_meshing import expected_by_pivots, expected_mesh, free_bytes

@@ -14,10 +14,11 @@ from typing import Any
 from ..errors import MeshingError
 from ..export_formats import RESULT_FORMATS
 from ..files import write_json
+from ..names import region_name, region_names
 from ..parallel import default_threads
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
-from .job_file import JobFile, refuse_other_regions, region_name, region_names
+from .job_file import JobFile, refuse_replacing
 from .job_folder import JobFolder
 from .machine import describe_machine, peak_memory_bytes
 from .stages import Stage, read_done, run_stage, source_fingerprint, stage_key
@@ -85,14 +86,8 @@ def run_job(
     threads = job.settings.threads or default_threads()
     overall = _Overall(sink, is_cancelled)
     begun_s = time.time()
-    from ..meshing.region import parse_region
-
-    own = {
-        parse_region(body, Path(request)).name: region_name(request, body)
-        for request, body in job.region_bodies.items()
-    }
+    refuse_replacing(folder.result, job)
     names = region_names(job.settings.regions, job.region_bodies)
-    refuse_other_regions(folder.result, own)
 
     cameras = _run_cameras(folder, job, overall, threads)
     if cameras.reused:
