@@ -15,6 +15,7 @@ from typing import Any
 
 from ..errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError, WrapError
 from ..helper_process import child_command, child_environment, emit
+from ..machine import total_memory_bytes
 from ..worker_environment import known_environments
 from ..worker_requirements import read_requirements, requirements_file
 
@@ -105,9 +106,7 @@ def _device() -> Diagnosis:
 
 
 def _memory() -> Diagnosis:
-    from .machine import _memory_bytes
-
-    total_bytes = _memory_bytes()
+    total_bytes = total_memory_bytes()
     if not total_bytes:
         return Diagnosis("Memory", True, "unknown")
     return Diagnosis(

@@ -14,13 +14,14 @@ from typing import Any
 from ..errors import MeshingError
 from ..export_formats import RESULT_FORMATS
 from ..files import write_json
+from ..machine import describe_machine
 from ..names import region_name, region_names
 from ..parallel import default_threads
+from ..peak_memory import peak_memory_bytes
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
 from .job_file import JobFile, refuse_replacing
 from .job_folder import JobFolder
-from .machine import describe_machine, peak_memory_bytes
 from .stages import Stage, read_done, run_stage, source_fingerprint, stage_key
 
 _logger = logging.getLogger(__name__)
