@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
-from gaussian_wrapping_addon.core.helper_process import child_environment
 from gaussian_wrapping_addon.core.peak_memory import peak_memory_bytes
+from gaussian_wrapping_addon.core.processes.spawn import child_environment
 
 PRINT_PEAKS = (
     "import json, sys\n"

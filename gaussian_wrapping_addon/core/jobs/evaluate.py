@@ -11,7 +11,6 @@ import errno
 import json
 import logging
 import os
-import subprocess
 import tempfile
 import time
 from dataclasses import asdict
@@ -29,7 +28,8 @@ from ..errors import (
     cannot_be_written,
 )
 from ..files import read_json, write_json
-from ..helper_process import child_command, child_environment, emit, kill_group
+from ..helper_process import child_command, emit
+from ..processes.spawn import kill_group, spawn
 from .answer import answer
 from .job_folder import MARKER, JobFolder
 
@@ -68,14 +68,7 @@ def run_in_worker(
     text = json.dumps(request, allow_nan=False)
     with tempfile.TemporaryFile() as words:
         try:
-            process = subprocess.Popen(
-                child_command(module, text, python=python),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=words,
-                env=child_environment(),
-                start_new_session=True,
-            )
+            process = spawn(child_command(module, text, python=python), stderr=words)
         except OSError as error:
             raise WorkerError(
                 f"{python} does not run: {error}.", "Choose another Python."

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..errors import EXIT_OTHER, UsageError, WorkerError
-from ..helper_process import child_command, child_environment, kill_group
+from ..helper_process import child_command
 from ..jobs.job_folder import JobFolder, JobStatus
+from ..processes.spawn import child_environment, kill_group
 from .commands import SetupRequest, check_folders, kind_for
 from .pythons import probe
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..errors import EXIT_RESOURCES, Cancelled, ResourceError, WorkerError
-from ..helper_process import child_environment, kill_group
+from ..processes.spawn import child_environment, kill_group
 
 HANG_S = 900.0
 """Neither a word nor a byte for so long: it hangs."""

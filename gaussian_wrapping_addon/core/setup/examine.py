@@ -15,7 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ..errors import EXIT_DONE, WorkerError
-from ..helper_process import child_command, child_environment, emit
+from ..helper_process import child_command, emit
+from ..processes.spawn import child_environment
 from ..worker_requirements import Requirement, read_requirements
 
 EXAMINE_DEADLINE_S = 180.0
