@@ -316,6 +316,7 @@ def _run_texture(
     key = stage_key(STAGE_VERSIONS["texture"], meshed.key, to_json(texture))
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        from ..dataset.photo_source import PhotoSource
         from ..dataset.photos import PhotoStore
         from ..dataset.scene_file import load_saved_scene
         from ..evaluation.views.photo_comparison import compare_with_photos
@@ -324,7 +325,6 @@ def _run_texture(
         from ..limits import MAX_IMAGE_SIDE_PX
         from ..meshing.mesh_file import load_mesh
         from ..meshing.region import parse_region
-        from ..texture.bake import Photos
         from ..texture.export import file_offset, write_textured
         from ..texture.levels import levels_of_detail
         from ..texture.texture_mesh import texture_mesh
@@ -335,7 +335,7 @@ def _run_texture(
         mesh = load_mesh(meshed.folder / "mesh.npz")
         dense_path = meshed.folder / DENSE_MESH
         dense = load_mesh(dense_path) if dense_path.is_file() else None
-        source: Photos = photos
+        source: PhotoSource = photos
         if texture.source == "gaussians":
             from ..gaussians.gaussian_file import load_gaussians
             from ..texture.gaussian_photos import GaussianPhotos
