@@ -219,37 +219,3 @@ def test_point_file_missing_or_outside(tmp_path: Path) -> None:
         model = read_transforms(write(tmp_path, valid() | {"ply_file_path": name}))
         assert len(model.points) == 0
         assert "ply_file_path" in model.warnings[0]
-
-
-def test_header_lines_may_end_in_blanks_and_a_carriage_return(tmp_path: Path) -> None:
-    header = HEADER.format("ascii 1.0", 1, XYZ + "element face 0\nproperty list uchar int v\n")
-    header = header.replace("ply\n", "ply \n").replace("\n", " \r\n")
-    points, colors = _read_ply(tmp_path, header, b"1 2 0.1\r\n")
-    np.testing.assert_array_equal(points, [[1, 2, np.float32(0.1)]])  # the declared type decides
-    np.testing.assert_array_equal(colors, [[128, 128, 128]])
-
-
-def test_colours_of_text_are_of_the_declared_type(tmp_path: Path) -> None:
-    body = b"1 2 3 10.7 300 nan\n"
-    _, colors = _read_ply(
-        tmp_path, HEADER.format("ascii 1.0", 1, XYZ + RGB.replace("uchar", "int")), body
-    )
-    np.testing.assert_array_equal(colors, [[10, 255, 0]])
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "place"),
-    [
-        ("property float x", "property float w", "header"),
-        ("comment x", "surprise x", "line 3"),
-        ("element vertex 1", "element face 1", "header"),
-        ("float z", "float y", "line 7"),
-    ],
-)
-def test_clouds_with_broken_headers_are_refused(
-    old: str, new: str, place: str, tmp_path: Path
-) -> None:
-    header = HEADER.format("ascii 1.0", 1, XYZ).replace(old, new)
-    with pytest.raises(ParseError) as caught:
-        _read_ply(tmp_path, header, b"1 2 3\n")
-    assert caught.value.place == place
