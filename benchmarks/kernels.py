@@ -22,6 +22,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import torch
 
 from gaussian_wrapping_addon.core.evaluation.report.plot import Panel, Series, write_svg
+from gaussian_wrapping_addon.core.machine import processor_name
 from gaussian_wrapping_addon.core.parallel import default_threads
 
 from .error_tables import (
@@ -42,7 +43,7 @@ from .speed_tables import (
     raster_table,
     thread_table,
 )
-from .tables import Table, processor, versions
+from .tables import Table, versions
 from .yardstick.build import AVX2, AVX512, NO_COMPILER, compilers, host_instruction_sets
 
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
@@ -159,7 +160,7 @@ def header(wanted: Plan, seconds: float) -> list[str]:
     """Return what the figures were measured on."""
     compiled = "; ".join(f"{c.name}: {c.version}" for c in compilers()) or "none"
     today = datetime.datetime.now(datetime.UTC).date()
-    machine = f"{processor()}, {default_threads()} cores; {today}; {versions()}"
+    machine = f"{processor_name()}, {default_threads()} cores; {today}; {versions()}"
     chosen = f"seed {wanted.seed}; {', '.join(wanted.parts)}; {seconds:.0f} s"
     return [f"{machine}; C++ compilers: {compiled}; {chosen}.", _MADE_BY]
 

@@ -7,7 +7,6 @@ import dataclasses
 import math
 import platform
 from importlib import metadata
-from pathlib import Path
 
 Cell = str | float | int | None
 
@@ -66,16 +65,6 @@ def _text(cell: Cell) -> str:
     if abs(cell) < 0.01 or abs(cell) >= 1e5:
         return f"{cell:.1e}"
     return f"{cell:.1f}" if abs(cell) >= 20.0 else f"{cell:.2f}"
-
-
-def processor() -> str:
-    """Return the processor's name, as far as the system tells it."""
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
 
 
 def versions() -> str:

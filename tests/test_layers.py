@@ -15,24 +15,28 @@ CORE = PACKAGE / "core"
 
 # Each part may import the parts named, and the plain files of core/.
 ALLOWED = {
-    "dataset": set(),
-    "gaussians": {"dataset"},
+    "ply": set(),
+    "regions": set(),
+    "dataset": {"ply"},
+    "gaussians": {"dataset", "ply"},
     "render": {"dataset", "gaussians"},
     "training": {"dataset", "gaussians", "render", "evaluation"},
     "field": {"dataset", "gaussians", "render"},
-    "meshing": {"dataset", "gaussians", "render", "field"},
+    "meshing": {"dataset", "gaussians", "render", "field", "regions"},
     "texture": {"dataset", "gaussians", "render", "field", "meshing"},
-    "evaluation": {"dataset", "gaussians", "render", "field", "meshing", "texture"},
+    "evaluation": {"ply", "dataset", "gaussians", "render", "field", "meshing", "texture"},
     "setup": {"jobs"},
     "jobs": {
         "dataset", "gaussians", "render", "training", "field", "meshing", "texture", "evaluation",
+        "regions",
     },
 }  # fmt: skip
 
 # Blender's own process has only the standard library and numpy: what it loads may import no more.
 BLENDER_SIDE = (
     "core.jobs.client", "core.jobs.evaluate", "core.jobs.job_file", "core.dataset.check",
-    "core.settings", "core.setup.install", "core.worker_environment",
+    "core.settings", "core.setup.install", "core.worker_environment", "core.regions.box",
+    "core.regions.region_file", "core.names",
 )  # fmt: skip
 HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl")
 

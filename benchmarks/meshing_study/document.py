@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from gaussian_wrapping_addon.core.files import write_bytes
+from gaussian_wrapping_addon.core.machine import processor_name
 
 from ..speed_error.document import reading
-from ..tables import processor, versions
+from ..tables import versions
 from ..training_study.tables import missing_table
 from .acceptance import acceptance_table
 from .carry_out import Outcome
@@ -74,7 +75,7 @@ def _made_by(outcome: Outcome, facts: dict[str, Any]) -> list[str]:
     seconds += sum(run["wall_s"] for run in outcome.trainings.values())
     load = f"{max(loads):.1f}" if loads else "not recorded"
     return [
-        f"`{facts['command']}`, {facts['date']}. {processor()}, {facts['threads']} threads;",
+        f"`{facts['command']}`, {facts['date']}. {processor_name()}, {facts['threads']} threads;",
         f"{versions()}, Open3D {_open3d()}.",
         f"Code of the meshes: {', '.join(codes) or 'none'}; of the trainings:",
         f"{', '.join(trained) or 'none'}. {len(made)} meshes; they, their scores and the trainings",

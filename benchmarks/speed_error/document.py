@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from gaussian_wrapping_addon.core.files import read_json, write_bytes
+from gaussian_wrapping_addon.core.machine import processor_name
 
-from ..tables import Cell, Table, processor, versions
+from ..tables import Cell, Table, versions
 from .figures import write_plots
 from .pictures import write_comparison
 from .plan import MAIN_SCENES
@@ -116,7 +117,7 @@ def made_by(results: Sequence[Result], facts: dict[str, Any], more_s: float = 0.
     seconds = math.fsum(r.wall_s + r.scores.get("seconds_scoring", 0.0) for r in results) + more_s
     known = [load for load in loads if load is not None]
     load = f"{max(known):.1f}" if len(known) == len(loads) else "not recorded for all runs"
-    machine = f"{processor()}, {results[0].report['machine']['threads']} threads; {versions()}"
+    machine = f"{processor_name()}, {results[0].report['machine']['threads']} threads; {versions()}"
     return [
         f"`{facts['command']}`, {facts['date']}. {machine}.",
         f"Code: {', '.join(codes)}. {len(results)} meshes; runs and scores took",

@@ -15,14 +15,14 @@ _logger = logging.getLogger("gaussian_wrapping")
 
 def add_export(commands: Commands) -> None:
     """Add ``export``."""
-    from ..core.jobs.export_formats import BLENDER_FORMATS, OWN_FORMATS, SHADINGS
+    from ..core.export_formats import BLENDER_FORMATS, EXPORT_FORMATS, SHADINGS
 
     parser = commands.add_parser("export", help="meshes of a finished job for other programs")
     parser.add_argument("job", type=Path, metavar="JOB", help="job folder, or its result folder")
     parser.add_argument(
         "--format",
         default="glb",
-        help=f"comma separated, of {','.join((*OWN_FORMATS, *BLENDER_FORMATS))}; "
+        help=f"comma separated, of {','.join(EXPORT_FORMATS)}; "
         f"{' and '.join(BLENDER_FORMATS)} need bpy or Blender",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
@@ -45,19 +45,18 @@ def add_export(commands: Commands) -> None:
 
 def _export(options: Namespace) -> int:
     from ..core.errors import UsageError
+    from ..core.export_formats import BLENDER_FORMATS, EXPORT_FORMATS
     from ..core.jobs.client import worker_python
     from ..core.jobs.evaluate import run_in_worker
     from ..core.jobs.export_files import result_of
-    from ..core.jobs.export_formats import BLENDER_FORMATS, OWN_FORMATS
 
     formats = list(dict.fromkeys(f for f in options.format.split(",") if f))
-    known = (*OWN_FORMATS, *BLENDER_FORMATS)
-    wrong = [f for f in formats if f not in known]
+    wrong = [f for f in formats if f not in EXPORT_FORMATS]
     if wrong or not formats:
         raise UsageError(
             f"--format {options.format} names no format." if not formats
             else f"--format {wrong[0]} is not known.",
-            f"Use {', '.join(known)}.",
+            f"Use {', '.join(EXPORT_FORMATS)}.",
         )  # fmt: skip
     by_blender = [f for f in formats if f in BLENDER_FORMATS]
     if by_blender and not has_bpy():
@@ -67,7 +66,7 @@ def _export(options: Namespace) -> int:
             "Run blender --background -P batch.py -- export ..., pip install bpy, or leave it out.",
         )
     result, out = result_of(options.job), options.out.resolve()
-    own = [f for f in formats if f in OWN_FORMATS]
+    own = [f for f in formats if f not in BLENDER_FORMATS]
     if own:
         request = {
             "result": str(result), "out": str(out), "formats": own, "placed": options.placed,

@@ -29,8 +29,9 @@ def has_bpy() -> bool:
 def require_bpy(job: JobFile, options: Namespace) -> None:
     """Refuse before the start what could not be finished without bpy."""
     from ..core.errors import UsageError
+    from ..core.export_formats import BLENDER_FORMATS
 
-    wants = "usd" in job.settings.export or not options.no_blend
+    wants = not options.no_blend or bool(set(job.settings.export) & set(BLENDER_FORMATS))
     if wants and not has_bpy():
         raise UsageError(
             "Writing scene.blend or USD needs bpy, which this Python does not have.",

@@ -63,6 +63,7 @@ def add_estimate_mesh(commands: Commands) -> None:
 def _estimate_mesh(options: Namespace) -> int:
     from ..core.jobs.client import worker_python
     from ..core.jobs.evaluate import run_in_worker
+    from ..core.names import AUTOMATIC_REGIONS
     from ..core.settings import JobSettings, MeshingSettings, to_json
 
     meshing = MeshingSettings(**method_settings(options))
@@ -70,7 +71,7 @@ def _estimate_mesh(options: Namespace) -> int:
     region = options.region
     request = {
         "out": str(options.out.resolve()),
-        "region": region if region in ("auto", "all") else str(Path(region).resolve()),
+        "region": region if region in AUTOMATIC_REGIONS else str(Path(region).resolve()),
         "meshing": to_json(meshing),
         "threads": options.threads,
     }

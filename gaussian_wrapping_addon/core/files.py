@@ -12,8 +12,7 @@ from typing import Any
 
 from . import limits
 from .errors import ParseError
-
-_RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{d}{i}" for d in ("COM", "LPT") for i in range(1, 10))}
+from .names import is_reserved_name
 
 
 def write_json(path: Path, values: Any) -> None:
@@ -102,11 +101,6 @@ def _check_depth(path: Path, values: Any, depth: int) -> None:
     if isinstance(values, (dict, list)):
         for child in children:
             _check_depth(path, child, depth + 1)
-
-
-def is_reserved_name(name: str) -> bool:
-    """Tell whether Windows keeps a name for itself, whatever its ending."""
-    return name.split(".")[0].rstrip(" ").upper() in _RESERVED
 
 
 def resolve_inside(root: Path, name: str) -> Path | None:

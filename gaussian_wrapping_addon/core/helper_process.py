@@ -26,6 +26,7 @@ from typing import IO, Any
 from . import limits
 from .errors import DatasetError, ResourceError, WorkerError
 from .peak_memory import note_helper
+from .processes.spawn import kill_group, spawn
 from .progress import Progress
 from .worker_environment import PACKAGES_OPTION, interpreter_of
 
@@ -34,16 +35,6 @@ _logger = logging.getLogger(__name__)
 _POLL_S = 0.1
 _running: set[subprocess.Popen[bytes]] = set()
 _LAST_WORDS_LINES = 8
-
-
-def child_environment() -> dict[str, str]:
-    """Return the environment for a child: nothing of ours that steers its Python.
-
-    Idle OpenMP threads of torch wait instead of spinning: while they spin, they take the cores
-    that our own threads compute on (measured: rendering took twice the processor time).
-    """
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
-    return {"OMP_WAIT_POLICY": "PASSIVE", **kept}
 
 
 def child_command(module: str, *arguments: str, python: str | None = None) -> list[str]:
@@ -68,20 +59,6 @@ def emit(**values: Any) -> None:
     """Write one JSON line to stdout; helpers and the worker speak through this."""
     sys.stdout.write(json.dumps(values, allow_nan=False) + "\n")
     sys.stdout.flush()
-
-
-def kill_group(process: subprocess.Popen[Any], grace_s: float = 2.0) -> None:
-    """End a child that leads its own group: terminate, wait, then kill the whole group."""
-    for number in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)):
-        if process.poll() is not None:
-            return
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            if hasattr(os, "killpg"):
-                os.killpg(process.pid, number)
-            else:
-                process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(grace_s)
 
 
 def end_helpers() -> None:
@@ -116,14 +93,7 @@ def run_helper(
         The helper crashed; the message names the signal and its last words.
     """
     command = child_command("helper_entry", module, str(folder), str(memory_bytes or 0))
-    process = subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=child_environment(),
-        start_new_session=True,
-    )
+    process = spawn(command)
     _running.add(process)
     lines: queue.Queue[tuple[str, str]] = queue.Queue()
     assert process.stdout is not None

@@ -8,21 +8,20 @@ once can abort the process, which inside Blender would lose the user's scene.
 from __future__ import annotations
 
 import functools
-import os
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from .machine import processors
+
 CHUNKS_PER_THREAD = 16
 
 
 def default_threads() -> int:
-    """Return the number of cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return max(1, len(os.sched_getaffinity(0)))
-    return max(1, os.cpu_count() or 1)
+    """Return the number of processors that this process may use."""
+    return processors()
 
 
 @functools.lru_cache(maxsize=4)

@@ -29,6 +29,15 @@ def own_peak_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
+def peak_memory_bytes() -> dict[str, int]:
+    """Return the largest resident size so far of this process and of its largest helper.
+
+    Empty where the system does not tell.
+    """
+    own_bytes = own_peak_bytes()
+    return {"worker": own_bytes, "largest_helper": largest_helper_bytes()} if own_bytes else {}
+
+
 def note_helper(peak_bytes: int) -> None:
     """Keep what a helper process says of itself, where it is the largest so far."""
     global _largest_helper_bytes

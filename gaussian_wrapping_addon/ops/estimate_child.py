@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any
 
 from ..core.errors import WorkerError
-from ..core.helper_process import child_environment, kill_group
+from ..core.processes.spawn import kill_group, spawn
 
 
 def ask_child(
@@ -35,18 +34,8 @@ def ask_child(
     WorkerError
         It does not run, or takes too long.
     """
-    options: dict[str, Any] = {"start_new_session": True}
-    if sys.platform == "win32":
-        options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     try:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=child_environment(),
-            **options,
-        )
+        process = spawn(command)
     except OSError as error:
         raise WorkerError(
             f"{command[0]} does not run: {error}.", "Choose another Python."

@@ -20,8 +20,9 @@ import numpy as np
 
 from ..core.dataset.file_frame import FileFrame, file_offset
 from ..core.errors import ResourceError, UsageError
-from ..core.jobs.file_stems import file_stems
+from ..core.export_formats import EXPORT_FORMATS, MESH_FORMATS
 from ..core.jobs.sidecar import write_sidecar
+from ..core.names import file_stems
 from ..core.texture.file_checks import check_mesh, writing
 from ..core.texture.mesh_ply import vertex_colors, write_mesh_ply
 from . import tags
@@ -32,10 +33,6 @@ from .region_objects import matrix_of
 
 _logger = logging.getLogger(__name__)
 
-FORMATS = ("glb", "obj", "ply", "usd", "fbx")
-_SUFFIXES = {"usd": ".usdc"}
-_PACKED_SUFFIXES = {"usd": ".usdz"}
-_UNLIT = {"glb": "keep", "usd": "emission"}
 _OPERATORS = {
     "glb": "export_scene.gltf",
     "obj": "wm.obj_export",
@@ -51,6 +48,7 @@ class ObjectExport:
     """What is to be written, and where."""
 
     format: str
+    """Among :data:`MESH_FORMATS`."""
     folder: Path
     """Made where it is missing; files of the same names are replaced."""
     placed: bool = True
@@ -81,8 +79,8 @@ def export_objects(
     ResourceError
         The folder cannot be written.
     """
-    if request.format not in FORMATS:
-        raise UsageError(f"{request.format!r} is no export.", f"Use {', '.join(FORMATS)}.")
+    if request.format not in MESH_FORMATS:
+        raise UsageError(f"{request.format!r} is no export.", f"Use {', '.join(MESH_FORMATS)}.")
     if not things:
         raise UsageError("There is no mesh to export.", "Select meshes of a result.")
     operator = _operator(request.format) if request.format in _OPERATORS else None
@@ -96,7 +94,7 @@ def export_objects(
     for thing in things:
         with _copy_of(thing, frame) as (data, vertices):
             offset = np.zeros(3)
-            if not request.placed and request.format != "ply":
+            if not request.placed and not EXPORT_FORMATS[request.format].doubles:
                 offset = file_offset(target_from_scene.points(vertices))
             place = FileFrame(request.format, target_from_scene, offset)
             path, contents = _write(
@@ -194,19 +192,19 @@ def _write(
         "region": region, "level": level, "vertices": len(local), "faces": count,
         "shading": "lit", "textures": [],
     }  # fmt: skip
-    suffixes = _SUFFIXES | (_PACKED_SUFFIXES if request.pack else {})
-    path = request.folder / f"{stem}{suffixes.get(request.format, '.' + request.format)}"
+    kind = EXPORT_FORMATS[request.format]
+    path = request.folder / f"{stem}{kind.file_suffix(pack=request.pack)}"
     if operator is None:
         write_mesh_ply(path, local, faces, _colors(thing, data, len(local), faces, uvs))
         return path, contents
-    inside = request.format == "glb" or (request.pack and request.format in ("usd", "fbx"))
+    inside = kind.textures == "inside" or (request.pack and kind.textures == "either")
     with contextlib.ExitStack() as stack:
         images = request.folder
         if inside:
             images = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gwrap-")))
         copies = MaterialCopies(
             stem, images,
-            unlit=_UNLIT.get(request.format, "lit"), fold_specular=request.format == "usd",
+            unlit=kind.unlit, fold_specular=request.format == "usd",
         )  # fmt: skip
         stack.callback(copies.remove)
         for index, material in enumerate(data.materials):

@@ -8,12 +8,11 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ..core.errors import UsageError
+from ..core.export_formats import EXPORT_FORMATS, MESH_FORMATS, PACKABLE_FORMATS
 from . import tags
 from .export_objects import ObjectExport, export_objects
 from .materials import images_of
 from .reporting import NeedsObjectMode, NeedsResult, ReportsErrors
-
-PACKABLE: Final = ("USD", "FBX")
 
 
 class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
@@ -25,12 +24,9 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
     filter_folder: BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     format: EnumProperty(  # type: ignore[valid-type]
         name="Format",
-        items=(
-            ("GLB", "glTF Binary (.glb)", "Textures inside; lit or unlit as the material is"),
-            ("OBJ", "OBJ (.obj)", "Textures beside the file"),
-            ("PLY", "PLY (.ply)", "Double precision and vertex colours, no texture"),
-            ("USD", "USD (.usdc)", "Textures beside the file, or inside as .usdz"),
-            ("FBX", "FBX (.fbx)", "Textures beside the file, or inside"),
+        items=tuple(
+            (name.upper(), EXPORT_FORMATS[name].label, EXPORT_FORMATS[name].help)
+            for name in MESH_FORMATS
         ),
     )
     scope: EnumProperty(  # type: ignore[valid-type]
@@ -72,7 +68,7 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
         if self.scope == "ALL":
             layout.prop(self, "levels")
         layout.prop(self, "placed")
-        if self.format in PACKABLE:
+        if self.format.lower() in PACKABLE_FORMATS:
             layout.prop(self, "pack")
 
     def work(self, context: bpy.types.Context) -> set[str]:
@@ -90,7 +86,7 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
             self.format.lower(),
             Path(bpy.path.abspath(self.directory)).resolve(),
             self.placed,
-            self.pack and self.format in PACKABLE,
+            self.pack and self.format.lower() in PACKABLE_FORMATS,
         )
         paths = []
         frames = {t: tags.frame_of(t) for t in chosen}

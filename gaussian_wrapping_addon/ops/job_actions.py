@@ -8,19 +8,15 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import UsageError, WrapError
+from ..core.errors import DatasetError, UsageError, WrapError
 from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.earlier_job import finished_job
-from ..core.jobs.job_file import (
-    AUTOMATIC_REGIONS,
-    make_job,
-    read_job,
-    region_name,
-    region_names,
-)
+from ..core.jobs.job_file import make_job, read_job
 from ..core.jobs.job_folder import JobFolder
 from ..core.jobs.more import job_with_more
 from ..core.jobs.stages import read_done
+from ..core.names import AUTOMATIC_REGIONS, region_name, region_names
+from ..core.regions.region_file import read_region_file
 from ..core.settings import with_values
 from . import job_timer, tags
 from .region_objects import export_region
@@ -262,8 +258,20 @@ def _result_name(region: bpy.types.Object, frame: bpy.types.Object) -> str:
     things = [t for t in bpy.data.objects if tags.kind_of(t) == "region"]
     same = [t for t in things if t.get(tags.REGION) == name and tags.frame_of(t) == frame]
     if len(same) == 1 or region_name(region.name, {"blender_object_name": region.name}) == name:
-        return name
+        return _stored_name(frame, name)
     return ""
+
+
+def _stored_name(frame: bpy.types.Object, folder: str) -> str:
+    """Return the name of the region whose result lies in a folder: the folder's is a simpler one.
+
+    Under another name it would be another region, whose result may not be replaced.
+    """
+    try:
+        stored = read_region_file(tags.result_folder(frame) / folder / "region.json").name
+    except DatasetError:
+        return folder
+    return stored if region_name(stored, {"blender_object_name": stored}) == folder else folder
 
 
 def _refuse_running(folder: Path) -> None:

@@ -22,8 +22,9 @@ import numpy as np
 
 from ..core.errors import WrapError
 from ..core.files import write_json
-from ..core.helper_process import child_command, kill_group
+from ..core.helper_process import child_command
 from ..core.jobs.client import worker_python
+from ..core.processes.spawn import kill_group
 from ..core.settings import MeshingSettings, to_json
 from . import region_watch, tags
 from .estimate_child import ask_child

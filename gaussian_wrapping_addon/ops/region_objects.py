@@ -12,16 +12,11 @@ import numpy as np
 from mathutils import Matrix
 
 from ..core.errors import UsageError
-from ..core.files import read_json, write_json
+from ..core.files import write_json
+from ..core.regions.box import CUBE_CORNERS, CUBE_TRIANGLES, box_matrix
+from ..core.regions.region_file import region_to_json
+from ..core.regions.volume import check_volume
 from . import tags
-from .region_geometry import (
-    CUBE_CORNERS,
-    CUBE_TRIANGLES,
-    box_matrix,
-    check_volume,
-    region_to_json,
-    vertices_of_region,
-)
 from .region_hull import convex_hull
 
 # Share of the hull's volume by which that of a convex mesh may be off (float32 coordinates).
@@ -79,7 +74,7 @@ def hull_in_blender(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int
 
     Raises
     ------
-    UsageError
+    UsageError, MeshingError
         The object is of another kind, or encloses no volume.
     """
     local, triangles = local_hull(thing)
@@ -148,7 +143,7 @@ def region_from_object(thing: bpy.types.Object) -> np.ndarray:
 
     Raises
     ------
-    UsageError
+    UsageError, MeshingError
         The object cannot be a region, or its frame has lost its coordinates.
     """
     return _region_in_world(thing)[0]
@@ -168,7 +163,7 @@ def region_body(thing: bpy.types.Object, name: str = "") -> dict[str, Any]:
 
     Raises
     ------
-    UsageError
+    UsageError, MeshingError
         As :func:`region_from_object`.
     """
     return region_to_json(name or thing.name, *_region_in_world(thing))
@@ -182,13 +177,6 @@ def export_region(thing: bpy.types.Object, path: Path, name: str = "") -> None:
         raise UsageError(
             f"{path} cannot be written: {error.strerror}.", "Choose another."
         ) from None
-
-
-def read_region_vertices(path: Path) -> np.ndarray:
-    """Return the (n, 3) world vertices of a region file."""
-    if not path.is_file():
-        raise UsageError(f"{path} does not exist.", "Choose a region file.")
-    return vertices_of_region(read_json(path), path)
 
 
 def create_region(

@@ -10,15 +10,16 @@ import numpy as np
 from bpy.props import EnumProperty, StringProperty
 
 from ..core.errors import UsageError
+from ..core.names import file_stem
+from ..core.regions.box import CUBE_CORNERS
+from ..core.regions.region_file import read_region_file
 from . import tags
-from .region_geometry import CUBE_CORNERS
 from .region_objects import (
     box_around,
     create_region,
     export_region,
     hull_in_blender,
     is_convex,
-    read_region_vertices,
     scene_from_blender,
     transformed,
 )
@@ -154,7 +155,7 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
         return True
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        name = bpy.path.clean_name(context.view_layer.objects.active.name)
+        name = file_stem(context.view_layer.objects.active.name, 0)
         self.filepath = str(Path(self.filepath).parent / f"{name}.json")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
@@ -181,7 +182,7 @@ class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> set[str]:
         path = Path(bpy.path.abspath(self.filepath))
-        vertices = read_region_vertices(path)
+        vertices = read_region_file(path).vertices
         frame, collection = _target(context)
         if frame is not None:
             vertices = tags.world_from_scene(frame).inverse().points(vertices)

@@ -18,9 +18,9 @@ from ..core.dataset.placement_file import FILE_NAME, read_placement
 from ..core.dataset.similarity import Similarity
 from ..core.errors import DatasetError, ParseError
 from ..core.files import read_json
+from ..core.regions.region_file import read_region_file
 from ..core.settings import MAX_LODS
 from ..core.texture.file_checks import SINGLE_MAX, atlas_file, check_face_atlas
-from .region_geometry import vertices_of_region
 from .report_data import figures_of_report
 
 _logger = logging.getLogger(__name__)
@@ -172,7 +172,7 @@ def _region(folder: Path) -> RegionResult:
     if not region_path.is_file():
         raise DatasetError(f"{folder} holds no region.json.", "Mesh the region again.")
     albedo, normal_map = _textures(folder, face_atlas)
-    box = vertices_of_region(read_json(region_path), region_path)
+    box = read_region_file(region_path).vertices
     stamp = f"{state.st_size}:{state.st_mtime_ns}"
     levels = []
     while (level := folder / f"lod{len(levels) + 1}" / "mesh.npz").is_file():

@@ -13,9 +13,10 @@ from typing import Any
 import bpy
 
 from ..core.errors import WorkerError, WrapError
-from ..core.helper_process import child_command, kill_group
+from ..core.helper_process import child_command
 from ..core.jobs.client import worker_python
 from ..core.jobs.job_file import make_job
+from ..core.processes.spawn import kill_group
 from .estimate_child import ask_child
 from .job_actions import WorkerChoice, source_of
 from .redrawing import answers_in, redraw

@@ -11,8 +11,8 @@ import bpy
 import numpy as np
 
 from ..core.errors import WrapError
+from ..core.regions.box import hull_edges
 from ..ops import region_watch
-from ..ops.region_geometry import hull_edges
 from ..ops.region_objects import local_hull
 
 _logger = logging.getLogger(__name__)

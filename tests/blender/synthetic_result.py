@@ -14,11 +14,8 @@ import numpy as np
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.ops.region_geometry import (
-    CUBE_CORNERS,
-    CUBE_TRIANGLES,
-    region_to_json,
-)
+from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS, CUBE_TRIANGLES
+from gaussian_wrapping_addon.core.regions.region_file import region_to_json
 
 
 def rotation_about(axis: tuple[float, float, float], angle: float) -> np.ndarray:

@@ -16,10 +16,11 @@ import pytest
 from gaussian_wrapping_addon.core.dataset.placement_file import FILE_NAME, write_placement
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import MeshingError, UsageError
+from gaussian_wrapping_addon.core.export_formats import MESH_FORMATS
 from gaussian_wrapping_addon.core.jobs.export_files import ExportRequest, export_files
 from gaussian_wrapping_addon.core.jobs.sidecar import sidecar_path
 from gaussian_wrapping_addon.ops import export_objects as module
-from gaussian_wrapping_addon.ops.export_objects import FORMATS, ObjectExport, export_objects
+from gaussian_wrapping_addon.ops.export_objects import ObjectExport, export_objects
 from gaussian_wrapping_addon.ops.export_result import export_result
 from gaussian_wrapping_addon.ops.materials import images_of, set_shading, shading_of
 from gaussian_wrapping_addon.ops.scene_objects import ImportedResult, import_result
@@ -113,7 +114,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("placed", [True, False])
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", MESH_FORMATS)
 def test_coordinates_lead_back_to_the_world(
     imported: ImportedResult, tmp_path: Path, format: str, placed: bool
 ) -> None:
@@ -146,7 +147,7 @@ def test_coordinates_lead_back_to_the_world(
     assert (values["vertices"], values["faces"]) == (8, 12)
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", MESH_FORMATS)
 def test_the_scene_stays_as_it_was(imported: ImportedResult, tmp_path: Path, format: str) -> None:
     (thing,) = imported.meshes
     level = next(o for o in bpy.data.objects if o.name.endswith("LOD1"))
@@ -246,7 +247,7 @@ def test_what_a_person_changed_is_exported(imported: ImportedResult, tmp_path: P
     assert sidecar(path)["vertices"] == 16
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", MESH_FORMATS)
 @pytest.mark.parametrize("what", ["vertex", "uv", "empty"])
 def test_what_is_not_finite_is_refused(
     imported: ImportedResult, tmp_path: Path, format: str, what: str

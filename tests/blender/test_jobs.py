@@ -243,6 +243,30 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     assert len(regions) == 2, "the automatic box comes back, the edited one is not doubled"
 
 
+def test_a_name_that_is_no_folder_name_is_kept_and_protected(photos: Path, worker: object) -> None:
+    """Its folder has a simpler name, which another region may not take."""
+    region = finished_wrap(photos)
+    folder = Path(bpy.context.scene.gwrap.job_folder)
+    select(region)
+    region.name = "Front Door"
+    assert bpy.ops.gwrap.mesh_region() == {"FINISHED"}
+    wait_for("DONE")
+    stored = folder / "result" / "Front_Door" / "region.json"
+    values = json.loads(stored.read_text())
+    stored.write_text(json.dumps({**values, "blender_object_name": "Front Door"}))  # as it is
+    select(region)
+    assert bpy.ops.gwrap.mesh_region() == {"FINISHED"}, "the same region, meshed again"
+    wait_for("DONE")
+    stored.write_text(json.dumps({**values, "blender_object_name": "Front Door"}))
+    ((_, body),) = read_job(folder / "job.json").region_bodies.items()
+    assert body["blender_object_name"] == "Front Door"
+    bpy.ops.gwrap.add_region_box()
+    bpy.context.view_layer.objects.active.name = "Front/Door"
+    with pytest.raises(RuntimeError, match="would replace the result of region 'Front Door'"):
+        bpy.ops.gwrap.mesh_region()
+    assert status().state == "DONE"  # type: ignore[attr-defined]
+
+
 def test_mesh_region_refuses_what_cannot_be_meshed(photos: Path, worker: object) -> None:
     assert not bpy.ops.gwrap.mesh_region.poll()
     region = finished_wrap(photos)

@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 import pytest
 
+from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
 from gaussian_wrapping_addon.ops import tags
 from gaussian_wrapping_addon.ops.region_box import (
     LEAST_HALF,
@@ -16,7 +17,6 @@ from gaussian_wrapping_addon.ops.region_box import (
     set_cage_matrix,
     steadied,
 )
-from gaussian_wrapping_addon.ops.region_geometry import CUBE_CORNERS
 from gaussian_wrapping_addon.ops.region_objects import hull_in_blender
 
 pytestmark = pytest.mark.usefixtures("addon")

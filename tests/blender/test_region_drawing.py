@@ -10,8 +10,8 @@ import bpy
 import numpy as np
 import pytest
 
+from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
 from gaussian_wrapping_addon.ops import region_watch, tags
-from gaussian_wrapping_addon.ops.region_geometry import CUBE_CORNERS
 from gaussian_wrapping_addon.ops.region_objects import create_region
 from gaussian_wrapping_addon.ui import region_drawing
 

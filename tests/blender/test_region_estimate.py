@@ -18,8 +18,8 @@ import pytest
 
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.helper_process import child_command
+from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
 from gaussian_wrapping_addon.ops import estimate_child, region_estimate, tags
-from gaussian_wrapping_addon.ops.region_geometry import CUBE_CORNERS
 from gaussian_wrapping_addon.ops.region_objects import create_region
 
 pytestmark = pytest.mark.usefixtures("addon")

@@ -7,7 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from gaussian_wrapping_addon.core.helper_process import child_command, child_environment
+from gaussian_wrapping_addon.core.helper_process import child_command
+from gaussian_wrapping_addon.core.processes.spawn import child_environment
 
 
 def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[bytes]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import DatasetError, WrapError
 from ..limits import MIN_IMAGES
-from ..ply_table import vertex_layout
+from ..ply.table import vertex_layout
 from .normalisation import find_scene_frame
 from .photo_finder import PhotoIndex, find_mask, list_photos, photo_root
 from .photo_header import read_photo_header

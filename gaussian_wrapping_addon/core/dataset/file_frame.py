@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..export_formats import EXPORT_FORMATS
 from .similarity import Similarity
 
 FAR_FROM_ORIGIN = 100.0
@@ -20,14 +21,13 @@ FAR_FROM_ORIGIN = 100.0
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation from Z up to Y up."""
 
-Y_UP_FORMATS = ("glb", "obj", "fbx")
-
 
 @dataclass(frozen=True)
 class FileFrame:
     """The frame of one file."""
 
     format: str
+    """A name of :data:`EXPORT_FORMATS`."""
     target_from_scene: Similarity
     """Leads to the world of the input, or to the scene as placed in Blender."""
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -36,7 +36,7 @@ class FileFrame:
     @property
     def turn(self) -> np.ndarray:
         """(3, 3) rotation from the target's axes to those of the file."""
-        return Y_UP if self.format in Y_UP_FORMATS else np.eye(3)
+        return Y_UP if EXPORT_FORMATS[self.format].y_up else np.eye(3)
 
     def local(self, points: np.ndarray) -> np.ndarray:
         """Return (n, 3) float64 of points in the scene frame: less the offset, not turned."""
@@ -52,7 +52,7 @@ class FileFrame:
     ) -> dict[str, Any]:
         """Return what a sidecar says of coordinates: every way out of the file, in double."""
         scene_from_file = self.file_from_scene().inverse()
-        up = "+Y" if self.format in Y_UP_FORMATS else "+Z"
+        up = "+Y" if EXPORT_FORMATS[self.format].y_up else "+Z"
         return {
             "up": up,
             "front": "+Z" if up == "+Y" else "-Y",

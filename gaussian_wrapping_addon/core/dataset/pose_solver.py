@@ -21,6 +21,7 @@ from ..errors import DatasetError
 from ..files import write_json
 from ..helper_process import run_helper
 from ..limits import MIN_IMAGES
+from ..machine import total_memory_bytes
 from ..parallel import default_threads
 from ..progress import Progress
 from .camera import Camera
@@ -283,8 +284,5 @@ def _keep_model(folder: Path, work_folder: Path) -> None:
 
 def _memory_limit_bytes() -> int | None:
     """Return a share of the machine's memory, or ``None`` where it is not known."""
-    try:
-        installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        return max(int(_MEMORY_SHARE * installed), _LEAST_MEMORY_BYTES)
-    except (AttributeError, ValueError, OSError):
-        return None
+    total = total_memory_bytes()
+    return max(int(_MEMORY_SHARE * total), _LEAST_MEMORY_BYTES) if total else None

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import DatasetError, ParseError
-from ..ply_table import PlyHeader, read_ply_header
+from ..ply.header import PlyHeader, read_ply_header
 
 MAX_FILE_DEGREE = 4
 """Highest degree of the harmonics that files are known to have."""

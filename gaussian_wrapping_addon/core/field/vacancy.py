@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -14,6 +13,7 @@ from .. import tolerances
 from ..dataset.camera import Camera
 from ..errors import UsageError
 from ..gaussians.model import GaussianArrays
+from ..machine import total_memory_bytes
 from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
 from ..progress import Progress
 from .camera_bins import TILE_PX, CameraBins, VirtualScreen, bin_camera
@@ -54,10 +54,7 @@ class VacancyResult:
 
 def default_cache_bytes() -> int:
     """Return how much memory prepared cameras may take on this machine."""
-    try:
-        return int(CACHE_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, OSError, ValueError):  # not on Windows
-        return CACHE_BYTES_UNKNOWN
+    return int(CACHE_SHARE * total_memory_bytes()) or CACHE_BYTES_UNKNOWN
 
 
 class VacancyField:

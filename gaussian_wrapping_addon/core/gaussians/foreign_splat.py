@@ -19,7 +19,7 @@ import torch
 
 from ..dataset.splat_header import EXPECTED, SplatHeader, read_splat_header
 from ..errors import ParseError
-from ..ply_table import read_vertices
+from ..ply.table import read_vertices
 from ..tolerances import QUATERNION_MIN_NORM
 from .initialisation import SH_C0
 from .model import OrientedGaussians

@@ -21,7 +21,8 @@ import torch
 from ..dataset.similarity import Similarity
 from ..errors import MeshingError, ParseError
 from ..files import write_bytes
-from ..ply_table import read_ply_header, read_vertices
+from ..ply.header import read_ply_header
+from ..ply.table import read_vertices
 from .model import OrientedGaussians
 
 _logger = logging.getLogger(__name__)

@@ -13,13 +13,13 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, cannot_be_written
-from ..helper_process import child_command, child_environment, kill_group
+from ..helper_process import child_command
+from ..processes.spawn import kill_group, spawn
 from ..worker_environment import ready_worker
 from .earlier_job import keep_finished
-from .job_file import JobFile, read_job, write_job
+from .job_file import JobFile, read_job, refuse_replacing, write_job
 from .job_folder import JobFolder, JobStatus, process_alive
 from .smaller import killed_hint, killed_mesh_hint
 
@@ -120,6 +120,7 @@ class JobClient:
         target.create()
         if target.locked():
             raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
+        refuse_replacing(target.result, job)
         with _writing(target.root):
             keep_finished(target, job)
             write_job(target.job_path, job)
@@ -145,21 +146,12 @@ class JobClient:
             target.cancel_path.unlink(missing_ok=True)
             target.write_status(JobStatus(heartbeat_s=time.time()))
             output = (target.root / "worker-output.txt").open("wb")
-        options: dict[str, Any] = {"start_new_session": True}
-        if sys.platform == "win32":
-            options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
         parent = "0" if keep_running else str(os.getpid())
         with output:
-            process = subprocess.Popen(
-                child_command(
-                    WORKER_MODULE, str(target.root), parent, python=python or worker_python()
-                ),
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=child_environment(),
-                **options,
+            command = child_command(
+                WORKER_MODULE, str(target.root), parent, python=python or worker_python()
             )
+            process = spawn(command, stdout=output, stderr=subprocess.STDOUT)
         return cls(target, process)
 
     @classmethod

@@ -14,7 +14,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ..errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError, WrapError
-from ..helper_process import child_command, child_environment, emit
+from ..helper_process import child_command, emit
+from ..machine import total_memory_bytes
+from ..processes.spawn import run_to_end
 from ..worker_requirements import read_requirements, requirements_file
 
 MIN_PYTHON = (3, 11)
@@ -104,9 +106,7 @@ def _device() -> Diagnosis:
 
 
 def _memory() -> Diagnosis:
-    from .machine import _memory_bytes
-
-    total_bytes = _memory_bytes()
+    total_bytes = total_memory_bytes()
     if not total_bytes:
         return Diagnosis("Memory", True, "unknown")
     return Diagnosis(
@@ -134,27 +134,21 @@ def diagnose_worker(python: str) -> list[Diagnosis]:
         The interpreter does not start or gives no answer.
     """
     try:
-        done = subprocess.run(
-            child_command("jobs.doctor", python=python),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            env=child_environment(),
-            timeout=DOCTOR_DEADLINE_S,
-            check=False,
-        )
+        command = child_command("jobs.doctor", python=python)
+        _, output, last_words = run_to_end(command, DOCTOR_DEADLINE_S)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise WorkerError(
             f"{python} does not run: {error}.", "Press Set Up Worker, or choose another Python."
         ) from None
     findings: list[Diagnosis] = []
-    for line in done.stdout.decode(errors="replace").splitlines():
+    for line in output.splitlines():
         try:
             values: Any = json.loads(line)
             findings.append(Diagnosis(**values))
         except (ValueError, TypeError):
             continue
     if not findings:
-        words = done.stderr.decode(errors="replace").strip().splitlines()
+        words = last_words.strip().splitlines()
         raise WorkerError(
             f"{python} gave no answer: {words[-1] if words else 'no output'}.",
             "Press Set Up Worker, or choose a Python 3.11 or newer with the worker's packages.",

@@ -7,13 +7,10 @@ line: ``{"message"}`` while it works, ``{"line"}`` for the table, ``{"error", "h
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import importlib.metadata
 import json
 import logging
 import os
-import subprocess
 import tempfile
 import time
 from dataclasses import asdict
@@ -31,7 +28,8 @@ from ..errors import (
     cannot_be_written,
 )
 from ..files import read_json, write_json
-from ..helper_process import child_command, child_environment, emit, kill_group
+from ..helper_process import child_command, emit
+from ..processes.spawn import kill_group, spawn
 from .answer import answer
 from .job_folder import MARKER, JobFolder
 
@@ -41,7 +39,6 @@ if TYPE_CHECKING:
 _logger = logging.getLogger("gaussian_wrapping")
 
 LAST_WORDS_BYTES = 2000
-_EXTRA_PACKAGES = ("libigl", "trimesh")
 
 
 def run_in_worker(
@@ -71,14 +68,7 @@ def run_in_worker(
     text = json.dumps(request, allow_nan=False)
     with tempfile.TemporaryFile() as words:
         try:
-            process = subprocess.Popen(
-                child_command(module, text, python=python),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=words,
-                env=child_environment(),
-                start_new_session=True,
-            )
+            process = spawn(child_command(module, text, python=python), stderr=words)
         except OSError as error:
             raise WorkerError(
                 f"{python} does not run: {error}.", "Choose another Python."
@@ -156,9 +146,10 @@ def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return the report and its table."""
     from ..evaluation.command import EvaluationRequest, evaluate_mesh, read_cameras, table
     from ..evaluation.layouts.mesh_input import read_mesh
+    from ..machine import describe_machine
     from ..parallel import default_threads
+    from ..peak_memory import peak_memory_bytes
     from ..progress import Progress, ProgressEvent
-    from .machine import describe_machine, peak_memory_bytes
 
     begun_s, begun_unix_s = time.monotonic(), time.time()
 
@@ -188,10 +179,6 @@ def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
 
     vertices, faces = read_mesh(path)
     result = evaluate_mesh(vertices, faces, cameras, request, Progress("evaluate", say))
-    machine = describe_machine(request.threads)
-    for name in _EXTRA_PACKAGES:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            machine["packages"][name] = importlib.metadata.version(name)
     report = {
         "version": 1,
         "started_unix_s": begun_unix_s,
@@ -201,7 +188,7 @@ def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
         "cameras": len(cameras),
         "asked": {**asdict(request), "truth": str(request.truth)},
         **result,
-        "machine": machine,
+        "machine": describe_machine(request.threads),
         "peak_memory_bytes": peak_memory_bytes(),
     }
     return report, [f"{path.name}: {len(vertices)} vertices, {len(faces)} faces", *table(result)]

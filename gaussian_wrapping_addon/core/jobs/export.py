@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from ..dataset.similarity import Similarity
-from ..evaluation.report.markdown import CURVE, PICTURES
+from ..evaluation.report.markdown import CURVE
 from ..evaluation.report.report import write_report
 from ..files import finite, read_json, resolve_inside, write_json
+from ..names import REPORT_FOLDER
 from ..progress import Progress
 from .job_file import JobFile
 from .job_folder import JobFolder
@@ -66,9 +67,9 @@ def export_results(
         shutil.copy2(regions[0][2].folder / "preview.png", new / "preview.png")
         progress.update(0.9, "writing the report")
         # A region may have the name of this folder, of this job or of an earlier one.
-        if (folder.result / PICTURES).is_dir() and not (new / PICTURES).exists():
-            shutil.copytree(folder.result / PICTURES, new / PICTURES)
-        _training_pictures(trained, new / PICTURES)
+        if (folder.result / REPORT_FOLDER).is_dir() and not (new / REPORT_FOLDER).exists():
+            shutil.copytree(folder.result / REPORT_FOLDER, new / REPORT_FOLDER)
+        _training_pictures(trained, new / REPORT_FOLDER)
         # Regions of an earlier training stay on disk; this report is about this training.
         known = {**_figures_in(folder.result), **_figures_in(new)}
         of_training = {n: f for n, f in sorted(known.items()) if f.get("training") == trained.key}

@@ -20,11 +20,11 @@ from ..dataset.file_frame import FileFrame, file_offset
 from ..dataset.placement_file import FILE_NAME, read_placement
 from ..dataset.similarity import Similarity
 from ..errors import DatasetError, ParseError, UsageError
+from ..export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
 from ..files import read_json, write_bytes
+from ..names import SPLAT_STEM, file_stems
 from ..texture.file_checks import atlas_file
 from .answer import answer
-from .export_formats import OWN_FORMATS, SHADINGS
-from .file_stems import SPLAT_STEM, file_stems
 from .job_folder import MARKER
 from .sidecar import write_sidecar
 
@@ -43,7 +43,7 @@ class ExportRequest:
     out: Path
     """Made where it is missing; files of the same names are replaced."""
     formats: tuple[str, ...]
-    """Among :data:`OWN_FORMATS`."""
+    """Among :data:`WORKER_FORMATS`."""
     placed: bool = False
     """Whether coordinates are those of the scene as placed in Blender, else the input's world."""
     regions: tuple[str, ...] = ()
@@ -131,7 +131,7 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
     """
     from ..texture.file_checks import writing
 
-    for name, known in (("formats", OWN_FORMATS), ("shading", SHADINGS)):
+    for name, known in (("formats", WORKER_FORMATS), ("shading", SHADINGS)):
         asked = getattr(request, name)
         wrong = sorted({*([asked] if isinstance(asked, str) else asked)} - set(known))
         if wrong:
@@ -217,7 +217,7 @@ def _write_mesh(
 
     target_from_scene = blender_from_scene if request.placed else world_from_scene
     frame = FileFrame(format, target_from_scene)
-    if not request.placed and format != "ply":  # doubles need no offset
+    if not request.placed and not EXPORT_FORMATS[format].doubles:
         # That of the finest level, so that all levels lie over each other.
         finest = mesh
         if mesh.level:
@@ -226,7 +226,7 @@ def _write_mesh(
             format, target_from_scene, file_offset(target_from_scene.points(finest.vertices))
         )
     local = frame.local(mesh.vertices)
-    path = request.out / f"{mesh.stem}.{format}"
+    path = request.out / f"{mesh.stem}{EXPORT_FORMATS[format].suffix}"
     textures: list[str] = []
     missing = mesh.folder / "albedo.png"
     shading = "lit"

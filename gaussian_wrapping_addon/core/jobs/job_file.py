@@ -3,26 +3,21 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import DatasetError, ParseError, SettingError, UsageError
-from ..files import is_reserved_name, read_json, write_json
+from ..files import read_json, write_json
+from ..names import AUTOMATIC_REGIONS, region_name, region_names
+from ..regions.region_file import parse_region_file, read_region_body
 from ..settings import JobSettings, MeshingSettings, from_json, to_json
-from .stages import stage_key
 
 SCHEMA_VERSION = 1
 COMMANDS = ("wrap", "mesh", "more")
-AUTOMATIC_REGIONS = ("auto", "all")
-NAME_CHARACTERS = 40
-PICTURES = "report"
-"""Folder of a result in which the report's pictures lie: no region's."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +115,7 @@ def make_job(
         path = Path(region)
         name = str(path.resolve())
         bodies[name] = read_region_body(path)
-        _check_region(bodies[name], path)
+        parse_region_file(bodies[name], path)
         names.append(name)
         lengths |= {name: own[region]} if region in own else {}
     names = list(dict.fromkeys(names))
@@ -153,39 +148,29 @@ def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:
     return {name: float(value) for name, value in values.items()}
 
 
-def region_name(request: str, body: Any) -> str:
-    """Return the folder name of a requested region: ASCII, short, never empty."""
-    if request in AUTOMATIC_REGIONS:
-        return request
-    text = _wanted_name(request, body)
-    clean = re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_")[:NAME_CHARACTERS]
-    if not clean or clean.lower() in AUTOMATIC_REGIONS:
-        return f"region_{stage_key(request)[:6]}"
-    taken = clean.lower() == PICTURES or is_reserved_name(clean)
-    return f"region_{clean}" if taken else clean
+def refuse_replacing(result: Path, job: JobFile) -> None:
+    """Refuse a job of which a region would replace the result of another region.
 
+    A region of the same name is the same region, meshed again.
 
-def _wanted_name(request: str, body: Any) -> str:
-    wanted = body.get("blender_object_name") if isinstance(body, dict) else None
-    return wanted if isinstance(wanted, str) and wanted.strip() else Path(request).stem
-
-
-def region_names(requests: Sequence[str], bodies: dict[str, Any]) -> list[str]:
-    """Return the folder names of all requested regions.
+    Parameters
+    ----------
+    result : Path
+        The result folder of the job, which may be missing.
 
     Raises
     ------
     UsageError
-        Two have one name, or names that are one where case does not count: the result of one
-        would replace that of the other.
+        Names both: two regions of the job, or one of it and one that was meshed before.
+    ParseError
+        A region in the job file is broken.
     """
-    names = [region_name(request, bodies.get(request)) for request in requests]
-    for index, name in enumerate(names):
-        if name.lower() in (other.lower() for other in names[:index]):
-            raise UsageError(
-                f"Two regions have the same name, {name}.", "Give each region its own name."
-            )
-    return names
+    region_names(job.settings.regions, job.region_bodies)
+    folders = {
+        parse_region_file(body, Path(request)).name: region_name(request, body)
+        for request, body in job.region_bodies.items()
+    }
+    refuse_other_regions(result, folders)
 
 
 def refuse_other_regions(result: Path, folders: dict[str, str]) -> None:
@@ -218,34 +203,6 @@ def refuse_other_regions(result: Path, folders: dict[str, str]) -> None:
                     f"kept in a folder {name}.",
                     "Give it another name.",
                 )
-
-
-def read_region_body(path: Path) -> Any:
-    """Read the content of a region file, which :func:`~.region_file.parse_region` takes.
-
-    Raises
-    ------
-    DatasetError
-        There is no file, or it cannot be read.
-    """
-    if path.is_dir():
-        raise DatasetError(f"{path} is a folder, not a region file.", "Give a file in it.")
-    if not path.is_file():
-        raise DatasetError(f"Region file {path} does not exist.", "Check the path.")
-    try:
-        return read_json(path)
-    except OSError as error:
-        raise DatasetError(
-            f"Region file {path} cannot be read: {error.strerror}.", "Check its permissions."
-        ) from None
-
-
-def _check_region(body: Any, path: Path) -> None:
-    """Refuse a bad region before anything starts; Blender may lack scipy, then the worker does."""
-    if importlib.util.find_spec("scipy") is not None:
-        from ..meshing.region import parse_region
-
-        parse_region(body, path)
 
 
 def read_job(path: Path) -> JobFile:

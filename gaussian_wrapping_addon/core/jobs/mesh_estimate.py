@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MeshingError, UsageError
+from ..names import AUTOMATIC_REGIONS
 from ..parallel import default_threads
 from ..progress import Progress
 from ..settings import MeshingSettings, from_json
 from .answer import answer
-from .job_file import AUTOMATIC_REGIONS, read_region_body
 from .job_folder import JobFolder
 from .more import no_finished_training
 from .region_meshing import expected_by_pivots, expected_mesh, free_bytes
@@ -45,7 +45,7 @@ def _lines(request: dict[str, Any]) -> list[str]:
     from ..field.sightings import find_sightings
     from ..field.vacancy import VacancyField
     from ..gaussians.gaussian_file import load_gaussians
-    from ..meshing.region import automatic_region, parse_region, whole_region
+    from ..meshing.region import automatic_region, read_region, whole_region
     from ..meshing.resolution import checked_request
 
     folder = JobFolder(Path(request["out"]))
@@ -54,8 +54,7 @@ def _lines(request: dict[str, Any]) -> list[str]:
     meshing = from_json(MeshingSettings, request["meshing"], "meshing")
     threads = int(request["threads"]) or default_threads()
     if request["region"] not in AUTOMATIC_REGIONS:
-        path = Path(request["region"])
-        world_region = parse_region(read_region_body(path), path)
+        world_region = read_region(Path(request["region"]))
     scene = load_saved_scene(_newest(folder.stages, "cameras"))
     gaussians = load_gaussians(_newest(folder.stages, "train") / "gaussians.npz")
     arrays = gaussians.arrays()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DeviceError
-from .job_file import AUTOMATIC_REGIONS
+from ..names import AUTOMATIC_REGIONS
 
 if TYPE_CHECKING:
     from ..dataset.scene import Scene

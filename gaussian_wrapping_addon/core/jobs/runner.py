@@ -12,13 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MeshingError
+from ..export_formats import RESULT_FORMATS
 from ..files import write_json
+from ..machine import describe_machine
+from ..names import region_name, region_names
 from ..parallel import default_threads
+from ..peak_memory import peak_memory_bytes
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
-from .job_file import JobFile, refuse_other_regions, region_name, region_names
+from .job_file import JobFile, refuse_replacing
 from .job_folder import JobFolder
-from .machine import describe_machine, peak_memory_bytes
 from .stages import Stage, read_done, run_stage, source_fingerprint, stage_key
 
 _logger = logging.getLogger(__name__)
@@ -84,14 +87,8 @@ def run_job(
     threads = job.settings.threads or default_threads()
     overall = _Overall(sink, is_cancelled)
     begun_s = time.time()
-    from ..meshing.region import parse_region
-
-    own = {
-        parse_region(body, Path(request)).name: region_name(request, body)
-        for request, body in job.region_bodies.items()
-    }
+    refuse_replacing(folder.result, job)
     names = region_names(job.settings.regions, job.region_bodies)
-    refuse_other_regions(folder.result, own)
 
     cameras = _run_cameras(folder, job, overall, threads)
     if cameras.reused:
@@ -319,6 +316,7 @@ def _run_texture(
     key = stage_key(STAGE_VERSIONS["texture"], meshed.key, to_json(texture))
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        from ..dataset.photo_source import PhotoSource
         from ..dataset.photos import PhotoStore
         from ..dataset.scene_file import load_saved_scene
         from ..evaluation.views.photo_comparison import compare_with_photos
@@ -327,7 +325,6 @@ def _run_texture(
         from ..limits import MAX_IMAGE_SIDE_PX
         from ..meshing.mesh_file import load_mesh
         from ..meshing.region import parse_region
-        from ..texture.bake import Photos
         from ..texture.export import file_offset, write_textured
         from ..texture.levels import levels_of_detail
         from ..texture.texture_mesh import texture_mesh
@@ -338,7 +335,7 @@ def _run_texture(
         mesh = load_mesh(meshed.folder / "mesh.npz")
         dense_path = meshed.folder / DENSE_MESH
         dense = load_mesh(dense_path) if dense_path.is_file() else None
-        source: Photos = photos
+        source: PhotoSource = photos
         if texture.source == "gaussians":
             from ..gaussians.gaussian_file import load_gaussians
             from ..texture.gaussian_photos import GaussianPhotos
@@ -356,7 +353,7 @@ def _run_texture(
             textured, dense, texture, stage_folder, progress.span(coarse_from, 0.9),
             threads=threads, region=region.transformed(scene.world_from_scene.inverse()),
         )  # fmt: skip
-        formats = tuple(f for f in job.settings.export if f != "usd")
+        formats = tuple(f for f in job.settings.export if f in RESULT_FORMATS)
         offset = file_offset(scene.world_from_scene.points(mesh.vertices))
         for number, level in enumerate([textured, *levels]):
             folder = stage_folder / "files" / (f"lod{number}" if number else "")

@@ -21,8 +21,9 @@ from ..dataset.file_frame import FileFrame
 from ..dataset.similarity import Similarity
 from ..errors import WrapError
 from ..files import finite, read_json, write_json
+from ..names import AUTOMATIC_REGIONS
 from ..settings import to_json
-from .job_file import AUTOMATIC_REGIONS, read_job
+from .job_file import read_job
 
 _logger = logging.getLogger("gaussian_wrapping")
 

@@ -9,12 +9,8 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from .. import limits
 from ..dataset.similarity import Similarity
-from ..errors import MeshingError
-
-FLAT_SHARE = 1e-6
-"""A body thinner than this share of its diagonal has no usable volume."""
+from ..regions.volume import check_volume, flat_region
 
 COPLANAR_COSINE = 1.0 - 1e-9
 """Hull triangles whose normals agree this well are one face."""
@@ -40,35 +36,13 @@ class Region:
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, np.float64)
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < 4:
-            raise MeshingError(
-                f"Region {self.name!r} needs at least four corners.", "Draw a box around the thing."
-            )
-        if len(vertices) > limits.MAX_REGION_VERTICES:
-            raise MeshingError(
-                f"Region {self.name!r} has {len(vertices)} corners.",
-                f"Use at most {limits.MAX_REGION_VERTICES}.",
-            )
-        if not np.isfinite(vertices).all():
-            raise MeshingError(
-                f"Region {self.name!r} has a corner that is not finite.", "Draw it again."
-            )
+        check_volume(vertices, self.name)
         vertices.setflags(write=False)
         object.__setattr__(self, "vertices", vertices)
-        if not self._has_volume():
-            raise MeshingError(
-                f"Region {self.name!r} is flat: it encloses no volume.", "Give it some height."
-            )
+        if not self._has_hull():
+            raise flat_region(self.name)
 
-    def _has_volume(self) -> bool:
-        low, high = self.bounds
-        diagonal = float(np.linalg.norm(high - low))
-        if diagonal <= 0.0:
-            return False
-        centred = self.vertices - self.vertices.mean(0)  # (v, 3)
-        widths = np.linalg.svd(centred / diagonal, compute_uv=False)  # (3,)
-        if widths[2] / np.sqrt(len(centred)) < FLAT_SHARE:
-            return False
+    def _has_hull(self) -> bool:
         try:
             return bool(self._hull.volume > 0.0)
         except QhullError:

@@ -17,4 +17,3 @@ BOUNDARIES = ("closed", "open")
 UNSEEN = ("empty", "occupied")
 MAX_LODS = 8
 TEXTURE_SOURCES = ("photos", "gaussians")
-EXPORT_FORMATS = ("glb", "obj", "ply", "usd")

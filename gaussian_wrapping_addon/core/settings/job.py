@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UsageError
+from ..export_formats import JOB_FORMATS
 from .checks import Choices, Condition, Range, Subset
-from .choices import EXPORT_FORMATS, PRESETS
+from .choices import PRESETS
 from .declaration import (
     Declaration,
     Item,
@@ -94,10 +95,10 @@ class JobSettings:
     export: tuple[str, ...] = setting(
         ("glb",),
         help="File formats that the meshes are written in.",
-        check=Subset(EXPORT_FORMATS),
+        check=Subset(JOB_FORMATS),
         option=Option(
             "--export",
-            help=f"file formats, comma separated, of {','.join(EXPORT_FORMATS)}",
+            help=f"file formats, comma separated, of {','.join(JOB_FORMATS)}",
             scope="region",
             parse=_formats,
         ),
@@ -126,7 +127,7 @@ class JobSettings:
     texture: TextureSettings = field(default_factory=TextureSettings)
 
     def validated(self) -> JobSettings:
-        """Return self, or raise :class:`~..errors.SettingError` naming the first setting out of range."""
+        """Return self, or raise :class:`~..errors.SettingError` naming the first bad setting."""
         validate(self)
         return self
 

@@ -16,12 +16,11 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from ..errors import (
     EXIT_DONE,
@@ -33,8 +32,9 @@ from ..errors import (
     cannot_be_written,
 )
 from ..files import write_json
-from ..helper_process import child_command, child_environment
+from ..helper_process import child_command
 from ..jobs.job_folder import JobFolder, JobStatus
+from ..processes.spawn import child_environment, spawn
 from ..worker_environment import (
     FOLDERS,
     MARKER,
@@ -205,14 +205,14 @@ def start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes
     """
     kept = {k: v for k, v in child_environment().items() if k.upper() not in _STEERING}
     places = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
-    options: dict[str, Any] = {"start_new_session": True}
-    if sys.platform == "win32":
-        options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     try:
-        return subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            cwd=temporary, env={**kept, **places, "PIP_USER": "0"}, **options,
-        )  # fmt: skip
+        return spawn(
+            command,
+            stdin=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            environment={**kept, **places, "PIP_USER": "0"},
+            folder=temporary,
+        )
     except OSError as error:
         raise WorkerError(
             f"{command[0]} does not start: {error.strerror}.", "Choose another Python."

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import UsageError
-from ..helper_process import child_environment
+from ..processes.spawn import child_environment
 
 OLDEST = (3, 11)
 NEWEST_WITH_WHEELS = (3, 13)

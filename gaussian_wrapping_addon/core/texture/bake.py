@@ -6,12 +6,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from ..compiled import kernel, part
-from ..dataset.camera import Camera
+from ..dataset.photo_source import PhotoSource
 from ..parallel import even_bounds, run_chunks
 from ..progress import Progress
 from .evenness import solve_fields
@@ -41,22 +41,6 @@ EXPOSURE_POINTS = 24_000
 EXPOSURE_CELLS = 8_000_000
 """Bound on points x photos of the exposure step."""
 COARSE_LONG_SIDE_PX = 480
-
-
-class Photos(Protocol):
-    """What baking needs of :class:`~.photos.PhotoStore`."""
-
-    def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Camera of a photo at a level."""
-        ...
-
-    def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """(h, w, 3) uint8."""
-        ...
-
-    def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """(h, w) bool or None."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -111,7 +95,7 @@ class _Exposure:
 def bake(
     points: SurfacePoints,
     surface: SurfaceArrays,
-    photos: Photos,
+    photos: PhotoSource,
     survey: Survey,
     progress: Progress,
     *,
@@ -123,7 +107,7 @@ def bake(
     ----------
     points : SurfacePoints
         Points in texture order.
-    photos : Photos
+    photos : PhotoSource
         Read one at a time, at the level that the texel size needs.
     survey : Survey
         Of these photos, by :func:`look_at_photos`.
@@ -181,7 +165,7 @@ def bake(
 
 
 def _view(
-    photos: Photos, index: int, divisor: int, surface: SurfaceArrays, threads: int
+    photos: PhotoSource, index: int, divisor: int, surface: SurfaceArrays, threads: int
 ) -> PhotoView:
     camera = photos.camera(index, divisor)
     mask = photos.mask(index, divisor)
@@ -202,7 +186,7 @@ def survey_points(count: int) -> int:
 def look_at_photos(
     part: SurfacePoints,
     surface: SurfaceArrays,
-    photos: Photos,
+    photos: PhotoSource,
     count: int,
     progress: Progress,
     *,

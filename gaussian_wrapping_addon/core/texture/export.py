@@ -23,6 +23,7 @@ import numpy as np
 from ..dataset.file_frame import file_offset
 from ..dataset.similarity import Similarity
 from ..errors import UsageError
+from ..export_formats import RESULT_FORMATS
 from ..files import write_bytes, write_json
 from .file_checks import atlas_file, check_mesh, writing
 from .glb import glb_bytes
@@ -30,8 +31,6 @@ from .mesh_ply import vertex_colors, write_mesh_ply
 from .shading import OBJ_SHININESS, SPECULAR_LEVEL
 from .tangent_frame import shading_normals
 from .textured_mesh import TexturedMesh
-
-FORMATS = ("glb", "obj", "ply")
 
 
 def write_obj(
@@ -133,7 +132,7 @@ def write_textured(
     folder : Path
         Made when missing.
     formats : tuple of str
-        Among ``"glb"``, ``"obj"``, ``"ply"`` (always written).
+        Among :data:`RESULT_FORMATS`; ``"ply"`` is always written.
     world_from_scene : Similarity
         Leads to the world frame of the input.
     offset : (3,) float64, optional
@@ -149,9 +148,11 @@ def write_textured(
     ResourceError
         The folder cannot be written.
     """
-    unknown = sorted(set(formats) - set(FORMATS))
+    unknown = sorted(set(formats) - set(RESULT_FORMATS))
     if unknown:
-        raise UsageError(f"There is no export {unknown[0]!r} here.", f"Use {', '.join(FORMATS)}.")
+        raise UsageError(
+            f"There is no export {unknown[0]!r} here.", f"Use {', '.join(RESULT_FORMATS)}."
+        )
     mesh = textured.mesh
     check_mesh(mesh.vertices, mesh.faces, textured.corner_uvs)
     world = world_from_scene.points(mesh.vertices)

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 
 from ..dataset.camera import Camera
+from ..dataset.photo_source import PhotoSource
 from ..gaussians.model import OrientedGaussians
 from ..render.render import render
 from ..render.types import RenderOptions
-from .bake import Photos
 
 MIN_ALPHA = 0.5
 """Where the Gaussians let more light through, there is no surface to take a colour from."""
@@ -33,7 +33,7 @@ class GaussianPhotos:
         The result does not depend on it.
     """
 
-    def __init__(self, gaussians: OrientedGaussians, photos: Photos, *, threads: int) -> None:
+    def __init__(self, gaussians: OrientedGaussians, photos: PhotoSource, *, threads: int) -> None:
         self._gaussians = gaussians
         self._photos = photos
         self._options = RenderOptions(depth=False, sh_degree=0, threads=threads)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import limits
+from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
 from ..errors import MeshingError, UsageError
 from ..meshing.surface_mesh import SurfaceMesh
@@ -18,7 +19,7 @@ from ..settings import TextureSettings
 from .atlas_colors import CONTINUED_POINTS, AtlasColors, continue_colors
 from .atlas_points import atlas_points, blocks_of
 from .atlas_raster import AtlasRaster
-from .bake import Photos, bake, look_at_photos, survey_points
+from .bake import bake, look_at_photos, survey_points
 from .detail import bake_detail, merged_statistics, wants_normal_map
 from .face_graph import FaceGraph, face_graph
 from .photo_samples import SurfaceArrays, SurfacePoints
@@ -35,7 +36,7 @@ _logger = logging.getLogger(__name__)
 def texture_mesh(
     mesh: SurfaceMesh,
     scene: Scene,
-    photos: Photos,
+    photos: PhotoSource,
     settings: TextureSettings,
     work_folder: Path,
     progress: Progress,
@@ -150,7 +151,7 @@ def texture_mesh(
 
 def _plan(
     graph: FaceGraph,
-    photos: Photos,
+    photos: PhotoSource,
     count: int,
     settings: TextureSettings,
     dense: SurfaceMesh | None,

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from .. import limits
-from .bake import Photos
+from ..dataset.photo_source import PhotoSource
 from .face_graph import FaceGraph
 from .photo_samples import MIN_COSINE
 
@@ -29,7 +29,7 @@ ENOUGH = 0.8
 
 
 def wanted_side(
-    graph: FaceGraph, photos: Photos, count: int, detail_points: int = 0, seed: int = 0
+    graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0, seed: int = 0
 ) -> float:
     """Return the side in pixels of one texture that shows about what the photos do; no limits.
 
@@ -61,7 +61,7 @@ def wanted_side(
 
 
 def automatic_size(
-    graph: FaceGraph, photos: Photos, count: int, detail_points: int = 0, seed: int = 0
+    graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0, seed: int = 0
 ) -> int:
     """Return the side in pixels, a power of two from 256 to 4096, that :func:`wanted_side` asks."""
     return _power_of_two(wanted_side(graph, photos, count, detail_points, seed))

@@ -9,8 +9,8 @@ from typing import TypeVar
 import numpy as np
 
 from ..dataset.camera import Camera
+from ..dataset.photo_source import PhotoSource
 from ..progress import Progress
-from .photo_source import Photos
 
 Item = TypeVar("Item")
 
@@ -43,7 +43,7 @@ class CheckedPhotos:
     For what looks at all photos before the first iteration, or after the last.
     """
 
-    def __init__(self, photos: Photos, progress: Progress) -> None:
+    def __init__(self, photos: PhotoSource, progress: Progress) -> None:
         self._photos, self._progress = photos, progress
 
     def camera(self, index: int, divisor: int = 1) -> Camera:

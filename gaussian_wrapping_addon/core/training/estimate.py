@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ import numpy as np
 
 from ..errors import ResourceError
 from ..gaussians.initialisation import FEW_POINTS
+from ..machine import available_memory_bytes
 from ..settings import TrainingSettings
 from .schedule import Schedule
 
@@ -171,30 +171,7 @@ def this_machine(folder: Path, threads: int, speed: float = 1.0) -> Machine:
         free_bytes = shutil.disk_usage(existing).free
     except OSError:
         free_bytes = 0
-    return Machine(threads, speed, _free_memory_bytes(), free_bytes)
-
-
-def _free_memory_bytes() -> int:
-    """Return what could be taken without swapping; 0 where the system does not tell."""
-    try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return min(int(line.split()[1]) * 1024, _group_limit_bytes())
-        return 0
-    except (OSError, ValueError, IndexError):
-        pass
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return 0
-
-
-def _group_limit_bytes() -> int:
-    """Return the limit of the control group (a container's memory), large where there is none."""
-    try:
-        return int(Path("/sys/fs/cgroup/memory.max").read_text())
-    except (OSError, ValueError):
-        return 1 << 60
+    return Machine(threads, speed, available_memory_bytes(), free_bytes)
 
 
 def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float) -> np.ndarray:

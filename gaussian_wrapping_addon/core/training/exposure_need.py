@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
+from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
 from .background import pixels_of
 from .exposure import FIT_BRIGHTEST, FIT_DARKEST, SRGB_PEDESTAL
-from .photo_source import Photos
 
 NEEDED_SPREAD = 0.025
 """Robust spread of the log gains above which exposures are modelled. At a middle grey such photos
@@ -121,7 +121,7 @@ class LogGains:
     """(photos, 3) points by weight."""
 
 
-def exposure_need(scene: Scene, photos: Photos, views: Sequence[int]) -> ExposureNeed:
+def exposure_need(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> ExposureNeed:
     """Decide from the colours of the sparse points whether exposures are to be modelled.
 
     Parameters
@@ -172,7 +172,7 @@ def split_by_place(points: np.ndarray) -> list[np.ndarray]:
 
 
 def sample_points(
-    points: np.ndarray, photos: Photos, views: Sequence[int]
+    points: np.ndarray, photos: PhotoSource, views: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the points' colours in the photos that may see them.
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..dataset.camera import Camera
+from ..dataset.photo_source import PhotoSource
 from ..gaussians.model import OrientedGaussians
 from ..render.array_store import ArrayStore
 from ..render.projection import RawArrays
@@ -26,7 +27,6 @@ from .multi_view import (
     multi_view_losses,
 )
 from .overlap_price import add_overlap_price
-from .photo_source import Photos
 from .schedule import Schedule
 from .state import TrainingState
 from .windows import Window, windows
@@ -72,7 +72,7 @@ class Stepper:
 
     def __init__(
         self,
-        photos: Photos,
+        photos: PhotoSource,
         schedule: Schedule,
         views: Sequence[int],
         neighbours: dict[int, np.ndarray],

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..dataset.photo_source import PhotoSource
 from ..evaluation.views.view_metrics import psnr
 from ..files import write_bytes
 from ..gaussians.model import OrientedGaussians
@@ -22,7 +23,6 @@ from ..render.projection import RawArrays
 from ..render.types import RenderOptions
 from ..render.view_renderer import ViewRenderer
 from ..settings import TrainingSettings
-from .photo_source import Photos
 
 _logger = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ Correction = Callable[[np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
 """Brings a (h, w, 3) render to the exposure of a (h, w, 3) uint8 photo, seen through a mask."""
 
 
-def divisor_for(photos: Photos, index: int, longest_px: int) -> int:
+def divisor_for(photos: PhotoSource, index: int, longest_px: int) -> int:
     """Return the smallest divisor that brings a photo's long side to at most ``longest_px``."""
     camera = photos.camera(index, 1)
     divisor = -(-max(camera.width, camera.height) // longest_px)
@@ -62,7 +62,7 @@ def spread(views: Sequence[int], count: int) -> list[int]:
 
 def measure_held_out(
     gaussians: OrientedGaussians,
-    photos: Photos,
+    photos: PhotoSource,
     held_out: Sequence[int],
     *,
     threads: int,
@@ -114,7 +114,7 @@ def measure_held_out(
 def _rendered(
     renderer: ViewRenderer,
     raw: RawArrays,
-    photos: Photos,
+    photos: PhotoSource,
     view: int,
     divisor: int,
     threads: int,
@@ -148,7 +148,7 @@ class LiveView:
 
     def __init__(
         self,
-        photos: Photos,
+        photos: PhotoSource,
         held_out: Sequence[int],
         folder: Path,
         settings: TrainingSettings,

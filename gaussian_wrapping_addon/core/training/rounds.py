@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from .. import tolerances
+from ..dataset.photo_source import PhotoSource
 from ..gaussians.mip_filter import mip_filter
 from ..gaussians.model import OrientedGaussians
 from ..progress import Progress
@@ -21,7 +22,6 @@ from .harmonics_trial import NeedView
 from .iteration import Stepper
 from .live_view import divisor_for
 from .needs import wrapping_need
-from .photo_source import Photos
 from .schedule import Schedule
 from .state import TrainingState
 from .wrapping import WrapView, normal_errors, start_orientation, wrap
@@ -63,7 +63,7 @@ class Rounds:
         progress: Progress,
     ) -> None:
         self.stepper, self.held_out, self.inside = stepper, list(held_out), inside
-        self.photos: Photos = stepper.photos
+        self.photos: PhotoSource = stepper.photos
         self.schedule: Schedule = stepper.schedule
         self.settings, self.views, self.threads = (
             self.schedule.settings, stepper.views, stepper.threads,

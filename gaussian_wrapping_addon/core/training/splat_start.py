@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from ..dataset.camera import Camera
+from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
 from ..errors import DatasetError
 from ..gaussians.foreign_splat import read_foreign_splat
@@ -25,7 +26,6 @@ from ..render.render import render
 from ..render.types import RenderOptions
 from ..settings import TrainingSettings
 from .orientation import orient
-from .photo_source import Photos
 from .splat_motion import move_gaussians, with_degree
 
 _logger = logging.getLogger(__name__)
@@ -90,7 +90,7 @@ def wrapping_settings(settings: TrainingSettings) -> TrainingSettings:
 def start_from_splat(
     path: Path,
     scene: Scene,
-    photos: Photos,
+    photos: PhotoSource,
     view_indices: Sequence[int],
     settings: TrainingSettings,
     progress: Progress,
@@ -217,7 +217,7 @@ def _spread(indices: Sequence[int], count: int) -> list[int]:
     return [indices[i] for i in positions.tolist()]
 
 
-def _divisor(photos: Photos, index: int) -> int:
+def _divisor(photos: PhotoSource, index: int) -> int:
     """Return the divisor of a small image that still has a few tiles."""
     camera = photos.camera(index, 1)
     return _SMALL_DIVISOR if min(camera.width, camera.height) >= 32 * _SMALL_DIVISOR else 1
@@ -240,7 +240,7 @@ def _shown(
 
 def _match(
     gaussians: OrientedGaussians,
-    photos: Photos,
+    photos: PhotoSource,
     view_indices: Sequence[int],
     progress: Progress,
     *,

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
 from ..errors import Cancelled, DatasetError, WrapError
 from ..evaluation.views.lpips import lpips_if_ready
@@ -33,7 +34,6 @@ from .iteration import NotFinite, Stepper, trimmed
 from .live_view import Correction, LiveView, measure_held_out, spread
 from .needs import Decision, Needs, decide, multi_view_need
 from .neighbours import find_neighbours
-from .photo_source import Photos
 from .result import HeldOutFigure, TrainingResult
 from .rounds import Inside, Rounds
 from .schedule import SMALLEST_SIDE_PX, Schedule
@@ -79,7 +79,7 @@ def held_out_views(scene: Scene, every: int) -> list[int]:
 
 def train(
     scene: Scene,
-    photos: Photos,
+    photos: PhotoSource,
     settings: TrainingSettings,
     folder: Path,
     progress: Progress,
@@ -148,7 +148,7 @@ class _Trainer:
     def __init__(
         self,
         scene: Scene,
-        photos: Photos,
+        photos: PhotoSource,
         settings: TrainingSettings,
         folder: Path,
         seed: int,

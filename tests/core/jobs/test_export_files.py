@@ -35,10 +35,10 @@ from gaussian_wrapping_addon.core.jobs.export_files import (
     main,
     result_of,
 )
-from gaussian_wrapping_addon.core.jobs.file_stems import file_stem, file_stems
 from gaussian_wrapping_addon.core.jobs.job_file import JobFile, write_job
 from gaussian_wrapping_addon.core.jobs.sidecar import code_fingerprint, sidecar_path
-from gaussian_wrapping_addon.core.ply_table import read_ply_header
+from gaussian_wrapping_addon.core.names import file_stem, file_stems
+from gaussian_wrapping_addon.core.ply.header import read_ply_header
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types import RenderOptions
 from gaussian_wrapping_addon.core.settings import JobSettings

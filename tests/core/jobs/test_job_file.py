@@ -16,20 +16,20 @@ from gaussian_wrapping_addon.core.errors import (
     ParseError,
     UsageError,
 )
-from gaussian_wrapping_addon.core.evaluation.report import markdown
 from gaussian_wrapping_addon.core.jobs import answer, mesh_estimate
+from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.job_file import (
-    PICTURES,
     JobFile,
     make_job,
     read_job,
     refuse_other_regions,
-    region_name,
-    region_names,
+    refuse_replacing,
     write_job,
 )
 from gaussian_wrapping_addon.core.jobs.job_folder import MARKER
+from gaussian_wrapping_addon.core.jobs.stages import stage_key
 from gaussian_wrapping_addon.core.jobs.training_stage import training_keys
+from gaussian_wrapping_addon.core.names import region_name, region_names
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings, preset
 
 
@@ -102,7 +102,6 @@ def test_region_names_are_safe_folder_names(request_: str, body: object, name: s
 
 @pytest.mark.parametrize("name", ["report", "Report", "CON", "nul", "com1"])
 def test_a_region_never_has_a_folder_that_is_taken(name: str) -> None:
-    assert PICTURES == markdown.PICTURES
     assert region_name("x/a.json", {"blender_object_name": name}) == f"region_{name}"
     assert region_name("x/a.json", {"blender_object_name": f"{name}s"}) == f"{name}s"
 
@@ -111,6 +110,39 @@ def test_names_that_differ_in_case_alone_are_one() -> None:
     with pytest.raises(UsageError, match="same name"):
         region_names(["x/Head.json", "x/head.json"], {})
     assert region_names(["x/Head.json", "x/Heads.json"], {}) == ["Head", "Heads"]
+
+
+def test_two_names_for_one_folder_are_both_told() -> None:
+    requests = ["x/a b.json", "x/auto.json", "x/a_b.json"]
+    with pytest.raises(UsageError, match="a_b: 'a b' and 'a_b' are kept in one folder"):
+        region_names(requests, {})
+    assert region_names(requests[:2], {})[0] == "a_b"
+
+
+def test_a_job_that_would_replace_another_result_never_starts(tmp_path: Path) -> None:
+    """Panel and command line start jobs by this client: no worker has to be asked."""
+    body = {"class_name": "GaussianWrappingBoundingVolume", "version": 1}
+    body |= {"vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+    job, photos = tmp_path / "job", tmp_path / "photos"
+    photos.mkdir()
+    (job / "result" / "a_b").mkdir(parents=True)
+    (job / MARKER).touch()
+    (job / "result" / "a_b" / "region.json").write_text('{"blender_object_name": "a_b"}')
+    requests = []
+    for number, name in enumerate(("a b", "a_b")):
+        path = tmp_path / f"{number}.json"
+        path.write_text(json.dumps({**body, "blender_object_name": name}))
+        requests.append(make_job("mesh", photos, JobSettings(regions=(str(path),))))
+    with pytest.raises(UsageError, match="'a b' would replace the result of region 'a_b'"):
+        JobClient.start(job, requests[0], python="none")
+    assert not (job / "job.json").exists()
+    refuse_replacing(job / "result", requests[1])
+
+
+def test_regions_without_a_name_in_ascii_are_told_apart() -> None:
+    """The number is the one of 0.1.0, so that a region meshed again finds its folder."""
+    request = "x/\u4e2d.json"
+    assert region_name(request, {}) == f"region_{stage_key(request)[:6]}"
 
 
 @pytest.mark.parametrize(("new", "refused"), [("Würfel", False), ("Wörfel", True), ("w", False)])

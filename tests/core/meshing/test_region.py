@@ -12,9 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.errors import MeshingError, ParseError
+from gaussian_wrapping_addon.core.errors import DatasetError, MeshingError, ParseError
 from gaussian_wrapping_addon.core.limits import MAX_NAME_BYTES
 from gaussian_wrapping_addon.core.meshing.region import Region, read_region, write_region
+from gaussian_wrapping_addon.core.regions.region_file import read_region_file
 
 TURN = Rotation.from_euler("xyz", [20, 30, 50], degrees=True).as_matrix()
 UTM = np.array([5e5, 4e6, 120.0])
@@ -107,9 +108,11 @@ def body(**changes: Any) -> dict[str, Any]:
 def test_variants_that_are_read(values: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "roi.json"
     path.write_text(json.dumps(values))
-    region = read_region(path)
+    region, file = read_region(path), read_region_file(path)
     assert region.volume == pytest.approx(1)
     assert region.name in ("Cube", "roi")
+    assert file.name == region.name
+    np.testing.assert_array_equal(file.vertices, region.vertices)
 
 
 @pytest.mark.parametrize(
@@ -163,16 +166,19 @@ def test_names_can_be_written_anywhere(name: str, clean: str, tmp_path: Path) ->
 def test_bad_files_are_refused_with_their_place(text: str, place: str, tmp_path: Path) -> None:
     path = tmp_path / "roi.json"
     path.write_text(text)
-    with pytest.raises(ParseError) as caught:
-        read_region(path)
-    assert caught.value.place == place
-    assert "roi.json" in caught.value.message
-    assert caught.value.hint
+    for read in (read_region, read_region_file):  # the worker's, Blender's
+        with pytest.raises(ParseError) as caught:
+            read(path)
+        assert caught.value.place == place
+        assert "roi.json" in caught.value.message
+        assert caught.value.hint
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(ParseError, match=r"none\.json"):
+    with pytest.raises(DatasetError, match=r"none\.json does not exist"):
         read_region(tmp_path / "none.json")
+    with pytest.raises(DatasetError, match="is a folder"):
+        read_region(tmp_path)
 
 
 @pytest.mark.parametrize("height", [0.0, 1e-9])

@@ -32,8 +32,8 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError, ResourceError, UsageError
 from gaussian_wrapping_addon.core.jobs.export_files import ExportRequest, export_files
-from gaussian_wrapping_addon.core.jobs.file_stems import file_stem
 from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.names import file_stem
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.texture import charts
 from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas

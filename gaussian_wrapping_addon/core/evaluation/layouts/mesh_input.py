@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -11,26 +10,21 @@ import numpy as np
 
 from ...dataset.point_file import read_point_ply
 from ...errors import ParseError, WorkerError
+from ...ply.header import read_ply_header
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
-_HEADER_BYTES = 64 * 1024
 _AGAIN = "Export the file again."
 
 
 def is_cloud(path: Path) -> bool:
-    """Tell whether a PLY file announces no faces; other formats are taken for meshes."""
-    return path.suffix.lower() == ".ply" and not _announced(path, "face")
+    """Tell whether a PLY file announces no faces; other formats are taken for meshes.
 
-
-def _announced(path: Path, element: str) -> int:
-    """Return how many of an element a PLY's header announces; 0 where it names none."""
-    try:
-        with path.open("rb") as stream:
-            header = stream.read(_HEADER_BYTES).split(b"end_header", 1)[0]
-    except OSError as error:
-        raise ParseError(path, "whole file", f"cannot be read: {error.strerror}.", _AGAIN) from None
-    found = re.search(rb"^element\s+" + element.encode() + rb"\s+(\d{1,18})\s*$", header, re.M)
-    return int(found.group(1)) if found else 0
+    Raises
+    ------
+    ParseError
+        A PLY whose header is broken.
+    """
+    return path.suffix.lower() == ".ply" and not read_ply_header(path, _AGAIN).count("face")
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -98,7 +92,7 @@ def read_cloud(path: Path) -> np.ndarray:
     ParseError
         Not a PLY, cut off, empty, or with points that are not finite.
     """
-    announced = _announced(path, "vertex")
+    announced = read_ply_header(path, _AGAIN).count("vertex")
     points, _ = read_point_ply(path)
     if announced == 0:
         raise ParseError(path, "header", "the cloud is empty.", _AGAIN)

@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ...files import resolve_inside
+from ...names import REPORT_FOLDER
 from .estimate import estimate_lines
 from .figures import figure_rows
 from .needs import needs_lines
@@ -31,8 +32,6 @@ from .text import (
 )
 from .warnings import FEW_HELD_OUT, collect_warnings, warning_lines
 
-PICTURES = "report"
-"""Folder of the training's pictures in the result folder."""
 CURVE = "learning-curve.svg"
 
 _STAGES = {
@@ -291,7 +290,7 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
         f"{number(training.get('gaussians'), 'Gaussians')} after {iterations}.",
         *estimate_lines(training),
         "",
-        *picture(f"{PICTURES}/{CURVE}", "How training went."),
+        *picture(f"{REPORT_FOLDER}/{CURVE}", "How training went."),
     ]
     if not held_out:
         why = "No photo was held out: " if training.get("held_out") == [] else ""
@@ -316,7 +315,7 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
     for entry in map(part, items(training.get("pictures"))):
         psnr = number(entry.get("psnr"), "dB", digits=1)
         caption = f"{entry.get('name') or 'photo'}, {psnr}"
-        shown += picture(f"{PICTURES}/{entry.get('file')}", caption)
+        shown += picture(f"{REPORT_FOLDER}/{entry.get('file')}", caption)
     if not shown:
         return [*lines, "", "There are no pictures of the photos held out."]
     lines += [

@@ -6,12 +6,12 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from ...dataset.camera import Camera
+from ...dataset.photo_source import PhotoSource
 from ...files import write_bytes
 from ...gaussians.model import OrientedGaussians
 from ...render.projection import RawArrays
@@ -39,19 +39,6 @@ _INK = (232, 232, 232)
 
 # Dark to bright also in grey, so that it reads without colour: black, violet, red, orange, ivory.
 _HEAT = np.array([(0, 0, 0), (74, 20, 120), (196, 42, 80), (250, 150, 30), (255, 250, 210)])
-
-
-class Photos(Protocol):
-    """What is asked of :class:`~.photos.PhotoStore`."""
-
-    def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Return the camera of a level."""
-
-    def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return (h, w, 3) uint8."""
-
-    def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """Return (h, w) bool or ``None``."""
 
 
 def heat(values: np.ndarray) -> np.ndarray:
@@ -118,7 +105,7 @@ def worst_to_best(figures: Sequence[float], count: int = MAX_PICTURES) -> list[i
 
 def write_held_out(
     gaussians: OrientedGaussians,
-    photos: Photos,
+    photos: PhotoSource,
     views: Sequence[tuple[int, str, float]],
     folder: Path,
     *,

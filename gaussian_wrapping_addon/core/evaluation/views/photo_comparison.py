@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from ...dataset.photo_source import PhotoSource
 from ...dataset.scene import Scene
 from ...parallel import default_threads
 from ...progress import Progress
-from ...texture.bake import Photos
 from ...texture.textured_mesh import TexturedMesh
 from .lpips import lpips_if_ready
 from .mesh_rendering import render_views
@@ -33,7 +33,7 @@ FROM_GAUSSIANS = "the texture is of the Gaussians, which no held-out photo has t
 def compare_with_photos(
     textured: TexturedMesh,
     scene: Scene,
-    photos: Photos,
+    photos: PhotoSource,
     held_out: Collection[str],
     folder: Path,
     progress: Progress,

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ...dataset.camera import Camera
+from ...dataset.photo_source import PhotoSource
 from ...dataset.scene import Scene
 from ...parallel import default_threads
-from ...texture.bake import Photos
 from ...texture.depth_buffer import depth_buffer
 from ...texture.textured_mesh import TexturedMesh
 from .side_by_side import write_side_by_side
@@ -24,7 +24,9 @@ CROP_MARGIN = 0.15
 MIN_MARGIN_SHARE = 0.02
 
 
-def choose_view(textured: TexturedMesh, photos: Photos, count: int, *, threads: int = 0) -> int:
+def choose_view(
+    textured: TexturedMesh, photos: PhotoSource, count: int, *, threads: int = 0
+) -> int:
     """Return the photo in which the mesh is large, whole, and seen from its front.
 
     0 threads uses every core.
@@ -70,7 +72,7 @@ def _crop(textured: TexturedMesh, camera: Camera, threads: int) -> tuple[int, in
 def write_preview(
     textured: TexturedMesh,
     scene: Scene,
-    photos: Photos,
+    photos: PhotoSource,
     path: Path,
     *,
     view: int | None = None,

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from ...dataset.camera import Camera
+from ...dataset.photo_source import PhotoSource
 from ...dataset.scene import Scene
 from ...progress import Progress
 from ...settings import TextureSettings
-from ...texture.bake import Photos
 from ...texture.face_graph import face_graph, uv_charts
 from ...texture.texture_mesh import texture_mesh
 from ...texture.textured_mesh import TexturedMesh
@@ -26,7 +26,7 @@ MIN_SIZE_PX = 256
 class _Subset:
     """Some photos of a store, numbered anew."""
 
-    def __init__(self, photos: Photos, indices: list[int]) -> None:
+    def __init__(self, photos: PhotoSource, indices: list[int]) -> None:
         self._photos = photos
         self._indices = indices
 
@@ -43,7 +43,7 @@ class _Subset:
 def texture_without(
     textured: TexturedMesh,
     scene: Scene,
-    photos: Photos,
+    photos: PhotoSource,
     names: Collection[str],
     reduction: int,
     work_folder: Path,

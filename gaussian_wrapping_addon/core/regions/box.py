@@ -1,19 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Boxes and region files as plain arrays; the file format is in docs/file-formats.md."""
+"""Boxes as plain arrays, and the edges of a hull that are drawn."""
 
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-
-from ..core import limits
-from ..core.errors import ParseError, UsageError
-
-CLASS_NAME = "GaussianWrappingBoundingVolume"
-VERSION = 1
 
 # Corners of the cube that an Empty with display size 1 draws; triangles seen from outside.
 CUBE_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))  # (8, 3)
@@ -22,35 +14,10 @@ CUBE_TRIANGLES = (
     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
 )  # fmt: skip
 
-# Share of the largest extent below which a volume counts as flat.
-FLAT_SHARE = 1e-6
 # Neighbouring faces of a hull count as one where the cosine of their angle differs from 1 by less.
 FLAT_EDGE = 1e-6
 # Share of the diagonal by which corners of a box may be off (float32 matrices of Blender).
 BOX_TOLERANCE = 1e-5
-
-
-def check_volume(vertices: np.ndarray, name: str) -> None:
-    """Refuse vertices that enclose no volume.
-
-    Raises
-    ------
-    UsageError
-        Fewer than four vertices, a number that is not finite, or all in one plane.
-    """
-    if len(vertices) < 4:
-        raise UsageError(f"Region {name} has {len(vertices)} vertices.", "Use a box or a solid.")
-    if len(vertices) > limits.MAX_REGION_VERTICES:
-        raise UsageError(
-            f"The hull of region {name} has {len(vertices)} vertices, more than "
-            f"{limits.MAX_REGION_VERTICES}.",
-            "Use a simpler mesh or a box.",
-        )
-    if not np.isfinite(vertices).all():
-        raise UsageError(f"Region {name} has a position that is not finite.", "Move it back.")
-    extents = np.linalg.svd(vertices - vertices.mean(0), compute_uv=False)  # (3,)
-    if not extents[2] > FLAT_SHARE * extents[0]:
-        raise UsageError(f"Region {name} is flat.", "Scale it so that it encloses a volume.")
 
 
 def hull_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -79,58 +46,6 @@ def hull_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     # The sign of a normal follows the triangle's winding, which hulls of meshes leave open.
     flat = (counts == 2) & (np.abs((one * other).sum(1)) > 1.0 - FLAT_EDGE)
     return np.asarray(edges[~flat])
-
-
-def region_to_json(name: str, vertices: np.ndarray, simplices: Any) -> dict[str, Any]:
-    """Return the bounding-volume JSON of a region.
-
-    Parameters
-    ----------
-    name : str
-    vertices : (n, 3) float64, world frame
-    simplices : sequence of index triples, or None
-        Triangles of the hull.
-    """
-    return {
-        "class_name": CLASS_NAME,
-        "version": VERSION,
-        "blender_object_name": name,
-        "vertices": np.asarray(vertices, np.float64).tolist(),
-        "hull_simplices": None if simplices is None else [list(map(int, s)) for s in simplices],
-    }
-
-
-def vertices_of_region(values: Any, path: Path) -> np.ndarray:
-    """Return the (n, 3) float64 vertices of a bounding-volume JSON.
-
-    Raises
-    ------
-    ParseError
-        Wrong class, wrong version, or vertices that are not finite triples or enclose nothing.
-    """
-    hint = "Export the region again."
-    if not isinstance(values, dict) or values.get("class_name") != CLASS_NAME:
-        raise ParseError(path, "class_name", f"is not {CLASS_NAME}.", "Choose a region file.")
-    if values.get("version") != VERSION:
-        raise ParseError(path, "version", f"is {values.get('version')!r}, not {VERSION}.", hint)
-    rows = values.get("vertices")
-    if not isinstance(rows, list) or len(rows) > limits.MAX_REGION_VERTICES:
-        raise ParseError(path, "vertices", "is not a list of a possible length.", hint)
-    for index, row in enumerate(rows):
-        if (
-            not isinstance(row, list)
-            or len(row) != 3
-            or not all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in row)
-        ):
-            raise ParseError(path, f"vertices[{index}]", "is not three numbers.", hint)
-    try:
-        vertices = np.array(rows, np.float64).reshape(-1, 3)
-        check_volume(vertices, path.stem)
-    except OverflowError:
-        raise ParseError(path, "vertices", "a number is too large.", hint) from None
-    except UsageError as error:
-        raise ParseError(path, "vertices", error.message, error.hint) from None
-    return vertices
 
 
 def box_matrix(vertices: np.ndarray) -> np.ndarray | None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bounded reader of a PLY's header and of its vertices as a table of numbers."""
+"""Bounded reader of a PLY's header: the only one."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from . import limits
-from .errors import ParseError
+from ..errors import ParseError
 
 MAX_HEADER_BYTES = 64 * 1024
 
@@ -22,7 +19,7 @@ _TYPES = {
 
 _ENCODINGS = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
 
-_LIST = "list"
+LIST = "list"
 """Type of a property whose length differs from row to row; only elements after the vertices may
 have one."""
 
@@ -53,6 +50,10 @@ class PlyHeader:
     begin: int
     """Byte at which the body begins."""
 
+    def count(self, element: str) -> int:
+        """Return how many of an element are announced, 0 where it is not named."""
+        return next((found.count for found in self.elements if found.name == element), 0)
+
 
 def read_ply_header(path: Path, hint: str) -> PlyHeader:
     """Read a header of at most :data:`MAX_HEADER_BYTES`.
@@ -73,9 +74,9 @@ def read_ply_header(path: Path, hint: str) -> PlyHeader:
             head = stream.read(MAX_HEADER_BYTES)
     except OSError as error:
         raise ParseError(path, "whole file", f"cannot be read: {error.strerror}.", hint) from None
-    if not re.match(rb"ply\r?\n", head):
+    if not re.match(rb"ply[ \t]*\r?\n", head):
         raise ParseError(path, "byte 0", "not a PLY file.", hint)
-    end = re.search(rb"\nend_header\r?\n", head)
+    end = re.search(rb"\nend_header[ \t]*\r?\n", head)
     if end is None:
         raise ParseError(path, "header", f"does not end within {MAX_HEADER_BYTES} bytes.", hint)
     encoding = ""
@@ -114,7 +115,7 @@ def _property(
     """Return (name, type) of a property line."""
     is_list = len(words) == 5 and words[1] == "list"
     if is_list and words[2] in _TYPES and words[3] in _TYPES:
-        name, kind = words[4], _LIST
+        name, kind = words[4], LIST
     elif len(words) == 3 and words[1] in _TYPES:
         name, kind = words[2], _TYPES[words[1]]
     else:
@@ -122,77 +123,3 @@ def _property(
     if name in dict(before):
         raise ParseError(path, place, f"property {name} comes twice.", hint)
     return name, kind
-
-
-def vertex_layout(path: Path, header: PlyHeader, hint: str) -> np.dtype:
-    """Return how the vertices of a file lie in it; parameters and errors of `read_vertices`."""
-    if not header.elements or header.elements[0].name != "vertex":
-        raise ParseError(path, "header", "the first element is not named vertex.", hint)
-    vertex = header.elements[0]
-    if vertex.count > limits.MAX_GAUSSIANS:
-        raise ParseError(
-            path, "header", f"{vertex.count} vertices; at most {limits.MAX_GAUSSIANS} are read.",
-            hint,
-        )  # fmt: skip
-    if not vertex.properties:
-        raise ParseError(path, "header", "vertices without properties.", hint)
-    if any(kind == _LIST for _, kind in vertex.properties):
-        raise ParseError(path, "header", "vertices with a list property.", hint)
-    text = header.encoding == "ascii"
-    order = "=" if text else header.encoding
-    layout = np.dtype([(n, order + ("f8" if text else kind)) for n, kind in vertex.properties])
-    # A number and its separator take two bytes; the last line may lack its end.
-    smallest = vertex.count * (2 * len(vertex.properties) if text else layout.itemsize)
-    need_bytes = header.begin + smallest - text
-    size_bytes = path.stat().st_size
-    if size_bytes < need_bytes:
-        raise ParseError(
-            path, f"byte {size_bytes}", f"cut off: the header promises {need_bytes} bytes.", hint
-        )
-    return layout
-
-
-def read_vertices(path: Path, header: PlyHeader, hint: str) -> np.ndarray:
-    """Read the vertices, the first element of a file.
-
-    Nothing is allocated before the file is known to be as long as the header promises.
-
-    Parameters
-    ----------
-    path : Path
-    header : PlyHeader
-        Of that file.
-    hint : str
-        Next step of every error.
-
-    Returns
-    -------
-    (n,) structured array
-        One field per property; of an ASCII file all are float64.
-
-    Raises
-    ------
-    ParseError
-        Vertices do not come first, are too many, have lists, or the body is cut.
-    """
-    layout = vertex_layout(path, header, hint)
-    vertex, text = header.elements[0], header.encoding == "ascii"
-    with path.open("rb") as stream:
-        stream.seek(header.begin)
-        if not text:
-            return np.fromfile(stream, layout, vertex.count)
-        if vertex.count == 0:
-            return np.zeros(0, layout)
-        try:
-            table = np.loadtxt(stream, ndmin=2, comments=None, max_rows=vertex.count)  # (n, p)
-        except ValueError as error:
-            raise ParseError(path, "body", f"{error}.", hint) from None
-    if table.shape != (vertex.count, len(vertex.properties)):
-        raise ParseError(
-            path, "body", f"{table.shape[0]} lines of {table.shape[1]} numbers; the header "
-            f"promises {vertex.count} of {len(vertex.properties)}.", hint,
-        )  # fmt: skip
-    rows = np.empty(vertex.count, layout)
-    for column, name in enumerate(vertex.names):
-        rows[name] = table[:, column]
-    return rows

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What training asks of the photos."""
+"""What training, baking and pictures ask of a scene's photos."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from typing import Protocol
 
 import numpy as np
 
-from ..dataset.camera import Camera
+from .camera import Camera
 
 
-class Photos(Protocol):
+class PhotoSource(Protocol):
     """Cameras, photos and masks of the scene's views at sizes divided by whole numbers.
 
     :class:`~.photos.PhotoStore` is one.
     """
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Return the camera of a level."""
+        """Return the camera that fits ``photo(index, divisor)`` pixel for pixel."""
 
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:
         """Return (h, w, 3) uint8."""
 
     def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
-        """Return (h, w) bool or ``None``."""
+        """Return (h, w) bool, true where the photo counts, or ``None``."""

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which corners enclose a volume that can be meshed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .. import limits
+from ..errors import MeshingError
+
+FLAT_SHARE = 1e-6
+"""A body thinner than this share of its diagonal has no usable volume."""
+
+
+def check_volume(vertices: np.ndarray, name: str) -> None:
+    """Refuse corners that enclose no volume.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float64
+    name : str
+        Of the region, for messages.
+
+    Raises
+    ------
+    MeshingError
+        Fewer than four corners, too many, one that is not finite, or all in one plane.
+    """
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < 4:
+        raise MeshingError(
+            f"Region {name!r} needs at least four corners.", "Draw a box around the thing."
+        )
+    if len(vertices) > limits.MAX_REGION_VERTICES:
+        raise MeshingError(
+            f"Region {name!r} has {len(vertices)} corners; {limits.MAX_REGION_VERTICES} is the "
+            "most.",
+            "Use a simpler body, such as a box.",
+        )
+    if not np.isfinite(vertices).all():
+        raise MeshingError(f"Region {name!r} has a corner that is not finite.", "Draw it again.")
+    if not _is_thick(vertices):
+        raise flat_region(name)
+
+
+def flat_region(name: str) -> MeshingError:
+    """Return the error of a region without a volume."""
+    return MeshingError(f"Region {name!r} is flat: it encloses no volume.", "Give it some height.")
+
+
+def _is_thick(vertices: np.ndarray) -> bool:
+    diagonal = float(np.linalg.norm(vertices.max(0) - vertices.min(0)))
+    if diagonal <= 0.0:
+        return False
+    centred = vertices - vertices.mean(0)  # (n, 3)
+    widths = np.linalg.svd(centred / diagonal, compute_uv=False)  # (3,)
+    return bool(widths[2] / np.sqrt(len(centred)) >= FLAT_SHARE)

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Children are started alike everywhere: own group, nothing inherited, ended with their own."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core.processes import spawn as module
+from gaussian_wrapping_addon.core.processes.spawn import (
+    child_environment,
+    group_options,
+    kill_group,
+    run_to_end,
+    spawn,
+)
+
+PACKAGE = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon"
+
+TELL = (
+    "import json, os, sys\n"
+    "open_files = [n for n in range(3, 64) if os.path.exists(f'/proc/self/fd/{n}')"
+    " and os.path.basename(os.path.realpath(f'/proc/self/fd/{n}')) == 'held']\n"
+    "print(json.dumps({'read': sys.stdin.read(), 'group': os.getpgid(0), 'own': os.getpid(),"
+    " 'environment': dict(os.environ), 'files': open_files}))\n"
+)
+NAP = "import time; time.sleep(60)"
+
+
+def test_a_child_leads_a_group_and_inherits_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", "/nowhere")
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    with (tmp_path / "held").open("wb") as held:
+        os.set_inheritable(held.fileno(), True)
+        code, output, words = run_to_end([sys.executable, "-I", "-c", TELL], 60.0)
+    told = json.loads(output)
+    assert (code, words, told["read"], told["files"]) == (0, "", "", [])
+    assert told["group"] == told["own"] != os.getpgid(0)
+    assert "PYTHONPATH" not in told["environment"]
+    assert told["environment"]["OMP_WAIT_POLICY"] == "PASSIVE"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    assert child_environment()["OMP_WAIT_POLICY"] == "ACTIVE"
+
+
+def test_an_environment_can_be_given() -> None:
+    process = spawn([sys.executable, "-I", "-c", TELL], environment={"ONLY": "1"})
+    output, _ = process.communicate(timeout=60)
+    assert json.loads(output)["environment"]["ONLY"] == "1"
+    assert "OMP_WAIT_POLICY" not in json.loads(output)["environment"]
+
+
+def test_on_windows_a_group_without_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.sys, "platform", "win32")
+    monkeypatch.setattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0x200, raising=False)
+    monkeypatch.setattr(subprocess, "CREATE_NO_WINDOW", 0x8000000, raising=False)
+    assert group_options() == {"creationflags": 0x8000200}
+
+
+def test_what_a_child_has_started_ends_with_it() -> None:
+    code = (
+        "import subprocess, sys, time\n"
+        f"child = subprocess.Popen([sys.executable, '-c', {NAP!r}])\n"
+        "print(child.pid, flush=True)\n" + NAP
+    )
+    process = spawn([sys.executable, "-I", "-c", code])
+    assert process.stdout is not None
+    grandchild = int(process.stdout.readline())
+    kill_group(process)
+    process.communicate()
+    assert process.returncode != 0
+    deadline_s = time.monotonic() + 10.0
+    while is_at_work(grandchild):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+
+
+def is_at_work(pid: int) -> bool:
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return False
+    return text.rpartition(")")[2].split()[0] != "Z"
+
+
+def test_deadlines_and_missing_programs() -> None:
+    begun_s = time.monotonic()
+    with pytest.raises(subprocess.TimeoutExpired):
+        run_to_end([sys.executable, "-I", "-c", NAP], 0.5)
+    assert time.monotonic() - begun_s < 30.0
+    with pytest.raises(FileNotFoundError):
+        run_to_end(["/no/such/program"], 1.0)
+
+
+def test_nothing_else_starts_processes() -> None:
+    """But for the set-up of the worker, which runs foreign Pythons."""
+    wrong = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if path.name == "spawn.py" or "setup" in path.parts:
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if (
+                isinstance(node, ast.Call)
+                and isinstance(node.func, ast.Attribute)
+                and isinstance(node.func.value, ast.Name)
+                and node.func.value.id == "subprocess"
+                and node.func.attr in ("Popen", "run", "call", "check_call", "check_output")
+            ):
+                wrong.append(f"{path.relative_to(PACKAGE)}:{node.lineno}")
+    assert wrong == []
