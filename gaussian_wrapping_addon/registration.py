@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import bpy
 
+from . import batch
 from .ops import (
     camera_operators,
     cli_command,
@@ -104,7 +105,7 @@ def register() -> None:
         for name, handler in HANDLERS:
             getattr(bpy.app.handlers, name).append(handler)
         region_drawing.start()
-        cli_command.register()
+        cli_command.register(batch.main)
         # While Blender starts, scripts may not see the open file yet.
         bpy.app.timers.register(job_timer.attach_later, first_interval=0.1, persistent=True)
     except Exception:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import bpy
 import pytest
@@ -71,16 +72,21 @@ def test_the_command_is_known_while_the_addon_is(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_command_has_the_exit_codes_of_batch(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    known: list[Any] = []
+    monkeypatch.setattr(bpy.utils, "register_cli_command", lambda _, run: known.append(run))
+    gaussian_wrapping_addon.register()
+    gaussian_wrapping_addon.unregister()
+    (run,) = known
     logging.getLogger("gaussian_wrapping").addHandler(caplog.handler)
     try:
-        assert cli_command.run(["no-such-command"]) == 2
+        assert run(["no-such-command"]) == 2
     finally:
         logging.getLogger("gaussian_wrapping").removeHandler(caplog.handler)
     assert "Usage: blender --command gwrap" in caplog.text
-    assert cli_command.run(["resume", str(tmp_path / "missing")]) in (1, 2)
-    assert cli_command.run(["check", str(tmp_path)]) == 3
+    assert run(["resume", str(tmp_path / "missing")]) in (1, 2)
+    assert run(["check", str(tmp_path)]) == 3
 
 
 def test_a_job_of_the_button_goes_on_in_batch(

@@ -12,19 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MeshingError
-from ..files import write_json
 from ..parallel import default_threads
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
 from .job_file import JobFile, refuse_other_regions, region_name, region_names
 from .job_folder import JobFolder
 from .machine import describe_machine, peak_memory_bytes
-from .stages import Stage, read_done, run_stage, source_fingerprint, stage_key
+from .mesh_stages import mesh_key
+from .stages import STAGE_VERSIONS, Stage, read_done, run_stage, source_fingerprint, stage_key
 
 _logger = logging.getLogger(__name__)
-
-# Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
-STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 9, "texture": 11}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
@@ -195,26 +192,6 @@ def _run_training(
     return run_training(folder, job, cameras, progress, version=version, threads=threads)
 
 
-def _mesh_key(job: JobFile, request: str, name: str, trained_key: str) -> str:
-    body = job.region_bodies.get(request)
-    return stage_key(
-        STAGE_VERSIONS["mesh"], trained_key, request if body is None else body, name,
-        to_json(job.meshing_of(request)), job.settings.seed,
-    )  # fmt: skip
-
-
-def mesh_stages(folder: JobFolder, job: JobFile) -> set[str]:
-    """Return the names of the mesh stages that the job has, or would have, in a folder."""
-    finished = [p for p in folder.stages.glob("train-*") if read_done(p) is not None]
-    trained = [path.name.partition("-")[2] for path in finished]
-    names = {r: region_name(r, job.region_bodies.get(r)) for r in job.settings.regions}
-    return {
-        f"mesh-{name}-{_mesh_key(job, request, name, key)}"
-        for request, name in names.items()
-        for key in trained
-    }
-
-
 def _run_meshing(
     folder: JobFolder,
     job: JobFile,
@@ -227,7 +204,7 @@ def _run_meshing(
 ) -> Stage:
     meshing = job.meshing_of(request)
     body = job.region_bodies.get(request)
-    key = _mesh_key(job, request, name, trained.key)
+    key = mesh_key(job, request, name, trained.key)
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         import numpy as np
@@ -375,22 +352,3 @@ def _run_texture(
 
     formats = json.dumps(sorted(job.settings.export))
     return run_stage(folder.stages, f"texture-{name}", stage_key(key, formats), progress, work)
-
-
-def write_scene_summary(path: Path, cameras: Stage) -> None:
-    """Write ``result/scene.json``: what Blender needs of the scene (docs/architecture.md)."""
-    from ..dataset.scene_file import load_saved_scene
-    from ..tolerances import SCENE_RADIUS
-
-    scene = load_saved_scene(cameras.folder)
-    write_json(
-        path,
-        {
-            "version": 1,
-            "world_from_scene": scene.world_from_scene.to_json(),
-            "radius": SCENE_RADIUS,
-            "cameras": [
-                {**view.camera.to_json(), "photo": str(view.photo_path)} for view in scene.views
-            ],
-        },
-    )

@@ -17,8 +17,8 @@ from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.earlier_job import NAME, finished_job, keep_finished
 from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_job, write_job
 from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.jobs.mesh_stages import mesh_stages
 from gaussian_wrapping_addon.core.jobs.region_meshing import open_lists
-from gaussian_wrapping_addon.core.jobs.runner import mesh_stages
 from gaussian_wrapping_addon.core.jobs.tile_worker import help_with_tiles
 from gaussian_wrapping_addon.core.meshing.tiles.store import LIST_NAME
 from gaussian_wrapping_addon.core.settings import JobSettings, TextureSettings
