@@ -21,7 +21,7 @@ from ..core.jobs.job_file import (
 from ..core.jobs.job_folder import JobFolder
 from ..core.jobs.more import job_with_more
 from ..core.jobs.stages import read_done
-from . import job_timer, tags
+from . import job_timer, tags, watched_jobs
 from .region_objects import export_region
 from .region_resolution import own_lengths, world_per_blender
 from .training_choices import job_settings, texture_choices
@@ -277,7 +277,7 @@ def _result_name(region: bpy.types.Object, frame: bpy.types.Object) -> str:
 
 
 def _refuse_running(folder: Path) -> None:
-    if job_timer.is_running(str(folder)):
+    if watched_jobs.is_running(str(folder)):
         raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
 
 

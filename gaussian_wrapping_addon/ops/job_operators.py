@@ -11,11 +11,13 @@ from ..core.errors import UsageError, WrapError
 from . import (
     doctor,
     job_actions,
+    job_attach,
     job_timer,
     known_jobs,
     panel_state,
     photo_check,
     tags,
+    watched_jobs,
     worker_setup,
 )
 from .reporting import ReportsErrors
@@ -23,7 +25,7 @@ from .reporting import ReportsErrors
 
 def no_job_runs(cls: type, context: bpy.types.Context) -> bool:
     """Tell whether no job runs in the scene; the tooltip says why a button is grey."""
-    if job_timer.is_running(context.scene.gwrap.job_folder):
+    if watched_jobs.is_running(context.scene.gwrap.job_folder):
         cls.poll_message_set("A job is running; cancel it or wait for it")  # type: ignore[attr-defined]
         return False
     return True
@@ -180,7 +182,7 @@ class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not job_timer.is_running(context.scene.gwrap.job_folder):
+        if not watched_jobs.is_running(context.scene.gwrap.job_folder):
             cls.poll_message_set("No job is running; Wrap Scene starts one")
             return False
         return True
@@ -200,7 +202,7 @@ class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
         if not context.scene.gwrap.job_folder:
             cls.poll_message_set("This scene has no job; press Wrap Scene, or find its folder")
             return False
-        if job_timer.is_gone(context.scene.gwrap.job_folder):
+        if watched_jobs.is_gone(context.scene.gwrap.job_folder):
             cls.poll_message_set("The job's folder is gone; press Find Job where it was moved")
             return False
         return no_job_runs(cls, context)
@@ -229,7 +231,7 @@ class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose the folder of a job.")
         folder = Path(bpy.path.abspath(self.directory)).resolve()
-        status = job_timer.attach(context.scene, folder)
+        status = job_attach.attach(context.scene, folder)
         known_jobs.remember(folder)
         self.report({"INFO"}, f"Found a job: {status.state.lower()}")
         return {"FINISHED"}

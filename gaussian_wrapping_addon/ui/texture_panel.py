@@ -5,7 +5,7 @@ from typing import Final
 
 import bpy
 
-from ..ops import job_timer
+from ..ops import watched_jobs
 from .panel_base import Readiness, TabPanel, plain
 from .text import characters_of, wrapped_label
 
@@ -23,7 +23,7 @@ class GWRAP_PT_texture(TabPanel, bpy.types.Panel):
         layout, properties = self.layout, context.scene.gwrap
         plain(layout)
         column = layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column.enabled = not watched_jobs.is_running(properties.job_folder)
         column.prop(properties, "texture_size", text="Size")
         column.prop(properties, "max_atlases")
         column.row().prop(properties, "texture_source", text="Colors From", expand=True)

@@ -5,7 +5,7 @@ from typing import Final
 
 import bpy
 
-from ..ops import job_timer
+from ..ops import watched_jobs
 from ..ops.training_choices import DECISIONS, NUMBERS, preset_lines
 from .panel_base import CATEGORY, plain
 from .text import characters_of, wrapped_label
@@ -24,7 +24,7 @@ class GWRAP_PT_train_advanced(bpy.types.Panel):
         properties = context.scene.gwrap
         training = properties.training
         column = self.layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column.enabled = not watched_jobs.is_running(properties.job_folder)
         column.label(text="What the Scene Needs")
         for name in DECISIONS:
             column.row().prop(training, name, expand=True)

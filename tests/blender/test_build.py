@@ -127,7 +127,8 @@ timer = sys.modules[name + ".ops.job_timer"]
 end_s = time.monotonic() + 60
 while timer.poll_jobs() and time.monotonic() < end_s:
     time.sleep(0.1)
-status = timer.status_of(scene.gwrap.job_folder)
+watched = sys.modules[name + ".ops.watched_jobs"]
+status = watched.status_of(scene.gwrap.job_folder)
 print("STATUS", status.state, status.error)
 known = Path(bpy.utils.extension_path_user(name)) / "known_jobs.json"
 assert scene.gwrap.job_folder in known.read_text()

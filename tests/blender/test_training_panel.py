@@ -20,6 +20,7 @@ from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_j
 from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.core.settings import DECISIONS, MASK_MODES, preset, to_json
 from gaussian_wrapping_addon.ops import (
+    background,
     job_timer,
     known_jobs,
     live_preview,
@@ -302,7 +303,7 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def wait_for_answer() -> str:
     """Play the timer, which never fires in background Blender; return what is drawn."""
     end_s = time.monotonic() + 30.0
-    while training_estimate.show() is not None:
+    while background.poll() is not None:
         assert time.monotonic() < end_s
         time.sleep(0.02)
     return draw(TRAIN).texts.replace("\n", " ")
@@ -343,5 +344,5 @@ def test_stopping_forgets_the_question(worker: Path, monkeypatch: pytest.MonkeyP
     training_estimate.stop()
     assert not training_estimate.is_busy()
     time.sleep(0.1)
-    training_estimate.show()
+    background.poll()
     assert "4 to 6 min" not in draw(TRAIN).texts
