@@ -51,8 +51,9 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
             now_s = time.monotonic()
             news = (status.stage, status.message)
             due = status.stage != shown[0] or now_s - shown_s > LINE_EVERY_S
+            failed = status.state in ("FAILED", "LOST")
             # What has failed was at another place: a finished job that is put back says 100 %.
-            if status.stage and due and news != shown and not status.error:
+            if status.stage and due and news != shown and not failed:
                 shown_s, shown = now_s, news
                 left = (
                     "" if status.seconds_left is None else f" · {_span(status.seconds_left)} left"

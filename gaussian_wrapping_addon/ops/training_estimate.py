@@ -26,7 +26,6 @@ MAX_LINES = 20
 MAX_TEXT = 300
 MAX_KNOWN = 20
 """Answers kept, so that going back to a preset shows its estimate again."""
-_WARNING = "warning: "
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
     Parameters
     ----------
     said : list of dict
-        ``{"line": text}`` for each line, of which some begin with ``warning:``, or
+        ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
         ``{"error": text, "hint": text}``.
     last_words : str
         The end of what the child wrote to its terminal, in case it said nothing else.
@@ -116,19 +115,19 @@ def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
     for values in said:
         if values.get("error"):
             return Estimate((), (str(values["error"]), str(values.get("hint", ""))))
-    lines = [str(values["line"])[:MAX_TEXT] for values in said if values.get("line")][:MAX_LINES]
-    if not lines:
+    told = [values for values in said if values.get("line") or values.get("warning")][:MAX_LINES]
+    if not told:
         raise WorkerError(
             f"There is no estimate: {last_words or 'the worker said nothing'}.",
             "Check the worker in the add-on's preferences.",
         )
-    warnings = tuple(line.removeprefix(_WARNING) for line in lines if line.startswith(_WARNING))
-    plain = tuple(_capital(line) for line in lines if not line.startswith(_WARNING))
-    return Estimate(plain, tuple(_capital(text) for text in warnings))
+    return Estimate(_texts(told, "line"), _texts(told, "warning"))
 
 
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
+def _texts(said: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
+    """Return the texts of one kind, as sentences."""
+    texts = (str(values[kind])[:MAX_TEXT] for values in said if values.get(kind))
+    return tuple(text[:1].upper() + text[1:] for text in texts)
 
 
 def estimate_of_failure(error: Exception) -> Estimate:

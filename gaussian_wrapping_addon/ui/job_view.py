@@ -79,7 +79,7 @@ def _draw_ended(layout: Any, context: bpy.types.Context, status: JobStatus) -> N
     if status.state == "CANCELLED":
         text = f"Cancelled at {100 * status.fraction:.0f} %. {status.hint}"
         wrapped_label(layout, text, characters, icon="PAUSE")
-    elif status.state != "DONE" or status.error:
+    elif status.state != "DONE" or status.put_back:
         box = layout.box()
         error = box.column()
         error.alert = True

@@ -312,7 +312,11 @@ def wait_for_answer() -> str:
 def test_estimate_asks_the_worker_and_shows_its_words(
     worker: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said = [{"line": "training: 4 to 6 min"}, {"line": "memory: 1.2 GB"}, {"line": "warning: full"}]
+    said = [
+        {"line": "training: 4 to 6 min"},
+        {"line": "memory: 1.2 GB"},
+        {"warning": "full", "code": "disk"},
+    ]
     monkeypatch.setenv("GW_ANSWER", "\n".join(["noise", *map(json.dumps, said)]))
     training().iterations = 432
     assert bpy.ops.gwrap.estimate() == {"FINISHED"}

@@ -55,7 +55,9 @@ class _Overall:
             elapsed_s = time.monotonic() - self._begun_s
             gained = overall - self._offset
             left_s = elapsed_s * (1.0 - overall) / gained if gained > 0.01 else None
-            self._sink(ProgressEvent(name, overall, event.message, event.figures, left_s))
+            self._sink(
+                ProgressEvent(name, overall, event.message, event.figures, left_s, event.phase)
+            )
 
         return Progress(name, forward, self._is_cancelled)
 
@@ -158,7 +160,7 @@ def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: in
         return {
             "views": len(scene.views),
             "points": len(scene.points),
-            "warnings": list(scene.warnings),
+            "warnings": [warning.to_json() for warning in scene.warnings],
             "facts": scene.facts,
         }
 
