@@ -98,7 +98,7 @@ def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Names
     if options.no_blend:
         set_aside_stale(result, before)
     else:
-        from ..ops.scene_objects import write_blend
+        from ..ops.blend_writer import write_blend
 
         try:
             write_blend(result, result / NAME)
@@ -106,7 +106,7 @@ def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Names
             set_aside_stale(result, before)
             raise
     if "usd" in job.settings.export:
-        from ..ops.scene_objects import export_usd
+        from ..ops.blend_writer import export_usd
 
         export_usd(result)
     from ..core.evaluation.report.report import headline

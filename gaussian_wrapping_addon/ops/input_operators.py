@@ -8,7 +8,7 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ..core.errors import UsageError
-from . import job_actions, photo_check, training_estimate, watched_jobs
+from . import photo_check, preferred_worker, training_estimate, watched_jobs
 from .job_operators import no_job_runs
 from .reporting import ReportsErrors
 
@@ -63,7 +63,7 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
             watched_jobs.detach(context.scene)
         properties.source = str(path)
         training_estimate.forget()
-        photo_check.start(context.scene, job_actions.worker_choice(context))
+        photo_check.start(context.scene, preferred_worker.worker_choice(context))
         return {"FINISHED"}
 
 

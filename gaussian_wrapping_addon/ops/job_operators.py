@@ -16,6 +16,7 @@ from . import (
     known_jobs,
     panel_state,
     photo_check,
+    preferred_worker,
     tags,
     watched_jobs,
     worker_setup,
@@ -131,7 +132,7 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
         return has_worker(cls) and no_job_runs(cls, context)
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        folder = job_actions.start_wrap(context.scene, job_actions.worker_choice(context))
+        folder = job_actions.start_wrap(context.scene, preferred_worker.worker_choice(context))
         self.report({"INFO"}, f"Wrapping in {folder}")
         return {"FINISHED"}
 
@@ -169,7 +170,7 @@ class GWRAP_OT_mesh_region(AsksAboutFolder, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> set[str]:
         regions = self._regions(context)
-        choice = job_actions.worker_choice(context)
+        choice = preferred_worker.worker_choice(context)
         job_actions.start_mesh(context.scene, regions, choice)
         self.report({"INFO"}, f"Meshing {', '.join(r.name for r in regions)}")
         return {"FINISHED"}
@@ -211,7 +212,7 @@ class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
         return Path(bpy.path.abspath(context.scene.gwrap.job_folder))
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        job_actions.resume(context.scene, job_actions.worker_choice(context))
+        job_actions.resume(context.scene, preferred_worker.worker_choice(context))
         return {"FINISHED"}
 
 
@@ -250,7 +251,7 @@ class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
         return True
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        doctor.start(job_actions.worker_choice(context).python)
+        doctor.start(preferred_worker.worker_choice(context).python)
         return {"FINISHED"}
 
 

@@ -11,8 +11,9 @@ import bpy
 from ..core.errors import WrapError
 from . import panel_state, tags, training_estimate
 from .background import Lane
-from .job_actions import WorkerChoice, source_of
+from .preferred_worker import WorkerChoice
 from .redrawing import redraw
+from .scene_folders import source_of
 
 if TYPE_CHECKING:
     from ..core.dataset.check import Finding

@@ -16,8 +16,9 @@ from ..core.jobs.job_file import make_job
 from . import estimate_child
 from .background import Lane
 from .estimate_child import Child
-from .job_actions import WorkerChoice, source_of
+from .preferred_worker import WorkerChoice
 from .redrawing import redraw
+from .scene_folders import source_of
 from .training_choices import choices_key, job_settings
 
 MODULE = "jobs.estimate"

@@ -29,7 +29,7 @@ from ..core.setup.pythons import FoundPython, find_pythons
 from ..core.worker_environment import WorkerEnvironment
 from ..core.worker_requirements import requirements_file
 from . import doctor
-from .job_actions import worker_choice
+from .preferred_worker import worker_choice
 from .redrawing import redraw
 
 _logger = logging.getLogger(__name__)

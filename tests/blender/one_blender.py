@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import bpy
 
 import gaussian_wrapping_addon
-from gaussian_wrapping_addon.ops import job_actions, job_attach, watched_jobs
+from gaussian_wrapping_addon.ops import job_attach, preferred_worker, watched_jobs
 from gaussian_wrapping_addon.ui import train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import meshes, play_to, play_until, start_wrap, status_of
@@ -32,8 +32,8 @@ def say(**values: object) -> None:
 
 def start(blend: Path, photos: Path, keep: bool) -> Path:
     """Start a job and save the file."""
-    choice = job_actions.worker_choice(bpy.context)
-    job_actions.worker_choice = lambda _context: job_actions.WorkerChoice(
+    choice = preferred_worker.worker_choice(bpy.context)
+    preferred_worker.worker_choice = lambda _context: preferred_worker.WorkerChoice(
         choice.python, choice.threads, keep
     )
     properties = bpy.context.scene.gwrap

@@ -116,8 +116,8 @@ preferences = bpy.context.preferences.addons[name].preferences
 preferences.threads = 3
 preferences.worker_python = {python!r}
 assert "gaussian_wrapping_addon" not in sys.modules
-actions = sys.modules[name + ".ops.job_actions"]
-choice = actions.worker_choice(bpy.context)
+workers = sys.modules[name + ".ops.preferred_worker"]
+choice = workers.worker_choice(bpy.context)
 assert (choice.threads, choice.python) == (3, {python!r}), choice
 import time
 scene = bpy.context.scene

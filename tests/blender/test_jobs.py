@@ -23,10 +23,10 @@ from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.job_file import read_job
 from gaussian_wrapping_addon.ops import (
     background,
-    job_actions,
     job_attach,
     job_timer,
     known_jobs,
+    preferred_worker,
     tags,
     watched_jobs,
 )
@@ -516,4 +516,4 @@ def test_job_status_of_a_half_written_file_is_survived(
 
 
 def test_worker_choice_without_preferences() -> None:
-    assert job_actions.worker_choice(bpy.context) == job_actions.WorkerChoice()
+    assert preferred_worker.worker_choice(bpy.context) == preferred_worker.WorkerChoice()

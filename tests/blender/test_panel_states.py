@@ -181,7 +181,8 @@ def meshing(folder: Path) -> None:
 
 def mesh_failed(folder: Path) -> None:
     done(folder)
-    job(folder, "DONE", "MESH", result=str(folder / "job" / "result"), error=ERROR, hint=HINT)
+    result = str(folder / "job" / "result")
+    job(folder, "DONE", "MESH", result=result, error=ERROR, hint=HINT, put_back=True)
 
 
 State = Callable[[Path], None]
