@@ -2,8 +2,8 @@
 """Background work in Blender: threads do it, one timer delivers what comes of it.
 
 A :class:`Lane` is a thread that runs one :class:`Task` after the other. Tasks touch nothing of
-Blender. Their results and errors are delivered on Blender's main thread by :func:`poll`, the
-add-on's only timer, which also calls the functions that were given to :func:`watch`. The timer
+Blender. Their results and errors are delivered on the main thread by :func:`poll`, the only timer
+of background work, which also calls the functions that were given to :func:`watch`. The timer
 waits for nothing and starts no thread: threads are started when work is submitted, or ahead of
 time by :meth:`Lane.start`.
 """

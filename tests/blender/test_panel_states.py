@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import builtins
+import json
 import os
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,6 +18,7 @@ import pytest
 
 from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
 from gaussian_wrapping_addon.ops import (
     background,
@@ -34,6 +37,7 @@ from gaussian_wrapping_addon.ops.training_choices import choices_key
 from gaussian_wrapping_addon.ops.training_estimate import Estimate
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.fake_worker import LIVE
+from tests.blender.job_play import write_fake_python
 from tests.blender.synthetic_result import png_bytes, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -436,6 +440,24 @@ def test_choosing_photos_checks_them_at_once(
     play(background.poll)
     assert tab()["Dataset"].header == "Cannot be used"
     assert len(asked) == 1
+
+
+def test_the_estimate_that_follows_a_check_starts_no_thread_in_the_timer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
+    monkeypatch.setenv("GW_ASKED", str(tmp_path / "asked.json"))
+    monkeypatch.setenv("GW_ANSWER", json.dumps({"line": "training: 4 to 6 min"}))
+    choose_photos(tmp_path)
+    assert bpy.ops.gwrap.choose_input(filepath=bpy.context.scene.gwrap.source) == {"FINISHED"}
+
+    def refuse(_thread: threading.Thread) -> None:
+        raise AssertionError("a thread is started")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        play(background.poll)
+    assert "Training 4 to 6 min" in words(tab()["Train"])
 
 
 def test_a_clicked_photo_stands_for_its_folder_and_files_for_themselves(tmp_path: Path) -> None:
