@@ -116,7 +116,6 @@ def register() -> None:
 
 def unregister() -> None:
     """Take everything out, as far as it is there; workers go on and are found again."""
-    background.stop()
     worker_setup.stop()
     training_estimate.forget()
     region_estimate.stop()
@@ -125,6 +124,7 @@ def unregister() -> None:
     region_watch.forget()
     job_timer.forget_all()
     live_preview.stop()
+    background.stop()  # last of these: what they end is ended by its threads
     cli_command.unregister()
     for name, handler in HANDLERS:
         handlers: list[Any] = getattr(bpy.app.handlers, name)
