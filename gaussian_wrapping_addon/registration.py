@@ -9,17 +9,18 @@ from typing import Any, Final
 
 import bpy
 
+from . import batch
 from .ops import (
+    background,
     camera_operators,
     cli_command,
-    doctor,
     export_operators,
     import_operators,
     input_operators,
+    job_attach,
     job_operators,
     job_timer,
     live_preview,
-    photo_check,
     placement,
     placement_operators,
     region_estimate,
@@ -81,11 +82,12 @@ CLASSES: Final[tuple[type, ...]] = (
 )
 
 HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (
-    ("load_post", job_timer.after_load),
+    ("load_pre", background.before_load),
+    ("load_post", job_attach.after_load),
     ("load_post", placement.after_load),
     ("load_post", region_watch.after_load),
-    ("undo_post", job_timer.after_undo),
-    ("redo_post", job_timer.after_undo),
+    ("undo_post", job_attach.after_undo),
+    ("redo_post", job_attach.after_undo),
     ("undo_post", placement.after_undo),
     ("redo_post", placement.after_undo),
     ("undo_post", region_watch.after_load),
@@ -104,9 +106,9 @@ def register() -> None:
         for name, handler in HANDLERS:
             getattr(bpy.app.handlers, name).append(handler)
         region_drawing.start()
-        cli_command.register()
+        cli_command.register(batch.main)
         # While Blender starts, scripts may not see the open file yet.
-        bpy.app.timers.register(job_timer.attach_later, first_interval=0.1, persistent=True)
+        background.watch(job_attach.attach_later)
     except Exception:
         unregister()
         raise
@@ -114,20 +116,15 @@ def register() -> None:
 
 def unregister() -> None:
     """Take everything out, as far as it is there; workers go on and are found again."""
-    job_timer.stop_timer()
-    if bpy.app.timers.is_registered(job_timer.attach_later):
-        bpy.app.timers.unregister(job_timer.attach_later)
-    doctor.stop()
-    photo_check.stop()
-    training_estimate.forget()
     worker_setup.stop()
-    training_estimate.stop()
+    training_estimate.forget()
     region_estimate.stop()
     region_drawing.stop()
     region_gizmo.stop()
     region_watch.forget()
     job_timer.forget_all()
     live_preview.stop()
+    background.stop()  # last of these: what they end is ended by its threads
     cli_command.unregister()
     for name, handler in HANDLERS:
         handlers: list[Any] = getattr(bpy.app.handlers, name)

@@ -36,7 +36,9 @@ def test_a_mesh_that_failed(
     figures.parent.mkdir(parents=True)
     write_json(figures, {"old": 1})
     finished = JobStatus("DONE", "export", 1.0, seconds_left=0.0)
-    folder.write_status(replace(finished, error="No surface.", hint="Look.", exit_code=3))
+    folder.write_status(
+        replace(finished, error="No surface.", hint="Look.", exit_code=3, put_back=True)
+    )
 
     def statuses() -> Iterator[JobStatus]:
         yield JobStatus("RUNNING", "mesh", 0.8, "meshing")

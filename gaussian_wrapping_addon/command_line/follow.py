@@ -52,8 +52,9 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
             now_s = time.monotonic()
             news = (status.stage, status.message)
             due = status.stage != shown[0] or now_s - shown_s > LINE_EVERY_S
+            failed = status.state in ("FAILED", "LOST")
             # What has failed was at another place: a finished job that is put back says 100 %.
-            if status.stage and due and news != shown and not status.error:
+            if status.stage and due and news != shown and not failed:
                 shown_s, shown = now_s, news
                 left = (
                     "" if status.seconds_left is None else f" · {_span(status.seconds_left)} left"
@@ -98,7 +99,7 @@ def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Names
     if options.no_blend:
         set_aside_stale(result, before)
     else:
-        from ..ops.scene_objects import write_blend
+        from ..ops.blend_writer import write_blend
 
         try:
             write_blend(result, result / NAME)
@@ -106,7 +107,7 @@ def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Names
             set_aside_stale(result, before)
             raise
     if "usd" in job.settings.export:
-        from ..ops.scene_objects import export_usd
+        from ..ops.blend_writer import export_usd
 
         export_usd(result)
     from ..core.evaluation.report.report import headline

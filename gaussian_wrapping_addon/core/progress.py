@@ -9,6 +9,10 @@ from dataclasses import dataclass, field
 
 from .errors import Cancelled
 
+COMPILING = "compiling"
+"""Phase in which kernels are compiled: no Python runs that could ask for cancelling, and nothing is
+lost where the process ends at once."""
+
 
 @dataclass(frozen=True)
 class ProgressEvent:
@@ -19,6 +23,8 @@ class ProgressEvent:
     message: str
     figures: dict[str, float] = field(default_factory=dict)
     seconds_left: float | None = None
+    phase: str = ""
+    """What programs must know of the moment, such as :data:`COMPILING`."""
 
 
 class Progress:
@@ -74,10 +80,19 @@ class Progress:
 
     def update(self, fraction: float, message: str = "", **figures: float) -> None:
         """Report ``fraction`` of this span as done, then check for cancelling."""
+        self._report(fraction, message, figures)
+
+    def enter(self, phase: str, message: str) -> None:
+        """Report the beginning of a phase, which lasts to the next report; check for cancelling."""
+        self._report(0.0, message, {}, phase)
+
+    def _report(
+        self, fraction: float, message: str, figures: dict[str, float], phase: str = ""
+    ) -> None:
         if self._sink is not None:
             local = min(max(fraction, 0.0), 1.0)
             overall = self._start + (self._end - self._start) * local
             elapsed_s = time.monotonic() - self._begun_s
             left_s = elapsed_s * (1.0 - overall) / overall if overall > 0.01 else None
-            self._sink(ProgressEvent(self.stage, overall, message, dict(figures), left_s))
+            self._sink(ProgressEvent(self.stage, overall, message, dict(figures), left_s, phase))
         self.check()

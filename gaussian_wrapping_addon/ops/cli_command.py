@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import Any
 
 import bpy
@@ -15,17 +16,20 @@ NAME = "gwrap"
 _handle: Any = None
 
 
-def run(arguments: list[str]) -> int:
-    """Run one command and return its exit code; Blender calls this."""
-    from .. import batch
+def register(main: Callable[[list[str], str], int]) -> None:
+    """Make the command known to Blender, once.
 
-    return batch.main(list(arguments), f"blender --command {NAME}")
-
-
-def register() -> None:
-    """Make the command known to Blender, once."""
+    Parameters
+    ----------
+    main : callable
+        Takes the arguments and the name of the program, runs one command, returns its exit code.
+    """
     global _handle
     if _handle is None:
+
+        def run(arguments: list[str]) -> int:
+            return main(list(arguments), f"blender --command {NAME}")
+
         _handle = bpy.utils.register_cli_command(NAME, run)
 
 

@@ -1,22 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Examine the worker's Python without blocking Blender: a thread waits, a timer shows."""
+"""Examine the worker's Python in the background."""
 
 from __future__ import annotations
 
-import queue
-import threading
 from pathlib import Path
 
-import bpy
-
 from ..core.jobs.doctor import Diagnosis, find_and_diagnose
+from .background import Lane
 from .redrawing import redraw
 
-POLL_S = 0.3
-
-_answers: queue.Queue[list[Diagnosis]] = queue.Queue()
+_checks = Lane()
 _findings: list[Diagnosis] = []
-_busy = threading.Event()
 
 
 def findings() -> tuple[Diagnosis, ...]:
@@ -26,7 +20,7 @@ def findings() -> tuple[Diagnosis, ...]:
 
 def is_busy() -> bool:
     """Tell whether a check runs."""
-    return _busy.is_set()
+    return _checks.busy
 
 
 def as_text() -> str:
@@ -40,36 +34,20 @@ def as_text() -> str:
 
 def start(preference: str) -> None:
     """Begin a check of the interpreter that jobs would use."""
-    _busy.set()
+    stop()
     _findings.clear()
-    threading.Thread(target=_examine, args=(preference,), daemon=True).start()
-    if not bpy.app.timers.is_registered(show):
-        bpy.app.timers.register(show, first_interval=POLL_S, persistent=True)
+    _checks.submit(lambda: find_and_diagnose(preference), _keep, failed=_keep_failure)
 
 
-def _examine(preference: str) -> None:
-    """Thread: touches nothing of Blender."""
-    try:
-        found = find_and_diagnose(preference)
-    except Exception as error:  # the queue must get an answer, or the check would never end
-        found = [Diagnosis("Python", False, f"{type(error).__name__}: {error}", "")]
-    _answers.put(found)
-
-
-def show() -> float | None:
-    """Timer: take the answer when there is one, and redraw."""
-    try:
-        found = _answers.get_nowait()
-    except queue.Empty:
-        return POLL_S
+def _keep(found: list[Diagnosis]) -> None:
     _findings[:] = found
-    _busy.clear()
     redraw("PREFERENCES")
-    return None
+
+
+def _keep_failure(error: Exception) -> None:
+    _keep([Diagnosis("Python", False, f"{type(error).__name__}: {error}", "")])
 
 
 def stop() -> None:
-    """Take the timer out."""
-    if bpy.app.timers.is_registered(show):
-        bpy.app.timers.unregister(show)
-    _busy.clear()
+    """Forget a check that is under way."""
+    _checks.cancel()

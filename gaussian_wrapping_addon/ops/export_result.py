@@ -9,10 +9,11 @@ import bpy
 
 from ..core.errors import UsageError
 from . import tags
+from .blend_writer import start_empty
 from .export_objects import ObjectExport, export_objects
 from .import_operators import materials_of
 from .materials import set_shading
-from .scene_objects import import_result, start_empty
+from .scene_objects import import_result
 
 
 def export_result(

@@ -8,7 +8,7 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ..core.errors import UsageError
-from . import job_actions, job_timer, photo_check, training_estimate
+from . import photo_check, preferred_worker, training_estimate, watched_jobs
 from .job_operators import no_job_runs
 from .reporting import ReportsErrors
 
@@ -60,10 +60,10 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
         if properties.source and Path(bpy.path.abspath(properties.source)) != path:
             if properties.output == properties.job_folder:
                 properties.output = ""  # it was made for the photos before
-            job_timer.detach(context.scene)
+            watched_jobs.detach(context.scene)
         properties.source = str(path)
         training_estimate.forget()
-        photo_check.start(context.scene, job_actions.worker_choice(context))
+        photo_check.start(context.scene, preferred_worker.worker_choice(context))
         return {"FINISHED"}
 
 

@@ -3,100 +3,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
 
-from ..core.errors import DatasetError, UsageError, WrapError
+from ..core.errors import DatasetError, UsageError
 from ..core.jobs.client import JobClient, worker_python
 from ..core.jobs.earlier_job import finished_job
-from ..core.jobs.job_file import make_job, read_job
+from ..core.jobs.job_file import make_job
 from ..core.jobs.job_folder import JobFolder
 from ..core.jobs.more import job_with_more
 from ..core.jobs.stages import read_done
 from ..core.names import AUTOMATIC_REGIONS, region_name, region_names
 from ..core.regions.region_file import read_region_file
 from ..core.settings import with_values
-from . import job_timer, tags
+from . import job_timer, tags, watched_jobs
+from .preferred_worker import WorkerChoice
 from .region_objects import export_region
 from .region_resolution import own_lengths, world_per_blender
+from .scene_folders import job_folder_of, output_of, source_of
 from .training_choices import job_settings, meshing_choices, texture_choices
-
-
-@dataclass(frozen=True)
-class WorkerChoice:
-    """What the add-on's preferences say about workers. Never read from a .blend file."""
-
-    python: str = ""
-    threads: int = 0
-    keep_running: bool = False
-
-
-def worker_choice(context: bpy.types.Context) -> WorkerChoice:
-    """Read the add-on's preferences; defaults where it is not enabled as an add-on."""
-    addon = context.preferences.addons.get(__package__.rpartition(".")[0])
-    preferences = addon.preferences if addon is not None else None
-    if preferences is None:
-        return WorkerChoice()
-    python = bpy.path.abspath(preferences.worker_python) if preferences.worker_python else ""
-    return WorkerChoice(python, preferences.threads, preferences.keep_running)
-
-
-def source_of(scene: bpy.types.Scene) -> Path:
-    """Return the photo folder of a scene.
-
-    Raises
-    ------
-    UsageError
-        None is chosen.
-    """
-    if not scene.gwrap.source:
-        raise UsageError("No photo folder is chosen.", "Choose one in Dataset.")
-    return Path(bpy.path.abspath(scene.gwrap.source)).resolve()
-
-
-def output_of(scene: bpy.types.Scene, source: Path) -> Path:
-    """Return the job folder for a source: the one chosen, or a sibling of the source.
-
-    Raises
-    ------
-    UsageError
-        It lies inside the photo folder, which is never written to.
-    """
-    text = "" if _is_of_other_photos(scene, source) else scene.gwrap.output
-    if source.suffix.lower() == ".ply":
-        base = source.with_suffix("")  # a splat: other files in its folder are not its input
-    else:
-        base = source.parent if source.is_file() else source
-    if not text and not base.name:  # a memory card, or the root of a disk
-        raise UsageError(
-            f"{base} is a whole disk, which has no folder beside it.",
-            "Copy the photos into a folder of their own.",
-        )
-    folder = Path(bpy.path.abspath(text)).resolve() if text else base.with_name(f"{base.name}_wrap")
-    if folder.is_relative_to(base):
-        raise UsageError(
-            f"{folder} lies inside the photo folder.", "Choose an output folder outside of it."
-        )
-    return folder
-
-
-def _is_of_other_photos(scene: bpy.types.Scene, source: Path) -> bool:
-    """Tell whether the output is that of this scene's last job, which had another source.
-
-    Typing over the photos' path must not wrap other photos over a finished job.
-    """
-    properties = scene.gwrap
-    if not properties.output or properties.output != properties.job_folder:
-        return False
-    job = JobFolder(Path(bpy.path.abspath(properties.job_folder)))
-    if not job.is_job():
-        return False
-    try:
-        return Path(read_job(job.job_path).source).resolve() != source
-    except WrapError:
-        return False
 
 
 def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
@@ -213,22 +140,6 @@ def resume(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     return folder
 
 
-def job_folder_of(frame: bpy.types.Object) -> Path:
-    """Return the job folder of a result's frame.
-
-    Raises
-    ------
-    UsageError
-        It has been moved or deleted.
-    """
-    folder = tags.result_folder(frame).resolve().parent
-    if not JobFolder(folder).is_job():
-        raise UsageError(
-            f"{folder} holds no job.", "Import the result again from where its folder is now."
-        )
-    return folder
-
-
 def _require_training(folder: Path) -> None:
     if not any(read_done(path) for path in (folder / "stages").glob("train-*")):
         raise UsageError(
@@ -275,7 +186,7 @@ def _stored_name(frame: bpy.types.Object, folder: str) -> str:
 
 
 def _refuse_running(folder: Path) -> None:
-    if job_timer.is_running(str(folder)):
+    if watched_jobs.is_running(str(folder)):
         raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
 
 

@@ -11,11 +11,14 @@ from ..core.errors import UsageError, WrapError
 from . import (
     doctor,
     job_actions,
+    job_attach,
     job_timer,
     known_jobs,
     panel_state,
     photo_check,
+    preferred_worker,
     tags,
+    watched_jobs,
     worker_setup,
 )
 from .reporting import ReportsErrors
@@ -23,7 +26,7 @@ from .reporting import ReportsErrors
 
 def no_job_runs(cls: type, context: bpy.types.Context) -> bool:
     """Tell whether no job runs in the scene; the tooltip says why a button is grey."""
-    if job_timer.is_running(context.scene.gwrap.job_folder):
+    if watched_jobs.is_running(context.scene.gwrap.job_folder):
         cls.poll_message_set("A job is running; cancel it or wait for it")  # type: ignore[attr-defined]
         return False
     return True
@@ -129,7 +132,7 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
         return has_worker(cls) and no_job_runs(cls, context)
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        folder = job_actions.start_wrap(context.scene, job_actions.worker_choice(context))
+        folder = job_actions.start_wrap(context.scene, preferred_worker.worker_choice(context))
         self.report({"INFO"}, f"Wrapping in {folder}")
         return {"FINISHED"}
 
@@ -167,7 +170,7 @@ class GWRAP_OT_mesh_region(AsksAboutFolder, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> set[str]:
         regions = self._regions(context)
-        choice = job_actions.worker_choice(context)
+        choice = preferred_worker.worker_choice(context)
         job_actions.start_mesh(context.scene, regions, choice)
         self.report({"INFO"}, f"Meshing {', '.join(r.name for r in regions)}")
         return {"FINISHED"}
@@ -180,7 +183,7 @@ class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not job_timer.is_running(context.scene.gwrap.job_folder):
+        if not watched_jobs.is_running(context.scene.gwrap.job_folder):
             cls.poll_message_set("No job is running; Wrap Scene starts one")
             return False
         return True
@@ -200,7 +203,7 @@ class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
         if not context.scene.gwrap.job_folder:
             cls.poll_message_set("This scene has no job; press Wrap Scene, or find its folder")
             return False
-        if job_timer.is_gone(context.scene.gwrap.job_folder):
+        if watched_jobs.is_gone(context.scene.gwrap.job_folder):
             cls.poll_message_set("The job's folder is gone; press Find Job where it was moved")
             return False
         return no_job_runs(cls, context)
@@ -209,7 +212,7 @@ class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
         return Path(bpy.path.abspath(context.scene.gwrap.job_folder))
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        job_actions.resume(context.scene, job_actions.worker_choice(context))
+        job_actions.resume(context.scene, preferred_worker.worker_choice(context))
         return {"FINISHED"}
 
 
@@ -229,7 +232,7 @@ class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose the folder of a job.")
         folder = Path(bpy.path.abspath(self.directory)).resolve()
-        status = job_timer.attach(context.scene, folder)
+        status = job_attach.attach(context.scene, folder)
         known_jobs.remember(folder)
         self.report({"INFO"}, f"Found a job: {status.state.lower()}")
         return {"FINISHED"}
@@ -248,7 +251,7 @@ class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
         return True
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        doctor.start(job_actions.worker_choice(context).python)
+        doctor.start(preferred_worker.worker_choice(context).python)
         return {"FINISHED"}
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import bpy.utils.previews
 import numpy as np
 
-from .in_background import InBackground, Lane
+from .background import Lane, Task
 
 _logger = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ class _Shown:
     stamp: Stamp | None = None
     names: tuple[str, ...] = ()
     icons: tuple[int, ...] = ()
-    reading: InBackground[_Read | None] | None = None
+    reading: Task[_Read | None] | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def refresh(folder: str, now_s: float) -> bool:
         if now_s - shown.looked_s >= EVERY_S:
             shown.looked_s = now_s
             known = shown.stamp
-            shown.reading = _readings.run(lambda: _read(Path(folder), known))
+            shown.reading = _readings.submit(lambda: _read(Path(folder), known))
         return False
     if not shown.reading.finished():
         return False

@@ -8,7 +8,7 @@ from typing import Final
 
 import bpy
 
-from . import job_timer, tags
+from . import tags, watched_jobs
 
 
 class Stage(enum.Enum):
@@ -47,16 +47,16 @@ def stage_of(context: bpy.types.Context) -> Stage:
     properties = scene.gwrap
     frame = tags.current_frame(scene, context.view_layer.objects.active)
     if properties.job_folder:
-        status = job_timer.status_of(properties.job_folder)
+        status = watched_jobs.status_of(properties.job_folder)
         if status is None:
-            return Stage.GONE if job_timer.is_gone(properties.job_folder) else Stage.NOT_OPEN
+            return Stage.GONE if watched_jobs.is_gone(properties.job_folder) else Stage.NOT_OPEN
         if status.active:
             return Stage.RUNNING
         if status.state != "DONE":
             return Stage.STOPPED
-        if job_timer.waits_for_object_mode(properties.job_folder):
+        if watched_jobs.waits_for_object_mode(properties.job_folder):
             return Stage.WAITING
-        if job_timer.result_to_import(scene):
+        if watched_jobs.result_to_import(scene):
             return Stage.IMPORTABLE
         if frame is not None:
             return Stage.FINISHED

@@ -1,47 +1,31 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Check an input without blocking Blender: a thread looks, a timer keeps what it found."""
+"""Check an input in the background, and keep the findings with its scene."""
 
 from __future__ import annotations
 
 import logging
-import queue
-import threading
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
 
 from ..core.errors import WrapError
-from . import panel_state, training_estimate
-from .job_actions import WorkerChoice, source_of
-from .redrawing import answers_in, redraw
+from . import panel_state, tags, training_estimate
+from .background import Lane
+from .preferred_worker import WorkerChoice
+from .redrawing import redraw
+from .scene_folders import source_of
 
 if TYPE_CHECKING:
     from ..core.dataset.check import Finding
 
 _logger = logging.getLogger(__name__)
 
-POLL_S = 0.2
-
-
-@dataclass
-class _Check:
-    number: int = 0
-    scene_uid: int = 0
-    source: str = ""
-    choice: WorkerChoice | None = None
-    busy: bool = False
-
-
-_check = _Check()
-_answers: queue.Queue[tuple[int, list[Finding]]] = queue.Queue()
+_checks = Lane(of_file=True)
 
 
 def is_busy() -> bool:
     """Tell whether a check is under way."""
-    return _check.busy
+    return _checks.busy
 
 
 def check_now(scene: bpy.types.Scene) -> None:
@@ -71,44 +55,28 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None) -> None:
     UsageError
         No input is chosen.
     """
-    from ..core.dataset.check import check_input  # imported here: threads import nothing
+    from ..core.dataset.check import Finding, check_input  # imported here: threads import nothing
 
     source = source_of(scene)
     stop()
-    _check.scene_uid, _check.source = scene.session_uid, scene.gwrap.source
-    _check.choice, _check.busy = choice, True
-    arguments = (_check.number, check_input, source)
-    threading.Thread(target=_look, args=arguments, daemon=True).start()
-    if not bpy.app.timers.is_registered(show):
-        bpy.app.timers.register(show, first_interval=POLL_S, persistent=True)
+    if choice is not None:
+        training_estimate.get_ready()
+    uid, chosen = scene.session_uid, scene.gwrap.source
 
-
-def _look(number: int, check_input: Callable[[Path], list[Finding]], source: Path) -> None:
-    """Thread: touches nothing of Blender."""
-    from ..core.dataset.check import Finding
-
-    try:
-        found = check_input(source)
-    except Exception as error:  # the queue must get an answer, or the check would never end
-        _logger.exception("checking %s", source)
-        found = [Finding("error", f"{type(error).__name__}: {error}", "See the system console.")]
-    _answers.put((number, found))
-
-
-def show() -> float | None:
-    """Timer: keep the findings when they are there, and redraw."""
-    for number, found in answers_in(_answers):
-        if number != _check.number:
-            continue  # of a check that a later one has replaced
-        _check.busy = False
-        scene = next((s for s in bpy.data.scenes if s.session_uid == _check.scene_uid), None)
-        if scene is not None and scene.gwrap.source == _check.source:
+    def keep(found: list[Finding]) -> None:
+        scene = tags.scene_of_uid(uid)
+        if scene is not None and scene.gwrap.source == chosen:
             _keep(scene, found)
-            _estimate(scene)
-    if _check.busy:
-        return POLL_S
-    redraw()
-    return None
+            if choice is not None:
+                _estimate(scene, choice)
+        redraw()
+
+    def keep_failure(error: Exception) -> None:
+        _logger.error("checking %s", source, exc_info=error)
+        text = f"{type(error).__name__}: {error}"
+        keep([Finding("error", text, "See the system console.")])
+
+    _checks.submit(lambda: check_input(source), keep, failed=keep_failure)
 
 
 def _keep(scene: bpy.types.Scene, found: list[Finding]) -> None:
@@ -123,18 +91,15 @@ def _keep(scene: bpy.types.Scene, found: list[Finding]) -> None:
         row.hint = finding.hint
 
 
-def _estimate(scene: bpy.types.Scene) -> None:
-    if _check.choice is None or panel_state.has_errors(scene):
+def _estimate(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
+    if panel_state.has_errors(scene):
         return
     try:
-        training_estimate.start(scene, _check.choice)
+        training_estimate.start(scene, choice)
     except WrapError as error:
         training_estimate.answer_with(scene, error)
 
 
 def stop() -> None:
-    """Forget a check that is under way; its thread ends by itself."""
-    _check.number += 1
-    _check.busy = False
-    if bpy.app.timers.is_registered(show):
-        bpy.app.timers.unregister(show)
+    """Forget a check that is under way."""
+    _checks.cancel()

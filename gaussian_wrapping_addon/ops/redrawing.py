@@ -3,13 +3,7 @@
 
 from __future__ import annotations
 
-import queue
-from collections.abc import Iterator
-from typing import TypeVar
-
 import bpy
-
-Answer = TypeVar("Answer")
 
 
 def redraw(*kinds: str) -> None:
@@ -18,9 +12,3 @@ def redraw(*kinds: str) -> None:
         for area in window.screen.areas:
             if area.type in (kinds or ("VIEW_3D",)):
                 area.tag_redraw()
-
-
-def answers_in(answers: queue.Queue[Answer]) -> Iterator[Answer]:
-    """Take out what threads have put into a queue so far; never waits."""
-    while not answers.empty():
-        yield answers.get_nowait()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ask the worker what the meshes of regions will take; a thread waits, a timer shows the answers.
+"""Ask the worker in the background what the meshes of regions will take.
 
 Regions are asked about one after the other. An answer stays until its region is asked about again;
 :func:`answer_for` tells whether what it was about has changed since.
@@ -9,34 +9,30 @@ from __future__ import annotations
 
 import json
 import os
-import queue
-import subprocess
 import tempfile
-import threading
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import bpy
 import numpy as np
 
-from ..core.errors import WrapError
 from ..core.files import write_json
 from ..core.helper_process import child_command
 from ..core.jobs.client import worker_python
-from ..core.processes.spawn import kill_group
 from ..core.settings import MeshingSettings, to_json
 from . import region_watch, tags
-from .estimate_child import ask_child
-from .redrawing import answers_in, redraw
+from .background import Lane, Task
+from .estimate_child import Child
+from .redrawing import redraw
 from .region_objects import region_body
 from .region_resolution import checked_edge_length, edge_length_in_blender, world_per_blender
 from .training_choices import method_choices
-from .training_estimate import Estimate, estimate_of
+from .training_estimate import Estimate, estimate_of, estimate_of_failure
 
 MODULE = "jobs.mesh_estimate"
 DEADLINE_S = 600.0
-POLL_S = 0.3
 
 # Relative: what float32 matrices of an object that nobody moved may differ by.
 _SAME = 1e-5
@@ -66,29 +62,33 @@ class _Question:
     python: str
 
 
+@dataclass(frozen=True)
+class _Asking:
+    child: Child
+    task: Task[Estimate]
+
+
 @dataclass
 class _State:
-    number: int = 0
-    waiting: list[int] = field(default_factory=list)
-    """Session ids of the regions that have no answer yet."""
+    asking: dict[int, _Asking] = field(default_factory=dict)
+    """By the region's session id."""
     asked: dict[int, Asked] = field(default_factory=dict)
     answers: dict[int, Estimate] = field(default_factory=dict)
-    process: subprocess.Popen[bytes] | None = None
 
 
+_questions = Lane(of_file=True)
 _state = _State()
-_answers: queue.Queue[tuple[int, int, Estimate]] = queue.Queue()
-_guard = threading.Lock()
 
 
 def is_busy() -> bool:
     """Tell whether answers are awaited."""
-    return bool(_state.waiting)
+    return _questions.busy
 
 
 def is_waiting(region: bpy.types.Object) -> bool:
     """Tell whether a region's answer is awaited."""
-    return region.session_uid in _state.waiting
+    asking = _state.asking.get(region.session_uid)
+    return asking is not None and asking.task.pending
 
 
 def answer_for(scene: bpy.types.Scene, region: bpy.types.Object) -> tuple[Estimate | None, bool]:
@@ -141,10 +141,15 @@ def start(
     for region in regions:
         _state.asked[region.session_uid] = asked_of(scene, region)
         _state.answers.pop(region.session_uid, None)
-    _state.waiting = [question.uid for question in questions]
-    threading.Thread(target=_ask_all, args=(_state.number, questions), daemon=True).start()
-    if not bpy.app.timers.is_registered(show):
-        bpy.app.timers.register(show, first_interval=POLL_S, persistent=True)
+    for question in questions:
+        child = Child()
+        task = _questions.submit(
+            partial(_ask, child, question),
+            partial(_keep, question.uid),
+            failed=partial(_keep_failure, question.uid),
+            end=child.end,
+        )
+        _state.asking[question.uid] = _Asking(child, task)
 
 
 def _question(
@@ -161,56 +166,30 @@ def _question(
     return _Question(region.session_uid, region_body(region), request, python)
 
 
-def _ask_all(number: int, questions: list[_Question]) -> None:
-    """Thread: touches nothing of Blender."""
-    for question in questions:
-        try:
-            answer = _ask(number, question)
-        except WrapError as error:
-            answer = Estimate((), (error.message, error.hint))
-        except Exception as error:  # the queue must get an answer, or the wait would never end
-            answer = Estimate((), (f"{type(error).__name__}: {error}",))
-        if _state.number != number:
-            return
-        _answers.put((number, question.uid, answer))
-
-
-def _ask(number: int, question: _Question) -> Estimate:
-    def begun(process: subprocess.Popen[bytes]) -> bool:
-        with _guard:
-            wanted = _state.number == number
-            _state.process = process if wanted else _state.process
-        return wanted
-
+def _ask(child: Child, question: _Question) -> Estimate:
+    """Ask one question; runs in a thread."""
     with tempfile.TemporaryDirectory(prefix="gwrap-") as folder:
         path = os.path.join(folder, "region.json")
         write_json(Path(path), question.body)
         request = json.dumps({**question.request, "region": path}, allow_nan=False)
         command = child_command(MODULE, request, python=question.python)
-        return estimate_of(*ask_child(command, begun, DEADLINE_S))
+        return estimate_of(*child.ask(command, DEADLINE_S))
 
 
-def show() -> float | None:
-    """Timer: take the answers that are there, and redraw."""
-    news = False
-    for number, uid, answer in answers_in(_answers):
-        if number == _state.number and uid in _state.waiting:
-            _state.answers[uid] = answer
-            _state.waiting.remove(uid)
-            news = True
-    if news:
-        redraw()
-    return POLL_S if is_busy() else None
+def _keep(uid: int, answer: Estimate) -> None:
+    _state.answers[uid] = answer
+    _state.asking.pop(uid, None)
+    redraw()
+
+
+def _keep_failure(uid: int, error: Exception) -> None:
+    _keep(uid, estimate_of_failure(error))
 
 
 def stop_asking() -> None:
     """End what is being asked; answers stay."""
-    with _guard:
-        process, _state.process = _state.process, None
-        _state.number += 1
-        _state.waiting = []
-    if process is not None and process.poll() is None:
-        threading.Thread(target=kill_group, args=(process,), daemon=True).start()
+    _questions.cancel()
+    _state.asking.clear()
 
 
 def stop() -> None:
@@ -218,5 +197,3 @@ def stop() -> None:
     stop_asking()
     _state.asked.clear()
     _state.answers.clear()
-    if bpy.app.timers.is_registered(show):
-        bpy.app.timers.unregister(show)

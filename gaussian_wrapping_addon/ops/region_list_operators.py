@@ -8,7 +8,13 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ..core.errors import UsageError
-from . import job_actions, region_estimate, tags
+from . import (
+    job_actions,
+    preferred_worker,
+    region_estimate,
+    scene_folders,
+    tags,
+)
 from .job_operators import AsksAboutFolder, chosen_regions
 from .reporting import NeedsObjectMode
 
@@ -36,8 +42,8 @@ class GWRAP_OT_estimate_regions(AsksAboutFolder, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> set[str]:
         regions = chosen_regions(context, checked=self.checked)
-        folder = job_actions.job_folder_of(job_actions.common_frame(regions))
-        python = job_actions.worker_choice(context).python
+        folder = scene_folders.job_folder_of(job_actions.common_frame(regions))
+        python = preferred_worker.worker_choice(context).python
         region_estimate.start(context.scene, regions, folder, python)
         return {"FINISHED"}
 

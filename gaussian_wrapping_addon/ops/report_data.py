@@ -126,7 +126,7 @@ def figures_of_report(report: Any) -> dict[str, Any]:
         for entry in map(part, items(training.get("decisions"))[:MAX_ROWS])
     ]
     figures["warnings"] = [
-        f"{warning.stage}: {warning.text} {warning.next_step}".strip()[:MAX_TEXT]
+        f"{warning.stage}: {warning.text} {warning.hint}".strip()[:MAX_TEXT]
         for warning in collect_warnings(report)[:MAX_WARNINGS]
     ]
     figures["regions"] = {

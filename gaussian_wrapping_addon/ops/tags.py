@@ -48,6 +48,11 @@ def objects_of_kind(scene: bpy.types.Scene, kind: str) -> Iterator[bpy.types.Obj
     return (thing for thing in scene.objects if kind_of(thing) == kind)
 
 
+def scene_of_uid(uid: int) -> bpy.types.Scene | None:
+    """Return the scene of a session uid in the open file."""
+    return next((s for s in bpy.data.scenes if s.session_uid == uid), None)
+
+
 def frame_of(thing: bpy.types.Object | None) -> bpy.types.Object | None:
     """Return the parent empty of a result's object (or the object itself), or None."""
     while thing is not None:

@@ -7,7 +7,7 @@ from typing import Final
 import bpy
 
 from ..core.errors import UsageError
-from . import job_actions, tags, training_estimate
+from . import job_actions, preferred_worker, tags, training_estimate
 from .job_operators import AsksAboutFolder, no_job_runs
 from .reporting import ReportsErrors
 
@@ -32,7 +32,7 @@ class GWRAP_OT_estimate(ReportsErrors, bpy.types.Operator):
         return True
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        training_estimate.start(context.scene, job_actions.worker_choice(context))
+        training_estimate.start(context.scene, preferred_worker.worker_choice(context))
         return {"FINISHED"}
 
 
@@ -58,7 +58,7 @@ class GWRAP_OT_train_more(AsksAboutFolder, bpy.types.Operator):
         frame = _frame(context)
         if frame is None:
             raise UsageError("The scene holds no result.", "Wrap the scene or import a result.")
-        job_actions.start_more(context.scene, frame, job_actions.worker_choice(context))
+        job_actions.start_more(context.scene, frame, preferred_worker.worker_choice(context))
         count = context.scene.gwrap.training.more_iterations
         self.report({"INFO"}, f"Training {count:,} iterations more")
         return {"FINISHED"}

@@ -26,7 +26,7 @@ from ..core.setup.pythons import FoundPython, find_pythons
 from ..core.worker_environment import WorkerEnvironment
 from ..core.worker_requirements import requirements_file
 from . import doctor
-from .job_actions import worker_choice
+from .preferred_worker import worker_choice
 from .redrawing import redraw
 
 POLL_S = 0.3

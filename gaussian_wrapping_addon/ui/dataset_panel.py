@@ -5,7 +5,7 @@ from typing import Any, Final
 
 import bpy
 
-from ..ops import job_timer, panel_state, photo_check
+from ..ops import panel_state, photo_check, watched_jobs
 from .panel_base import Readiness, TabPanel, button, plain
 from .text import characters_of, wrapped_label
 from .worker_setup_view import draw_worker_missing
@@ -40,7 +40,7 @@ class GWRAP_PT_dataset(TabPanel, bpy.types.Panel):
             text = "Photos of one thing from all sides, in a folder of their own."
             wrapped_label(layout, text, characters)
         column = layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column.enabled = not watched_jobs.is_running(properties.job_folder)
         if properties.source:
             row = column.row(align=True)
             row.prop(properties, "source", text="")

@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ..core.jobs.job_folder import JobStatus
-from ..ops import job_timer
+from ..ops import watched_jobs
 from ..ops.panel_state import Stage, stage_of
 from .live_view import draw_live
 from .panel_base import Readiness, button
@@ -20,9 +20,9 @@ def job_readiness(context: bpy.types.Context, command: str) -> Readiness | None:
     properties = context.scene.gwrap
     if properties.job_command != command or not properties.job_folder:
         return None
-    status = job_timer.status_of(properties.job_folder)
+    status = watched_jobs.status_of(properties.job_folder)
     if status is None:
-        gone = job_timer.is_gone(properties.job_folder)
+        gone = watched_jobs.is_gone(properties.job_folder)
         return Readiness("Job is gone" if gone else "Not open", "QUESTION")
     if status.active:
         text = "Cancelling" if status.state == "CANCELLING" else f"{100 * status.fraction:.0f} %"
@@ -37,9 +37,9 @@ def draw_job(layout: Any, context: bpy.types.Context, command: str) -> bool:
     properties = context.scene.gwrap
     if properties.job_command != command or not properties.job_folder:
         return False
-    status = job_timer.status_of(properties.job_folder)
+    status = watched_jobs.status_of(properties.job_folder)
     characters = characters_of(context)
-    if status is None and job_timer.is_gone(properties.job_folder):
+    if status is None and watched_jobs.is_gone(properties.job_folder):
         text = "The folder of this file's job is gone. Find it, or start anew with Wrap Scene."
         wrapped_label(layout, text, characters, icon="QUESTION")
         button(layout, context, "gwrap.find_job", icon="FILE_FOLDER")
@@ -79,7 +79,7 @@ def _draw_ended(layout: Any, context: bpy.types.Context, status: JobStatus) -> N
     if status.state == "CANCELLED":
         text = f"Cancelled at {100 * status.fraction:.0f} %. {status.hint}"
         wrapped_label(layout, text, characters, icon="PAUSE")
-    elif status.state != "DONE" or status.error:
+    elif status.state != "DONE" or status.put_back:
         box = layout.box()
         error = box.column()
         error.alert = True

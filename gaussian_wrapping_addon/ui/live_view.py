@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..core.jobs.job_folder import JobStatus
-from ..ops import job_timer, live_preview
+from ..ops import live_preview, watched_jobs
 from ..ops.live_figures import live_rows
 from .panel_base import table
 
@@ -19,7 +19,7 @@ def draw_live(layout: Any, folder: str, status: JobStatus) -> bool:
     if not rows:
         return False
     table(layout, rows)
-    icons = live_preview.icons_of(job_timer.key_of(folder))
+    icons = live_preview.icons_of(watched_jobs.key_of(folder))
     if icons:
         row = layout.row(align=True)
         for icon in icons:

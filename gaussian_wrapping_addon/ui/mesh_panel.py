@@ -5,7 +5,7 @@ from typing import Final
 
 import bpy
 
-from ..ops import job_timer, tags
+from ..ops import tags, watched_jobs
 from ..ops.job_operators import selected_regions
 from .job_view import draw_job, job_readiness
 from .panel_base import CATEGORY, Readiness, TabPanel, button, plain
@@ -32,7 +32,7 @@ class GWRAP_PT_mesh(TabPanel, bpy.types.Panel):
         plain(layout)
         selected = selected_regions(context)
         column = layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column.enabled = not watched_jobs.is_running(properties.job_folder)
         column.prop(properties, "resolution")
         draw_settings(column, properties, settings_in("mesh"))
         if draw_job(layout, context, "MESH"):
@@ -63,7 +63,7 @@ class GWRAP_PT_mesh_advanced(bpy.types.Panel):
         layout, properties = self.layout, context.scene.gwrap
         plain(layout)
         column = layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column.enabled = not watched_jobs.is_running(properties.job_folder)
         column.prop(properties, "decimate")
         draw_settings(column, properties, settings_in("mesh_advanced"))
 

@@ -5,7 +5,7 @@ from typing import Final
 
 import bpy
 
-from ..ops import job_timer
+from ..ops import watched_jobs
 from .panel_base import Readiness, TabPanel, plain
 from .setting_properties import draw_settings, settings_in
 from .text import characters_of, wrapped_label
@@ -24,7 +24,7 @@ class GWRAP_PT_texture(TabPanel, bpy.types.Panel):
         layout, properties = self.layout, context.scene.gwrap
         plain(layout)
         column = layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column.enabled = not watched_jobs.is_running(properties.job_folder)
         draw_settings(column, properties, settings_in("texture"))
         text = "Counts for the next Wrap Scene or Mesh Region."
         wrapped_label(layout, text, characters_of(context), icon="INFO")

@@ -6,7 +6,7 @@ from typing import Final
 import bpy
 
 from ..core.settings.declaration import JOB
-from ..ops import job_timer
+from ..ops import watched_jobs
 from ..ops.training_choices import preset_lines
 from .panel_base import CATEGORY, plain
 from .setting_properties import draw_settings, settings_in
@@ -26,7 +26,7 @@ class GWRAP_PT_train_advanced(bpy.types.Panel):
         properties = context.scene.gwrap
         training = properties.training
         column = self.layout.column()
-        column.enabled = not job_timer.is_running(properties.job_folder)
+        column.enabled = not watched_jobs.is_running(properties.job_folder)
         shown = settings_in("train_advanced")
         selection = [d for d in shown if d.model_selection]
         limits = [d for d in shown if d.panel is not None and d.panel.preset_if_zero]

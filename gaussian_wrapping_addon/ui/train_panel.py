@@ -5,7 +5,7 @@ from typing import Any, Final
 
 import bpy
 
-from ..ops import job_timer, tags, training_estimate
+from ..ops import tags, training_estimate, watched_jobs
 from ..ops.panel_state import Stage, primary_of, stage_of
 from ..ops.report_data import report_of
 from .job_view import draw_job, job_readiness
@@ -39,7 +39,7 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
             training = report_of(tags.figures_of(frame)).training
             words = f"Trained: {training}" if training else "Trained"
             wrapped_label(layout, words, characters)
-        running = job_timer.is_running(properties.job_folder)
+        running = watched_jobs.is_running(properties.job_folder)
         column = layout.column()
         column.enabled = not running
         row = column.row()

@@ -73,11 +73,11 @@ def addon(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
 @pytest.fixture
 def ended_workers(addon: object, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """No job of a test is known to others; its workers end before ``addon`` forgets them."""
-    from gaussian_wrapping_addon.ops import job_timer, known_jobs
+    from gaussian_wrapping_addon.ops import job_timer, known_jobs, watched_jobs
 
     monkeypatch.setattr(known_jobs, "_session", [])
     yield
-    for job in job_timer._jobs.values():
+    for job in watched_jobs.jobs.values():
         if job.client.poll().active:
             job.client.kill()
             assert not job.client.poll().active, "a worker outlived its test"

@@ -13,7 +13,7 @@ from pathlib import Path
 import bpy
 
 from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
-from gaussian_wrapping_addon.ops import job_timer, tags
+from gaussian_wrapping_addon.ops import job_timer, tags, watched_jobs
 
 WAIT_S = float(os.environ.get("GW_WAIT_S", "40"))
 """Longest wait for a state; more where the real worker is at work."""
@@ -38,7 +38,7 @@ def start_wrap(photos: Path, scene: bpy.types.Scene | None = None) -> Path:
 
 def status_of(folder: Path) -> JobStatus:
     """Return what the panel would show of a job."""
-    found = job_timer.status_of(str(folder))
+    found = watched_jobs.status_of(str(folder))
     assert found is not None, f"no job is watched in {folder}"
     return found
 
@@ -51,7 +51,7 @@ def play_until(holds: Callable[[], bool], what: str) -> None:
         if holds():
             return
         time.sleep(0.02)
-    raise AssertionError(f"{what}: {[(f, j.status) for f, j in job_timer._jobs.items()]}")
+    raise AssertionError(f"{what}: {[(f, j.status) for f, j in watched_jobs.jobs.items()]}")
 
 
 def play_to(folder: Path, *states: str) -> JobStatus:

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import bpy
 
 import gaussian_wrapping_addon
-from gaussian_wrapping_addon.ops import job_actions, job_timer
+from gaussian_wrapping_addon.ops import job_attach, preferred_worker, watched_jobs
 from gaussian_wrapping_addon.ui import train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import meshes, play_to, play_until, start_wrap, status_of
@@ -32,8 +32,8 @@ def say(**values: object) -> None:
 
 def start(blend: Path, photos: Path, keep: bool) -> Path:
     """Start a job and save the file."""
-    choice = job_actions.worker_choice(bpy.context)
-    job_actions.worker_choice = lambda _context: job_actions.WorkerChoice(
+    choice = preferred_worker.worker_choice(bpy.context)
+    preferred_worker.worker_choice = lambda _context: preferred_worker.WorkerChoice(
         choice.python, choice.threads, keep
     )
     properties = bpy.context.scene.gwrap
@@ -51,7 +51,7 @@ def start(blend: Path, photos: Path, keep: bool) -> Path:
 def reopen(blend: Path) -> None:
     """Open the file and bring its job to an end."""
     bpy.ops.wm.open_mainfile(filepath=str(blend))
-    job_timer.attach_later()
+    job_attach.attach_later()
     folder = Path(bpy.context.scene.gwrap.job_folder)
     found = status_of(folder).state
     offered = draw(train_panel.GWRAP_PT_train).operators
@@ -61,8 +61,8 @@ def reopen(blend: Path) -> None:
     (folder / "finish").touch()
     play_to(folder, "DONE", "FAILED", "LOST")
     final = status_of(folder)
-    if not meshes() and job_timer.result_to_import(bpy.context.scene):
-        bpy.ops.gwrap.import_result(directory=job_timer.result_to_import(bpy.context.scene))
+    if not meshes() and watched_jobs.result_to_import(bpy.context.scene):
+        bpy.ops.gwrap.import_result(directory=watched_jobs.result_to_import(bpy.context.scene))
     say(found=found, offered=offered, state=final.state, error=final.error, meshes=meshes())
 
 

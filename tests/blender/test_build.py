@@ -116,8 +116,8 @@ preferences = bpy.context.preferences.addons[name].preferences
 preferences.threads = 3
 preferences.worker_python = {python!r}
 assert "gaussian_wrapping_addon" not in sys.modules
-actions = sys.modules[name + ".ops.job_actions"]
-choice = actions.worker_choice(bpy.context)
+workers = sys.modules[name + ".ops.preferred_worker"]
+choice = workers.worker_choice(bpy.context)
 assert (choice.threads, choice.python) == (3, {python!r}), choice
 import time
 scene = bpy.context.scene
@@ -127,7 +127,8 @@ timer = sys.modules[name + ".ops.job_timer"]
 end_s = time.monotonic() + 60
 while timer.poll_jobs() and time.monotonic() < end_s:
     time.sleep(0.1)
-status = timer.status_of(scene.gwrap.job_folder)
+watched = sys.modules[name + ".ops.watched_jobs"]
+status = watched.status_of(scene.gwrap.job_folder)
 print("STATUS", status.state, status.error)
 known = Path(bpy.utils.extension_path_user(name)) / "known_jobs.json"
 assert scene.gwrap.job_folder in known.read_text()

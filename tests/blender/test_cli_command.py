@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import bpy
 import pytest
@@ -18,7 +19,7 @@ from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder
 from gaussian_wrapping_addon.core.settings import preset
-from gaussian_wrapping_addon.ops import cli_command, job_timer, known_jobs
+from gaussian_wrapping_addon.ops import cli_command, job_timer, known_jobs, watched_jobs
 from gaussian_wrapping_addon.ui import train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import (
@@ -41,7 +42,7 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = tmp_path / "photos"
     folder.mkdir()
     yield folder
-    for job in job_timer._jobs.values():
+    for job in watched_jobs.jobs.values():
         job.client.kill()
     job_timer.forget_all()
 
@@ -71,16 +72,21 @@ def test_the_command_is_known_while_the_addon_is(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_command_has_the_exit_codes_of_batch(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    known: list[Any] = []
+    monkeypatch.setattr(bpy.utils, "register_cli_command", lambda _, run: known.append(run))
+    gaussian_wrapping_addon.register()
+    gaussian_wrapping_addon.unregister()
+    (run,) = known
     logging.getLogger("gaussian_wrapping").addHandler(caplog.handler)
     try:
-        assert cli_command.run(["no-such-command"]) == 2
+        assert run(["no-such-command"]) == 2
     finally:
         logging.getLogger("gaussian_wrapping").removeHandler(caplog.handler)
     assert "Usage: blender --command gwrap" in caplog.text
-    assert cli_command.run(["resume", str(tmp_path / "missing")]) in (1, 2)
-    assert cli_command.run(["check", str(tmp_path)]) == 3
+    assert run(["resume", str(tmp_path / "missing")]) in (1, 2)
+    assert run(["check", str(tmp_path)]) == 3
 
 
 def test_a_job_of_the_button_goes_on_in_batch(
@@ -111,7 +117,7 @@ def test_a_job_of_batch_is_opened_by_the_button(addon: object, photos: Path) -> 
     assert done.returncode == 0, done.stdout + done.stderr
     bpy.ops.gwrap.find_job(directory=str(folder))
     assert "Import Finished Result" in draw(train_panel.GWRAP_PT_train).texts
-    bpy.ops.gwrap.import_result(directory=job_timer.result_to_import(bpy.context.scene))
+    bpy.ops.gwrap.import_result(directory=watched_jobs.result_to_import(bpy.context.scene))
     assert meshes() == 1
     bpy.ops.gwrap.resume_job()  # and goes on from the button
     play_to(folder, "DONE")

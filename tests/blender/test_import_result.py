@@ -16,10 +16,11 @@ from mathutils import Vector
 
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, WrapError
 from gaussian_wrapping_addon.ops import tags
+from gaussian_wrapping_addon.ops.blend_writer import export_usd, write_blend
 from gaussian_wrapping_addon.ops.camera_objects import look_through
 from gaussian_wrapping_addon.ops.materials import set_shading, shading_of, texture_of
 from gaussian_wrapping_addon.ops.region_objects import region_from_object
-from gaussian_wrapping_addon.ops.scene_objects import export_usd, import_result, write_blend
+from gaussian_wrapping_addon.ops.scene_objects import import_result
 from tests.blender.synthetic_result import (
     BOX_SCENE,
     CAMERAS,

@@ -43,7 +43,13 @@ from gaussian_wrapping_addon.core.jobs.job_folder import (
     JobStatus,
     process_start_ticks,
 )
-from gaussian_wrapping_addon.ops import in_background, job_timer, live_preview
+from gaussian_wrapping_addon.ops import (
+    background,
+    job_attach,
+    job_timer,
+    live_preview,
+    watched_jobs,
+)
 from gaussian_wrapping_addon.ops.result_files import read_result
 from gaussian_wrapping_addon.ui import train_panel
 from tests.blender.fake_layout import draw
@@ -72,7 +78,7 @@ GRID = 317
 """Vertices a side of the typical mesh: 199 712 faces."""
 
 
-class _HeldReading(in_background.InBackground):
+class _HeldReading(background.Task):
     """A reading that lasts until the test lets it end."""
 
     hold = threading.Event()
@@ -128,7 +134,7 @@ def job_in(stage: str, photos: Path, worker: Callable[[str, str], None]) -> Path
 
 def _undo(_blend: Path) -> None:
     bpy.context.scene.gwrap.job_folder = ""  # what undo does to a job started after the step
-    job_timer.after_undo(bpy.context.scene)
+    job_attach.after_undo(bpy.context.scene)
 
 
 def _file_new(blend: Path) -> None:
@@ -163,7 +169,7 @@ def _disable(blend: Path) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     gaussian_wrapping_addon.unregister()
     gaussian_wrapping_addon.register()
-    job_timer.attach_later()
+    job_attach.attach_later()
 
 
 def _reload(blend: Path) -> None:
@@ -172,7 +178,7 @@ def _reload(blend: Path) -> None:
     importlib.reload(job_timer)
     importlib.reload(registration)
     gaussian_wrapping_addon.register()
-    job_timer.attach_later()
+    job_attach.attach_later()
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -199,7 +205,7 @@ def test_38_the_job_is_found_again(
     if stage == "import" and action in (_disable, _reload):
         assert meshes() == 0, "what was finished before is offered, not imported unasked"
         assert "Import Finished Result" in draw(train_panel.GWRAP_PT_train).texts
-        bpy.ops.gwrap.import_result(directory=job_timer.result_to_import(bpy.context.scene))
+        bpy.ops.gwrap.import_result(directory=watched_jobs.result_to_import(bpy.context.scene))
     else:
         play_until(lambda: meshes() == 1, "never imported")
     assert meshes() == 1
@@ -320,10 +326,10 @@ def test_41_a_worker_of_another_blender_that_does_not_listen_is_killed(
     worker("hang")
     folder = start_wrap(photos)
     play_until(lambda: status_of(folder).fraction == 0.25, "never at work")
-    process = job_timer._jobs[str(folder)].client._process
+    process = watched_jobs.jobs[str(folder)].client._process
     job_timer.forget_all()
     bpy.ops.gwrap.find_job(directory=str(folder))
-    job_timer._jobs[str(folder)].client.kill()
+    watched_jobs.jobs[str(folder)].client.kill()
     assert process is not None
     assert process.wait(5) == -9
     play_to(folder, "LOST")
@@ -404,7 +410,7 @@ def test_45_cancelling_a_job_from_elsewhere_ends_no_other_program(
         job_timer.forget_all()
         bpy.ops.gwrap.find_job(directory=str(folder))
         assert status_of(folder).active
-        job_timer._jobs[str(folder)].client.kill()
+        watched_jobs.jobs[str(folder)].client.kill()
         time.sleep(0.1)
         assert victim.poll() is None
     finally:
@@ -466,7 +472,7 @@ def test_bringing_in_a_typical_mesh_blocks_for_less_than_a_second(
     _make_typical(result)
     reading = _HeldReading(result)
     hold.set()
-    job_timer._jobs[str(folder)].reading = reading
+    watched_jobs.jobs[str(folder)].reading = reading
     longest_s = 0.0
     while status_of(folder).stage == "import" and not meshes():
         begun_s = time.perf_counter() - _waited_s()

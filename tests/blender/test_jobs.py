@@ -21,7 +21,15 @@ import pytest
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.job_file import read_job
-from gaussian_wrapping_addon.ops import job_actions, job_timer, known_jobs, tags
+from gaussian_wrapping_addon.ops import (
+    background,
+    job_attach,
+    job_timer,
+    known_jobs,
+    preferred_worker,
+    tags,
+    watched_jobs,
+)
 from gaussian_wrapping_addon.ui import dataset_panel, mesh_panel, report_panel, train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.synthetic_result import BOX_SCENE, WORLD_FROM_SCENE
@@ -59,7 +67,7 @@ def start_wrap(photos: Path) -> None:
 
 
 def status() -> object:
-    return job_timer.status_of(bpy.context.scene.gwrap.job_folder)
+    return watched_jobs.status_of(bpy.context.scene.gwrap.job_folder)
 
 
 def wait_for(*states: str, clock: Callable[[], float] = time.monotonic) -> None:
@@ -100,7 +108,7 @@ def test_wrap_scene_runs_and_imports(photos: Path, worker: object) -> None:
     kinds = sorted(tags.kind_of(o) for o in bpy.context.scene.objects)
     assert kinds == ["camera"] * 4 + ["frame", "mesh", "region"]
     assert not job_timer.poll_jobs(), "the timer must stop when idle"
-    assert job_timer.tick() is None
+    assert background.poll() is None
     layout = draw(report_panel.GWRAP_PT_report)
     for text in ("27.2 dB", "4,321", "Faces\n12\n", "Closed\nYes\n", "87.5 %", "1 min 23 s"):
         assert text in layout.texts
@@ -146,7 +154,7 @@ def test_failures_are_shown_with_the_next_step(
     worker(mode)
     start_wrap(photos)
     wait_for("FAILED", "LOST")
-    job = job_timer._jobs[job_timer.key_of(bpy.context.scene.gwrap.job_folder)]
+    job = watched_jobs.jobs[watched_jobs.key_of(bpy.context.scene.gwrap.job_folder)]
     job.client._process.wait(10)  # type: ignore[union-attr]
     assert words in status().error  # type: ignore[attr-defined]
     assert status().state == state  # type: ignore[attr-defined]
@@ -348,7 +356,7 @@ def test_a_file_finds_its_running_job_again(
     bpy.ops.wm.read_homefile(use_empty=True)
     (folder / "finish").touch()
     end_s = time.monotonic() + 20
-    while job_timer._jobs[str(folder)].status.state != "DONE" and time.monotonic() < end_s:
+    while watched_jobs.jobs[str(folder)].status.state != "DONE" and time.monotonic() < end_s:
         job_timer.poll_jobs()
         time.sleep(0.02)
     assert len(bpy.data.objects) == 0, "another file gets nothing"
@@ -372,7 +380,7 @@ def test_another_blender_finds_the_job_and_offers_its_result(
     assert not job_timer.poll_jobs()
     assert len(bpy.data.objects) == 0, "opening a file imports nothing by itself"
     assert "Import Finished Result" in draw(train_panel.GWRAP_PT_train).texts
-    bpy.ops.gwrap.import_result(directory=job_timer.result_to_import(bpy.context.scene))
+    bpy.ops.gwrap.import_result(directory=watched_jobs.result_to_import(bpy.context.scene))
     assert "Import Finished Result" not in draw(train_panel.GWRAP_PT_train).texts
 
 
@@ -422,7 +430,7 @@ def test_a_file_from_elsewhere_opens_no_job_unasked(
     job_timer.forget_all()
     monkeypatch.setattr(known_jobs, "_session", [])  # another person's machine
     bpy.ops.wm.open_mainfile(filepath=str(elsewhere / "work.blend"))
-    assert job_timer._jobs == {}
+    assert watched_jobs.jobs == {}
     if bpy.context.scene.gwrap.job_folder:
         assert "gwrap.find_job" in draw(train_panel.GWRAP_PT_train).operators
     bpy.ops.gwrap.find_job(directory=folder)
@@ -439,8 +447,8 @@ def test_undo_does_not_lose_a_running_job(photos: Path, worker: Callable[[str], 
     start_wrap(photos)
     folder = bpy.context.scene.gwrap.job_folder
     bpy.context.scene.gwrap.job_folder = ""  # what undo does to a job started after the step
-    assert job_timer.after_undo in bpy.app.handlers.undo_post
-    job_timer.after_undo(bpy.context.scene)
+    assert job_attach.after_undo in bpy.app.handlers.undo_post
+    job_attach.after_undo(bpy.context.scene)
     assert bpy.context.scene.gwrap.job_folder == folder
 
 
@@ -450,7 +458,7 @@ def test_undo_of_an_import_keeps_the_job(photos: Path, worker: object) -> None:
     properties = bpy.context.scene.gwrap
     folder = properties.job_folder
     properties.job_folder, properties.job_command = "", "MESH"
-    job_timer.after_undo(bpy.context.scene)
+    job_attach.after_undo(bpy.context.scene)
     assert (properties.job_folder, properties.job_command) == (folder, "WRAP")
 
 
@@ -461,12 +469,12 @@ def test_disabling_the_addon_leaves_the_job_to_be_found(
     start_wrap(photos)
     wait_until_it_says_something(photos)
     folder = Path(bpy.context.scene.gwrap.job_folder)
-    client = job_timer._jobs[str(folder)].client
+    client = watched_jobs.jobs[str(folder)].client
     addon.unregister()
     assert client.poll().active, "the worker goes on"
     addon.register()
-    job_timer.attach_later()
-    assert job_timer.is_running(bpy.context.scene.gwrap.job_folder)
+    job_attach.attach_later()
+    assert watched_jobs.is_running(bpy.context.scene.gwrap.job_folder)
     (folder / "finish").touch()
     wait_for("DONE")
     assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1
@@ -532,4 +540,4 @@ def test_job_status_of_a_half_written_file_is_survived(
 
 
 def test_worker_choice_without_preferences() -> None:
-    assert job_actions.worker_choice(bpy.context) == job_actions.WorkerChoice()
+    assert preferred_worker.worker_choice(bpy.context) == preferred_worker.WorkerChoice()

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import builtins
+import json
 import os
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,13 +18,17 @@ import pytest
 
 from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
 from gaussian_wrapping_addon.ops import (
+    background,
+    job_attach,
     job_timer,
     panel_state,
     photo_check,
     tags,
     training_estimate,
+    watched_jobs,
 )
 from gaussian_wrapping_addon.ops.panel_state import PRIMARY, Stage
 from gaussian_wrapping_addon.ops.report_data import ReportData, report_of
@@ -31,6 +37,7 @@ from gaussian_wrapping_addon.ops.training_choices import choices_key
 from gaussian_wrapping_addon.ops.training_estimate import Estimate
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.fake_worker import LIVE
+from tests.blender.job_play import write_fake_python
 from tests.blender.synthetic_result import png_bytes, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -93,7 +100,7 @@ def not_checked(folder: Path) -> None:
 
 def checking(folder: Path) -> None:
     choose_photos(folder)
-    photo_check._check.busy = True
+    photo_check._checks.submit(lambda: time.sleep(1.0), lambda _: None)
 
 
 def checked(folder: Path) -> None:
@@ -143,7 +150,7 @@ def not_open(folder: Path) -> None:
 
 def gone(folder: Path) -> None:
     not_open(folder)
-    job_timer._gone.add(str(folder / "job"))
+    watched_jobs.gone.add(str(folder / "job"))
 
 
 def to_import(folder: Path) -> None:
@@ -155,7 +162,7 @@ def in_edit_mode(folder: Path) -> None:
     to_import(folder)
     bpy.ops.mesh.primitive_cube_add()
     bpy.ops.object.mode_set(mode="EDIT")
-    job_timer._jobs[str(folder / "job")].waits_for_mode = True
+    watched_jobs.jobs[str(folder / "job")].waits_for_mode = True
 
 
 def done(folder: Path) -> None:
@@ -178,7 +185,8 @@ def meshing(folder: Path) -> None:
 
 def mesh_failed(folder: Path) -> None:
     done(folder)
-    job(folder, "DONE", "MESH", result=str(folder / "job" / "result"), error=ERROR, hint=HINT)
+    result = str(folder / "job" / "result")
+    job(folder, "DONE", "MESH", result=result, error=ERROR, hint=HINT, put_back=True)
 
 
 State = Callable[[Path], None]
@@ -423,15 +431,33 @@ def test_choosing_photos_checks_them_at_once(
     assert bpy.ops.gwrap.choose_input(filepath=f"{folder}/") == {"FINISHED"}
     assert properties.source == folder
     assert tab()["Dataset"].header == "Checking…"
-    play(photo_check.show)
+    play(background.poll)
     assert tab()["Dataset"].header == "3 photos"
     assert len(asked) == 1, "the estimate follows by itself"
     (tmp_path / "photos" / "0.png").unlink()
     (tmp_path / "photos" / "1.png").unlink()
     assert bpy.ops.gwrap.check_photos("INVOKE_DEFAULT") == {"FINISHED"}
-    play(photo_check.show)
+    play(background.poll)
     assert tab()["Dataset"].header == "Cannot be used"
     assert len(asked) == 1
+
+
+def test_the_estimate_that_follows_a_check_starts_no_thread_in_the_timer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
+    monkeypatch.setenv("GW_ASKED", str(tmp_path / "asked.json"))
+    monkeypatch.setenv("GW_ANSWER", json.dumps({"line": "training: 4 to 6 min"}))
+    choose_photos(tmp_path)
+    assert bpy.ops.gwrap.choose_input(filepath=bpy.context.scene.gwrap.source) == {"FINISHED"}
+
+    def refuse(_thread: threading.Thread) -> None:
+        raise AssertionError("a thread is started")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        play(background.poll)
+    assert "Training 4 to 6 min" in words(tab()["Train"])
 
 
 def test_a_clicked_photo_stands_for_its_folder_and_files_for_themselves(tmp_path: Path) -> None:
@@ -458,7 +484,7 @@ def test_other_photos_begin_anew_beside_the_earlier_result(tmp_path: Path) -> No
     other.mkdir()
     bpy.ops.gwrap.choose_input(filepath=str(other))
     assert (properties.job_folder, properties.output) == ("", "")
-    job_timer.after_undo(bpy.context.scene)
+    job_attach.after_undo(bpy.context.scene)
     assert properties.job_folder == "", "undo does not bring the job of other photos back"
     assert panel_state.stage_of(bpy.context) is Stage.READY
     assert tab()["Result"].header == "1 mesh"
@@ -468,7 +494,7 @@ def test_a_check_of_photos_that_are_no_longer_chosen_is_dropped(tmp_path: Path) 
     choose_photos(tmp_path)
     photo_check.start(bpy.context.scene)
     bpy.context.scene.gwrap.source = str(tmp_path)
-    play(photo_check.show)
+    play(background.poll)
     assert tab()["Dataset"].header == "Not checked"
     assert len(bpy.context.scene.gwrap.findings) == 0
 

@@ -19,7 +19,7 @@ import pytest
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.helper_process import child_command
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
-from gaussian_wrapping_addon.ops import estimate_child, region_estimate, tags
+from gaussian_wrapping_addon.ops import background, estimate_child, region_estimate, tags
 from gaussian_wrapping_addon.ops.region_objects import create_region
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -37,7 +37,7 @@ def play_until(holds: Callable[[], bool]) -> None:
     end_s = time.monotonic() + WAIT_S
     while not holds():
         assert time.monotonic() < end_s
-        region_estimate.show()
+        background.poll()
         time.sleep(0.05)
 
 
@@ -123,14 +123,15 @@ def test_disabling_the_addon_ends_the_process(
     slow = [sys.executable, "-c", "import time; time.sleep(100)"]
     monkeypatch.setattr(region_estimate, "child_command", lambda *_, **__: slow)
     region_estimate.start(bpy.context.scene, [region], folder, sys.executable)
-    play_until(lambda: region_estimate._state.process is not None)
-    process = region_estimate._state.process
+    child = region_estimate._state.asking[region.session_uid].child
+    play_until(lambda: child.process is not None)
+    process = child.process
     assert process is not None
     os.kill(process.pid, 0)
     addon.unregister()
     assert process.wait(10) != 0
     assert not region_estimate.is_busy()
-    assert not bpy.app.timers.is_registered(region_estimate.show)
+    assert not bpy.app.timers.is_registered(background.poll)
     addon.register()
     with pytest.raises(ProcessLookupError):
         os.kill(process.pid, 0)

@@ -12,7 +12,7 @@ import pytest
 
 import gaussian_wrapping_addon
 from gaussian_wrapping_addon import registration
-from gaussian_wrapping_addon.ops import doctor, job_timer, worker_setup
+from gaussian_wrapping_addon.ops import background, job_attach, job_timer, worker_setup
 
 REPOSITORY = Path(gaussian_wrapping_addon.__file__).resolve().parents[1]
 
@@ -24,7 +24,7 @@ def left_behind() -> list[str]:
         handlers = getattr(bpy.app.handlers, name)
         if isinstance(handlers, list):
             found += [name for h in handlers if "gaussian_wrapping" in h.__module__]
-    for function in (job_timer.tick, job_timer.attach_later, doctor.show, worker_setup.tick):
+    for function in (background.poll, worker_setup.tick):
         if bpy.app.timers.is_registered(function):
             found.append(function.__name__)
     return found
@@ -63,7 +63,7 @@ def test_register_and_unregister_twice() -> None:
 def test_register_after_register_doubles_nothing() -> None:
     gaussian_wrapping_addon.register()
     gaussian_wrapping_addon.register()
-    assert bpy.app.handlers.load_post.count(job_timer.after_load) == 1
+    assert bpy.app.handlers.load_post.count(job_attach.after_load) == 1
     gaussian_wrapping_addon.unregister()
     assert left_behind() == []
 

@@ -17,14 +17,10 @@ from gaussian_wrapping_addon.core.dataset.placement_file import FILE_NAME, read_
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import ParseError
 from gaussian_wrapping_addon.ops import known_jobs, placement, tags
+from gaussian_wrapping_addon.ops.blend_writer import export_usd, write_blend
 from gaussian_wrapping_addon.ops.region_objects import matrix_of, region_from_object, transformed
 from gaussian_wrapping_addon.ops.region_resolution import own_lengths
-from gaussian_wrapping_addon.ops.scene_objects import (
-    ImportedResult,
-    export_usd,
-    import_result,
-    write_blend,
-)
+from gaussian_wrapping_addon.ops.scene_objects import ImportedResult, import_result
 from tests.blender.synthetic_result import (
     WORLD_FROM_SCENE,
     rotation_about,

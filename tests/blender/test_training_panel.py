@@ -26,6 +26,7 @@ from gaussian_wrapping_addon.core.settings import (
     to_json,
 )
 from gaussian_wrapping_addon.ops import (
+    background,
     job_timer,
     known_jobs,
     live_preview,
@@ -308,7 +309,7 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def wait_for_answer() -> str:
     """Play the timer, which never fires in background Blender; return what is drawn."""
     end_s = time.monotonic() + 30.0
-    while training_estimate.show() is not None:
+    while background.poll() is not None:
         assert time.monotonic() < end_s
         time.sleep(0.02)
     return draw(TRAIN).texts.replace("\n", " ")
@@ -317,7 +318,11 @@ def wait_for_answer() -> str:
 def test_estimate_asks_the_worker_and_shows_its_words(
     worker: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said = [{"line": "training: 4 to 6 min"}, {"line": "memory: 1.2 GB"}, {"line": "warning: full"}]
+    said = [
+        {"line": "training: 4 to 6 min"},
+        {"line": "memory: 1.2 GB"},
+        {"warning": "full", "code": "disk"},
+    ]
     monkeypatch.setenv("GW_ANSWER", "\n".join(["noise", *map(json.dumps, said)]))
     training().iterations = 432
     assert bpy.ops.gwrap.estimate() == {"FINISHED"}
@@ -349,5 +354,5 @@ def test_stopping_forgets_the_question(worker: Path, monkeypatch: pytest.MonkeyP
     training_estimate.stop()
     assert not training_estimate.is_busy()
     time.sleep(0.1)
-    training_estimate.show()
+    background.poll()
     assert "4 to 6 min" not in draw(TRAIN).texts

@@ -103,7 +103,7 @@ def _check_poses(kind: SourceKind, findings: list[Finding]) -> None:
             Finding("fact", f"{kind.transforms.name} is present too; the COLMAP model is used.")
         )
     model = read_poses(kind)
-    findings += [Finding("warning", text) for text in model.warnings]
+    findings += [Finding("warning", said.text, said.hint) for said in model.warnings]
     findings.append(
         Finding("fact", f"{len(model.photos)} posed photos, {len(model.points)} sparse points.")
     )

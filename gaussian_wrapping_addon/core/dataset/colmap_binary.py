@@ -15,6 +15,7 @@ import numpy as np
 
 from .. import limits
 from ..errors import ParseError
+from ..report_warning import ReportWarning
 from .source_model import LENS_NAMES, LENS_PARAMETERS, LensCamera
 
 _AGAIN = "Export the model again, or solve the cameras from the photos."
@@ -117,14 +118,14 @@ _IMAGE = struct.Struct("<I7dI")
 _POINT = struct.Struct("<Q3d3Bd")
 
 
-def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[str]]:
+def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]]:
     """Read ``cameras.bin``.
 
     Returns
     -------
     cameras : dict
         Camera number to camera.
-    warnings : list of str
+    warnings : list of ReportWarning
 
     Raises
     ------
@@ -163,7 +164,7 @@ def add_camera(
     cameras[camera_id] = camera
 
 
-def read_images(path: Path) -> tuple[list[RawImage], list[str]]:
+def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
     """Read ``images.bin``; the 2D points are passed over.
 
     Raises
@@ -193,7 +194,7 @@ def read_images(path: Path) -> tuple[list[RawImage], list[str]]:
     return images, _rest(cursor)
 
 
-def read_points(path: Path) -> tuple[RawPoints, list[str]]:
+def read_points(path: Path) -> tuple[RawPoints, list[ReportWarning]]:
     """Read ``points3D.bin``; tracks are passed over, their lengths kept.
 
     Raises
@@ -218,7 +219,8 @@ def read_points(path: Path) -> tuple[RawPoints, list[str]]:
     return RawPoints(positions, colors, errors, lengths), _rest(cursor)
 
 
-def _rest(cursor: _Cursor) -> list[str]:
+def _rest(cursor: _Cursor) -> list[ReportWarning]:
     if cursor.left == 0:
         return []
-    return [f"{cursor.path.name} has {cursor.left} bytes after its last record; they were ignored."]
+    text = f"{cursor.path.name} has {cursor.left} bytes after its last record; they were ignored."
+    return [ReportWarning("bytes-after-last-record", text)]

@@ -12,6 +12,7 @@ import numpy as np
 from .. import limits
 from ..errors import DatasetError, ParseError
 from ..files import resolve_inside
+from ..report_warning import LEFT_OUT_HINT, ReportWarning
 from . import colmap_binary, colmap_text
 from .colmap_binary import RawImage, RawPoints
 from .source_model import LensCamera, PosedPhoto, SourceModel, rotation_from_quaternion
@@ -79,7 +80,7 @@ def read_colmap(source: Path) -> SourceModel:
             f"{source.name} holds no COLMAP model.",
             "Wanted: cameras, images and points3D (.bin or .txt) in sparse/0, sparse or here.",
         )
-    warnings: list[str] = []
+    warnings: list[ReportWarning] = []
     chosen = models[0]
     if len(models) > 1:
         chosen, counts = _largest(models, warnings)
@@ -88,7 +89,13 @@ def read_colmap(source: Path) -> SourceModel:
             for m, n in zip(models, counts, strict=True)
         )
         name = chosen.folder.relative_to(source).as_posix()
-        warnings.append(f"The input holds {len(models)} models: {listed}; {name} was used.")
+        warnings.append(
+            ReportWarning(
+                "several-models",
+                f"The input holds {len(models)} models: {listed}; {name} was used.",
+                "Take photos that connect the parts, so that one model holds them all.",
+            )
+        )
     model = read_model(chosen)
     facts = {"model": chosen.folder.relative_to(source).as_posix() or ".", **model.facts}
     if chosen.suffix == ".bin" and (chosen.folder / "images.txt").is_file():
@@ -103,7 +110,9 @@ def read_colmap(source: Path) -> SourceModel:
     )
 
 
-def _largest(models: list[ModelFiles], warnings: list[str]) -> tuple[ModelFiles, list[int]]:
+def _largest(
+    models: list[ModelFiles], warnings: list[ReportWarning]
+) -> tuple[ModelFiles, list[int]]:
     """Return the model with most images; a broken one counts as empty unless all are broken."""
     counts, failure = [], None
     for model in models:
@@ -112,7 +121,8 @@ def _largest(models: list[ModelFiles], warnings: list[str]) -> tuple[ModelFiles,
             counts.append(len(images))
         except ParseError as error:
             failure = failure or error
-            warnings.append(f"Model {model.folder.name} was left out: {error.message}")
+            text = f"Model {model.folder.name} was left out: {error.message}"
+            warnings.append(ReportWarning("model-left-out", text, LEFT_OUT_HINT))
             counts.append(0)
     if failure is not None and max(counts) == 0:
         raise failure
@@ -138,7 +148,7 @@ def read_model(model: ModelFiles) -> SourceModel:
     if not photos:
         raise DatasetError(
             f"None of the {len(images)} images of {model.path('images').name} is usable.",
-            warnings[-1] if warnings else "Solve the cameras again.",
+            warnings[-1].text if warnings else "Solve the cameras again.",
         )
     points_path = model.path("points3D")
     if points_path.is_file():
@@ -146,10 +156,17 @@ def read_model(model: ModelFiles) -> SourceModel:
         warnings.extend(more)
     else:
         raw = RawPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0))
-        warnings.append(f"{points_path.name} is missing; start points are made from the photos.")
+        warnings.append(
+            ReportWarning(
+                "points-missing",
+                f"{points_path.name} is missing; start points are made from the photos.",
+                "Export the COLMAP model together with its points.",
+            )
+        )
     finite = np.isfinite(raw.positions).all(1)
     if not finite.all():
-        warnings.append(f"{int((~finite).sum())} points that are not finite were left out.")
+        text = f"{int((~finite).sum())} points that are not finite were left out."
+        warnings.append(ReportWarning("points-not-finite", text, LEFT_OUT_HINT))
     facts = {
         "camera_models": sorted({p.lens.model for p in photos if p.lens is not None}),
         "images_in_model": len(images),
@@ -171,7 +188,10 @@ def read_model(model: ModelFiles) -> SourceModel:
 
 
 def _usable_photos(
-    root: Path, images: list[RawImage], cameras: dict[int, LensCamera], warnings: list[str]
+    root: Path,
+    images: list[RawImage],
+    cameras: dict[int, LensCamera],
+    warnings: list[ReportWarning],
 ) -> list[PosedPhoto]:
     """Keep images with a safe name, a known camera and a finite pose; say what was left out."""
     photos: list[PosedPhoto] = []
@@ -199,7 +219,8 @@ def _usable_photos(
         photos.append(PosedPhoto(name, cameras[image.camera_id], pose))
     for reason, names in dropped.items():
         listed = ", ".join(names[:_EXAMPLES]) + (" ..." if len(names) > _EXAMPLES else "")
-        warnings.append(f"{len(names)} images were left out for {reason}: {listed}.")
+        text = f"{len(names)} images were left out for {reason}: {listed}."
+        warnings.append(ReportWarning("images-left-out", text, LEFT_OUT_HINT))
     return photos
 
 

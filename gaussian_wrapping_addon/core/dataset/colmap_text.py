@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import limits
 from ..errors import ParseError
+from ..report_warning import ReportWarning
 from .colmap_binary import RawImage, RawPoints, add_camera
 from .source_model import LENS_PARAMETERS, LensCamera
 
@@ -61,7 +62,7 @@ def _whole(path: Path, line: int, text: str, what: str) -> int:
     return int(value)
 
 
-def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[str]]:
+def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]]:
     """Read ``cameras.txt``.
 
     Raises
@@ -94,7 +95,7 @@ def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[str]]:
     return cameras, []
 
 
-def read_images(path: Path) -> tuple[list[RawImage], list[str]]:
+def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
     """Read ``images.txt``: two lines an image, of which the second may be empty.
 
     Where a second line was left out, the next line is not a list of 2D points (triples of
@@ -124,7 +125,8 @@ def read_images(path: Path) -> tuple[list[RawImage], list[str]]:
     if not without_points:
         return images, []
     lacking = f"{path.name} lacks the line of 2D points of {without_points} images"
-    return images, [f"{lacking}; they were read without it."]
+    text = f"{lacking}; they were read without it."
+    return images, [ReportWarning("point-lines-missing", text)]
 
 
 def _image(path: Path, line: int, text: str) -> RawImage:
@@ -142,7 +144,7 @@ def _image(path: Path, line: int, text: str) -> RawImage:
     )
 
 
-def read_points(path: Path) -> tuple[RawPoints, list[str]]:
+def read_points(path: Path) -> tuple[RawPoints, list[ReportWarning]]:
     """Read ``points3D.txt``.
 
     Raises

@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import DatasetError
 from ..limits import MIN_IMAGES
 from ..progress import Progress
+from ..report_warning import LEFT_OUT_HINT, ReportWarning
 from ..tolerances import SCENE_RADIUS
 from .camera import Camera
 from .normalisation import find_scene_frame
@@ -64,7 +65,7 @@ def load_scene(
     kind = source_kind(source)
     work_folder.mkdir(parents=True, exist_ok=True)
     progress.update(0.0, "reading the input")
-    warnings: list[str] = []
+    warnings: list[ReportWarning] = []
     facts: dict[str, Any] = {"kind": kind.kind}
     if kind.kind == "photos":
         model = _solve(kind, work_folder, progress.span(0.0, 0.8), seed, threads)
@@ -134,7 +135,7 @@ def _solve(
 
 
 def _frame(
-    views: list[PreparedView], warnings: list[str]
+    views: list[PreparedView], warnings: list[ReportWarning]
 ) -> tuple[list[PreparedView], Similarity, dict[str, Any]]:
     """Choose the scene frame and leave out cameras that stand impossibly far away."""
     rotations = np.array([view.cam_from_world[:, :3] for view in views])  # (n, 3, 3)
@@ -143,12 +144,21 @@ def _frame(
     frame = find_scene_frame(rotations, centers)
     far = [view.name for view, keep in zip(views, frame.keep, strict=True) if not keep]
     if far:
-        warnings.append(
+        text = (
             f"{len(far)} cameras stand far away from all others and were left out: "
             f"{', '.join(far[:3])}."
         )
+        warnings.append(
+            ReportWarning("cameras-far-away", text, "Check the poses of these cameras.")
+        )
     if frame.collinear:
-        warnings.append("All cameras stand on one line; depth and the up direction are weak.")
+        warnings.append(
+            ReportWarning(
+                "cameras-on-a-line",
+                "All cameras stand on one line; depth and the up direction are weak.",
+                "Take photos from other heights and directions too.",
+            )
+        )
     kept = [view for view, keep in zip(views, frame.keep, strict=True) if keep]
     return kept, frame.scene_from_world, {"up_from": frame.up_rule}
 
@@ -161,12 +171,13 @@ def _camera(view: PreparedView) -> Camera:
 
 
 def _points(
-    model: SourceModel, scene_from_world: Similarity, warnings: list[str]
+    model: SourceModel, scene_from_world: Similarity, warnings: list[ReportWarning]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bring the input's sparse points to the scene frame and drop impossible ones."""
     with np.errstate(over="ignore", invalid="ignore"):
         points = scene_from_world.points(model.points.reshape(-1, 3))
         near = np.linalg.norm(points, axis=1) <= POINT_REACH
     if not near.all():
-        warnings.append(f"{int((~near).sum())} sparse points lie impossibly far; left out.")
+        text = f"{int((~near).sum())} sparse points lie impossibly far; left out."
+        warnings.append(ReportWarning("points-far-away", text, LEFT_OUT_HINT))
     return points[near], model.point_colors[near]

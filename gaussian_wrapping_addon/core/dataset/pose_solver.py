@@ -24,6 +24,7 @@ from ..limits import MIN_IMAGES
 from ..machine import total_memory_bytes
 from ..parallel import default_threads
 from ..progress import Progress
+from ..report_warning import UNREADABLE_HINT, ReportWarning
 from .camera import Camera
 from .colmap_reader import ModelFiles, read_model
 from .pair_choice import pairs_by_order, pairs_by_pose
@@ -163,10 +164,16 @@ def _with_source_names(
     if lost:
         listed = ", ".join(lost[:5]) + (" ..." if len(lost) > 5 else "")
         warnings.append(
-            f"{len(lost)} of {len(names)} photos could not be placed and are not used: {listed}."
+            ReportWarning(
+                "photos-not-placed",
+                f"{len(lost)} of {len(names)} photos could not be placed and are not used: "
+                f"{listed}.",
+                "Take more photos with more overlap there, or remove blurred ones.",
+            )
         )
     if bad:
-        warnings.append(f"{len(bad)} photos cannot be read and are not used: {bad[0]}")
+        text = f"{len(bad)} photos cannot be read and are not used: {bad[0]}"
+        warnings.append(ReportWarning("photos-unreadable", text, UNREADABLE_HINT))
     facts = {
         "photos": offered,
         "photos_placed": len(photos),

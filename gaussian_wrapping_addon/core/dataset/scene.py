@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..report_warning import ReportWarning
 from .camera import Camera
 from .similarity import Similarity
 
@@ -38,8 +39,8 @@ class Scene:
     point_colors: np.ndarray
     """(n, 3) uint8."""
     world_from_scene: Similarity
-    warnings: tuple[str, ...] = ()
-    """Findings a person should read, one sentence each."""
+    warnings: tuple[ReportWarning, ...] = ()
+    """What a person should read."""
     facts: dict[str, Any] = field(default_factory=dict)
     """What was read (kind of input, counts), for the report."""
 

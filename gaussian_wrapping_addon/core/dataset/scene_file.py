@@ -13,6 +13,7 @@ import numpy as np
 from .. import limits
 from ..errors import DatasetError, ParseError
 from ..files import read_json, write_bytes, write_json
+from ..report_warning import read_warnings
 from .camera import Camera
 from .scene import Scene, View
 from .similarity import Similarity
@@ -59,7 +60,7 @@ def scene_to_json(scene: Scene, folder: Path | None = None) -> dict[str, Any]:
     return {
         "version": VERSION,
         "world_from_scene": scene.world_from_scene.to_json(),
-        "warnings": list(scene.warnings),
+        "warnings": [warning.to_json() for warning in scene.warnings],
         "facts": scene.facts,
         "views": [
             {
@@ -92,7 +93,7 @@ def scene_from_json(values: Any, folder: Path) -> Scene:
             for entry in values["views"]
         )
         world_from_scene = Similarity.from_json(values["world_from_scene"])
-        warnings, facts = tuple(values["warnings"]), dict(values["facts"])
+        warnings, facts = read_warnings(values["warnings"]), dict(values["facts"])
     except (KeyError, TypeError, ValueError) as error:
         raise ParseError(path, "views", f"not as expected ({error}).", _AGAIN) from None
     for view in views:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import limits
+from ..report_warning import ReportWarning
 from ..tolerances import QUATERNION_MIN_NORM
 
 LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
@@ -166,7 +167,7 @@ class SourceModel:
     """(n, 3) float64."""
     point_colors: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     """(n, 3) uint8."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[ReportWarning, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import ResourceError, WorkerError
 from ..progress import Progress
+from ..report_warning import ReportWarning
 from ..tolerances import NEAR_Z, SCENE_RADIUS
 from .camera import Camera
 from .pose_solver import triangulate_points
@@ -23,6 +24,8 @@ RANDOM_POINTS = 20_000
 _ROUNDS = 40
 _MIN_SEEN = 2
 
+_HINT = "Photos with more texture help, or a COLMAP model with its points."
+
 
 def make_start_points(
     cameras: Sequence[Camera],
@@ -30,7 +33,7 @@ def make_start_points(
     masks: Sequence[Path | None],
     work_folder: Path,
     progress: Progress,
-    warnings: list[str],
+    warnings: list[ReportWarning],
     *,
     seed: int,
     threads: int,
@@ -46,14 +49,16 @@ def make_start_points(
         )
     except (WorkerError, ResourceError) as error:
         _logger.warning("triangulation failed: %s", error)
-        warnings.append(f"Start points could not be triangulated: {error.message}")
+        text = f"Start points could not be triangulated: {error.message}"
+        warnings.append(ReportWarning("points-not-triangulated", text, _HINT))
         points, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if len(points) >= MIN_POINTS:
         return points, colors, "triangulated from the photos"
-    warnings.append(
+    text = (
         f"The photos gave only {len(points)} start points; random ones are used, which makes "
         "training slower and less exact."
     )
+    warnings.append(ReportWarning("random-start-points", text, _HINT))
     points = random_points(cameras, seed=seed)
     return points, np.full(points.shape, 128, np.uint8), "random"
 

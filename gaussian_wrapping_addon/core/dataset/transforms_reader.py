@@ -17,6 +17,7 @@ import numpy as np
 from .. import limits
 from ..errors import DatasetError, ParseError
 from ..files import read_json, resolve_inside
+from ..report_warning import LEFT_OUT_HINT, ReportWarning
 from .colmap_reader import is_safe_name
 from .point_file import read_point_ply
 from .source_model import LENS_PARAMETERS, LensCamera, PosedPhoto, SourceModel
@@ -66,7 +67,7 @@ def read_transforms(path: Path) -> SourceModel:
         raise ParseError(path, "frames", "a list of at least one frame was expected.", _AGAIN)
     if len(frames) > limits.MAX_IMAGES:
         raise ParseError(path, "frames", f"{len(frames)} frames are too many.", "Split the file.")
-    warnings: list[str] = []
+    warnings: list[ReportWarning] = []
     photos: list[PosedPhoto] = []
     unsafe: list[str] = []
     repeated = scaled = 0
@@ -91,17 +92,21 @@ def read_transforms(path: Path) -> SourceModel:
             mask = _name(path, f"{place}.mask_path", mask)
         photos.append(PosedPhoto(name, lens, pose, mask, angle_x))
     if unsafe:
-        warnings.append(
+        text = (
             f"{len(unsafe)} frames were left out because their file_path leads outside the "
             f"folder: {', '.join(unsafe[:3])}."
         )
+        warnings.append(ReportWarning("frames-outside-folder", text, LEFT_OUT_HINT))
     if repeated:
-        warnings.append(f"{repeated} frames repeat a photo and were left out.")
+        text = f"{repeated} frames repeat a photo and were left out."
+        warnings.append(ReportWarning("frames-repeated", text, LEFT_OUT_HINT))
     if scaled:
-        warnings.append(f"{scaled} matrices held a scale, which was removed.")
+        text = f"{scaled} matrices held a scale, which was removed."
+        warnings.append(ReportWarning("scale-removed", text))
     if not photos:
         raise DatasetError(
-            f"None of the {len(frames)} frames of {path.name} is usable.", " ".join(warnings)
+            f"None of the {len(frames)} frames of {path.name} is usable.",
+            " ".join(warning.text for warning in warnings),
         )
     points, colors = _start_points(path, values.get("ply_file_path"), warnings)
     facts: dict[str, Any] = {
@@ -229,12 +234,20 @@ def _intrinsics(
     return lens, None
 
 
-def _start_points(path: Path, name: Any, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
+def _start_points(
+    path: Path, name: Any, warnings: list[ReportWarning]
+) -> tuple[np.ndarray, np.ndarray]:
     nothing = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     if name is None:
         return nothing
     found = resolve_inside(path.parent, name) if isinstance(name, str) and name else None
     if found is None or not found.is_file():
-        warnings.append(f"ply_file_path {json.dumps(name)[:80]} was not found in the folder.")
+        warnings.append(
+            ReportWarning(
+                "point-file-missing",
+                f"ply_file_path {json.dumps(name)[:80]} was not found in the folder.",
+                "Put the file where transforms.json says it is.",
+            )
+        )
         return nothing
     return read_point_ply(found)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from ..errors import DatasetError
 from ..files import resolve_inside
 from ..parallel import default_threads
 from ..progress import Progress
+from ..report_warning import UNREADABLE_HINT, ReportWarning
 from .photo_file import (
     MASK_THRESHOLD,
     DecodedPhoto,
@@ -72,7 +72,7 @@ def prepare_views(
     progress: Progress,
     *,
     threads: int = 0,
-) -> tuple[list[PreparedView], list[str], dict[str, int]]:
+) -> tuple[list[PreparedView], list[ReportWarning], dict[str, int]]:
     """Make every posed photo a pinhole view; photos that fit already are used where they lie.
 
     Written files: ``work_folder/images/*.jpg`` (undistorted, or brought upright and to 8 bits) and
@@ -82,7 +82,7 @@ def prepare_views(
     -------
     views : list of PreparedView
         In the order of the names.
-    warnings : list of str
+    warnings : list of ReportWarning
     facts : dict
 
     Raises
@@ -313,29 +313,37 @@ class _MapCache:
             return self._maps[lens]
 
 
-def _warnings(notes: _Notes, stated: int, kind: str) -> list[str]:
+def _warnings(notes: _Notes, stated: int, kind: str) -> list[ReportWarning]:
     out = []
 
-    def say(items: list[str], text: Callable[[int], str]) -> None:
+    def say(code: str, items: list[str], text: str, hint: str = "") -> None:
         if items:
             listed = ", ".join(sorted(items)[:3]) + (" ..." if len(items) > 3 else "")
-            out.append(f"{text(len(items))}: {listed}.")
+            out.append(ReportWarning(code, f"{len(items)} {text}: {listed}.", hint))
 
     say(
+        "photos-not-found",
         notes.missing,
-        lambda n: f"{n} of the {stated} photos that the {kind} names were not found",
+        f"of the {stated} photos that the {kind} names were not found",
     )
     say(
+        "photos-unreadable",
         [m.rstrip(".") for m in notes.bad],
-        lambda n: f"{n} photos cannot be read and are not used",
+        "photos cannot be read and are not used",
+        UNREADABLE_HINT,
     )
-    say([m.rstrip(".") for m in notes.wrong_masks], lambda n: f"{n} masks were not used")
-    say(notes.fully_masked, lambda n: f"{n} photos are masked altogether and are not used")
+    say("masks-not-used", [m.rstrip(".") for m in notes.wrong_masks], "masks were not used")
+    say(
+        "photos-masked-altogether",
+        notes.fully_masked,
+        "photos are masked altogether and are not used",
+    )
     if notes.renamed:
-        out.append(
+        text = (
             f"{notes.renamed} photos were found under a name that differs in case, extension or "
             "folder."
         )
+        out.append(ReportWarning("photos-renamed", text))
     return out
 
 

@@ -20,6 +20,7 @@ import torch
 from ..dataset.splat_header import EXPECTED, SplatHeader, read_splat_header
 from ..errors import ParseError
 from ..ply.table import read_vertices
+from ..report_warning import LEFT_OUT_HINT, ReportWarning
 from ..tolerances import QUATERNION_MIN_NORM
 from .initialisation import SH_C0
 from .model import OrientedGaussians
@@ -52,7 +53,7 @@ class ForeignSplat:
     """Whether the file has orientations."""
     dropped: int
     """Gaussians left out because a value was not finite or senseless."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[ReportWarning, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
 
 
@@ -106,8 +107,8 @@ def read_foreign_splat(path: Path) -> ForeignSplat:
         "splat_surfels": header.axes == 2,
         "splat_oriented": oriented,
     }
-    for text in warnings:
-        _logger.warning("%s: %s", path.name, text)
+    for warning in warnings:
+        _logger.warning("%s: %s", path.name, warning.text)
     return ForeignSplat(OrientedGaussians(**tensors), oriented, dropped, tuple(warnings), facts)
 
 
@@ -137,22 +138,25 @@ def _sensible(arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 def _warnings(
     header: SplatHeader, arrays: dict[str, np.ndarray], dropped: int, count: int
-) -> list[str]:
+) -> list[ReportWarning]:
     out = []
     if dropped:
-        out.append(f"{dropped} of {count} Gaussians with senseless values were left out.")
+        text = f"{dropped} of {count} Gaussians with senseless values were left out."
+        out.append(ReportWarning("gaussians-left-out", text, LEFT_OUT_HINT))
     if header.degree > MAX_DEGREE:
-        out.append(
+        text = (
             f"The splat's harmonics are of degree {header.degree}; those above degree "
             f"{MAX_DEGREE} are left out, so that highlights may look softer."
         )
+        out.append(ReportWarning("harmonics-left-out", text, LEFT_OUT_HINT))
     opacity, scales = arrays["opacity_logits"], arrays["log_scales"]
     plain = (opacity >= 0) & (opacity <= 1) & (scales > 0).all(axis=1)
     if plain.mean() > _ACTIVATED_SHARE and np.ptp(opacity) > 0:
-        out.append(
+        text = (
             "Opacities and scales look like plain values; logits and logarithms are expected. "
             "If the mesh looks wrong, export the splat again in Inria's convention."
         )
+        out.append(ReportWarning("values-look-activated", text))
     return out
 
 

@@ -21,12 +21,15 @@ from ..errors import (
     cannot_be_written,
 )
 from ..helper_process import emit
+from ..report_warning import ReportWarning
 
 PARENT_POLL_S = 1.0
 
 
-def answer(work: Callable[[], Iterable[str]], memory_hint: str = "Close other programs.") -> int:
-    """Emit the lines of ``work`` as they come, or its error; return the exit code.
+def answer(
+    work: Callable[[], Iterable[str | ReportWarning]], memory_hint: str = "Close other programs."
+) -> int:
+    """Emit the lines and warnings of ``work`` as they come, or its error; return the exit code.
 
     The process ends when the one that asked does.
     """
@@ -34,7 +37,10 @@ def answer(work: Callable[[], Iterable[str]], memory_hint: str = "Close other pr
     threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
     try:
         for line in work():
-            emit(line=line)
+            if isinstance(line, ReportWarning):
+                emit(warning=line.text, code=line.code)
+            else:
+                emit(line=line)
     except WrapError as error:
         emit(error=error.message, hint=error.hint)
         return error.exit_code

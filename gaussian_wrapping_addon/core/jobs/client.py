@@ -173,7 +173,7 @@ class JobClient:
             # Where it is now: the job may have been moved, and one from elsewhere may name any.
             status = replace(status, result=str(self.folder.result))
         self._seen_at_work = self._seen_at_work or status.active
-        if self._seen_at_work and status.state == "DONE" and status.error:
+        if self._seen_at_work and status.state == "DONE" and status.put_back:
             return replace(status, state="FAILED")
         return status
 

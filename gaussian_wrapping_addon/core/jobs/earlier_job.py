@@ -95,7 +95,7 @@ def put_back(folder: JobFolder) -> JobStatus | None:
 
 
 def _without_error(status: JobStatus) -> JobStatus:
-    return replace(status, error="", hint="", exit_code=0)
+    return replace(status, error="", hint="", exit_code=0, put_back=False)
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import DatasetError
+from ..report_warning import ReportWarning
 from .answer import answer
 from .job_file import JobFile
 
@@ -23,7 +24,7 @@ def main(arguments: list[str]) -> int:
     return answer(lambda: _estimate(JobFile.from_json(json.loads(arguments[0]))))
 
 
-def _estimate(job: JobFile) -> list[str]:
+def _estimate(job: JobFile) -> list[str | ReportWarning]:
     from ..parallel import default_threads
     from ..training.estimate import MESH_AND_TEXTURE_SHARE, estimate, judge, this_machine
     from ..training.machine_speed import machine_speed, renderer_is_compiled
@@ -53,7 +54,7 @@ def _estimate(job: JobFile) -> list[str]:
         lines.append("solving the cameras: minutes before")
     if not compiled:
         lines.append("not timed here: the first job compiles the renderer, about a minute, once")
-    return [*lines, *(f"warning: {text}" for text in judge(expected, machine))]
+    return [*lines, *judge(expected, machine)]
 
 
 def input_facts(source: Path) -> SceneFacts:

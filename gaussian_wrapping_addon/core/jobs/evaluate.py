@@ -2,7 +2,8 @@
 """``evaluate`` of the command line: judges a mesh or a job in the worker's Python.
 
 The caller's side needs neither scipy nor libigl; the child reports on stdout, one JSON object a
-line: ``{"message"}`` while it works, ``{"line"}`` for the table, ``{"error", "hint"}`` at the end.
+line: ``{"message"}`` while it works, ``{"line"}`` for the table, ``{"warning", "code"}``,
+``{"error", "hint"}`` at the end.
 """
 
 from __future__ import annotations
@@ -106,7 +107,9 @@ def _show(raw: bytes) -> bool:
     if "error" in values:
         _logger.error("error: %s", f"{values['error']} {values.get('hint', '')}".strip())
         return True
-    if "line" in values:
+    if "warning" in values:
+        _logger.info("warning: %s", values["warning"])
+    elif "line" in values:
         _logger.info("%s", values["line"])
     elif "message" in values:
         _logger.info("[%5.1f %%] %s", 100 * float(values.get("fraction", 0)), values["message"])

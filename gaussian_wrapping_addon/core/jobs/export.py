@@ -17,6 +17,7 @@ from ..progress import Progress
 from .job_file import JobFile
 from .job_folder import JobFolder
 from .result_swap import new_result
+from .scene_summary import write_scene_summary
 from .stages import Stage
 
 REPORTS = ("report.json", "report.md")
@@ -45,7 +46,6 @@ def export_results(
     from ..dataset.scene_file import load_saved_scene
     from ..gaussians.gaussian_file import load_gaussians
     from ..gaussians.splat_ply import write_splat_ply
-    from .runner import write_scene_summary
 
     with new_result(folder.result, last=REPORTS) as new:
         progress.update(0.1, "writing the scene")

@@ -29,9 +29,10 @@ class JobStatus:
     stage: str = ""
     fraction: float = 0.0
     message: str = ""
+    """For people only."""
     seconds_left: float | None = None
     error: str = ""
-    """Why it failed; of a job that is DONE, why it could not be meshed again."""
+    """Why it failed; of a job that was put back, why it could not be meshed again."""
     hint: str = ""
     exit_code: int | None = None
     pid: int = 0
@@ -43,6 +44,10 @@ class JobStatus:
     """Absolute path of the result folder, once there is one."""
     figures: dict[str, float] = field(default_factory=dict)
     """Live figures of the stage at work, such as ``iteration``, ``gaussians`` and ``psnr``."""
+    phase: str = ""
+    """For programs: what is special about the moment, such as ``progress.COMPILING``."""
+    put_back: bool = False
+    """This is the finished job from before a mesh that has failed."""
 
     @property
     def active(self) -> bool:
@@ -63,11 +68,14 @@ class JobStatus:
         for name, value in known.items():
             if not _is_kind(name, value):
                 raise TypeError(f"{name} is {type(value).__name__}")
-        return cls(**known)
+        # Version 0.1.0 told of a job that was put back by its error alone.
+        old = known.get("state") == "DONE" and bool(known.get("error"))
+        return cls(**{"put_back": old, **known})
 
 
 _WHOLE_NUMBERS = ("pid", "pid_started", "exit_code")
 _NUMBERS = ("fraction", "seconds_left", "heartbeat_s")
+_FLAGS = ("put_back",)
 _MAY_BE_NONE = ("seconds_left", "exit_code")
 
 
@@ -75,8 +83,8 @@ def _is_kind(name: str, value: Any) -> bool:
     """Tell whether a value can be the field of this name of a status."""
     if value is None:
         return name in _MAY_BE_NONE
-    if isinstance(value, bool):
-        return False
+    if isinstance(value, bool) or name in _FLAGS:
+        return name in _FLAGS and isinstance(value, bool)
     if name in _WHOLE_NUMBERS:
         return isinstance(value, int)
     if name in _NUMBERS:

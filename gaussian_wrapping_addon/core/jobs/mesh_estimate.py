@@ -14,6 +14,7 @@ from ..errors import MeshingError, UsageError
 from ..names import AUTOMATIC_REGIONS
 from ..parallel import default_threads
 from ..progress import Progress
+from ..report_warning import ReportWarning
 from ..settings import MeshingSettings, from_json
 from .answer import answer
 from .job_folder import JobFolder
@@ -40,7 +41,7 @@ def _newest(stages: Path, name: str) -> Path:
     return max(done)[1]
 
 
-def _lines(request: dict[str, Any]) -> list[str]:
+def _lines(request: dict[str, Any]) -> list[str | ReportWarning]:
     from ..dataset.scene_file import load_saved_scene
     from ..field.sightings import find_sightings
     from ..field.vacancy import VacancyField
@@ -80,9 +81,9 @@ def _lines(request: dict[str, Any]) -> list[str]:
     if meshing.method == "pivots":
         by_pivots = expected_by_pivots(vacancy, arrays, region, meshing, sightings)
         by_pivots.refuse(memory_bytes)
-        return by_pivots.lines()
+        return [*by_pivots.lines()]
     expected = expected_mesh(vacancy, scene.cameras, region, meshing, edge_length, sightings)
     tiled = meshing.tiles != "off" and (meshing.tiles != "auto" or expected.tiles_for(memory_bytes))
     expected.refuse(memory_bytes, tiled=tiled)
     how = "it would be meshed in tiles" if tiled else "it would be meshed whole"
-    return [*expected.lines(), how, *(f"warning: {note}" for note in notes)]
+    return [*expected.lines(), how, *notes]

@@ -16,6 +16,8 @@ from ..settings import JobSettings, MeshingSettings, from_json, to_json
 from .claims import Claims, work_through
 from .job_file import read_job
 from .job_folder import JobFolder
+from .mesh_stages import mesh_stages
+from .stages import read_done
 
 if TYPE_CHECKING:
     from ..dataset.camera import Camera
@@ -257,8 +259,6 @@ def open_lists(folder: JobFolder) -> list[Path]:
     not matter: from another machine that cannot be seen.
     """
     from ..meshing.tiles.store import LIST_NAME
-    from .runner import mesh_stages
-    from .stages import read_done
 
     found = sorted(folder.stages.glob(f"mesh-*/{FOLDER}/{LIST_NAME}"))
     undone = [path.parent for path in found if read_done(path.parent.parent) is None]

@@ -13,21 +13,18 @@ from typing import Any
 
 from ..errors import MeshingError
 from ..export_formats import RESULT_FORMATS
-from ..files import write_json
 from ..machine import describe_machine
-from ..names import region_name, region_names
+from ..names import region_names
 from ..parallel import default_threads
 from ..peak_memory import peak_memory_bytes
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
 from .job_file import JobFile, refuse_replacing
 from .job_folder import JobFolder
-from .stages import Stage, read_done, run_stage, source_fingerprint, stage_key
+from .mesh_stages import mesh_key
+from .stages import STAGE_VERSIONS, Stage, read_done, run_stage, source_fingerprint, stage_key
 
 _logger = logging.getLogger(__name__)
-
-# Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
-STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 9, "texture": 11}
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
@@ -61,7 +58,9 @@ class _Overall:
             elapsed_s = time.monotonic() - self._begun_s
             gained = overall - self._offset
             left_s = elapsed_s * (1.0 - overall) / gained if gained > 0.01 else None
-            self._sink(ProgressEvent(name, overall, event.message, event.figures, left_s))
+            self._sink(
+                ProgressEvent(name, overall, event.message, event.figures, left_s, event.phase)
+            )
 
         return Progress(name, forward, self._is_cancelled)
 
@@ -158,7 +157,7 @@ def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: in
         return {
             "views": len(scene.views),
             "points": len(scene.points),
-            "warnings": list(scene.warnings),
+            "warnings": [warning.to_json() for warning in scene.warnings],
             "facts": scene.facts,
         }
 
@@ -192,26 +191,6 @@ def _run_training(
     return run_training(folder, job, cameras, progress, version=version, threads=threads)
 
 
-def _mesh_key(job: JobFile, request: str, name: str, trained_key: str) -> str:
-    body = job.region_bodies.get(request)
-    return stage_key(
-        STAGE_VERSIONS["mesh"], trained_key, request if body is None else body, name,
-        to_json(job.meshing_of(request)), job.settings.seed,
-    )  # fmt: skip
-
-
-def mesh_stages(folder: JobFolder, job: JobFile) -> set[str]:
-    """Return the names of the mesh stages that the job has, or would have, in a folder."""
-    finished = [p for p in folder.stages.glob("train-*") if read_done(p) is not None]
-    trained = [path.name.partition("-")[2] for path in finished]
-    names = {r: region_name(r, job.region_bodies.get(r)) for r in job.settings.regions}
-    return {
-        f"mesh-{name}-{_mesh_key(job, request, name, key)}"
-        for request, name in names.items()
-        for key in trained
-    }
-
-
 def _run_meshing(
     folder: JobFolder,
     job: JobFile,
@@ -224,7 +203,7 @@ def _run_meshing(
 ) -> Stage:
     meshing = job.meshing_of(request)
     body = job.region_bodies.get(request)
-    key = _mesh_key(job, request, name, trained.key)
+    key = mesh_key(job, request, name, trained.key)
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         import numpy as np
@@ -372,22 +351,3 @@ def _run_texture(
 
     formats = json.dumps(sorted(job.settings.export))
     return run_stage(folder.stages, f"texture-{name}", stage_key(key, formats), progress, work)
-
-
-def write_scene_summary(path: Path, cameras: Stage) -> None:
-    """Write ``result/scene.json``: what Blender needs of the scene (docs/architecture.md)."""
-    from ..dataset.scene_file import load_saved_scene
-    from ..tolerances import SCENE_RADIUS
-
-    scene = load_saved_scene(cameras.folder)
-    write_json(
-        path,
-        {
-            "version": 1,
-            "world_from_scene": scene.world_from_scene.to_json(),
-            "radius": SCENE_RADIUS,
-            "cameras": [
-                {**view.camera.to_json(), "photo": str(view.photo_path)} for view in scene.views
-            ],
-        },
-    )

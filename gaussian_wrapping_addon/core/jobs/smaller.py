@@ -12,6 +12,7 @@ from typing import Any, Generic, TypeVar
 
 from ..errors import ParseError, ResourceError
 from ..files import read_json, write_json
+from ..report_warning import ReportWarning
 from ..settings import MeshingSettings, TrainingSettings
 
 _logger = logging.getLogger(__name__)
@@ -37,8 +38,8 @@ class Trained(Generic[Result]):
 
     result: Result
     settings: TrainingSettings
-    warnings: tuple[str, ...]
-    """One sentence for each step down."""
+    warnings: tuple[ReportWarning, ...]
+    """One for each step down."""
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -97,7 +98,9 @@ def train_within_memory(
         settings = one_smaller(settings) or settings
     while True:
         try:
-            return Trained(train(settings), settings, tuple(reasons))
+            result = train(settings)
+            warnings = tuple(ReportWarning("memory-step-down", reason) for reason in reasons)
+            return Trained(result, settings, warnings)
         except (MemoryError, ResourceError, RuntimeError) as error:
             # Words only: the error itself would keep the memory of the failed training.
             if not is_out_of_memory(error):

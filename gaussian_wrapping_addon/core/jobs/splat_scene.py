@@ -19,6 +19,7 @@ from ..dataset.splat_source import (
 )
 from ..files import write_bytes
 from ..progress import Progress
+from ..report_warning import ReportWarning
 from .job_file import JobFile
 
 MAX_START_POINTS = 30_000
@@ -84,11 +85,10 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
     chosen = np.nonzero((opacities >= SOLID) & near)[0]
     chosen = chosen[:: max(1, -(-len(chosen) // MAX_START_POINTS))]
     colors = np.clip(0.5 + SH_C0 * world.sh[chosen, 0].numpy(), 0.0, 1.0)  # (m, 3)
-    warnings = [*splat.warnings, WITHOUT_PHOTOS]
+    warnings = [*splat.warnings, ReportWarning("without-photos", WITHOUT_PHOTOS)]
     if extent.has_surroundings:
-        warnings.append(
-            "The splat reaches far beyond its middle; only the middle is covered by the views."
-        )
+        text = "The splat reaches far beyond its middle; only the middle is covered by the views."
+        warnings.append(ReportWarning("surroundings-not-covered", text))
     facts = {"kind": SPLAT, "views": len(views), "points": len(chosen), **splat.facts}
     progress.update(1.0, f"{len(views)} views are rendered")
     return Scene(

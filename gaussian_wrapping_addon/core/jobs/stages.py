@@ -20,6 +20,9 @@ from .job_folder import MARKER
 
 _logger = logging.getLogger(__name__)
 
+# Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
+STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 9, "texture": 11}
+
 HASH_CHARACTERS = 12
 INPUT_SUFFIXES = (
     ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".bin", ".txt", ".json", ".ply",

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DatasetError
-from ..progress import Progress
+from ..progress import COMPILING, Progress
+from ..report_warning import ReportWarning
 from ..settings import RESULT_FREE, TrainingSettings, to_json
 from .job_file import JobFile
 from .job_folder import JobFolder
@@ -27,10 +28,6 @@ if TYPE_CHECKING:
     from ..training.result import TrainingResult
 
 _logger = logging.getLogger(__name__)
-
-COMPILING = "compiling the renderer, about a minute, only this once"
-"""Message while kernels are compiled: no Python runs then that could ask for cancelling, and
-nothing is lost, so that the worker ends at once when it is cancelled meanwhile."""
 
 
 def start_fingerprint(path: str) -> list[Any]:
@@ -140,7 +137,8 @@ def _train(
     photos = PhotoStore(scene, trained.settings.max_image_px)
     pictures = write_held_out(result.gaussians, photos, shown, stage_folder, threads=threads)
     done = result.to_json()
-    done["warnings"] = [*warnings, *trained.warnings, *done["warnings"]]
+    earlier = [warning.to_json() for warning in (*warnings, *trained.warnings)]
+    done["warnings"] = [*earlier, *done["warnings"]]
     return {
         **done,
         "pictures": pictures,
@@ -173,7 +171,7 @@ def _inside_regions(job: JobFile, scene: Scene) -> Callable[[np.ndarray], np.nda
 
 def _estimate(
     scene: Scene, job: JobFile, stage_folder: Path, progress: Progress, threads: int
-) -> tuple[dict[str, Any], list[str]]:
+) -> tuple[dict[str, Any], list[ReportWarning]]:
     """Tell what the training will take; refuse where the disk is too full.
 
     The renderer is compiled meanwhile where that was never done here.
@@ -188,7 +186,7 @@ def _estimate(
     if start_splat_of(job) is not None:
         training = wrapping_settings(training)
     if not renderer_is_compiled():
-        progress.update(0.0, COMPILING)
+        progress.enter(COMPILING, "compiling the renderer, about a minute, only this once")
         compile_kernels(training, stage_folder, progress, threads=threads)
     progress.update(0.0, "timing this machine")
     machine = this_machine(stage_folder, threads, machine_speed(threads))
@@ -197,8 +195,8 @@ def _estimate(
     expected = estimate(scene_facts(scene), training, machine, first=first)
     warnings = judge(expected, machine)  # raises where the disk is too full
     _logger.info("estimate: %s", expected.sentence())
-    for text in warnings:
-        _logger.warning("%s", text)
+    for warning in warnings:
+        _logger.warning("%s", warning.text)
     progress.update(0.0, f"training will take {expected.span()}")
     values = {**dataclasses.asdict(expected), "speed": machine.speed}
     return values, warnings

@@ -26,11 +26,10 @@ from ..errors import (
     cannot_be_written,
 )
 from ..helper_process import end_helpers
-from ..progress import ProgressEvent
+from ..progress import COMPILING, ProgressEvent
 from .earlier_job import forget_finished, put_back
 from .job_file import read_job
 from .job_folder import JobFolder, JobStatus, process_start_ticks
-from .training_stage import COMPILING
 
 _logger = logging.getLogger(__name__)
 
@@ -65,6 +64,7 @@ class _Reporter:
                 stage=event.stage,
                 fraction=event.fraction,
                 message=event.message,
+                phase=event.phase,
                 seconds_left=event.seconds_left,
                 figures=_merged({} if changed else self.status.figures, event.figures),
             )
@@ -93,7 +93,7 @@ class _Reporter:
                 self.stop_asked = True
             if self.cancelled():
                 asked_s = min(asked_s, time.monotonic())
-            if self.cancelled() and self.status.message == COMPILING:
+            if self.cancelled() and self.status.phase == COMPILING:
                 self._end_at_once()
                 continue
             if time.monotonic() - asked_s > limits.CANCEL_ALONE_S:
@@ -227,9 +227,10 @@ def main(arguments: list[str]) -> int:
         forget_finished(folder)
     earlier = _put_back(folder) if state == "FAILED" else None
     finished = {"fraction": 1.0, "seconds_left": 0.0, "message": ""} if state == "DONE" else {}
-    last = {**finished, "state": state, "result": result}
+    last = {**finished, "state": state, "phase": "", "result": result}
     if earlier is not None:
         last = {k: v for k, v in asdict(earlier).items() if k != "heartbeat_s"}
+        last["put_back"] = True
     reporter.write(**{**last, "error": error, "hint": hint, "exit_code": code})
     folder.unlock()
     return code

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..progress import Progress
+from ..report_warning import ReportWarning
 from ..settings import MeshingSettings
 from .cap_planes import cap_planes
 from .convex_region import Region
@@ -67,10 +68,11 @@ def clean_up(
         vertices, faces = result.vertices, result.faces
         colors = None if colors is None else colors[result.source]
         if not result.reached:
-            notes.append(
+            text = (
                 f"{len(faces)} faces are left of {len(mesh.faces)}, more than the "
                 f"{settings.target_faces} asked for: fewer would fold or tear the mesh."
             )
+            notes.append(ReportWarning("more-faces-left", text).to_json())
         _logger.info("Decimated %d faces to %d", len(mesh.faces), len(faces))
     progress.update(0.9, "measuring the mesh")
     capped = (cap_planes(vertices, region).planes >= 0).any(1)
@@ -95,9 +97,10 @@ def _with_request(mesh: SurfaceMesh, settings: MeshingSettings) -> SurfaceMesh:
     """Say so where fewer faces were asked for than there are anyway."""
     if settings.target_faces == 0:
         return mesh
-    note = (
+    text = (
         f"The mesh has {len(mesh.faces)} faces, fewer than the {settings.target_faces} asked for: "
         "nothing was decimated."
     )
+    note = ReportWarning("not-decimated", text).to_json()
     notes = [*mesh.provenance.get("notes", []), note]
     return replace(mesh, provenance={**mesh.provenance, "notes": notes})

@@ -17,6 +17,7 @@ from ..errors import MeshingError
 from ..field.sightings import Sightings
 from ..gaussians.model import GaussianArrays
 from ..progress import Progress
+from ..report_warning import ReportWarning
 from ..settings import MeshingSettings
 from .candidate_surface import no_surface, pivot_cloud
 from .cap_planes import cap_planes
@@ -145,12 +146,12 @@ def _inside(
     return inside
 
 
-def _notes(settings: MeshingSettings, gaussians: int, chosen: int) -> list[str]:
+def _notes(settings: MeshingSettings, gaussians: int, chosen: int) -> list[dict[str, str]]:
     notes = []
     if settings.edge_length > 0 or settings.points > 0:
-        notes.append(
-            "The pivots decide the resolution; no edge length or number of points applies."
-        )
+        text = "The pivots decide the resolution; no edge length or number of points applies."
+        notes.append(ReportWarning("resolution-not-applied", text))
     if chosen < gaussians:
-        notes.append(f"{chosen} of {gaussians} Gaussians stand for all: memory is limited.")
-    return notes
+        text = f"{chosen} of {gaussians} Gaussians stand for all: memory is limited."
+        notes.append(ReportWarning("some-gaussians-chosen", text))
+    return [note.to_json() for note in notes]

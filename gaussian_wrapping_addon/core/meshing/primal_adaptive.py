@@ -132,7 +132,7 @@ def mesh_region(
         "sightings": 0 if sightings is None else len(sightings),
         "candidate_area": sampler.area,
         "spacing": settings.spacing,
-        "notes": [*wanted.request.notes, *cloud.notes],
+        "notes": [note.to_json() for note in (*wanted.request.notes, *cloud.notes)],
         "seed": seed,
         **cloud.figures,
         **figures,

@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import limits
 from ..errors import ResourceError, UsageError
+from ..report_warning import ReportWarning
 from .convex_region import Region
 from .sampling import EDGE_PER_RADIUS, POINTS_PER_SQUARE
 
@@ -44,7 +45,7 @@ class Request:
     edge_length: float
     """Scene units."""
     points: int
-    notes: tuple[str, ...] = ()
+    notes: tuple[ReportWarning, ...] = ()
     """What was changed, for the report."""
 
 
@@ -78,8 +79,8 @@ def checked_request(edge_length: float, points: int, region: Region) -> Request:
     coarsest = COARSEST_SHARE * region.diagonal
     if edge_length > coarsest:
         share = f"1/{1 / COARSEST_SHARE:.0f} of the region's diagonal"
-        note = f"The edge length was larger than {share} and was reduced to that."
-        return Request(coarsest, 0, (note,))
+        text = f"The edge length was larger than {share} and was reduced to that."
+        return Request(coarsest, 0, (ReportWarning("edge-length-reduced", text),))
     return Request(edge_length, points)
 
 
@@ -149,10 +150,10 @@ def dense_request(request: Request, area: float, region: Region) -> Dense:
     target, notes = round(share * expected), request.notes
     if target < MIN_VERTICES:
         asked = request.points or target  # with an edge length, what it comes to
-        note = (
+        text = (
             f"An adaptive mesh has at least {MIN_VERTICES} surface points; {asked} were asked for."
         )
-        notes = (*notes, note)
+        notes = (*notes, ReportWarning("points-raised", text))
         target = MIN_VERTICES
     dense = dense_points(target)
     if request.edge_length > 0:

@@ -18,6 +18,7 @@ from ..dataset.camera import Camera
 from ..field.isosurface_projection import TOLERANCE, project_to_isosurface
 from ..parallel import balanced_bounds
 from ..progress import Progress
+from ..report_warning import ReportWarning
 from .candidate_surface import CandidateSurface
 from .convex_region import Region
 from .marching_tetrahedra import bisect
@@ -74,7 +75,7 @@ class SurfacePoints:
     """(n,) float64 local thinning radius."""
     radius: float
     """The smallest of them, where nothing limits it."""
-    notes: tuple[str, ...]
+    notes: tuple[ReportWarning, ...]
     figures: dict[str, Any]
 
 
@@ -118,7 +119,7 @@ class SurfaceSampler:
 
     def spacing(
         self, request: Request, rng: np.random.Generator
-    ) -> tuple[Spacing, tuple[str, ...]]:
+    ) -> tuple[Spacing, tuple[ReportWarning, ...]]:
         """Return the local radii that answer to a request, and notes for the report.
 
         Raises
@@ -161,7 +162,7 @@ class SurfaceSampler:
         ResourceError
             The request needs more points than the cap.
         """
-        notes: tuple[str, ...] = ()
+        notes: tuple[ReportWarning, ...] = ()
         if spacing is None:
             spacing, notes = self._spacing(request, rng)
         progress.update(0.0, "spreading points")
@@ -207,17 +208,18 @@ class SurfaceSampler:
 
     def _spacing(
         self, request: Request, rng: np.random.Generator
-    ) -> tuple[Spacing, tuple[str, ...]]:
+    ) -> tuple[Spacing, tuple[ReportWarning, ...]]:
         """Choose the local radii, and tell where the photos limit them."""
         radius = thinning_radius(request, self.area, self._region)
         if len(self._cameras) == 0:
             return Spacing.uniform(radius), ()
         points, _ = sample_triangles(self._vertices, self._faces, SCOUTS, rng)
         spacing = footprint_spacing(points, self._cameras, radius)
-        notes: tuple[str, ...] = ()
+        notes: tuple[ReportWarning, ...] = ()
         if spacing.limited > NOTED_SHARE:
             share = f"On {spacing.limited:.0%} of the surface"
-            notes = (f"{share} the photos resolve no finer edges; uniform spacing makes them.",)
+            text = f"{share} the photos resolve no finer edges; uniform spacing makes them."
+            notes = (ReportWarning("photos-limit-edges", text),)
         return spacing, notes
 
     def _settled(

@@ -20,6 +20,7 @@ from ..meshing.convex_region import Region
 from ..meshing.decimation import decimate
 from ..meshing.surface_mesh import SurfaceMesh
 from ..progress import Progress
+from ..report_warning import ReportWarning
 from ..settings import TextureSettings
 from .atlas_raster import AtlasRaster
 from .chart_pyramid import ChartPyramid, chart_pyramid
@@ -122,7 +123,9 @@ def _ended(textured: TexturedMesh, settings: TextureSettings, number: int, reaso
     """Say, in the log and for the report, why there is no further level."""
     text = f"{number - 1} of {settings.lods} levels of detail were made, no further one: {reason}."
     _logger.warning("%s", text)
-    textured.statistics.setdefault("warnings", []).append(text)
+    hint = "Ask for fewer with --lods, or for a mesh with more faces."
+    warning = ReportWarning("fewer-levels", text, hint)
+    textured.statistics.setdefault("warnings", []).append(warning.to_json())
 
 
 def _level(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from ..errors import ResourceError
+from ..report_warning import ReportWarning
 from .bake import POINTS_PER_BLOCK
 
 BASE_BYTES = 500 * 10**6
@@ -30,7 +31,7 @@ def texture_memory_bytes(size_px: int, atlases: int, faces: int) -> int:
 
 def fit_into_memory(
     size_px: int, atlases: int, faces: int, free_bytes: int, *, may_lower: bool
-) -> tuple[int, int, str]:
+) -> tuple[int, int, ReportWarning | None]:
     """Return side and number of textures that fit, and a warning where they are less than asked.
 
     Parameters
@@ -51,7 +52,7 @@ def fit_into_memory(
     """
     needed = texture_memory_bytes(size_px, atlases, faces)
     if free_bytes == 0 or needed <= free_bytes:
-        return size_px, atlases, ""
+        return size_px, atlases, None
     side, number = size_px, atlases
     while number > 1 and texture_memory_bytes(side, number, faces) > free_bytes:
         number -= 1
@@ -67,4 +68,5 @@ def fit_into_memory(
         if fits:
             hint = f"Ask for {number} of {side} pixels, or close other programs."
         raise ResourceError(f"{text}.", hint)
-    return side, number, f"{text}: {number} of {side} pixels was made."
+    made = f"{text}: {number} of {side} pixels was made."
+    return side, number, ReportWarning("texture-made-smaller", made)

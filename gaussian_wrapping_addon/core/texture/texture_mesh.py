@@ -15,6 +15,7 @@ from ..dataset.scene import Scene
 from ..errors import MeshingError, UsageError
 from ..meshing.surface_mesh import SurfaceMesh
 from ..progress import Progress
+from ..report_warning import ReportWarning
 from ..settings import TextureSettings
 from .atlas_colors import CONTINUED_POINTS, AtlasColors, continue_colors
 from .atlas_points import atlas_points, blocks_of
@@ -136,7 +137,7 @@ def texture_mesh(
         "stretch_mean": stretch.mean,
         "stretch_p95": stretch.p95,
         "area_collapsed_share": stretch.collapsed_share,
-        "warnings": [warning] if warning else [],
+        "warnings": [] if warning is None else [warning.to_json()],
         **merged_statistics(details),
     }
     if statistics["texels_seen"] == 0:
@@ -156,7 +157,7 @@ def _plan(
     settings: TextureSettings,
     dense: SurfaceMesh | None,
     free_bytes: int,
-) -> tuple[int, int, str]:
+) -> tuple[int, int, ReportWarning | None]:
     """Return side and number of textures, and a warning where memory makes them fewer."""
     detail_points = 0
     if dense is not None and wants_normal_map(settings, is_decimated=True):
@@ -166,8 +167,8 @@ def _plan(
     size_px, atlases, warning = fit_into_memory(
         size_px, atlases, len(graph.areas), free_bytes, may_lower=settings.size_px == 0
     )
-    if warning:
-        _logger.warning("%s", warning)
+    if warning is not None:
+        _logger.warning("%s", warning.text)
     return size_px, atlases, warning
 
 

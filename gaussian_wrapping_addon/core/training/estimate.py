@@ -25,6 +25,7 @@ import numpy as np
 from ..errors import ResourceError
 from ..gaussians.initialisation import FEW_POINTS
 from ..machine import available_memory_bytes
+from ..report_warning import ReportWarning
 from ..settings import TrainingSettings
 from .schedule import Schedule
 
@@ -284,7 +285,7 @@ def estimate(
     return Estimate(low_s, high_s, round(memory), round(disk) + OTHER_DISK_BYTES, count)
 
 
-def judge(expected: Estimate, machine: Machine) -> list[str]:
+def judge(expected: Estimate, machine: Machine) -> list[ReportWarning]:
     """Refuse where the disk is clearly too full; return warnings about memory.
 
     Raises
@@ -306,5 +307,5 @@ def judge(expected: Estimate, machine: Machine) -> list[str]:
             f"{machine.memory_bytes / 2**30:.1f} GB are free: close other programs, or give fewer "
             "--max-gaussians or a smaller --max-image-px."
         )
-        return [text]
+        return [ReportWarning("memory-short", text)]
     return []

@@ -44,6 +44,8 @@ class Decision:
     """A plain sentence with figures."""
     figures: dict[str, float] = field(default_factory=dict)
     """The figures of the evidence, finite."""
+    measured: bool = True
+    """Whether the photos were asked; false where the settings alone decide."""
 
     def __post_init__(self) -> None:
         if self.setting not in DECISIONS:
@@ -83,7 +85,8 @@ class Decision:
             raise UsageError(
                 f"A stored decision cannot be read ({error}).", "Train the scene again."
             ) from error
-        return cls(name, setting, chosen, evidence, figures)
+        measured = values.get("measured") is not False  # version 0.1.0 did not tell
+        return cls(name, setting, chosen, evidence, figures, measured)
 
 
 @dataclass(frozen=True)

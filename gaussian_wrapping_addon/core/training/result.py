@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..gaussians.model import OrientedGaussians
+from ..report_warning import ReportWarning
 from .needs import Needs
 
 
@@ -41,7 +42,7 @@ class TrainingResult:
     """Loss, PSNR of the trained photos and number of Gaussians along the way."""
     held_out: tuple[HeldOutFigure, ...]
     seconds: float
-    warnings: tuple[str, ...]
+    warnings: tuple[ReportWarning, ...]
     lpips_note: str = ""
     """Why the held-out photos have no LPIPS."""
     needs: Needs = field(default_factory=Needs)
@@ -72,7 +73,7 @@ class TrainingResult:
             "seconds_training": round(self.seconds, 3),
             "held_out": [figure.to_json() for figure in self.held_out],
             "history": [dict(entry) for entry in self.history],
-            "warnings": list(self.warnings),
+            "warnings": [warning.to_json() for warning in self.warnings],
             "decisions": self.needs.to_json(),
             "held_out_exposure_fitted": self.exposure_fitted,
             "sh_degree": self.gaussians.sh_degree,

@@ -24,6 +24,7 @@ from ..gaussians.model import OrientedGaussians
 from ..progress import Progress
 from ..render.render import render
 from ..render.types import RenderOptions
+from ..report_warning import ReportWarning
 from ..settings import TrainingSettings
 from .orientation import orient
 from .splat_motion import move_gaussians, with_degree
@@ -62,7 +63,7 @@ class SplatStart:
 
     gaussians: OrientedGaussians
     """float32, scene frame; ``filter_3d`` is that of the training cameras at full size."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[ReportWarning, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
 
 
@@ -133,10 +134,11 @@ def start_from_splat(
     gaussians = fit_filter(moved, cameras, threads=threads)
     warnings, facts = list(splat.warnings), dict(splat.facts)
     if len(gaussians) > settings.max_gaussians:
-        warnings.append(
+        text = (
             f"The splat has {len(gaussians)} Gaussians; the {settings.max_gaussians} that the "
             "photos show most of are kept."
         )
+        warnings.append(ReportWarning("gaussians-over-cap", text))
         chosen = _spread(view_indices, WEIGHT_VIEWS)
         small = [photos.camera(i, _divisor(photos, i)) for i in chosen]
         weights = _shown(gaussians, small, progress, threads=threads)

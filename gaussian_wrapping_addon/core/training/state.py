@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ..gaussians.model import OrientedGaussians
+from ..report_warning import ReportWarning, read_warnings
 from .density_control import DensityStatistics
 from .exposure import Exposure
 from .growth_need import GrowthHistory
@@ -45,7 +46,7 @@ class TrainingState:
     """Where exposures are modelled."""
     visits: GrowthHistory = field(default_factory=GrowthHistory)
     """Errors of the photos, by which growth is judged."""
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[ReportWarning] = field(default_factory=list)
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
     """Time spent until the last checkpoint."""
@@ -98,7 +99,7 @@ class TrainingState:
             "seconds": self.seconds,
             "degree": self.degree,
             "needs": self.needs.to_json(),
-            "warnings": list(self.warnings),
+            "warnings": [warning.to_json() for warning in self.warnings],
         }
 
     @classmethod
@@ -142,7 +143,7 @@ class TrainingState:
         state.seconds = float(values["seconds"])
         state.degree = int(values["degree"])
         state.needs = Needs.from_json(values["needs"])
-        state.warnings = [str(text) for text in values["warnings"]]
+        state.warnings = list(read_warnings(values["warnings"]))
         exposure = _part(arrays, "exposure.")
         state.exposure = Exposure.restore(exposure) if exposure else None
         state.visits = GrowthHistory.restore(_part(arrays, "visits."))

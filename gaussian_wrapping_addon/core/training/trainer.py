@@ -23,6 +23,7 @@ from ..parallel import default_threads
 from ..progress import Progress
 from ..render.projection import RawArrays
 from ..render.types import RenderOptions
+from ..report_warning import ReportWarning
 from ..settings import TrainingSettings
 from .background import inside_masks
 from .cancelling import CheckedPhotos
@@ -263,10 +264,11 @@ class _Trainer:
         )
 
     def _start(self, rounds: Rounds, progress: Progress) -> TrainingState:
-        warnings = []
+        warnings: list[ReportWarning] = []
         if self.settings.holdout_every > 0 and len(self.scene.views) < FEW_PHOTOS:
             count = len(self.scene.views)
-            warnings.append(f"Few photos ({count}): {len(self.held_out)} held out for measuring.")
+            text = f"Few photos ({count}): {len(self.held_out)} held out for measuring."
+            warnings.append(ReportWarning("few-photos", text, "Take more photos, from all around."))
         if self.start_splat is None:
             gaussians = self._initial()
         else:
@@ -328,11 +330,15 @@ class _Trainer:
                 "the splat brings its own." if self.start_splat else "the settings decide."
             )
             needs = needs.with_decision(
-                Decision("harmonics", settings.harmonics, f"degree {degree}", evidence)
+                Decision(
+                    "harmonics", settings.harmonics, f"degree {degree}", evidence, measured=False
+                )
             )
         if settings.wrapping == "off":
             evidence = "Nothing was measured: the settings decide."
-            needs = needs.with_decision(Decision("wrapping", "off", "off", evidence))
+            needs = needs.with_decision(
+                Decision("wrapping", "off", "off", evidence, measured=False)
+            )
         state.needs = needs
 
     def _fall_back(
@@ -352,8 +358,12 @@ class _Trainer:
         restored.order = []
         restored.random = np.random.Generator(np.random.PCG64([self.seed, 3]))
         restored.warnings.append(
-            f"Training went back from iteration {state.iteration} to {restored.iteration} once, "
-            "because numbers were not finite."
+            ReportWarning(
+                "training-went-back",
+                f"Training went back from iteration {state.iteration} to {restored.iteration} "
+                "once, because numbers were not finite.",
+                "If the figures below are poor, train again with another seed.",
+            )
         )
         return restored
 

@@ -158,7 +158,7 @@ def test_trailing_bytes_are_forgiven(tmp_path: Path) -> None:
         stream.write(b"garbage")
     model = read_colmap(folder)
     assert len(model.photos) == 3
-    assert "7 bytes after" in model.warnings[0]
+    assert "7 bytes after" in model.warnings[0].text
 
 
 def _with_camera(params: list[float], kind: str | int = "PINHOLE", size=(WIDTH, HEIGHT)) -> Model:
@@ -226,7 +226,7 @@ def test_unsafe_names_are_left_out(tmp_path: Path, name: str) -> None:
     model.images[1].name = name
     read = read_colmap(write_binary(model, tmp_path))
     assert [p.name for p in read.photos] == ["p00.png", "p02.png", "p03.png"]
-    assert "1 images were left out for an unsafe name" in read.warnings[0]
+    assert "1 images were left out for an unsafe name" in read.warnings[0].text
 
 
 @pytest.mark.parametrize("writer", WRITERS)
@@ -250,7 +250,7 @@ def test_bad_poses_and_references_are_left_out(tmp_path: Path) -> None:
     model.images[4].image_id = model.images[5].image_id = 60
     read = read_colmap(write_binary(model, tmp_path))
     assert [p.name for p in read.photos] == ["p04.png", "p06.png", "p07.png", "p08.png"]
-    text = " ".join(read.warnings)
+    text = " ".join(w.text for w in read.warnings)
     assert "3 images were left out for a pose that is not finite" in text
     assert "1 images were left out for a camera that is not in the model" in text
     assert "1 images were left out for a number or name that was used before" in text
@@ -277,11 +277,11 @@ def test_missing_or_odd_points(tmp_path: Path) -> None:
     folder = write_binary(model, tmp_path)
     read = read_colmap(folder)
     assert len(read.points) == 3
-    assert "1 points that are not finite" in read.warnings[0]
+    assert "1 points that are not finite" in read.warnings[0].text
     (folder / "points3D.bin").unlink()
     read = read_colmap(folder)
     assert read.points.shape == (0, 3)
-    assert "points3D.bin is missing" in read.warnings[0]
+    assert "points3D.bin is missing" in read.warnings[0].text
 
 
 def test_text_without_second_lines_loses_nothing(tmp_path: Path) -> None:
@@ -290,7 +290,7 @@ def test_text_without_second_lines_loses_nothing(tmp_path: Path) -> None:
         image.name = f"{i:04d}"  # even a name that is a number
     read = read_colmap(write_text(model, tmp_path, second_lines=False))
     assert [p.name for p in read.photos] == ["0000", "0001", "0002", "0003"]
-    assert "lacks the line of 2D points of 3 images" in read.warnings[0]
+    assert "lacks the line of 2D points of 3 images" in read.warnings[0].text
 
 
 def test_text_with_empty_second_lines_bom_crlf_tabs_and_comments(tmp_path: Path) -> None:
@@ -335,11 +335,11 @@ def test_largest_of_several_models_wins_and_is_named(tmp_path: Path) -> None:
     read = read_colmap(tmp_path)
     assert len(read.photos) == 6
     assert read.facts["model"] == "sparse/1"
-    assert "sparse/0 (3), sparse/1 (6); sparse/1 was used" in read.warnings[0]
+    assert "sparse/0 (3), sparse/1 (6); sparse/1 was used" in read.warnings[0].text
     (tmp_path / "sparse" / "1" / "images.txt").write_text("broken")
     read = read_colmap(tmp_path)
     assert len(read.photos) == 3
-    assert "Model 1 was left out" in read.warnings[0]
+    assert "Model 1 was left out" in read.warnings[0].text
 
 
 def test_binary_wins_over_text_and_rigs_are_ignored(tmp_path: Path) -> None:

@@ -146,7 +146,7 @@ def test_names_that_differ_are_matched_and_counted(tmp_path: Path) -> None:
     scene = load(source)
     names = [v.photo_path.name for v in scene.views]
     assert names == ["P00.PNG", "p01.jpg", "p02.png", "p04.png", "p05.png"]
-    text = " ".join(scene.warnings)
+    text = " ".join(w.text for w in scene.warnings)
     assert "1 of the 6 photos that the COLMAP model names were not found: p03.png" in text
     assert "3 photos were found under a name that differs" in text
     findings = " ".join(f.message for f in check_input(source))
@@ -225,7 +225,7 @@ def test_masks_of_every_name_and_alpha(tmp_path: Path) -> None:
     for path in masked.values():
         if path is not None:
             np.testing.assert_array_equal(np.asarray(Image.open(path)), half)
-    text = " ".join(scene.warnings)
+    text = " ".join(w.text for w in scene.warnings)
     assert "1 masks were not used: Mask p04.png.png is 10 x 40" in text
     assert "1 photos are masked altogether and are not used: p03.png" in text
     assert scene.facts["photos_masked"] == 3
@@ -258,7 +258,7 @@ def test_few_bad_photos_are_left_out_many_are_refused(tmp_path: Path) -> None:
     (images / "p02.png").write_bytes(b"")
     scene = load(source)
     assert len(scene.views) == 8
-    assert "2 photos cannot be read and are not used" in scene.warnings[0]
+    assert "2 photos cannot be read and are not used" in scene.warnings[0].text
     (images / "p03.png").write_bytes(b"not a photo")
     with pytest.raises(DatasetError, match=r"3 of 10 photos cannot be read\. First: p0"):
         load(source)
@@ -274,7 +274,7 @@ def test_one_wild_camera_and_wild_points_are_left_out(tmp_path: Path) -> None:
     scene = load(tmp_path / "set")
     assert [c.name for c in scene.cameras] == [f"p{i:02d}.png" for i in (0, 1, 3, 4, 5)]
     assert len(scene.points) == 119
-    text = " ".join(scene.warnings)
+    text = " ".join(w.text for w in scene.warnings)
     assert "1 cameras stand far away" in text
     assert "1 sparse points lie impossibly far" in text
     assert any("1 cameras stand far away" in f.message for f in check_input(tmp_path / "set"))

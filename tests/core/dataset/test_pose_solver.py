@@ -151,7 +151,7 @@ def test_posed_photos_without_texture_start_from_random_points(tmp_path: Path) -
     scene = load_scene(tmp_path / "set", tmp_path / "work", Progress())
     assert scene.facts["start_points"] == "random"
     assert len(scene.points) > 1000
-    assert "random ones are used" in " ".join(scene.warnings)
+    assert "random ones are used" in " ".join(w.text for w in scene.warnings)
     assert (views_of_points(scene.cameras, scene.points) >= 2).all()
 
 

@@ -116,7 +116,7 @@ def test_repairs_are_counted(tmp_path: Path) -> None:
     read = read_transforms(write(tmp_path, values))
     assert [p.name for p in read.photos] == ["images/0.png", "images/1.png"]
     np.testing.assert_allclose(read.photos[1].cam_from_world, read.photos[0].cam_from_world)
-    text = " ".join(read.warnings)
+    text = " ".join(w.text for w in read.warnings)
     assert "1 frames repeat a photo" in text
     assert "1 matrices held a scale" in text
     assert "leads outside the folder: '../secret.png'" in text
@@ -218,4 +218,4 @@ def test_point_file_missing_or_outside(tmp_path: Path) -> None:
     for name in ("gone.ply", "../p.ply", 5):
         model = read_transforms(write(tmp_path, valid() | {"ply_file_path": name}))
         assert len(model.points) == 0
-        assert "ply_file_path" in model.warnings[0]
+        assert "ply_file_path" in model.warnings[0].text

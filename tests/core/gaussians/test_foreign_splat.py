@@ -105,7 +105,7 @@ def test_degree_4_is_cut_and_said(tmp_path: Path) -> None:
     path = write_ply(tmp_path / "a.ply", splat_columns(gaussians.replaced(sh=more)))
     found = read_foreign_splat(path)
     assert torch.equal(found.gaussians.sh, gaussians.sh)
-    assert "degree 4" in found.warnings[0]
+    assert "degree 4" in found.warnings[0].text
 
 
 def test_surfels_get_a_thin_third_axis(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_senseless_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
     found = read_foreign_splat(write_ply(tmp_path / "a.ply", columns))
     assert found.dropped == 5
     assert torch.equal(found.gaussians.means, example(1).means[5:])
-    assert "5 of 30" in found.warnings[0]
+    assert "5 of 30" in found.warnings[0].text
     columns["y"][:] = np.nan
     with pytest.raises(ParseError):
         read_foreign_splat(write_ply(tmp_path / "b.ply", columns))
@@ -159,7 +159,7 @@ def test_plain_opacities_and_scales_are_pointed_out(tmp_path: Path) -> None:
     for i in range(3):
         columns[f"scale_{i}"] = np.exp(columns[f"scale_{i}"])
     (warning,) = read_foreign_splat(write_ply(tmp_path / "a.ply", columns)).warnings
-    assert "logits" in warning
+    assert "logits" in warning.text
 
 
 @pytest.mark.parametrize("name", ["x", "f_dc_1", "opacity", "scale_0", "rot_3"])

@@ -17,8 +17,8 @@ from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.earlier_job import NAME, finished_job, keep_finished
 from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_job, write_job
 from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.jobs.mesh_stages import mesh_stages
 from gaussian_wrapping_addon.core.jobs.region_meshing import open_lists
-from gaussian_wrapping_addon.core.jobs.runner import mesh_stages
 from gaussian_wrapping_addon.core.jobs.tile_worker import help_with_tiles
 from gaussian_wrapping_addon.core.meshing.tiles.store import LIST_NAME
 from gaussian_wrapping_addon.core.settings import JobSettings, TextureSettings
@@ -84,8 +84,9 @@ def test_a_failed_mesh_leaves_the_job_as_it_was(folder: JobFolder) -> None:
     assert read_job(folder.job_path) == job
     after = folder.read_status()
     assert (after.error, after.hint, after.exit_code) == ("No surface.", "Draw it elsewhere.", 3)
+    assert after.put_back
     same = {"error": "", "hint": "", "exit_code": 0, "heartbeat_s": status.heartbeat_s}
-    assert replace(after, **same) == status
+    assert replace(after, **same, put_back=False) == status
     assert {path.name for path in folder.stages.iterdir()} == {
         "train-before", "train-done", "mesh-first-done", "mesh-auto-begun",
     }  # fmt: skip
@@ -94,7 +95,7 @@ def test_a_failed_mesh_leaves_the_job_as_it_was(folder: JobFolder) -> None:
     assert client.poll().state == "FAILED"
     assert JobClient.attach(folder.root).poll().state == "DONE"
     assert work(folder, "") == 0
-    assert folder.read_status().error == ""
+    assert (folder.read_status().error, folder.read_status().put_back) == ("", False)
 
 
 def test_a_copy_that_is_put_back_names_its_own_place(folder: JobFolder) -> None:

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,25 @@ def test_a_worker_that_ends_between_two_looks_is_not_lost(
 
     monkeypatch.setattr(job_folder, "process_alive", ends_now)
     assert folder.read_status().state == "DONE"
+
+
+def test_a_status_of_version_0_1_0_is_read(tmp_path: Path) -> None:
+    """It had neither ``phase`` nor ``put_back``: a finished job with an error was one put back."""
+    folder = JobFolder(tmp_path)
+    for status, put_back in (
+        (JobStatus("DONE", "export", 1.0), False),
+        (JobStatus("DONE", "export", 1.0, error="No surface."), True),
+        (JobStatus("FAILED", "mesh", 0.8, error="No surface."), False),
+    ):
+        values = {
+            name: value
+            for name, value in asdict(status).items()
+            if name not in ("phase", "put_back")
+        }
+        write_json(folder.status_path, values)
+        assert folder.read_status() == replace(status, put_back=put_back)
+        write_json(folder.status_path, {**values, "put_back": "yes"})
+        assert folder.read_status() == JobStatus(), "not of its kind"
 
 
 def test_status_of_a_living_worker_stays(tmp_path: Path) -> None:

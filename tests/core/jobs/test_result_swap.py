@@ -138,10 +138,7 @@ def exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         "gaussian_wrapping_addon.core.gaussians.splat_ply.write_splat_ply",
         lambda path, *_: path.write_bytes(b"gaussians"),
     )
-    monkeypatch.setattr(
-        "gaussian_wrapping_addon.core.jobs.runner.write_scene_summary",
-        lambda path, _: write_json(path, {}),
-    )
+    monkeypatch.setattr(export, "write_scene_summary", lambda path, _: write_json(path, {}))
     monkeypatch.setattr(export, "_in_world_units", lambda *_: {})
     folder = JobFolder(tmp_path / "out")
     folder.create()

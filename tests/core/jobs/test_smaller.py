@@ -59,8 +59,8 @@ def test_steps_down_and_says_so(tmp_path: Path, error: Exception, times: int) ->
     assert forgotten == list(range(1, times + 1))
     assert len(trained.warnings) == times
     for warning, (gaussians, side_px) in zip(trained.warnings, seen[1:], strict=True):
-        assert f"{gaussians} Gaussians" in warning
-        assert f"{side_px} px" in warning
+        assert f"{gaussians} Gaussians" in warning.text
+        assert f"{side_px} px" in warning.text
 
 
 def test_the_third_failure_is_told(tmp_path: Path) -> None:

@@ -38,12 +38,23 @@ time.sleep(60)
 """
 
 
+# The phase tells, not the words: nobody waits for a compilation.
+COMPILES = DEAF.replace("CANCEL_ALONE_S = 0.2", "CANCEL_ALONE_S = 1000.0").replace(
+    "reporter.write()",
+    """
+from gaussian_wrapping_addon.core.progress import COMPILING, Progress
+Progress("train", reporter.event).enter(COMPILING, "any words")
+""",
+)
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks at processes of Linux")
-def test_a_worker_that_does_not_listen_ends_itself(tmp_path: Path) -> None:
+@pytest.mark.parametrize("code", [DEAF, COMPILES], ids=["deaf", "compiling"])
+def test_a_worker_that_does_not_listen_ends_itself(code: str, tmp_path: Path) -> None:
     folder = JobFolder(tmp_path)
     (tmp_path / MARKER).touch()
     folder.job_path.write_text("{}")
-    process = subprocess.Popen([sys.executable, "-c", DEAF, str(tmp_path)], cwd=os.getcwd())
+    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], cwd=os.getcwd())
     try:
         end_s = time.monotonic() + 30.0
         while folder.read_status().state != "RUNNING" and time.monotonic() < end_s:

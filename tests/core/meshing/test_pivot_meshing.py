@@ -183,7 +183,7 @@ def test_open_and_closed_share_the_surface(closed: bool) -> None:
 def test_requests_that_do_not_apply_are_told() -> None:
     assert mesh_of(sphere(), cube(1.5)).provenance["notes"] == []
     (note,) = mesh_of(sphere(), cube(1.5), points=500).provenance["notes"]
-    assert "resolution" in note
+    assert "resolution" in note["text"]
 
 
 def test_regions_without_surface_get_an_answer() -> None:

@@ -56,11 +56,11 @@ def mesh_shape(
 def test_a_request_for_too_few_points_is_said() -> None:
     for points, said in ((1, True), (99, True), (100, False)):
         mesh = mesh_shape(sphere(), cube(1.3), points=points)
-        notes = " ".join(mesh.provenance["notes"])
+        notes = " ".join(n["text"] for n in mesh.provenance["notes"])
         assert (f"surface points; {points} were asked for" in notes) == said
         assert len(mesh.vertices) >= MIN_VERTICES - 4
     uniform = mesh_shape(sphere(), cube(1.3), points=60, spacing="uniform")
-    assert "surface points" not in " ".join(uniform.provenance["notes"])
+    assert "surface points" not in " ".join(n["text"] for n in uniform.provenance["notes"])
 
 
 def test_sphere_is_closed_of_genus_0_and_on_the_surface() -> None:
@@ -286,7 +286,7 @@ def test_absurd_requests_are_refused(edge: float, points: int, error: type[Excep
 def test_edge_longer_than_the_region_is_reduced_and_said() -> None:
     mesh = mesh_shape(sphere(), cube(1.3), edge=100.0)
     assert_closed_manifold(mesh)
-    assert any("reduced" in note for note in mesh.provenance["notes"])
+    assert any("reduced" in note["text"] for note in mesh.provenance["notes"])
     assert mesh.provenance["edge_length_scene"] == pytest.approx(cube(1.3).diagonal / 8)
 
 

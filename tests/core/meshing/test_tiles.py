@@ -147,7 +147,9 @@ def test_pieces_cover_the_part_of_the_surface_in_a_box() -> None:
 
 def test_a_request_for_too_few_points_is_said() -> None:
     mesh = mesh_tiles(sphere(), cube(1.3), 2, 40, spacing="adaptive")
-    assert "surface points; 40 were asked for" in " ".join(mesh.provenance["notes"])
+    assert "surface points; 40 were asked for" in " ".join(
+        n["text"] for n in mesh.provenance["notes"]
+    )
 
 
 def plan_around(region: Region, tiling: Tiling, radius: float, side: float) -> TilePlan:

@@ -240,11 +240,12 @@ def test_as_many_textures_as_the_photos_ask_for(
 
 def test_memory_is_judged_before() -> None:
     enough = texture_memory_bytes(4096, 2, 300_000)
-    assert fit_into_memory(4096, 2, 300_000, enough, may_lower=True) == (4096, 2, "")
-    assert fit_into_memory(8192, 4, 300_000, 0, may_lower=False) == (8192, 4, "")
+    assert fit_into_memory(4096, 2, 300_000, enough, may_lower=True) == (4096, 2, None)
+    assert fit_into_memory(8192, 4, 300_000, 0, may_lower=False) == (8192, 4, None)
     size_px, atlases, warning = fit_into_memory(4096, 2, 300_000, enough - 1, may_lower=True)
     assert (size_px, atlases) == (4096, 1)
-    assert "4096" in warning
+    assert warning is not None
+    assert "4096" in warning.text
     with pytest.raises(ResourceError, match="8192") as refused:
         fit_into_memory(8192, 1, 300_000, enough, may_lower=False)
     assert refused.value.exit_code == EXIT_RESOURCES == 4
@@ -262,7 +263,7 @@ def test_too_little_memory_makes_a_smaller_texture_and_says_so(
         threads=2, free_bytes=free,
     )  # fmt: skip
     assert textured.statistics["size_px"] == 256
-    assert "256" in textured.statistics["warnings"][0]
+    assert "256" in textured.statistics["warnings"][0]["text"]
     with pytest.raises(ResourceError):
         texture_mesh(
             spot(), photos.scene(), photos, TextureSettings(1024), tmp_path, Progress(),

@@ -151,7 +151,7 @@ def test_levels_that_are_not_made_become_a_warning(
         settings = TextureSettings(lods=lods, normal_map="off")
         levels_of_detail(top, None, settings, tmp_path, Progress(), threads=THREADS)
         report = {"regions": {"auto": {"texture": top.statistics}}}
-        assert all(w.next_step for w in collect_warnings(report))
+        assert all(w.hint for w in collect_warnings(report))
         return [w.text for w in collect_warnings(report)]
 
     assert warnings(2) == []

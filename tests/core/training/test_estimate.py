@@ -111,7 +111,8 @@ def test_a_full_disk_is_refused_and_little_memory_is_told() -> None:
         judge(found, replace(plenty, disk_free_bytes=found.disk_bytes - 1))
     assert caught.value.hint
     (warning,) = judge(found, replace(plenty, memory_bytes=found.memory_bytes))
-    assert "--max-gaussians" in warning
+    assert warning.code == "memory-short"
+    assert "--max-gaussians" in warning.text
 
 
 def test_this_machine_reads_what_is_free_also_for_folders_to_come(tmp_path: Path) -> None:

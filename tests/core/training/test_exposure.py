@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.evaluation.views.view_metrics import as_unit_floats as as_floats
+from gaussian_wrapping_addon.core.evaluation.views.image_values import as_unit_floats as as_floats
 from gaussian_wrapping_addon.core.evaluation.views.view_metrics import psnr
 from gaussian_wrapping_addon.core.training.exposure import (
     LARGEST_RATE,

@@ -164,7 +164,7 @@ def test_a_splat_in_the_world_frame_starts_in_the_scene_frame(tmp_path: Path) ->
     few = replace(SETTINGS, max_gaussians=300)
     capped = start_from_splat(path, scene, photos, range(9), few, Progress(), threads=1)
     assert len(capped.gaussians) == 300
-    assert any("800" in text for text in capped.warnings)
+    assert any("800" in warning.text for warning in capped.warnings)
 
 
 def test_the_cap_keeps_what_photos_show(tmp_path: Path) -> None:

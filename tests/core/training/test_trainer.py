@@ -185,7 +185,7 @@ def test_numbers_that_break_down_are_recovered_once(
 
     monkeypatch.setattr(iteration, "color_loss", sometimes_nan)
     result = train(scene, photos, settings, tmp_path, Progress(), threads=1)
-    assert any("went back from iteration 6 to 0" in w for w in result.warnings)
+    assert any("went back from iteration 6 to 0" in w.text for w in result.warnings)
     assert all(torch.isfinite(t).all() for _, t in result.gaussians.tensors())
     calls[0], bad = 0, {7, 12}
     (tmp_path / "again").mkdir()

@@ -73,7 +73,8 @@ def _who(entry: dict[str, Any]) -> str:
 
 def _evidence(entry: dict[str, Any]) -> str:
     evidence = words(entry.get("evidence"), "No evidence was recorded.")
-    if entry.get("setting") in ("on", "off") and not evidence.startswith("Nothing was"):
+    measured = entry.get("measured") is not False  # version 0.1.0 did not tell
+    if entry.get("setting") in ("on", "off") and measured:
         return f"You decided this. What the photos say: {evidence}"
     return evidence
 

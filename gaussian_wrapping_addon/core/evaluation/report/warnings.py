@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from ...report_warning import ReportWarning, read_warnings
 from .text import escaped, items, measured, number, part, percent, plural
 
 FEW_HELD_OUT = 3
@@ -24,31 +26,17 @@ HALF_WAY = 0.25
 REPROJECTION_PX = 2.0
 """Half of the 4 px at which structure from motion throws a point away."""
 
-# Parts of messages of the stages, and what to do about them.
-_STEPS = (
-    ("could not be placed", "Take more photos with more overlap there, or remove blurred ones."),
-    ("cannot be read", "Save these photos again as JPEG or PNG."),
-    ("start points", "Photos with more texture help, or a COLMAP model with its points."),
-    ("points3D", "Export the COLMAP model together with its points."),
-    ("held out for measuring", "Take more photos, from all around."),
-    ("numbers were not finite", "If the figures below are poor, train again with another seed."),
-    ("stand far away", "Check the poses of these cameras."),
-    ("stand on one line", "Take photos from other heights and directions too."),
-    ("models:", "Take photos that connect the parts, so that one model holds them all."),
-    ("left out", "Check whether these are needed; if so, export the input again."),
-    ("levels of detail were made", "Ask for fewer with --lods, or for a mesh with more faces."),
-    ("ply_file_path", "Put the file where transforms.json says it is."),
-)
-
 
 @dataclass(frozen=True)
-class ReportWarning:
+class StageWarning:
     """One warning of one stage."""
 
     stage: str
     """``cameras``, ``training``, ``mesh NAME`` or ``texture NAME``."""
+    code: str
+    """Stable identifier; empty for texts of version 0.1.0."""
     text: str
-    next_step: str = ""
+    hint: str = ""
     """What the person can do; empty where nothing is known to help."""
 
     def to_json(self) -> dict[str, str]:
@@ -56,7 +44,7 @@ class ReportWarning:
         return asdict(self)
 
 
-def collect_warnings(report: dict[str, Any]) -> list[ReportWarning]:
+def collect_warnings(report: dict[str, Any]) -> list[StageWarning]:
     """Return the warnings of every stage, in the order of the stages.
 
     Parameters
@@ -64,19 +52,30 @@ def collect_warnings(report: dict[str, Any]) -> list[ReportWarning]:
     report : dict
         Content of ``report.json``; of any version, whatever it lacks.
     """
-    found = _said("cameras", part(report, "cameras").get("warnings"))
-    found += _judge_cameras(part(report, "cameras", "facts"))
-    found += _said("training", part(report, "training").get("warnings"))
-    found += _judge_training(part(report, "training"))
+    cameras, training = part(report, "cameras"), part(report, "training")
+    found = _of_stage(
+        "cameras",
+        read_warnings(cameras.get("warnings")),
+        _judge_cameras(part(cameras, "facts")),
+    )
+    found += _of_stage(
+        "training", read_warnings(training.get("warnings")), _judge_training(training)
+    )
     for name, region in part(report, "regions").items():
         provenance, texture = part(region, "provenance"), part(region, "texture")
-        found += _said(f"mesh {name}", provenance.get("warnings"))
-        found += _said(f"mesh {name}", provenance.get("notes"))
-        found += _judge_mesh(f"mesh {name}", part(region, "statistics"), provenance)
-        found += _judge_check(f"mesh {name}", part(region, "check"))
-        found += _said(f"texture {name}", texture.get("warnings"))
-        found += _said(f"texture {name}", part(region).get("warnings"))
-        found += _judge_texture(f"texture {name}", texture)
+        found += _of_stage(
+            f"mesh {name}",
+            read_warnings(provenance.get("warnings")),
+            read_warnings(provenance.get("notes")),
+            _judge_mesh(part(region, "statistics"), provenance),
+            _judge_check(part(region, "check")),
+        )
+        found += _of_stage(
+            f"texture {name}",
+            read_warnings(texture.get("warnings")),
+            read_warnings(part(region).get("warnings")),
+            _judge_texture(texture),
+        )
     return list(dict.fromkeys(found))
 
 
@@ -84,20 +83,13 @@ def warning_lines(report: dict[str, Any]) -> list[str]:
     """Return the section "Warnings" as Markdown list entries."""
     lines = []
     for warning in collect_warnings(report):
-        step = f" *Next step:* {escaped(warning.next_step)}" if warning.next_step else ""
+        step = f" *Next step:* {escaped(warning.hint)}" if warning.hint else ""
         lines.append(f"- **{escaped(warning.stage)}**: {escaped(warning.text)}{step}")
     return lines or ["None of the stages had anything to warn about."]
 
 
-def _said(stage: str, texts: Any) -> list[ReportWarning]:
-    return [ReportWarning(stage, t, _next_step(t)) for t in items(texts) if isinstance(t, str)]
-
-
-def _next_step(text: str) -> str:
-    for mark, step in _STEPS:
-        if mark in text:
-            return step
-    return ""
+def _of_stage(stage: str, *lists: Iterable[ReportWarning]) -> list[StageWarning]:
+    return [StageWarning(stage, w.code, w.text, w.hint) for each in lists for w in each]
 
 
 def _judge_cameras(facts: dict[str, Any]) -> list[ReportWarning]:
@@ -108,7 +100,11 @@ def _judge_cameras(facts: dict[str, Any]) -> list[ReportWarning]:
         f"The cameras miss their points by {number(error_px, 'px', digits=2)} on average; "
         f"above {REPROJECTION_PX:g} px details blur."
     )
-    return [ReportWarning("cameras", text, "Photograph with one lens, without zooming or motion.")]
+    return [
+        ReportWarning(
+            "reprojection-error", text, "Photograph with one lens, without zooming or motion."
+        )
+    ]
 
 
 def _judge_training(training: dict[str, Any]) -> list[ReportWarning]:
@@ -117,11 +113,15 @@ def _judge_training(training: dict[str, Any]) -> list[ReportWarning]:
     count = len(training["held_out"])
     if count == 0:
         text = "No photo was held out: how exact new views are was not measured."
-        return [ReportWarning("training", text, "Take more photos, or allow held-out photos.")]
+        return [
+            ReportWarning("no-held-out-photos", text, "Take more photos, or allow held-out photos.")
+        ]
     found = []
     if count < FEW_HELD_OUT:
         text = f"Only {plural(count, 'photo')} held out: too few to trust the mean."
-        found.append(ReportWarning("training", text, "Take more photos from all around."))
+        found.append(
+            ReportWarning("few-held-out-photos", text, "Take more photos from all around.")
+        )
     history = items(training.get("history"))
     reached = measured(part(history[-1]).get("psnr")) if history else None
     new = measured(training.get("held_out_psnr"))
@@ -131,65 +131,75 @@ def _judge_training(training: dict[str, Any]) -> list[ReportWarning]:
             f"({new:.1f} dB against {reached:.1f} dB)."
         )
         step = "Take more photos between the present viewpoints; check for motion and exposure."
-        found.append(ReportWarning("training", text, step))
+        found.append(ReportWarning("new-views-worse", text, step))
     return found
 
 
-def _judge_mesh(
-    stage: str, statistics: dict[str, Any], provenance: dict[str, Any]
-) -> list[ReportWarning]:
+def _judge_mesh(statistics: dict[str, Any], provenance: dict[str, Any]) -> list[ReportWarning]:
     found = []
     by_request = provenance.get("boundary") == "open"
     if statistics.get("closed") is False and not by_request:
         edges = plural(statistics.get("boundary_edges"), "open edge")
         text = f"The mesh is not closed ({edges}); volumes and 3D prints need a closed one."
         step = "Fill the holes in Blender; send the job folder's log.txt with a bug report."
-        found.append(ReportWarning(stage, text, step))
+        found.append(ReportWarning("not-closed", text, step))
     wide = measured(provenance.get("level_error_p99"))
     # Smoothing and decimation move vertices off the surface on request.
     moved = "faces_before_clean_up" in provenance or measured(provenance.get("smooth_steps"))
     if wide is not None and wide > HALF_WAY and not moved:
         text = "At one vertex in a hundred the mesh is not on the surface the photos describe."
-        found.append(ReportWarning(stage, text, "Mesh with more points or a smaller region."))
+        found.append(
+            ReportWarning("off-the-surface", text, "Mesh with more points or a smaller region.")
+        )
     left = measured(provenance.get("degenerate_faces_left"))
     if left:
         text = f"{plural(int(left), 'face')} without area could not be removed."
-        found.append(ReportWarning(stage, text, "Blender: Mesh > Clean Up > Degenerate Dissolve."))
+        found.append(
+            ReportWarning(
+                "degenerate-faces", text, "Blender: Mesh > Clean Up > Degenerate Dissolve."
+            )
+        )
     return found
 
 
-def _judge_check(stage: str, check: dict[str, Any]) -> list[ReportWarning]:
+def _judge_check(check: dict[str, Any]) -> list[ReportWarning]:
     defects = [words for words in items(check.get("defects")) if isinstance(words, str)]
     if not defects:
         return []
     text = f"The check of the finished mesh found defects ({'; '.join(defects)})."
     step = "Mesh with other points; send the job folder's log.txt with a bug report."
-    return [ReportWarning(stage, text, step)]
+    return [ReportWarning("mesh-defects", text, step)]
 
 
-def _judge_texture(stage: str, texture: dict[str, Any]) -> list[ReportWarning]:
+def _judge_texture(texture: dict[str, Any]) -> list[ReportWarning]:
     found = []
     coverage = measured(texture.get("coverage"))
     if coverage == 0.0:
         text = "No photo sees the mesh: its texture is plain grey."
-        found.append(ReportWarning(stage, text, "Check the region and the cameras."))
+        found.append(
+            ReportWarning("no-photo-sees-the-mesh", text, "Check the region and the cameras.")
+        )
     elif coverage is not None and coverage < LOW_COVERAGE:
         text = (
             f"Only {percent(coverage)} of the texture was seen by photos: most of it was filled in "
             "from its surroundings."
         )
         step = "Make the region tighter, or photograph the sides that are missing."
-        found.append(ReportWarning(stage, text, step))
+        found.append(ReportWarning("little-seen", text, step))
     reason = texture.get("unwrap_fallback_reason")
     if isinstance(reason, str) and reason:
         text = f"The mesh was unwrapped in the simpler way: {reason}"
-        found.append(ReportWarning(stage, text, "Seams are more; a smaller mesh may unwrap."))
+        found.append(
+            ReportWarning("unwrapped-simply", text, "Seams are more; a smaller mesh may unwrap.")
+        )
     lost = measured(texture.get("faces_without_texel"))
     if lost:
         text = f"{plural(int(lost), 'face')} smaller than a texel: without a colour of their own."
-        found.append(ReportWarning(stage, text, "Choose a larger texture or a coarser mesh."))
+        found.append(
+            ReportWarning("faces-without-texel", text, "Choose a larger texture or a coarser mesh.")
+        )
     overlaps = measured(texture.get("texels_overlapping"))
     if overlaps:
         text = f"{plural(int(overlaps), 'texel')} belong to two faces at once."
-        found.append(ReportWarning(stage, text, "Choose a larger texture."))
+        found.append(ReportWarning("texels-overlap", text, "Choose a larger texture."))
     return found

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...errors import ParseError, ResourceError, UsageError, WrapError
-from .view_metrics import as_unit_floats, check_sizes
+from .image_values import as_unit_floats, check_sizes
 
 if TYPE_CHECKING:
     import torch

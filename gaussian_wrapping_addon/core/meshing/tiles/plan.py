@@ -12,6 +12,7 @@ import numpy as np
 from ... import limits
 from ...dataset.camera import Camera
 from ...progress import Progress
+from ...report_warning import ReportWarning
 from ..candidate_surface import CandidateSurface
 from ..convex_region import Region
 from ..region_caps import Caps, cap_points
@@ -60,7 +61,7 @@ class TilePlan:
     """Largest empty ball that touches the region."""
     caps: Caps
     seed: int
-    notes: tuple[str, ...]
+    notes: tuple[ReportWarning, ...]
     edge_length: float
     """Of the uniform mesh that the request stands for."""
     target: int

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...errors import ParseError
 from ...files import read_json, write_bytes, write_json
+from ...report_warning import read_warnings
 from ..candidate_surface import CandidateSurface
 from ..convex_region import Region
 from ..region_caps import Caps
@@ -67,7 +68,7 @@ def save_plan(folder: Path, plan: TilePlan, origin: dict[str, Any]) -> None:
             "seed": plan.seed,
             "radius": plan.spacing.nominal,
             "limited": plan.spacing.limited,
-            "notes": list(plan.notes),
+            "notes": [note.to_json() for note in plan.notes],
             "edge_length": plan.edge_length,
             "target": plan.target,
             "share": plan.share,
@@ -119,7 +120,7 @@ def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
                     arrays["cap_priority"],
                 ),
                 int(values["seed"]),
-                tuple(str(note) for note in values["notes"]),
+                read_warnings(values["notes"]),
                 float(values["edge_length"]),
                 int(values["target"]),
                 float(values["share"]),
@@ -175,7 +176,7 @@ def _of_cloud(cloud: SurfacePoints) -> dict[str, np.ndarray]:
         "kind": cloud.kind,
         "radius": np.array(cloud.radius),
         "radii": cloud.radii,
-        "notes": np.array(json.dumps(cloud.notes)),
+        "notes": np.array(json.dumps([note.to_json() for note in cloud.notes])),
         "figures": np.array(json.dumps(cloud.figures)),
     }
 
@@ -183,7 +184,7 @@ def _of_cloud(cloud: SurfacePoints) -> dict[str, np.ndarray]:
 def _cloud_of(arrays: Any) -> SurfacePoints:
     return SurfacePoints(
         arrays["points"], arrays["normals"], arrays["kind"], arrays["radii"],
-        float(arrays["radius"]), tuple(json.loads(str(arrays["notes"]))),
+        float(arrays["radius"]), read_warnings(json.loads(str(arrays["notes"]))),
         json.loads(str(arrays["figures"])),
     )  # fmt: skip
 

@@ -113,7 +113,7 @@ def join_tiles(
         "sightings": plan.sightings,
         "candidate_area": plan.area,
         "spacing": settings.spacing,
-        "notes": list(plan.notes),
+        "notes": [note.to_json() for note in plan.notes],
         "seed": plan.seed,
         **cloud.figures,
         **{name: sum(part.figures.get(name, 0) for part in parts) for name in sums},

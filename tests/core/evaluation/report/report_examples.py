@@ -8,6 +8,8 @@ from typing import Any
 
 from PIL import Image
 
+from gaussian_wrapping_addon.core.report_warning import ReportWarning
+
 REGION = "stem_1"
 PICTURES = (
     "preview.png",
@@ -52,7 +54,13 @@ def full_summary() -> dict[str, Any]:
         "cameras": {
             "views": 14,
             "points": 6333,
-            "warnings": ["2 of 16 photos could not be placed and are not used: a|b.jpg, c.jpg."],
+            "warnings": [
+                ReportWarning(
+                    "photos-not-placed",
+                    "2 of 16 photos could not be placed and are not used: a|b.jpg, c.jpg.",
+                    "Take more photos with more overlap there.",
+                ).to_json()
+            ],
             "facts": {
                 "kind": "photos",
                 "camera_models": ["SIMPLE_RADIAL"],
@@ -75,7 +83,13 @@ def full_summary() -> dict[str, Any]:
                 {"iteration": 200.0, "loss": 0.15, "psnr": 28.0, "gaussians": 10000.0},
                 {"iteration": 300.0, "loss": 0.1, "psnr": 30.0, "gaussians": 12235.0},
             ],
-            "warnings": ["Training went back once, because numbers were not finite."],
+            "warnings": [
+                ReportWarning(
+                    "training-went-back",
+                    "Training went back once, because numbers were not finite.",
+                    "Train again.",
+                ).to_json()
+            ],
             "pictures": [
                 {"file": "held-out-0.jpg", "name": "p|q.jpg", "psnr": 20.0},
                 {"file": "held-out-1.jpg", "name": "r.jpg", "psnr": 26.0},
@@ -99,7 +113,11 @@ def full_region() -> dict[str, Any]:
         },
         "provenance": {
             "method": "primal adaptive meshing",
-            "notes": ["The edge length was raised to 0.02."],
+            "notes": [
+                ReportWarning(
+                    "edge-length-reduced", "The edge length was raised to 0.02."
+                ).to_json()
+            ],
             "vertices_on_surface": 80,
             "vertices_on_region_boundary": 20,
             "degenerate_faces_left": 3,

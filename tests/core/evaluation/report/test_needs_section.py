@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
 from gaussian_wrapping_addon.core.evaluation.report.needs import needs_lines
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.needs import Needs, decide
+from gaussian_wrapping_addon.core.training.needs import Decision, Needs, decide
 from tests.core.evaluation.report.report_examples import full_summary
 
 NAMES = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size")
@@ -43,6 +44,21 @@ def test_what_a_person_decided_is_told_apart() -> None:
     assert text.count("| the photos |") == len(NAMES) - 1
     assert "You decided this. What the photos say: Photos differ by 20 %." in text
     assert text.count('"auto" leaves it to the photos') == 1
+
+
+def test_where_nothing_was_measured_the_photos_say_nothing() -> None:
+    evidence = "The settings decide."
+    decision = Decision("wrapping", "off", "off", evidence, measured=False)
+    stored = Decision.from_json(json.loads(json.dumps(decision.to_json())))
+    assert stored == decision
+    text = "\n".join(needs_lines({"decisions": [stored.to_json()]}))
+    assert f"{evidence}\n" in text
+    assert "You decided this" not in text
+    values = decision.to_json()
+    del values["measured"]  # as version 0.1.0 wrote it
+    assert Decision.from_json(values).measured
+    text = "\n".join(needs_lines({"decisions": [values]}))
+    assert f"You decided this. What the photos say: {evidence}" in text
 
 
 def test_the_section_stands_between_training_and_regions() -> None:

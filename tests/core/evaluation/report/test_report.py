@@ -30,6 +30,7 @@ from gaussian_wrapping_addon.core.evaluation.report.warnings import (
     collect_warnings,
 )
 from gaussian_wrapping_addon.core.files import finite
+from gaussian_wrapping_addon.core.report_warning import ReportWarning, read_warnings
 from gaussian_wrapping_addon.core.settings import JobSettings, to_json
 from tests.core.evaluation.report.report_examples import (
     PICTURES,
@@ -125,6 +126,42 @@ def test_every_warning_is_listed_with_stage_and_next_step(tmp_path: Path) -> Non
         assert line == f"warning ({warning['stage']}): {warning['text']}"
 
 
+def test_texts_of_version_0_1_0_are_read_without_a_hint(tmp_path: Path) -> None:
+    """``report.json`` and ``done.json`` held plain texts then; old stages are used again."""
+    summary, region = full_summary(), full_region()
+    whole = write(tmp_path, copy.deepcopy(summary), {REGION: copy.deepcopy(region)})[0]
+    for place in (summary["cameras"], summary["training"]):
+        place["warnings"] = [warning["text"] for warning in place["warnings"]]
+    region["provenance"]["notes"] = [n["text"] for n in region["provenance"]["notes"]]
+    report, text = write(tmp_path, summary, {REGION: region})
+    stated = "2 of 16 photos could not be placed and are not used: a|b.jpg, c.jpg."
+    assert report["warnings"][0] == {"stage": "cameras", "code": "", "text": stated, "hint": ""}
+    assert [w["text"] for w in report["warnings"]] == [w["text"] for w in whole["warnings"]]
+    line = next(x for x in text.splitlines() if escaped(stated) in x and x.startswith("- "))
+    assert "Next step" not in line
+
+
+def test_warnings_of_stages_are_written_as_they_were_made(tmp_path: Path) -> None:
+    report, _ = write(tmp_path)
+    made = report["cameras"]["warnings"][0]
+    assert made == {
+        "code": "photos-not-placed",
+        "text": "2 of 16 photos could not be placed and are not used: a|b.jpg, c.jpg.",
+        "hint": "Take more photos with more overlap there.",
+    }
+    assert report["warnings"][0] == {"stage": "cameras", **made}
+    assert all(warning["code"] for warning in report["warnings"])
+
+
+@pytest.mark.parametrize(
+    "values",
+    [None, "text", {"text": "a"}, [None, 3, [], {}, {"text": 3}, {"code": "a", "hint": "b"}]],
+)
+def test_what_is_no_warning_is_passed_over(values: Any) -> None:
+    assert read_warnings(values) == ()
+    assert read_warnings([{"text": "a", "code": 3, "hint": None}]) == (ReportWarning("", "a"),)
+
+
 def good() -> dict[str, Any]:
     """A report without anything to warn about."""
     report = {**full_summary(), "regions": {REGION: full_region()}}
@@ -176,7 +213,8 @@ def test_each_judgement_stands_alone(path: tuple[str, ...], value: Any, words: s
     place[path[-1]] = value
     (warning,) = collect_warnings(report)
     assert words in warning.text
-    assert warning.next_step
+    assert warning.hint
+    assert warning.code
 
 
 def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
