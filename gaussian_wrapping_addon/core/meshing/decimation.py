@@ -20,6 +20,7 @@ from ..mesh.simplification.optimal_collapse import (
     collapse_edges,
     push_edges,
 )
+from ..mesh.topology import ends_of, half_edges
 from ..progress import Progress
 from .cap_planes import CapPlanes, cap_planes
 from .components import compacted
@@ -155,7 +156,7 @@ class _Decimation(Simplification):
 
 def _on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
     """(v,) bool: vertices at an edge with one face; refuses what is no oriented manifold."""
-    begin, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    begin, end = half_edges(faces)
     forward, backward = np.sort(begin * count + end), end * count + begin
     place = np.minimum(np.searchsorted(forward, backward), len(forward) - 1)
     if (forward[1:] == forward[:-1]).any() or (begin == end).any():
@@ -163,8 +164,4 @@ def _on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
             "Only an oriented manifold can be decimated.",
             "Send the job folder's log.txt with a bug report.",
         )
-    single = forward[place] != backward
-    result = np.zeros(count, np.bool_)
-    result[begin[single]] = True
-    result[end[single]] = True
-    return result
+    return ends_of(forward[place] != backward, faces, count)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...dataset.camera import Camera
 from ...dataset.scene import Scene
+from ...mesh.topology import area_vectors
 from ...parallel import default_threads
 from ...texture.bake import Photos
 from ...texture.depth_buffer import depth_buffer
@@ -32,7 +33,7 @@ def choose_view(textured: TexturedMesh, photos: Photos, count: int, *, threads: 
     threads = threads or default_threads()
     vertices, faces = textured.mesh.vertices, textured.mesh.faces
     corners = vertices[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = area_vectors(vertices, faces)
     best, best_score = 0, -1.0
     for index in np.unique(np.linspace(0, count - 1, min(count, MAX_CHOICES)).astype(int)).tolist():
         full = photos.camera(index, 1)
