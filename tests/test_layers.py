@@ -15,16 +15,15 @@ CORE = PACKAGE / "core"
 
 # Each part may import the parts named, and the plain files of core/.
 ALLOWED = {
-    "ply": set(),
-    "regions": set(),
-    "dataset": {"ply"},
-    "gaussians": {"dataset", "ply"},
+    "mesh": set(),
+    "dataset": set(),
+    "gaussians": {"dataset"},
     "render": {"dataset", "gaussians"},
     "training": {"dataset", "gaussians", "render", "evaluation"},
     "field": {"dataset", "gaussians", "render"},
-    "meshing": {"dataset", "gaussians", "render", "field", "regions"},
-    "texture": {"dataset", "gaussians", "render", "field", "meshing"},
-    "evaluation": {"ply", "dataset", "gaussians", "render", "field", "meshing", "texture"},
+    "meshing": {"mesh", "dataset", "gaussians", "render", "field"},
+    "texture": {"mesh", "dataset", "gaussians", "render", "field", "meshing"},
+    "evaluation": {"mesh", "dataset", "gaussians", "render", "field", "meshing", "texture"},
     "setup": {"jobs"},
     "jobs": {
         "dataset", "gaussians", "render", "training", "field", "meshing", "texture", "evaluation",

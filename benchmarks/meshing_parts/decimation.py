@@ -19,10 +19,11 @@ import numpy as np
 import trimesh
 
 from gaussian_wrapping_addon.core.evaluation.surface.distance import distances_to_mesh
+from gaussian_wrapping_addon.core.mesh.topology import normals_and_areas
 from gaussian_wrapping_addon.core.meshing.decimation import decimate
 from gaussian_wrapping_addon.core.meshing.mesh_check import check_mesh
 from gaussian_wrapping_addon.core.meshing.mesh_file import load_mesh
-from gaussian_wrapping_addon.core.meshing.sampling import sample_triangles, triangle_normals
+from gaussian_wrapping_addon.core.meshing.sampling import sample_triangles
 from gaussian_wrapping_addon.core.progress import Progress
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -147,7 +148,7 @@ def _distances(first: Mesh, second: Mesh) -> np.ndarray:
 
 def _folds(vertices: np.ndarray, faces: np.ndarray) -> int:
     """Count pairs of neighbouring faces that lie on each other, nearly."""
-    normals, _ = triangle_normals(vertices, faces)
+    normals, _ = normals_and_areas(vertices, faces)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
     owner = np.tile(np.arange(len(faces)), 3)
     order = np.lexsort((edges[:, 1], edges[:, 0]))

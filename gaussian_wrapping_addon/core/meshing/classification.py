@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import tolerances
 from ..compiled import kernel
+from ..mesh.topology import area_vectors
 from ..progress import Progress
 from .minimum_cut import minimum_cut
 
@@ -204,8 +205,8 @@ def face_areas(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """Return (m, 4) areas of the faces opposite each corner."""
     result = np.empty(tetrahedra.shape)
     for k in range(4):
-        a, b, c = (points[tetrahedra[:, j]] for j in range(4) if j != k)
-        result[:, k] = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        faces = np.delete(tetrahedra, k, axis=1)
+        result[:, k] = np.linalg.norm(area_vectors(points, faces), axis=1) / 2
     return result
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from .sampling import triangle_normals
+from ..mesh.topology import half_edges, normals_and_areas
 
 
 def face_components(vertex_count: int, faces: np.ndarray) -> tuple[int, np.ndarray]:
@@ -19,7 +19,7 @@ def face_components(vertex_count: int, faces: np.ndarray) -> tuple[int, np.ndarr
     """
     if len(faces) == 0:
         return 0, np.zeros(0, np.int64)
-    rows, columns = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    rows, columns = half_edges(faces)
     shape = (vertex_count, vertex_count)
     graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=shape)
     _, label = connected_components(graph, directed=False)
@@ -37,7 +37,7 @@ def volumes_and_areas(
     center = vertices[faces.reshape(-1)].mean(0) if len(faces) else np.zeros(3)
     a, b, c = (vertices[faces[:, k]] - center for k in range(3))
     each = (a * np.cross(b, c)).sum(1) / 6.0
-    _, areas = triangle_normals(vertices, faces)
+    _, areas = normals_and_areas(vertices, faces)
     return (
         np.bincount(part, weights=each, minlength=count),
         np.bincount(part, weights=areas, minlength=count),

@@ -8,13 +8,20 @@ join sheets) or fold faces over: ``benchmarks/meshing_parts/decimation.py`` meas
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import MeshingError
+from ..mesh.simplification.engine import Heap, Simplification
+from ..mesh.simplification.optimal_collapse import (
+    HEAP_COLUMNS,
+    POINT_WEIGHT,
+    Limits,
+    collapse_edges,
+    push_edges,
+)
+from ..mesh.topology import ends_of, half_edges
 from ..progress import Progress
-from . import decimation_kernels as kernels
 from .cap_planes import CapPlanes, cap_planes
 from .components import compacted
 from .convex_region import Region
@@ -24,17 +31,6 @@ MIN_TARGET = 4
 
 LOOKS_PER_CALL = 100_000
 """Edges looked at between two moments at which the work can be cancelled: about 0.2 s."""
-
-
-class Limits(NamedTuple):
-    """What a collapse may do to the faces around it."""
-
-    turn_cos: float
-    """Cosine of the largest turn of a face in one collapse."""
-    fold_cos: float
-    """Cosine of the sharpest bend between neighbours that may come up: -1 is folded back flat."""
-    min_shape: float
-    """Least height of a new face over its longest edge, unless the face was narrower before."""
 
 
 LIMITS = Limits(0.0, -0.97, 1e-4)
@@ -104,25 +100,24 @@ def decimate(
         raise MeshingError(
             "A mesh without a finite size cannot be decimated.", "Mesh the region again."
         )
-    run = _Run((vertices - center) / size, faces, caps, center, size)
+    run = _Decimation((vertices - center) / size, faces, caps, center, size)
     first = len(faces)
     while True:
         before = run.faces_left
         share = (first - before) / (first - target)
-        run.work(LIMITS, target, progress.span(min(share, 1.0), 1.0), first)
+        run.work(target, progress.span(min(share, 1.0), 1.0), first)
         # What was refused may be allowed now that its surroundings have changed.
         if run.faces_left <= target or run.faces_left == before:
             break
-    kept = run.faces[run.faces[:, 0] >= 0]
     moved = run.stamps > 0
     result = np.where(moved[:, None], run.points * size + center, vertices)
-    result, kept, source = compacted(result, kept)
+    result, kept, source = compacted(result, run.faces())
     progress.update(1.0, f"{len(kept)} faces left")
     return Decimated(result, kept, source, len(kept) <= target)
 
 
-class _Run:
-    """The arrays that the kernels work on."""
+class _Decimation(Simplification):
+    """Collapses of edges that respect a region's planes."""
 
     def __init__(
         self,
@@ -132,57 +127,36 @@ class _Run:
         center: np.ndarray,
         size: float,
     ) -> None:
-        count = len(points)
-        self.points, self.faces = np.ascontiguousarray(points), faces
-        self.stamps = np.zeros(count, np.int64)
-        locked = caps.fixed | _on_boundary(faces, count)
-        head, following = np.full(count, -1), np.full(faces.size, -1)
-        kernels.link_corners(faces, head, following)
-        quadrics = np.zeros((count, kernels.COLUMNS))
-        kernels.face_quadrics(self.points, faces, quadrics)
-        marks = np.zeros(count, np.int64)
-        self._state = (
-            self.points, faces, head, following, quadrics, self.stamps, caps.planes, locked, marks,
-        )  # fmt: skip
+        locked = caps.fixed | _on_boundary(faces, len(points))
+        # Planes weigh the area of their face.
+        super().__init__(points, faces, 0.5, POINT_WEIGHT)
         offsets = (caps.offsets - caps.normals @ center) / size
-        self._region = (np.ascontiguousarray(caps.normals), offsets)
-        self._counts = np.array([0, 0, len(faces), 0])
+        self._caps = (caps.planes, locked, np.ascontiguousarray(caps.normals), offsets)
         self._scratch = np.zeros((8, 3))
-        self._heap: tuple[np.ndarray, ...] = ()
 
-    @property
-    def faces_left(self) -> int:
-        """Faces that still live."""
-        return int(self._counts[kernels.FACES_LEFT])
-
-    def work(self, limits: Limits, target: int, progress: Progress, first: int) -> None:
+    def work(self, target: int, progress: Progress, first: int) -> None:
         """Look at every edge once, and at those that change again, until nothing is left to do."""
-        self._counts[kernels.HEAP_SIZE] = 0
-        self._heap = _heap(3 * self.faces_left)
-        kernels.push_edges(self._state, self._region, self._heap, self._counts, self._scratch)
+        heap = self.empty_heap(3 * self.faces_left, HEAP_COLUMNS)
+        push_edges(self.mesh, self._caps, heap, self.counts, self._scratch)
         start = self.faces_left
-        while True:
-            done = kernels.collapse_edges(
-                self._state, self._region, self._heap, self._counts, np.array(limits),
-                self._scratch, target, LOOKS_PER_CALL,
+
+        def collapse(heap: Heap) -> int:
+            return collapse_edges(
+                self.mesh, self._caps, heap, self.counts, tuple(LIMITS), self._scratch, target,
+                LOOKS_PER_CALL,
             )  # fmt: skip
+
+        def report() -> None:
             left = self.faces_left
             share = (start - left) / max(start - target, 1)
             progress.update(min(share, 1.0), f"{left} of {first} faces left")
-            if done in (kernels.DONE, kernels.EMPTY):
-                return
-            if done == kernels.FULL:
-                self._heap = tuple(np.concatenate([c, np.zeros_like(c)]) for c in self._heap)
 
-
-def _heap(size: int) -> tuple[np.ndarray, ...]:
-    size = max(size, 4 * kernels.MAX_RING)
-    return (np.zeros(size), *(np.zeros(size, np.int64) for _ in range(5)))
+        self.run(heap, collapse, report)
 
 
 def _on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
     """(v,) bool: vertices at an edge with one face; refuses what is no oriented manifold."""
-    begin, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    begin, end = half_edges(faces)
     forward, backward = np.sort(begin * count + end), end * count + begin
     place = np.minimum(np.searchsorted(forward, backward), len(forward) - 1)
     if (forward[1:] == forward[:-1]).any() or (begin == end).any():
@@ -190,8 +164,4 @@ def _on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
             "Only an oriented manifold can be decimated.",
             "Send the job folder's log.txt with a bug report.",
         )
-    single = forward[place] != backward
-    result = np.zeros(count, np.bool_)
-    result[begin[single]] = True
-    result[end[single]] = True
-    return result
+    return ends_of(forward[place] != backward, faces, count)

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mesh.topology import edge_lengths, normals_and_areas
 from .cap_planes import ON_PLANE_SHARE
 from .convex_region import Region
-from .sampling import triangle_normals
 
 MAX_PASSES = 14
 
@@ -22,15 +22,9 @@ faces lie together, flips can go round in circles."""
 
 def narrow_faces(vertices: np.ndarray, faces: np.ndarray, height: float) -> np.ndarray:
     """Return indices of the faces whose smallest height is below ``height``."""
-    _, areas = triangle_normals(vertices, faces)
+    _, areas = normals_and_areas(vertices, faces)
     longest = edge_lengths(vertices, faces).max(1)
     return np.flatnonzero(2 * areas < height * np.maximum(longest, 1e-300))
-
-
-def edge_lengths(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (f, 3) lengths; edge k leads from corner k to the next."""
-    corners = vertices[faces]  # (f, 3, 3)
-    return np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=2)
 
 
 def remove_degenerate(

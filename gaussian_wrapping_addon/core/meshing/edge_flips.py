@@ -11,7 +11,7 @@ import igl
 import numpy as np
 
 from ..compiled import kernel
-from .sampling import triangle_normals
+from ..mesh.topology import edge_keys, normals_and_areas
 from .vertex_selection import LEAST_COSINE, LEAST_ROUNDNESS
 
 PASSES = 6
@@ -74,7 +74,7 @@ class _Heights:
         self._points, self._count = points, len(points)
         self._vertices = np.ascontiguousarray(vertices, np.float64)
         self._faces = np.ascontiguousarray(faces, np.int64)
-        self._normals, _ = triangle_normals(self._vertices, self._faces)
+        self._normals, _ = normals_and_areas(self._vertices, self._faces)
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
         self._keys = np.zeros(0, np.int64)
@@ -82,7 +82,7 @@ class _Heights:
 
     def key(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return a number for each pair of vertices, whatever their order."""
-        return np.minimum(a, b) * self._count + np.maximum(a, b)
+        return edge_keys(a, b, self._count)
 
     def over(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return heights (k,), negative inside, and normals (k, 3) of the surface there."""

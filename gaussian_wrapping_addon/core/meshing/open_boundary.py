@@ -10,11 +10,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..errors import MeshingError
+from ..mesh.topology import edge_keys, half_edges, next_half_edges, normals_and_areas
 from .cap_planes import ON_PLANE_SHARE, cap_planes
 from .components import compacted, without_floaters
 from .convex_region import Region
-from .repair import APART_SHARE, half_edges
-from .sampling import triangle_normals
+from .repair import APART_SHARE
 from .surface_mesh import SurfaceMesh
 
 MOVED_SHARE = 1.5 * APART_SHARE
@@ -120,7 +120,7 @@ def _cap_faces(
     near = np.flatnonzero(exact[faces].any(1) & ~cap & own)
     corners = vertices[faces[near]]  # (k, 3, 3)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
-    unit, _ = triangle_normals(vertices, faces[near])
+    unit, _ = normals_and_areas(vertices, faces[near])
     close = np.abs(distance[faces[near]]).max(1) <= MOVED_SHARE * longest
     cap[near[close & (unit @ normal >= ALONG_COSINE)]] = True
     return cap
@@ -137,12 +137,12 @@ def split_fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         Old vertex of each new one.
     """
     begin, end = half_edges(faces)
-    keys = np.minimum(begin, end) * np.int64(faces.max() + 1) + np.maximum(begin, end)
+    keys = edge_keys(begin, end, int(faces.max()) + 1)
     order = np.argsort(keys, kind="stable")
     same = keys[order[1:]] == keys[order[:-1]]
     first, second = order[:-1][same], order[1:][same]  # half-edges of one edge, opposite ways
     half = np.arange(faces.size)
-    following = half - half % 3 + (half + 1) % 3
+    following = next_half_edges(half)
     rows = np.concatenate([first, following[first]])
     columns = np.concatenate([following[second], second])
     graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(faces.size,) * 2)

@@ -16,6 +16,7 @@ from ..dataset.camera import Camera
 from ..errors import MeshingError
 from ..field.sightings import Sightings
 from ..gaussians.model import GaussianArrays
+from ..mesh.topology import edge_lengths
 from ..progress import Progress
 from ..report_warning import ReportWarning
 from ..settings import MeshingSettings
@@ -23,7 +24,7 @@ from .candidate_surface import no_surface, pivot_cloud
 from .cap_planes import cap_planes
 from .components import compacted, without_floaters
 from .convex_region import Region
-from .degenerate import edge_lengths, remove_degenerate
+from .degenerate import remove_degenerate
 from .delaunay import delaunay, far_points
 from .extraction import tetrahedron_neighbours
 from .level_error import level_errors

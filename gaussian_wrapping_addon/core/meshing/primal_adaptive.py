@@ -16,13 +16,14 @@ from ..dataset.camera import Camera
 from ..errors import MeshingError
 from ..field.sightings import Sightings
 from ..gaussians.model import GaussianArrays
+from ..mesh.topology import edge_lengths
 from ..progress import Progress
 from ..settings import MeshingSettings
 from .candidate_surface import candidate_surface
 from .classification import classify, on_one_sheet
 from .components import compacted, without_floaters
 from .convex_region import Region
-from .degenerate import edge_lengths, remove_degenerate
+from .degenerate import remove_degenerate
 from .delaunay import delaunay, far_points
 from .edge_flips import flip_edges
 from .extraction import boundary_faces, tetrahedron_neighbours

@@ -10,6 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..errors import MeshingError
+from ..mesh.topology import faces_per_edge, half_edges, next_half_edges
 
 APART_SHARE = 0.005
 """Copies of a vertex move this share of the way to the middle of their own faces, so that the
@@ -36,11 +37,6 @@ class Repaired:
     """Copies that were added."""
     split_edges: int
     """Edges that needed a vertex in their middle."""
-
-
-def half_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return begin and end of the half-edges, (3f,) each; number ``3 f + k`` starts at corner k."""
-    return faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
 
 
 def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> Repaired:
@@ -163,7 +159,7 @@ def _fans(faces: np.ndarray, partner: np.ndarray) -> tuple[np.ndarray, np.ndarra
         Old vertex of each new one.
     """
     corners = np.arange(faces.size)
-    following = corners - corners % 3 + (corners + 1) % 3
+    following = next_half_edges(corners)
     # Half-edge h starts at corner h and ends at the next one; its partner runs the other way.
     rows = np.concatenate([corners, following])
     columns = np.concatenate([following[partner], partner])
@@ -179,10 +175,7 @@ def _fans(faces: np.ndarray, partner: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _crowded(faces: np.ndarray) -> np.ndarray:
     """(3f,) bool: half-edges whose edge still has more than two faces."""
-    begin, end = half_edges(faces)
-    keys = np.minimum(begin, end) * (np.int64(faces.max()) + 1) + np.maximum(begin, end)
-    _, index, count = np.unique(keys, return_inverse=True, return_counts=True)
-    return count[index] > 2
+    return faces_per_edge(faces, int(faces.max()) + 1) > 2
 
 
 def _one_per_face(bad: np.ndarray, partner: np.ndarray) -> np.ndarray:

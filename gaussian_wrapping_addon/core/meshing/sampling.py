@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..compiled import kernel, part
+from ..mesh.topology import normals_and_areas
 
 POINTS_PER_SQUARE = 0.56
 """Points that thinning leaves per squared radius of area, with the numbers of candidates that
@@ -21,14 +22,6 @@ than this share of the radius."""
 
 LEVEL_STEP = 2.0
 """Between the cell sides of the levels of thinning."""
-
-
-def triangle_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit normals (f, 3), zero for degenerate faces, and areas (f,)."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    length = np.linalg.norm(cross, axis=1)
-    return cross / np.where(length > 0, length, 1.0)[:, None], length / 2
 
 
 def sample_triangles(
@@ -50,7 +43,7 @@ def sample_triangles(
     points : (count, 3) float64
     face : (count,) int64
     """
-    _, areas = triangle_normals(vertices, faces)
+    _, areas = normals_and_areas(vertices, faces)
     total = np.cumsum(areas if density is None else areas * density)
     where = (np.arange(count) + rng.random(count)) / count * total[-1]
     face = np.minimum(np.searchsorted(total, where, side="right"), len(faces) - 1)

@@ -11,6 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ..mesh.topology import edge_keys, half_edges
 from .components import face_components
 
 BOX_EDGES = (2.0, 3.0, 4.5)
@@ -121,7 +122,7 @@ def _one_grid(
         loop = _outline(faces[rows])
         if loop is None or len(loop) > MAX_LOOP:
             continue
-        pairs = _keys(loop[:, None], loop[None, :], count)  # (n, n)
+        pairs = edge_keys(loop[:, None], loop[None, :], count)  # (n, n)
         taken = keys[np.minimum(np.searchsorted(keys, pairs), len(keys) - 1)] == pairs
         taken &= ~np.isin(pairs, _edge_keys(faces[rows], count))
         taken |= np.array([key in covered for key in pairs.ravel().tolist()]).reshape(pairs.shape)
@@ -153,8 +154,8 @@ def _patches(vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.nda
     size = box.max(0) + 1
     box_id = (box[:, 0] * size[1] + box[:, 1]) * size[2] + box[:, 2]
     count = len(vertices)
-    begin, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
-    order = np.argsort(_keys(begin, end, count), kind="stable")
+    begin, end = half_edges(faces)
+    order = np.argsort(edge_keys(begin, end, count), kind="stable")
     # A closed 2-manifold: edges come in pairs.
     one, two = order[0::2] // 3, order[1::2] // 3  # (e,) faces beside each edge
     same = box_id[one] == box_id[two]
@@ -191,14 +192,9 @@ def _patches(vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.nda
     return _Patches(label, handles, loops)
 
 
-def _keys(begin: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
-    """Return one number for each pair of vertices, the same in both directions."""
-    return np.minimum(begin, end) * count + np.maximum(begin, end)
-
-
 def _edge_keys(faces: np.ndarray, count: int) -> np.ndarray:
     """Return the numbers of all half-edges, (3f,) int64."""
-    return _keys(faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1), count)
+    return edge_keys(*half_edges(faces), count)
 
 
 def _outline(faces: np.ndarray) -> np.ndarray | None:

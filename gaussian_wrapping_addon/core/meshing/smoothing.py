@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from ..mesh.topology import area_vectors, ends_of, faces_per_edge, half_edges
 from ..progress import Progress
 from .cap_planes import CapPlanes, cap_planes
 from .components import face_components, volumes_and_areas
@@ -75,7 +76,7 @@ def smooth(
     weights = _neighbour_weights(points, faces)
     count, part = face_components(len(points), faces)
     volume, _ = volumes_and_areas(points, faces, part, count)
-    first = _area_vectors(points, faces)
+    first = area_vectors(points, faces)
     for step in range(steps):
         progress.update(step / steps, f"smoothing, step {step + 1} of {steps}")
         for share in (SHRINK, GROW):
@@ -95,7 +96,7 @@ def smooth(
 
 def _neighbour_weights(points: np.ndarray, faces: np.ndarray) -> csr_matrix:
     """(v, v) rows that sum to 1: neighbours by the inverse of their distance."""
-    begin, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    begin, end = half_edges(faces)
     rows, columns = np.concatenate([begin, end]), np.concatenate([end, begin])
     length = np.linalg.norm(points[rows] - points[columns], axis=1)
     shortest = 1e-3 * length.mean()  # a needle's short edge must not outweigh everything
@@ -106,14 +107,7 @@ def _neighbour_weights(points: np.ndarray, faces: np.ndarray) -> csr_matrix:
 
 
 def _at_open_edges(faces: np.ndarray, count: int) -> np.ndarray:
-    begin, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
-    low, high = np.minimum(begin, end), np.maximum(begin, end)
-    _, index, sizes = np.unique(low * count + high, return_inverse=True, return_counts=True)
-    single = sizes[index] == 1
-    result = np.zeros(count, np.bool_)
-    result[begin[single]] = True
-    result[end[single]] = True
-    return result
+    return ends_of(faces_per_edge(faces, count) == 1, faces, count)
 
 
 def _safe_move(
@@ -142,7 +136,7 @@ def _safe_move(
         moved[beyond] = points[beyond]
     size = np.linalg.norm(first, axis=1)
     while True:
-        after = _area_vectors(moved, faces)
+        after = area_vectors(moved, faces)
         length = np.linalg.norm(after, axis=1)
         bad = (first * after).sum(1) < MAX_TURN_COS * size * length
         bad |= length < MIN_AREA_SHARE * size
@@ -168,12 +162,6 @@ def _in_planes(move: np.ndarray, caps: CapPlanes) -> np.ndarray:
     return result
 
 
-def _area_vectors(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(f, 3) twice the area times the normal."""
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    return np.cross(b - a, c - a)
-
-
 def _volume_move(
     points: np.ndarray,
     faces: np.ndarray,
@@ -185,7 +173,7 @@ def _volume_move(
 ) -> np.ndarray:
     """Return moves along the normals that give each part its volume again, to first order."""
     gradient = np.zeros_like(points)  # of the volume, (v, 3)
-    vectors = _area_vectors(points, faces) / 6.0
+    vectors = area_vectors(points, faces) / 6.0
     for k in range(3):
         np.add.at(gradient, faces[:, k], vectors)
     length = np.maximum(np.linalg.norm(gradient, axis=1), 1e-300)[:, None]

@@ -11,9 +11,14 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from ..mesh.topology import (
+    edge_keys,
+    edge_lengths,
+    half_edges,
+    next_half_edges,
+    normals_and_areas,
+)
 from .components import face_components, volumes_and_areas
-from .degenerate import edge_lengths
-from .sampling import triangle_normals
 from .surface_mesh import SurfaceMesh
 
 
@@ -53,9 +58,8 @@ def mesh_statistics(mesh: SurfaceMesh) -> MeshStatistics:
     """Measure a mesh; any triangle mesh is accepted, an empty one too."""
     vertices = np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
-    begin, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
-    low, high = np.minimum(begin, end), np.maximum(begin, end)
-    keys = low * np.int64(max(len(vertices), 1)) + high
+    begin, end = half_edges(faces)
+    keys = edge_keys(begin, end, max(len(vertices), 1))
     edges, index, count = np.unique(keys, return_inverse=True, return_counts=True)
     forward = np.bincount(index, weights=begin < end, minlength=len(edges))
     boundary, crowded = int((count == 1).sum()), int((count > 2).sum())
@@ -63,7 +67,7 @@ def mesh_statistics(mesh: SurfaceMesh) -> MeshStatistics:
     used = len(np.unique(faces))
     parts, part = face_components(len(vertices), faces)
     volume, area = volumes_and_areas(vertices, faces, part, parts)
-    _, areas = triangle_normals(vertices, faces)
+    _, areas = normals_and_areas(vertices, faces)
     repeated = (faces == faces[:, [1, 2, 0]]).any(1)
     fans = _fans(faces, keys)
     closed = len(faces) > 0 and boundary == 0 and crowded == 0 and inconsistent == 0
@@ -91,7 +95,7 @@ def mesh_statistics(mesh: SurfaceMesh) -> MeshStatistics:
 def _fans(faces: np.ndarray, keys: np.ndarray) -> int:
     """Count fans: corners at one vertex, connected over shared edges."""
     corners = np.arange(faces.size)
-    following = corners - corners % 3 + (corners + 1) % 3
+    following = next_half_edges(corners)
     order = np.argsort(keys, kind="stable")
     same = keys[order[1:]] == keys[order[:-1]]
     first, second = order[:-1][same], order[1:][same]  # half-edges on one edge

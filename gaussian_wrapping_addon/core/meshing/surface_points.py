@@ -16,6 +16,7 @@ import numpy as np
 from .. import tolerances
 from ..dataset.camera import Camera
 from ..field.isosurface_projection import TOLERANCE, project_to_isosurface
+from ..mesh.topology import normals_and_areas
 from ..parallel import balanced_bounds
 from ..progress import Progress
 from ..report_warning import ReportWarning
@@ -29,7 +30,6 @@ from .sampling import (
     POINTS_PER_SQUARE,
     sample_triangles,
     thin,
-    triangle_normals,
 )
 from .spacing import Spacing, footprint_spacing
 
@@ -113,7 +113,7 @@ class SurfaceSampler:
         self._faces = surface.faces[region.contains(centers, 0.0)]
         if len(self._faces) == 0:  # the whole surface lies in the margin
             self._faces = surface.faces
-        self._normals, areas = triangle_normals(self._vertices, self._faces)
+        self._normals, areas = normals_and_areas(self._vertices, self._faces)
         self.area = float(areas.sum())
         self._threads = threads
 
@@ -134,7 +134,7 @@ class SurfaceSampler:
     def _expected(self, spacing: Spacing) -> tuple[np.ndarray, float]:
         """Return the radius of each face as a share of the nominal one, and the points in all."""
         share = spacing.at(self._vertices[self._faces].mean(1), self._threads) / spacing.nominal
-        _, areas = triangle_normals(self._vertices, self._faces)
+        _, areas = normals_and_areas(self._vertices, self._faces)
         weight = float((areas * share**-2.0).sum())
         return share, POINTS_PER_SQUARE * weight / spacing.nominal**2
 
@@ -258,7 +258,7 @@ class SurfaceSampler:
         points : (n, 3) float64
         face : (n,) int64
         """
-        _, areas = triangle_normals(self._vertices, self._faces)
+        _, areas = normals_and_areas(self._vertices, self._faces)
         weight = areas * share**-2.0  # (f,)
         blocks = -(-count // MAX_BLOCK)
         bounds = balanced_bounds(weight, blocks)

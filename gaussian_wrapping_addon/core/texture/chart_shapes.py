@@ -7,6 +7,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
+from ..mesh.topology import area_vectors, half_edges
 from .chart_overlaps import conflicts, signed_areas
 
 SMOOTHING_STEPS = 2
@@ -37,7 +38,7 @@ def smoothed_copy(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     start = np.asarray(vertices, np.float64)
     centre = start[faces].mean(axis=(0, 1))
     start = start - centre
-    begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    begin, end = half_edges(faces)
     rows, columns = np.concatenate([begin, end]), np.concatenate([end, begin])
     count = len(start)
     degree = np.maximum(np.bincount(rows, minlength=count), 1)
@@ -56,20 +57,15 @@ def smoothed_copy(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def _without_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Put points back to their start where a face lost most of its area: wires keep their tubes."""
-    before = np.linalg.norm(_area_vectors(start, faces), axis=1)
+    before = np.linalg.norm(area_vectors(start, faces), axis=1)
     points = points.copy()
     while True:
-        crushed = np.linalg.norm(_area_vectors(points, faces), axis=1) < MIN_AREA_SHARE * before
+        crushed = np.linalg.norm(area_vectors(points, faces), axis=1) < MIN_AREA_SHARE * before
         back = np.unique(faces[crushed])
         back = back[(points[back] != start[back]).any(axis=1)]
         if len(back) == 0:
             return points
         points[back] = start[back]
-
-
-def _area_vectors(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    corners = points[faces]
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,7 +154,7 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
     shapes = _without_needles(shapes)
     weights = _cotangents(shapes)  # (f, 3) of the edge from corner k to k + 1
     size = len(points)
-    begin, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    begin, end = half_edges(corners)
     weight = weights.ravel()
     off = coo_matrix((-weight, (begin, end)), shape=(size, size)).tocsr()
     off = off + off.T

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import igl
 import numpy as np
 
+from ..mesh.topology import area_vectors
 from ..meshing.surface_mesh import SurfaceMesh
 from .tangent_frame import shading_normals
 
@@ -64,8 +65,7 @@ class DenseSurface:
         self.vertices = vertices
         self.vertex_normals = shading_normals(vertices, self.faces)
         self._local = (vertices - self._centre) / self.size
-        corners = self._local[self.faces]
-        self.face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self.face_normals = area_vectors(self._local, self.faces)
         self._tree = igl.AABB()
         self._tree.init(self._local, self.faces)
 

@@ -9,6 +9,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from ..mesh.topology import area_vectors, edge_keys, half_edges, normals_and_areas
+
 
 @dataclass(frozen=True)
 class FaceGraph:
@@ -26,18 +28,13 @@ class FaceGraph:
 
 def face_graph(vertices: np.ndarray, faces: np.ndarray) -> FaceGraph:
     """Build the graph; an edge that does not have exactly two faces is a border."""
-    corners = np.asarray(vertices, np.float64)[faces]  # (f, 3, 3)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double_areas = np.linalg.norm(cross, axis=1)
-    normals = cross / np.where(double_areas > 0, double_areas, 1.0)[:, None]
-    return FaceGraph(_opposite(faces), normals, 0.5 * double_areas, corners.mean(axis=1))
+    vertices = np.asarray(vertices, np.float64)
+    normals, areas = normals_and_areas(vertices, faces)
+    return FaceGraph(_opposite(faces), normals, areas, vertices[faces].mean(axis=1))
 
 
 def _opposite(faces: np.ndarray) -> np.ndarray:
-    a = faces.astype(np.int64)
-    b = np.roll(a, -1, axis=1)
-    low, high = np.minimum(a, b).ravel(), np.maximum(a, b).ravel()
-    key = low * (int(faces.max()) + 1) + high
+    key = edge_keys(*half_edges(faces), int(faces.max()) + 1)
     order = np.argsort(key, kind="stable")
     _, first, counts = np.unique(key[order], return_index=True, return_counts=True)
     first = first[counts == 2]
@@ -96,8 +93,7 @@ def uv_charts(graph: FaceGraph, faces: np.ndarray, corner_uvs: np.ndarray) -> np
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return (v, 3) float64 area-weighted unit normals; zero where none is defined."""
-    corners = np.asarray(vertices, np.float64)[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = area_vectors(np.asarray(vertices, np.float64), faces)
     total = np.stack(
         [
             np.bincount(faces.ravel(), np.repeat(cross[:, axis], 3), len(vertices))

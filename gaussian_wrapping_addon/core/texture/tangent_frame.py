@@ -16,6 +16,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from ..mesh.topology import area_vectors, next_half_edges
+
 
 @dataclass(frozen=True)
 class TangentFrames:
@@ -35,7 +37,7 @@ def shading_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     A vertex without a face with area has (0, 0, 1): files ask for unit length everywhere.
     """
     corners = np.asarray(vertices, np.float64)[faces]  # (f, 3, 3)
-    face_normals = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    face_normals = _unit(area_vectors(np.asarray(vertices, np.float64), faces))
     ahead = _unit(np.roll(corners, -1, axis=1) - corners)
     behind = _unit(np.roll(corners, 1, axis=1) - corners)
     weighted = _angles(ahead, behind)[..., None] * face_normals[:, None]  # (f, 3, 3)
@@ -98,7 +100,7 @@ def _groups(faces: np.ndarray, uvs: np.ndarray, signs: np.ndarray) -> np.ndarray
     key["uv"] = np.ascontiguousarray(uvs.reshape(-1, 2)).view(np.uint64)[:, 0]
     welded = np.unique(key, return_inverse=True)[1].ravel()
     corner = np.arange(faces.size)
-    follower = corner - corner % 3 + (corner % 3 + 1) % 3
+    follower = next_half_edges(corner)
     low = np.where(welded < welded[follower], corner, follower)
     high = corner + follower - low
     edge = welded[low] * (int(welded.max()) + 1) + welded[high]

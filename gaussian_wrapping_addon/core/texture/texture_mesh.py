@@ -13,6 +13,7 @@ from .. import limits
 from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
 from ..errors import MeshingError, UsageError
+from ..mesh.topology import area_vectors
 from ..meshing.surface_mesh import SurfaceMesh
 from ..progress import Progress
 from ..report_warning import ReportWarning
@@ -238,7 +239,6 @@ def check_mesh(mesh: SurfaceMesh) -> None:
             f"{int((~finite).sum())} vertices of the mesh are not finite, the first is {first}.",
             hint,
         )
-    corners = vertices[faces].astype(np.float64)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = area_vectors(vertices.astype(np.float64), faces)
     if not (np.abs(cross).max() > 0 and np.isfinite(cross).all()):
         raise MeshingError("No face of the mesh has an area.", hint)

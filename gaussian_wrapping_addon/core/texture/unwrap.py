@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import NO_ROOM, DatasetError, ResourceError, WorkerError, cannot_be_written
+from ..mesh.topology import edge_lengths
 from ..meshing.surface_mesh import SurfaceMesh
 from ..progress import Progress
 from .atlas_raster import AtlasRaster, raster_atlas
@@ -140,7 +141,7 @@ def _xatlas(
     corners = mesh.vertices[mesh.faces]
     if not np.isfinite(corners).all():
         raise DatasetError("Vertices of the mesh are not finite.")
-    edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+    edges = edge_lengths(mesh.vertices, mesh.faces)
     unit = float(np.median(edges[edges > 0]))
     solid = np.flatnonzero(graph.areas > FLAT_FACE_AREA * unit**2)
     if len(solid) == 0:

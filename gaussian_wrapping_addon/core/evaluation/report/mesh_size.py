@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ...dataset.similarity import Similarity
+from ...mesh.topology import edge_lengths
 from ...meshing.components import face_components, volumes_and_areas
-from ...meshing.degenerate import edge_lengths
 
 
 def sizes_in_world(

@@ -11,6 +11,7 @@ import numpy as np
 from ...dataset.camera import Camera
 from ...dataset.photo_source import PhotoSource
 from ...dataset.scene import Scene
+from ...mesh.topology import area_vectors
 from ...parallel import default_threads
 from ...texture.depth_buffer import depth_buffer
 from ...texture.textured_mesh import TexturedMesh
@@ -34,7 +35,7 @@ def choose_view(
     threads = threads or default_threads()
     vertices, faces = textured.mesh.vertices, textured.mesh.faces
     corners = vertices[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = area_vectors(vertices, faces)
     best, best_score = 0, -1.0
     for index in np.unique(np.linspace(0, count - 1, min(count, MAX_CHOICES)).astype(int)).tolist():
         full = photos.camera(index, 1)

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Half-edge collapses: a vertex merges into a neighbour, and none moves (numba).
+
+The heap holds vertices, each with the price of its cheapest collapse, and three columns: costs,
+vertices, stamps. What lies two edges away may change that price without a new entry, so it is
+computed again when a vertex is taken.
+"""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...compiled import kernel, part
+from .corners import drop_dead, merge
+from .counters import DONE, EMPTY, FULL, HEAP_ROOM, HEAP_SIZE, PAUSED, VERTICES_LEFT
+from .heap import drop_first, take_in_last
+from .link_condition import link_allows, mark_ring
+from .quadrics import WEIGHT, area_vector, error_of_one
+
+MAX_RING = 64
+"""Neighbours of a vertex at most; a vertex with more stays."""
+
+HEAP_COLUMNS = 2
+"""Columns of integers of the heap: vertices and stamps."""
+
+
+class ShapeBounds(NamedTuple):
+    """What a half-edge collapse may do to the faces around the vertex that goes."""
+
+    longest_squared: float
+    """No new edge is longer; square of a length."""
+    shape_weight: float
+    """Price of length beside that of height, both squared."""
+    least_roundness: float
+    """Height over the longest edge that a changed triangle must keep, unless it was narrower."""
+    least_cosine: float
+    """Between normals of a triangle before and after."""
+
+
+@part(fast=False)
+def _shapes_allow(gone, stays, mesh, bounds):
+    """Tell whether no face of ``gone`` turns, gets narrow or long when it moves to ``stays``."""
+    points, faces, head, following = mesh[0], mesh[1], mesh[2], mesh[3]
+    longest_squared, _, least_roundness, least_cosine = bounds
+    corner = head[gone]
+    while corner >= 0:
+        f, k = corner // 3, corner % 3
+        corner = following[corner]
+        b, c = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+        if b == stays or c == stays:
+            continue
+        ex, ey, ez = (
+            points[c, 0] - points[b, 0], points[c, 1] - points[b, 1], points[c, 2] - points[b, 2],
+        )  # fmt: skip
+        ux, uy, uz = (
+            points[gone, 0] - points[b, 0], points[gone, 1] - points[b, 1],
+            points[gone, 2] - points[b, 2],
+        )  # fmt: skip
+        wx, wy, wz = (
+            points[stays, 0] - points[b, 0], points[stays, 1] - points[b, 1],
+            points[stays, 2] - points[b, 2],
+        )  # fmt: skip
+        nx, ny, nz = area_vector(points, points[b, 0], points[b, 1], points[b, 2], c, gone)
+        mx, my, mz = area_vector(points, points[b, 0], points[b, 1], points[b, 2], c, stays)
+        before = np.sqrt(nx * nx + ny * ny + nz * nz)
+        after = np.sqrt(mx * mx + my * my + mz * mz)
+        if not (nx * mx + ny * my + nz * mz > least_cosine * before * after):
+            return False
+        side = ex * ex + ey * ey + ez * ez
+        old = max(side, ux * ux + uy * uy + uz * uz)
+        old = max(old, (ux - ex) ** 2 + (uy - ey) ** 2 + (uz - ez) ** 2)
+        first = wx * wx + wy * wy + wz * wz
+        second = (wx - ex) ** 2 + (wy - ey) ** 2 + (wz - ez) ** 2
+        if first > longest_squared or second > longest_squared:
+            return False
+        new = max(side, first, second)
+        # Roundness is twice the area over the longest edge squared.
+        if after < min(least_roundness * new, before / old * new):
+            return False
+    return True
+
+
+@part(fast=False)
+def _cheapest(vertex, mesh, counts, bounds, ring):
+    """Return the neighbour that ``vertex`` merges into at the least price, and the price.
+
+    (-1, inf) without one. Equal prices go by number, so that the order of faces does not matter.
+    """
+    points, faces, head, following, quadrics = mesh[0], mesh[1], mesh[2], mesh[3], mesh[4]
+    shape_weight = bounds[1]
+    best, lowest = -1, np.inf
+    drop_dead(vertex, faces, head, following)
+    around, mark = mark_ring(vertex, mesh, counts, ring)
+    if around > MAX_RING:
+        return best, lowest
+    # Nothing merges into a neighbour with more faces than MAX_RING, although a vertex with three
+    # faces would leave it with that number.
+    limit = MAX_RING - 1 if around == 3 else MAX_RING
+    for i in range(around):
+        stays = ring[i]
+        square = 0.0
+        for k in range(3):
+            square += (points[vertex, k] - points[stays, k]) ** 2
+        error = error_of_one(quadrics, vertex, points[stays, 0], points[stays, 1], points[stays, 2])
+        price = error + shape_weight * quadrics[vertex, WEIGHT] * square
+        if price > lowest or (price == lowest and stays > best):
+            continue
+        drop_dead(stays, faces, head, following)
+        if not link_allows(vertex, stays, around, mark, limit, mesh, counts):
+            continue
+        if _shapes_allow(vertex, stays, mesh, bounds):
+            best, lowest = stays, price
+    return best, lowest
+
+
+@part(fast=False)
+def _push(vertex, price, stamp, heap, counts):
+    slot = counts[HEAP_SIZE]
+    heap[0][slot], heap[1][slot], heap[2][slot] = price, vertex, stamp
+    take_in_last(heap, counts)
+
+
+@kernel(fast=False)
+def push_vertices(mesh, heap, counts, bounds):
+    """Put every vertex that can go into the empty heap, which must have room for all."""
+    head, stamps = mesh[2], mesh[5]
+    ring = np.empty(MAX_RING, np.int64)
+    for vertex in range(len(head)):
+        if head[vertex] >= 0:
+            best, price = _cheapest(vertex, mesh, counts, bounds, ring)
+            if best >= 0:
+                _push(vertex, price, stamps[vertex], heap, counts)
+
+
+@kernel(fast=False)
+def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
+    """Merge the cheapest vertices into neighbours until ``target`` vertices are left.
+
+    Parameters
+    ----------
+    mesh, heap, counts : tuple, tuple, array
+        See :mod:`.corners`, above and :mod:`.counters`.
+    bounds : tuple
+        Values of :class:`ShapeBounds`.
+    budget : int
+        Entries looked at.
+    """
+    stamps = mesh[5]
+    ring, changed = np.empty(MAX_RING, np.int64), np.empty(MAX_RING + 1, np.int64)
+    room = len(heap[0]) - HEAP_ROOM
+    for _ in range(budget):
+        if counts[VERTICES_LEFT] <= target:
+            return DONE
+        if counts[HEAP_SIZE] == 0:
+            return EMPTY
+        if counts[HEAP_SIZE] > room:
+            return FULL
+        price, gone, stamp = heap[0][0], heap[1][0], heap[2][0]
+        drop_first(heap, counts)
+        if stamps[gone] != stamp:
+            continue
+        stays, now = _cheapest(gone, mesh, counts, bounds, ring)
+        if stays < 0:
+            continue
+        if now > price:
+            stamps[gone] += 1
+            _push(gone, now, stamps[gone], heap, counts)
+            continue
+        merge(stays, gone, mesh, counts)
+        around, _ = mark_ring(stays, mesh, counts, changed)
+        changed[around] = stays
+        for slot in range(around + 1):
+            vertex = changed[slot]
+            stamps[vertex] += 1
+            best, price = _cheapest(vertex, mesh, counts, bounds, ring)
+            if best >= 0:
+                _push(vertex, price, stamps[vertex], heap, counts)
+    return PAUSED
