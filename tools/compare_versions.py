@@ -40,13 +40,14 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="the first case only")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="copy what both sides wrote there")
     parser.add_argument("--tree", type=Path, default=ROOT, help="the new side; default: this tree")
-    parser.add_argument("--cache", type=Path, default=ROOT / ".cache" / "versions")
+    parser.add_argument("--cache", type=Path, help="default: .cache/versions of the tree")
     options = parser.parse_args()
-    cache = options.cache.resolve()
+    tree = options.tree.resolve()
+    cache = (options.cache or tree / ".cache" / "versions").resolve()
     try:
         with locked(cache):
             cases = CASES[:1] if options.quick else CASES
-            old, new = _both_sides(options.against, options.tree.resolve(), cache, cases)
+            old, new = _both_sides(options.against, tree, cache, cases)
             if options.keep is not None:
                 for name, side in (("old", old), ("new", new)):
                     shutil.copytree(side, options.keep / name, dirs_exist_ok=True)
@@ -58,7 +59,7 @@ def main() -> int:
 
 def _both_sides(against: str, tree: Path, cache: Path, cases: tuple[Case, ...]) -> tuple[Path, ...]:
     """Return the folders of what the old version and the new one wrote."""
-    commit = commit_of(ROOT, against)
+    commit = commit_of(tree, against)
     inputs, run = cache / "inputs", cache / "run"
     shutil.rmtree(inputs, ignore_errors=True)
     write_inputs(inputs)
@@ -71,7 +72,7 @@ def _both_sides(against: str, tree: Path, cache: Path, cases: tuple[Case, ...]) 
         print(f"{commit[:12]}: results of an earlier run")
     else:
         old = wanted
-        seconds = run_cases(checkout(ROOT, commit, cache), cases, inputs, run, old)
+        seconds = run_cases(checkout(tree, commit, cache), cases, inputs, run, old)
         print(f"{commit[:12]}: run in {sum(seconds.values()):.0f} s")
     new = cache / "results" / "present"
     seconds = run_cases(tree, cases, inputs, run, new)

@@ -66,7 +66,7 @@ def write_inputs(folder: Path) -> None:
     wedge = np.array([[1.7, 0, -1.2], [0.2, 0, -1.2], [1.7, 1.5, -1.2], [0.2, 1.5, -1.2]])
     _write_region(folder / "wedge.json", np.concatenate([wedge, [[0.9, 0.6, 0.9]]]))
     _write_truth(folder / "truth.ply")
-    _write_splat(folder / "splat.ply", 900)
+    _write_splat(folder / "splat.ply", 1200)
     for path in (folder, *sorted(folder.rglob("*"))):
         os.utime(path, (MODIFIED_UNIX_S, MODIFIED_UNIX_S))
 
@@ -234,33 +234,34 @@ def _write_region(path: Path, corners: np.ndarray) -> None:
 
 
 def _write_splat(path: Path, count: int) -> None:
-    """Write flat Gaussians on balls and floor, world coordinates, as other programs do."""
+    """Write flat Gaussians on all surfaces, world coordinates, as other programs do."""
     points, colors = _surface_points(count)
-    points, colors = points[: 3 * count], colors[: 3 * count]  # without the dome
     generator = np.random.default_rng(11)
     rest = [f"f_rest_{number}" for number in range(9)]
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
     names += [*(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
-    normals = np.zeros((3 * count, 3))
+    total = len(points)
+    normals = np.zeros((total, 3))
     for number, (center, _) in enumerate(BALLS):
         part = slice(number * count, (number + 1) * count)
         normals[part] = points[part] - center
-    normals[2 * count :] = [0.0, 0.0, 1.0]
+    normals[2 * count : 3 * count] = [0.0, 0.0, 1.0]
+    normals[3 * count :] = points[3 * count :]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     # The rotation that takes z to the normal, as (w, x, y, z).
     turns = np.stack([1.0 + normals[:, 2], -normals[:, 1], normals[:, 0], 0.0 * normals[:, 0]], 1)
     turns /= np.maximum(np.linalg.norm(turns, axis=1, keepdims=True), 1e-9)
-    sizes = SCALE * np.repeat([0.06, 0.04, 0.2], count)
+    sizes = SCALE * np.repeat([0.04, 0.03, 0.1, 0.25], count)
     scales = np.stack([sizes, sizes, 0.1 * sizes], 1)
     table = np.concatenate(
         [
             SCALE * points + OFFSET, normals, (colors / 255.0 - 0.5) / 0.28209479177387814,
-            generator.normal(size=(3 * count, 9)) * 0.03, np.full((3 * count, 1), 3.0),
+            generator.normal(size=(total, 9)) * 0.01, np.full((total, 1), 3.0),
             np.log(scales), turns,
         ],
         axis=1,
     )  # fmt: skip
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {3 * count}"]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {total}"]
     header += [*(f"property float {name}" for name in names), "end_header", ""]
     path.write_bytes("\n".join(header).encode() + table.astype("<f4").tobytes())
 

@@ -39,7 +39,11 @@ def locked(cache: Path) -> Iterator[None]:
     """Hold the cache for this process; another one waits."""
     cache.mkdir(parents=True, exist_ok=True)
     with open(cache / "lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            print(f"waiting for another comparison in {cache}", flush=True)
+            fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 
@@ -107,6 +111,7 @@ def run_cases(
         folder.mkdir(parents=True)
     seconds = {}
     for case in cases:
+        print(f"{tree.name}: {case.name}", flush=True)
         begun_s = time.monotonic()
         said = []
         for step in case.steps:
