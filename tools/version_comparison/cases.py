@@ -14,6 +14,8 @@ class Step:
     exit_code: int = 0
     cancel_in: str = ""
     """Name of the stage in which the job is asked to stop, once it counts iterations."""
+    start: str = ""
+    """File below ``{out}`` that is copied to ``{out}/start.ply`` before, with a fixed date."""
     figures_in: str = ""
     """Regular expression of printed lines whose numbers are compared."""
 
@@ -99,10 +101,14 @@ CASES = (
     Case(
         "a splat as start, a splat alone",
         (
-            _step(
-                f"wrap {{in}}/colmap --out {{out}}/started {_COMMON} --iterations 80"
-                " --max-gaussians 3000 --start-splat {in}/splat.ply --region {in}/cap.json"
-                " --points 1000 --export ply"
+            Step(_words("export {out}/first --out {out}/exported-splat --format splat")),
+            Step(
+                _words(
+                    f"wrap {{in}}/colmap --out {{out}}/started {_COMMON} --iterations 80"
+                    " --max-gaussians 3000 --start-splat {out}/start.ply --region {in}/cap.json"
+                    " --points 1000 --export ply --no-blend"
+                ),
+                start="exported-splat/gaussians.splat.ply",
             ),
             _step(
                 f"wrap {{in}}/splat.ply --out {{out}}/splat {_COMMON} --iterations 40"
@@ -116,7 +122,7 @@ CASES = (
         "photos without cameras",
         (
             _step(
-                "wrap {in}/photos --out {out}/photos --preset draft --threads 1 --preview-every 0"
+                "wrap {in}/unposed --out {out}/photos --preset draft --threads 1 --preview-every 0"
                 " --texture-size 256 --iterations 60 --max-image-px 128 --max-gaussians 1500"
                 " --needs none --points 800 --export ply"
             ),

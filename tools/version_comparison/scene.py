@@ -59,14 +59,14 @@ def write_inputs(folder: Path) -> None:
     _write_colmap(folder / "colmap", photos=6, lens=Lens(112, 96, 125.0))
     lens = Lens(128, 104, 140.0, -0.06, 0.01)
     _write_transforms(folder / "transforms", photos=6, lens=lens)
-    _write_photos(folder / "photos", photos=8, lens=Lens(256, 208, 280.0))
+    _write_photos(folder / "unposed" / "photos", photos=8, lens=Lens(320, 256, 330.0))
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     _write_region(folder / "cut.json", corners * [1.3, 0.55, 1.2] + [0.1, 0.1, 0.3])
     _write_region(folder / "cap.json", corners * [0.6, 0.6, 0.5] + [0.0, 0.0, 0.9])
     wedge = np.array([[1.7, 0, -1.2], [0.2, 0, -1.2], [1.7, 1.5, -1.2], [0.2, 1.5, -1.2]])
     _write_region(folder / "wedge.json", np.concatenate([wedge, [[0.9, 0.6, 0.9]]]))
     _write_truth(folder / "truth.ply")
-    _write_splat(folder / "splat.ply", 1200)
+    _write_splat(folder / "splat.ply", 1000)
     for path in (folder, *sorted(folder.rglob("*"))):
         os.utime(path, (MODIFIED_UNIX_S, MODIFIED_UNIX_S))
 
@@ -78,9 +78,10 @@ def _pattern(points: np.ndarray, seed: int) -> np.ndarray:
     phases = generator.uniform(0, 2 * np.pi, size=(10, 3))
     amounts = generator.normal(size=(10, 3))
     soft = (np.sin((points @ waves.T)[:, :, None] + phases) * amounts).sum(1)
-    cells = np.floor(points * 4.0 + 0.137).astype(np.int64)
-    noise = (cells @ np.array([73856093, 19349663, 83492791]) % 1009) / 1009.0
-    return 0.5 + 0.33 * np.tanh(0.45 * soft) + 0.14 * (noise[:, None] - 0.5)
+    cells = np.floor(points * 5.0 + 0.137).astype(np.int64) * [73856093, 19349663, 83492791]
+    mixed = np.bitwise_xor.reduce(cells, axis=1) * 2654435761 >> 7
+    noise = (mixed % 1009) / 1009.0
+    return 0.5 + 0.25 * np.tanh(0.45 * soft) + 0.4 * (noise[:, None] - 0.5)
 
 
 def _trace(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -216,7 +217,7 @@ def _write_transforms(folder: Path, *, photos: int, lens: Lens) -> None:
 def _write_photos(folder: Path, *, photos: int, lens: Lens) -> None:
     """Write photos without cameras, close enough to each other for features to be matched."""
     folder.mkdir(parents=True)
-    for index, (center, rotation) in enumerate(_views(photos, arc=1.2)):
+    for index, (center, rotation) in enumerate(_views(photos, arc=0.9)):
         image = Image.fromarray(_photograph(center, rotation, lens, 1.0))
         image.save(folder / f"{index:02d}.png")
 
@@ -251,7 +252,7 @@ def _write_splat(path: Path, count: int) -> None:
     # The rotation that takes z to the normal, as (w, x, y, z).
     turns = np.stack([1.0 + normals[:, 2], -normals[:, 1], normals[:, 0], 0.0 * normals[:, 0]], 1)
     turns /= np.maximum(np.linalg.norm(turns, axis=1, keepdims=True), 1e-9)
-    sizes = SCALE * np.repeat([0.04, 0.03, 0.1, 0.25], count)
+    sizes = SCALE * np.repeat([0.07, 0.04, 0.24, 0.4], count)
     scales = np.stack([sizes, sizes, 0.1 * sizes], 1)
     table = np.concatenate(
         [

@@ -24,6 +24,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from .cases import Case, Step
+from .scene import MODIFIED_UNIX_S
 
 BATCH = Path("gaussian_wrapping_addon") / "batch.py"
 STEP_LIMIT_S = 900.0
@@ -138,6 +139,9 @@ def run_cases(
 def _run_step(tree: Path, case: Case, step: Step, inputs: Path, run: Path) -> str:
     """Run one command and return what it said."""
     arguments = [a.replace("{in}", str(inputs)).replace("{out}", str(run)) for a in step.arguments]
+    if step.start:
+        shutil.copyfile(run / step.start, run / "start.ply")
+        os.utime(run / "start.ply", (MODIFIED_UNIX_S, MODIFIED_UNIX_S))
     kept = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     environment = {
         **kept, "CUDA_VISIBLE_DEVICES": "", "GAUSSIAN_WRAPPING_DATA": str(run / "user-data"),
