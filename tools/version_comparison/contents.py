@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What a file of a result holds, as named items that are equal bit for bit or are not.
 
-:data:`LEFT_OUT_FILES` and :data:`LEFT_OUT_ENTRIES` are everything that is not compared.
+Everything that is not compared stands in :data:`LEFT_OUT_FILES`, :data:`LEFT_OUT_CONTENTS` and
+:data:`LEFT_OUT_ENTRIES`.
 """
 
 from __future__ import annotations
@@ -35,16 +36,20 @@ class LeftOut:
 
 LEFT_OUT_FILES = (
     LeftOut("said-*.log", "what a command printed: wording, and times"),
-    LeftOut("*/log.txt", "wording, and times"),
-    LeftOut("*/worker-output.txt", "wording"),
-    LeftOut("*/report.md", "wording; its figures are in report.json"),
     LeftOut("*/lock.json", "process number; it is there while a worker runs"),
     LeftOut("*/spent.json", "time"),
-    LeftOut("*.blend", "Blender writes memory addresses"),
     LeftOut("*/live-*", "pictures taken at moments of the clock"),
 )
 """Patterns of paths below the folder of a case. Of the checkpoints of a stage only the newest is
 compared: the one before it, if there is one, is of a moment of the clock."""
+
+LEFT_OUT_CONTENTS = (
+    LeftOut("*/log.txt", "wording, and times"),
+    LeftOut("*/worker-output.txt", "wording"),
+    LeftOut("*/report.md", "wording; its figures are in report.json"),
+    LeftOut("*.blend", "Blender writes memory addresses"),
+)
+"""The same of files that have to be there, whatever they hold."""
 
 LEFT_OUT_ENTRIES = (
     LeftOut(r"(^|\.)(processor_)?seconds(_low|_high|_training|_left)?$", "time"),
@@ -110,10 +115,13 @@ def read_contents(root: Path) -> Contents:
     usd = _usd_items(sorted(root.rglob("*.usd*")))
     for path in sorted(p for p in root.rglob("*") if p.is_file()):
         name = path.relative_to(root).as_posix()
-        if path in older or any(fnmatch.fnmatch(name, rule.pattern) for rule in LEFT_OUT_FILES):
+        if path in older or _matches(name, LEFT_OUT_FILES):
             left_out += 1
             continue
         items[name] = Item("file", "is there")
+        if _matches(name, LEFT_OUT_CONTENTS):
+            left_out += 1
+            continue
         for entry, item in usd.get(path) or _items_of(path):
             if item.kind in ("json", "usd") and _is_left_out(path.name, entry):
                 left_out += 1
@@ -132,6 +140,10 @@ def differences(old: Contents, new: Contents) -> list[tuple[str, str]]:
         elif (a.kind, a.digest) != (b.kind, b.digest):
             found.append((name, a.distance(b)))
     return found
+
+
+def _matches(name: str, rules: tuple[LeftOut, ...]) -> bool:
+    return any(fnmatch.fnmatch(name, rule.pattern) for rule in rules)
 
 
 def _is_left_out(file: str, entry: str) -> bool:
