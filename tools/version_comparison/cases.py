@@ -63,9 +63,9 @@ CASES = (
         "evidence decides, pivots, open, occupied",
         (
             _step(
-                f"wrap {{in}}/transforms --out {{out}}/evidence {_COMMON} --iterations 300"
-                " --max-gaussians 2500 --needs auto --mask-mode background --region-weight 2"
-                " --region {in}/cap.json auto --method pivots --pivots 9 --boundary open"
+                f"wrap {{in}}/transforms --out {{out}}/evidence {_COMMON} --iterations 500"
+                " --max-gaussians 3000 --needs auto --mask-mode background --region-weight 2"
+                " --region {in}/cap.json --method pivots --pivots 9 --boundary open"
                 " --unseen occupied --texture-source gaussians --export ply"
             ),
         ),

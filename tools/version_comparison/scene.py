@@ -58,7 +58,7 @@ def write_inputs(folder: Path) -> None:
     """Write every input of the cases below ``folder``."""
     _write_colmap(folder / "colmap", photos=6, lens=Lens(112, 96, 125.0))
     lens = Lens(128, 104, 140.0, -0.06, 0.01)
-    _write_transforms(folder / "transforms", photos=6, lens=lens)
+    _write_transforms(folder / "transforms", photos=12, lens=lens)
     _write_photos(folder / "unposed" / "photos", photos=8, lens=Lens(320, 256, 330.0))
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     _write_region(folder / "cut.json", corners * [1.3, 0.55, 1.2] + [0.1, 0.1, 0.3])
