@@ -146,7 +146,7 @@ CASES = (
             ),
             Step(
                 _words("estimate-mesh --out {out}/first --region {in}/cut.json --points 2000"),
-                figures_in="triangles|tetrahedra|whole",
+                figures_in="triangles|tetrahedra",
             ),
             Step(
                 _words("estimate-mesh --out {out}/first --method pivots --pivots 2"),

@@ -112,7 +112,7 @@ def read_contents(root: Path) -> Contents:
         for suffix in ("json", "npz")
         for path in sorted(folder.glob(f"checkpoint-*.{suffix}"))[:-1]
     }
-    usd = _usd_items(sorted(root.rglob("*.usd*")))
+    usd = _usd_items(sorted(root.rglob("*.usdc")))
     for path in sorted(p for p in root.rglob("*") if p.is_file()):
         name = path.relative_to(root).as_posix()
         if path in older or _matches(name, LEFT_OUT_FILES):

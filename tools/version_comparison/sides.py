@@ -28,6 +28,7 @@ from .scene import MODIFIED_UNIX_S
 
 BATCH = Path("gaussian_wrapping_addon") / "batch.py"
 STEP_LIMIT_S = 900.0
+_ARCHIVED = (str(BATCH.parent), "blender_manifest.toml")
 _PACKAGES = ("numpy", "torch", "numba", "scipy", "pillow", "xatlas", "pycolmap", "bpy")
 
 
@@ -61,7 +62,7 @@ def checkout(repository: Path, commit: str, cache: Path) -> Path:
     """Return a folder with the files of a commit; made once, compiled kernels stay in it."""
     folder = cache / "trees" / commit[:12]
     if not folder.is_dir():
-        command = ["git", "-C", str(repository), "archive", commit, str(BATCH.parent)]
+        command = ["git", "-C", str(repository), "archive", commit, *_ARCHIVED]
         data = subprocess.run(command, capture_output=True, check=True).stdout
         half = folder.with_name(f"{folder.name}.half")
         shutil.rmtree(half, ignore_errors=True)
