@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Choose the photos in Blender's file browser; they are checked at once."""
+"""Operators that choose the photos and check them."""
 
 from pathlib import Path
 from typing import Final
@@ -7,9 +7,9 @@ from typing import Final
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..core.errors import UsageError
+from ..core.errors import UsageError, WrapError
 from . import photo_check, preferred_worker, training_estimate, watched_jobs
-from .job_operators import no_job_runs
+from .job_guards import no_job_runs
 from .reporting import ReportsErrors
 
 _INPUT_FILES: Final = (".ply", ".json")
@@ -67,4 +67,38 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES: Final = (GWRAP_OT_choose_input,)
+class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
+    bl_idname = "gwrap.check_photos"
+    bl_label = "Check Photos"
+    bl_description = "Look through the photos and camera poses and list what stands in the way"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not context.scene.gwrap.source:
+            cls.poll_message_set("Choose the folder of the photos first")
+            return False
+        if photo_check.is_busy():
+            cls.poll_message_set("The check is under way; it takes seconds")
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """Look in a thread: the button must not make Blender wait for a slow disk."""
+        try:
+            photo_check.start(context.scene)
+        except WrapError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        properties = context.scene.gwrap
+        photo_check.check_now(context.scene)
+        errors = sum(row.severity == "error" for row in properties.findings)
+        warnings = sum(row.severity == "warning" for row in properties.findings)
+        kind = "WARNING" if errors or warnings else "INFO"
+        self.report({kind}, f"Photos checked: {errors} errors, {warnings} warnings")
+        return {"FINISHED"}
+
+
+CLASSES: Final = (GWRAP_OT_choose_input, GWRAP_OT_check_photos)

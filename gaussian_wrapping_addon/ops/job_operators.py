@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators that start, stop, find and resume jobs, and check photos; none changes data."""
+"""Operators that start, stop, find and resume jobs; none changes data of the open file."""
 
 from pathlib import Path
 from typing import Final
@@ -7,111 +7,25 @@ from typing import Final
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..core.errors import UsageError, WrapError
+from ..core.errors import UsageError
 from . import (
-    doctor,
     job_actions,
     job_attach,
     job_timer,
     known_jobs,
     panel_state,
-    photo_check,
     preferred_worker,
     tags,
     watched_jobs,
-    worker_setup,
+)
+from .job_guards import (
+    AsksAboutFolder,
+    chosen_regions,
+    has_worker,
+    no_job_runs,
+    selected_regions,
 )
 from .reporting import ReportsErrors
-
-
-def no_job_runs(cls: type, context: bpy.types.Context) -> bool:
-    """Tell whether no job runs in the scene; the tooltip says why a button is grey."""
-    if watched_jobs.is_running(context.scene.gwrap.job_folder):
-        cls.poll_message_set("A job is running; cancel it or wait for it")  # type: ignore[attr-defined]
-        return False
-    return True
-
-
-def has_worker(cls: type) -> bool:
-    """Tell whether a job has a Python to run in; the tooltip says what to do where it has none."""
-    problem = worker_setup.worker_problem()
-    if problem:
-        cls.poll_message_set(problem)  # type: ignore[attr-defined]
-    return not problem
-
-
-def selected_regions(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the selected region objects, the active one first; else a result's only one."""
-    active = context.view_layer.objects.active
-    things = [t for t in context.selected_objects if tags.kind_of(t) == "region"]
-    frame = None if things else tags.current_frame(context.scene, active)
-    if frame is not None:
-        own = [t for t in frame.children if tags.kind_of(t) == "region"]
-        things = own if len(own) == 1 else []
-    return sorted(things, key=lambda t: (t != active, t.name))
-
-
-def chosen_regions(context: bpy.types.Context, *, checked: bool) -> list[bpy.types.Object]:
-    """Return the checked regions of the scene by name, or the selected ones."""
-    if not checked:
-        return selected_regions(context)
-    things = tags.objects_of_kind(context.scene, "region")
-    return sorted((t for t in things if t.gwrap.checked), key=lambda t: t.name)
-
-
-class AsksAboutFolder(ReportsErrors):
-    """Asks before it works in a folder that only the file names (it may come from elsewhere)."""
-
-    def folder(self, context: bpy.types.Context) -> Path | None:
-        """Return the folder that the operator would use."""
-        raise NotImplementedError
-
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask where the folder is not known on this machine."""
-        folder = self.folder(context)
-        if folder is None or known_jobs.is_trusted(folder):
-            return self.execute(context)
-        return context.window_manager.invoke_confirm(  # type: ignore[no-any-return]
-            self,
-            event,
-            title="Use This Job Folder?",
-            message=f"The file names a job folder that is new on this machine: {folder}",
-            confirm_text="Use Folder",
-        )
-
-
-class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
-    bl_idname = "gwrap.check_photos"
-    bl_label = "Check Photos"
-    bl_description = "Look through the photos and camera poses and list what stands in the way"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not context.scene.gwrap.source:
-            cls.poll_message_set("Choose the folder of the photos first")
-            return False
-        if photo_check.is_busy():
-            cls.poll_message_set("The check is under way; it takes seconds")
-            return False
-        return True
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Look in a thread: the button must not make Blender wait for a slow disk."""
-        try:
-            photo_check.start(context.scene)
-        except WrapError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        return {"FINISHED"}
-
-    def work(self, context: bpy.types.Context) -> set[str]:
-        properties = context.scene.gwrap
-        photo_check.check_now(context.scene)
-        errors = sum(row.severity == "error" for row in properties.findings)
-        warnings = sum(row.severity == "warning" for row in properties.findings)
-        kind = "WARNING" if errors or warnings else "INFO"
-        self.report({kind}, f"Photos checked: {errors} errors, {warnings} warnings")
-        return {"FINISHED"}
 
 
 class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
@@ -238,47 +152,10 @@ class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
-    bl_idname = "gwrap.check_worker"
-    bl_label = "Check Worker"
-    bl_description = "Look whether the worker's Python has what jobs need, in the background"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if doctor.is_busy():
-            cls.poll_message_set("The check is running; it takes seconds")
-            return False
-        return True
-
-    def work(self, context: bpy.types.Context) -> set[str]:
-        doctor.start(preferred_worker.worker_choice(context).python)
-        return {"FINISHED"}
-
-
-class GWRAP_OT_copy_findings(bpy.types.Operator):
-    bl_idname = "gwrap.copy_findings"
-    bl_label = "Copy Findings"
-    bl_description = "Copy the findings about the worker, to paste them into a bug report"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not doctor.findings():
-            cls.poll_message_set("Press Check Worker first")
-            return False
-        return True
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        context.window_manager.clipboard = doctor.as_text()
-        return {"FINISHED"}
-
-
 CLASSES: Final = (
-    GWRAP_OT_check_photos,
     GWRAP_OT_wrap_scene,
     GWRAP_OT_mesh_region,
     GWRAP_OT_cancel_job,
     GWRAP_OT_resume_job,
     GWRAP_OT_find_job,
-    GWRAP_OT_check_worker,
-    GWRAP_OT_copy_findings,
 )

@@ -15,6 +15,7 @@ import bpy
 
 from ..core.errors import WrapError
 from ..core.files import read_json, write_json
+from .addon import addon_package
 
 _logger = logging.getLogger(__name__)
 
@@ -57,7 +58,7 @@ def is_remote(folder: Path) -> bool:
 
 
 def _list_path() -> Path | None:
-    package = __package__.rpartition(".")[0]
+    package = addon_package()
     with contextlib.suppress(ValueError, OSError):  # ValueError: not installed as an extension
         return Path(bpy.utils.extension_path_user(package, create=True)) / _FILE
     return None

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import bpy
 
+from .addon import addon_preferences
+
 
 @dataclass(frozen=True)
 class WorkerChoice:
@@ -19,8 +21,7 @@ class WorkerChoice:
 
 def worker_choice(context: bpy.types.Context) -> WorkerChoice:
     """Read the add-on's preferences; defaults where it is not enabled as an add-on."""
-    addon = context.preferences.addons.get(__package__.rpartition(".")[0])
-    preferences = addon.preferences if addon is not None else None
+    preferences = addon_preferences(context)
     if preferences is None:
         return WorkerChoice()
     python = bpy.path.abspath(preferences.worker_python) if preferences.worker_python else ""

@@ -15,7 +15,7 @@ from . import (
     scene_folders,
     tags,
 )
-from .job_operators import AsksAboutFolder, chosen_regions
+from .job_guards import AsksAboutFolder, chosen_regions
 from .reporting import NeedsObjectMode
 
 

@@ -8,7 +8,7 @@ import bpy
 
 from ..core.errors import UsageError
 from . import job_actions, preferred_worker, tags, training_estimate
-from .job_operators import AsksAboutFolder, no_job_runs
+from .job_guards import AsksAboutFolder, no_job_runs
 from .reporting import ReportsErrors
 
 

@@ -26,6 +26,7 @@ from ..core.setup.pythons import FoundPython, find_pythons
 from ..core.worker_environment import WorkerEnvironment
 from ..core.worker_requirements import requirements_file
 from . import doctor
+from .addon import addon_package
 from .preferred_worker import worker_choice
 from .redrawing import redraw
 
@@ -55,7 +56,7 @@ state = State()
 
 def environment() -> WorkerEnvironment:
     """Return the environment of this add-on in this Blender; it need not exist."""
-    package = __package__.rpartition(".")[0]
+    package = addon_package()
     with contextlib.suppress(ValueError, OSError):  # ValueError: not installed as an extension
         return WorkerEnvironment(Path(bpy.utils.extension_path_user(package, path="worker")))
     return WorkerEnvironment(worker_environment.default_root())

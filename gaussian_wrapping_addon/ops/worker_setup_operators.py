@@ -10,6 +10,7 @@ from bpy.props import EnumProperty, StringProperty
 from ..core.errors import WrapError
 from ..core.setup.commands import all_commands, as_line
 from . import worker_setup
+from .addon import addon_package, addon_preferences
 from .reporting import ReportsErrors
 from .worker_setup import state
 
@@ -21,8 +22,7 @@ _items: dict[str, list[tuple[str, str, str]]] = {}
 
 def wheel_folder(context: bpy.types.Context) -> str:
     """Return the wheel folder of the preferences; empty where there are none."""
-    addon = context.preferences.addons.get(__package__.rpartition(".")[0])
-    preferences = addon.preferences if addon is not None else None
+    preferences = addon_preferences(context)
     return str(preferences.wheel_folder) if preferences is not None else ""
 
 
@@ -179,7 +179,7 @@ class GWRAP_OT_open_preferences(bpy.types.Operator):
     bl_description = "Show this add-on's preferences, where the worker is set up"
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        package = __package__.rpartition(".")[0]
+        package = addon_package()
         try:
             return bpy.ops.preferences.addon_show(module=package)
         except RuntimeError as error:

@@ -6,7 +6,7 @@ from typing import Final
 import bpy
 
 from ..ops import tags, watched_jobs
-from ..ops.job_operators import selected_regions
+from ..ops.job_guards import selected_regions
 from .job_view import draw_job, job_readiness
 from .panel_base import CATEGORY, Readiness, TabPanel, button, plain
 from .setting_properties import draw_settings, settings_in

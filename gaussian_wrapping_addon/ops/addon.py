@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The package of this add-on, as Blender knows it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+
+def addon_package() -> str:
+    """Return the name under which Blender has enabled the add-on (``bl_ext...`` of an extension)."""
+    return __package__.rpartition(".ops")[0]
+
+
+def addon_preferences(context: bpy.types.Context) -> Any:
+    """Return the preferences, or ``None`` where the package is not enabled as an add-on."""
+    addon = context.preferences.addons.get(addon_package())
+    return addon.preferences if addon is not None else None
