@@ -9,7 +9,7 @@ import bpy
 
 
 def addon_package() -> str:
-    """Return the name under which Blender has enabled the add-on (``bl_ext...`` of an extension)."""
+    """Return the name under which Blender has enabled the add-on."""
     return __package__.rpartition(".ops")[0]
 
 
