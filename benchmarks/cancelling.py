@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.job_file import make_job
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
 from gaussian_wrapping_addon.core.settings import preset
 
 POLL_S = 0.02

@@ -11,17 +11,22 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render import reference
-from gaussian_wrapping_addon.core.render.blend import Images, RenderBuffers, blend, blend_backward
-from gaussian_wrapping_addon.core.render.projection import (
+from gaussian_wrapping_addon.core.render.projection.projection import (
     RawArrays,
     RawGradients,
     project_backward,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
+from gaussian_wrapping_addon.core.render.raster.blend import (
+    Images,
+    RenderBuffers,
+    blend,
+    blend_backward,
+)
+from gaussian_wrapping_addon.core.render.reference import reference
+from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
 from gaussian_wrapping_addon.core.render.render import project_view, render
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .exact import as_float64, exact_images
 from .exact_gradients import TRAINED

@@ -15,8 +15,8 @@ import numba
 import numpy as np
 
 from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.parallel import default_threads, even_bounds, run_chunks
-from gaussian_wrapping_addon.core.render.blend import ScreenView
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads, even_bounds, run_chunks
+from gaussian_wrapping_addon.core.render.raster.blend import ScreenView
 
 _TILE = tolerances.TILE_PX
 _MARGIN_PX = 0.02

@@ -19,9 +19,9 @@ import torch
 from gaussian_wrapping_addon.core import tolerances
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.parallel import default_threads, even_bounds, run_chunks
-from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads, even_bounds, run_chunks
+from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 TILE = 16
 _MARGIN_PX = 0.01

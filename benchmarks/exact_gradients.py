@@ -11,8 +11,9 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.reference import render_reference
-from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
+from gaussian_wrapping_addon.core.render.reference.reference import render_reference
+from gaussian_wrapping_addon.core.render.types.images import Render
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .exact import TILE, Tiles, as_float64
 

@@ -12,7 +12,7 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,23 +30,24 @@ from benchmarks.training_parts import RASTER, WHOLE, iteration_parts, training_p
 from benchmarks.workload import surface_gaussians, view
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.parallel import default_threads
-from gaussian_wrapping_addon.core.render.blend import (
-    Images,
-    RenderBuffers,
-    blend,
-    blend_backward,
-)
-from gaussian_wrapping_addon.core.render.projection import (
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads
+from gaussian_wrapping_addon.core.render.projection.projection import (
     RawArrays,
     RawGradients,
     project_backward,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.raster_math import vector_lanes
+from gaussian_wrapping_addon.core.render.raster.blend import (
+    Images,
+    RenderBuffers,
+    blend,
+    blend_backward,
+)
 from gaussian_wrapping_addon.core.render.render import project_view, render
-from gaussian_wrapping_addon.core.render.tiles import bin_gaussians
-from gaussian_wrapping_addon.core.render.types import ImageGradients, RenderOptions
+from gaussian_wrapping_addon.core.render.simd.raster_math import vector_lanes
+from gaussian_wrapping_addon.core.render.tiling.tiles import bin_gaussians
+from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 
 Part = tuple[str, Callable[[], object]]

@@ -21,22 +21,22 @@ from pathlib import Path
 import numpy as np
 
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.blend import (
+from gaussian_wrapping_addon.core.render.projection.projection import (
+    RawArrays,
+    RawGradients,
+    project_backward,
+    project_gaussians,
+)
+from gaussian_wrapping_addon.core.render.raster.blend import (
     Images,
     RenderBuffers,
     ScreenView,
     blend,
     blend_backward,
 )
-from gaussian_wrapping_addon.core.render.projection import (
-    RawArrays,
-    RawGradients,
-    project_backward,
-    project_gaussians,
-)
-from gaussian_wrapping_addon.core.render.raster_math import vector_lanes
 from gaussian_wrapping_addon.core.render.render import project_view
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.simd.raster_math import vector_lanes
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .evaluations import count_evaluations, reached_rows
 from .fma_peak import fma_peak

@@ -22,8 +22,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import torch
 
 from gaussian_wrapping_addon.core.evaluation.report.plot import Panel, Series, write_svg
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 from gaussian_wrapping_addon.core.machine import processor_name
-from gaussian_wrapping_addon.core.parallel import default_threads
 
 from .error_tables import (
     backward_table,

@@ -25,13 +25,10 @@ if __package__ in (None, ""):
 from benchmarks.workload import surface_gaussians, view
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.parallel import default_threads
-from gaussian_wrapping_addon.core.render.projection import RawArrays
-from gaussian_wrapping_addon.core.render.types import (
-    ImageGradients,
-    RenderOptions,
-    VisibleGradients,
-)
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads
+from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients, VisibleGradients
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")

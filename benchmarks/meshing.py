@@ -18,7 +18,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 
 from .meshing_study.carry_out import carry_out
 from .meshing_study.document import write_document

@@ -11,10 +11,11 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.raster_math import vector_lanes
-from gaussian_wrapping_addon.core.render.reference import render_reference
+from gaussian_wrapping_addon.core.render.reference.reference import render_reference
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
+from gaussian_wrapping_addon.core.render.simd.raster_math import vector_lanes
+from gaussian_wrapping_addon.core.render.types.images import Render
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .error_tables import covering
 from .exact_gradients import TRAINED, linear_loss

@@ -11,7 +11,8 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
+from gaussian_wrapping_addon.core.render.types.images import Render
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .exact import ExactImages, Tiles, exact_images, exact_tiles
 from .exact_gradients import (

@@ -17,7 +17,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 
 from .scenes import ensure_scene
 from .speed_error.document import write_document

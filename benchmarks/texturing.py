@@ -21,11 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
+from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
-from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
 
 from .texturing_parts.held_out import held_out_figures
 from .texturing_parts.judge import photos_that_see, psnr, seams, steps_between_texels, true_albedo
@@ -145,7 +145,7 @@ def _grey(points: np.ndarray) -> np.ndarray:
 
 
 def _uneven(threads: int) -> list[str]:
-    from gaussian_wrapping_addon.core.texture import bake
+    from gaussian_wrapping_addon.core.texture.bake import bake
 
     _logger.info("uneven photos")
     lines = [

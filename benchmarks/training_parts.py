@@ -11,21 +11,22 @@ import numpy as np
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.mip_filter import mip_filter
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.array_store import ArrayStore
-from gaussian_wrapping_addon.core.render.blend import (
+from gaussian_wrapping_addon.core.kernels.array_store import ArrayStore
+from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
+from gaussian_wrapping_addon.core.render.raster.blend import (
     Images,
     RenderBuffers,
     blend,
     pair_gradients,
 )
-from gaussian_wrapping_addon.core.render.projection import RawArrays
-from gaussian_wrapping_addon.core.render.raster_math import ROW_VALUES
 from gaussian_wrapping_addon.core.render.render import project_view
-from gaussian_wrapping_addon.core.render.types import ImageGradients, RenderOptions
+from gaussian_wrapping_addon.core.render.simd.raster_math import ROW_VALUES
+from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRenderer
-from gaussian_wrapping_addon.core.training.density_control import DensityStatistics
-from gaussian_wrapping_addon.core.training.losses import color_loss, normal_losses
-from gaussian_wrapping_addon.core.training.optimizer import TRAINED, Adam
+from gaussian_wrapping_addon.core.training.density.density_control import DensityStatistics
+from gaussian_wrapping_addon.core.training.losses.losses import color_loss, normal_losses
+from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED, Adam
 
 Part = tuple[str, Callable[[], object]]
 

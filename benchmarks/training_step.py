@@ -10,8 +10,8 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.types import Render
-from gaussian_wrapping_addon.core.training.losses import color_loss, normal_losses
+from gaussian_wrapping_addon.core.render.types.images import Render
+from gaussian_wrapping_addon.core.training.losses.losses import color_loss, normal_losses
 
 from .training_parts import Iteration
 

@@ -21,10 +21,10 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
 
     ``program`` is how help and usage call it.
     """
-    from .command_line.option_names import in_words_of_options
+    from .command_line.options.option_names import in_words_of_options
     from .command_line.parser import build_parser
     from .core.errors import EXIT_OTHER, NO_ROOM, SettingError, WrapError, cannot_be_written
-    from .core.worker_environment import interpreter_of, ready_worker
+    from .core.processes.worker_environment import interpreter_of, ready_worker
 
     _log_to_terminal()
     try:

@@ -10,47 +10,25 @@ from typing import Any, Final
 import bpy
 
 from . import batch
-from .ops import (
-    background,
-    camera_operators,
-    cli_command,
-    doctor_operators,
-    export_operators,
-    import_operators,
-    input_operators,
-    job_attach,
-    job_operators,
-    job_timer,
-    live_preview,
-    placement,
-    placement_operators,
-    region_estimate,
-    region_list_operators,
-    region_operators,
-    region_watch,
-    report_operators,
-    training_estimate,
-    training_operators,
-    worker_setup,
-    worker_setup_operators,
-)
-from .ui import (
-    dataset_panel,
-    mesh_panel,
-    preferences,
-    properties,
-    region_drawing,
-    region_gizmo,
-    region_panel,
-    region_properties,
-    report_panel,
-    result_panel,
-    scene_panel,
-    texture_panel,
-    train_advanced_panel,
-    train_panel,
-    training_properties,
-)
+from .ops import cli_command
+from .ops.cameras import camera_operators
+from .ops.common import background
+from .ops.dataset import input_operators
+from .ops.export import export_operators
+from .ops.jobs import job_attach, job_operators, job_timer, live_preview
+from .ops.meshing import region_estimate, region_list_operators
+from .ops.placement import placement, placement_operators
+from .ops.regions import region_operators, region_watch
+from .ops.results import import_operators, report_operators
+from .ops.training import training_estimate, training_operators
+from .ops.worker import worker_check_operators, worker_setup, worker_setup_operators
+from .ui import preferences, properties
+from .ui.dataset import dataset_panel
+from .ui.meshing import mesh_panel, texture_panel
+from .ui.placement import scene_panel
+from .ui.regions import region_drawing, region_gizmo, region_panel, region_properties
+from .ui.results import report_panel, result_panel
+from .ui.training import train_advanced_panel, train_panel, training_properties
 
 _logger = logging.getLogger(__name__)
 
@@ -62,7 +40,7 @@ CLASSES: Final[tuple[type, ...]] = (
     *input_operators.CLASSES,
     *worker_setup_operators.CLASSES,
     *job_operators.CLASSES,
-    *doctor_operators.CLASSES,
+    *worker_check_operators.CLASSES,
     *region_operators.CLASSES,
     *region_list_operators.CLASSES,
     *import_operators.CLASSES,

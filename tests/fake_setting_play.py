@@ -11,12 +11,12 @@ import sys
 from pathlib import Path
 
 import gaussian_wrapping_addon
-from gaussian_wrapping_addon.command_line.meshing_options import region_settings
-from gaussian_wrapping_addon.command_line.option_names import in_words_of_options
+from gaussian_wrapping_addon.command_line.options.meshing_options import region_settings
+from gaussian_wrapping_addon.command_line.options.option_names import in_words_of_options
+from gaussian_wrapping_addon.command_line.options.training_options import training_settings
 from gaussian_wrapping_addon.command_line.parser import build_parser
-from gaussian_wrapping_addon.command_line.training_options import training_settings
 from gaussian_wrapping_addon.core.errors import SettingError
-from gaussian_wrapping_addon.core.jobs.job_file import make_job, read_job, write_job
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, read_job, write_job
 from gaussian_wrapping_addon.core.settings import JobSettings
 from tools import settings_table
 

@@ -11,12 +11,15 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.command_line import export_command
-from gaussian_wrapping_addon.command_line.meshing_options import method_settings, region_settings
+from gaussian_wrapping_addon.command_line.options.meshing_options import (
+    method_settings,
+    region_settings,
+)
+from gaussian_wrapping_addon.command_line.options.setting_options import option_of
+from gaussian_wrapping_addon.command_line.options.training_options import training_settings
 from gaussian_wrapping_addon.command_line.parser import build_parser
-from gaussian_wrapping_addon.command_line.setting_options import option_of
-from gaussian_wrapping_addon.command_line.training_options import training_settings
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.jobs import evaluate
+from gaussian_wrapping_addon.core.jobs.commands import evaluate_command
 from gaussian_wrapping_addon.core.settings import (
     MODEL_SELECTION,
     PRESETS,
@@ -253,14 +256,14 @@ def test_export_asks_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (tmp_path / "result" / "scene.json").write_text("{}")
     asked = []
     monkeypatch.setattr(
-        evaluate, "run_in_worker", lambda request, **how: asked.append((request, how)) or 3
+        evaluate_command, "run_in_worker", lambda request, **how: asked.append((request, how)) or 3
     )
     command = ["export", str(tmp_path), "--out", str(tmp_path / "o"), "--format", "obj,splat,obj"]
     command += ["--placed", "--lods", "--region", "a", "b", "--shading", "unlit"]
     options = build_parser().parse_args(command)
     assert options.run(options) == 3
     ((request, how),) = asked
-    assert how["module"] == "jobs.export_files"
+    assert how["module"] == "jobs.commands.export_files"
     assert request == {
         "result": str(tmp_path / "result"), "out": str(tmp_path / "o"),
         "formats": ["obj", "splat"], "placed": True, "regions": ["a", "b"], "levels": True,

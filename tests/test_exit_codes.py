@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon import batch
-from gaussian_wrapping_addon.core.dataset import check
+from gaussian_wrapping_addon.core.dataset.loading import check
 from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, EXIT_RESOURCES, EXIT_USAGE
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.job_file import JobFile, write_job
-from gaussian_wrapping_addon.core.jobs.job_folder import MARKER
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, write_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER
 from gaussian_wrapping_addon.core.settings import JobSettings
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"

@@ -14,8 +14,8 @@ import pytest
 from gaussian_wrapping_addon.command_line import follow as module
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.job_file import make_job, write_job
-from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.core.settings import JobSettings
 
 

@@ -1,103 +1,240 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arrows of docs/architecture.md: imports run down only, and core never reaches Blender."""
+"""The plan of docs/architecture.md: folders in order, imports that run down, no circles."""
 
 from __future__ import annotations
 
 import ast
 import subprocess
 import sys
-from pathlib import Path
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
 
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon"
 CORE = PACKAGE / "core"
 
-# Each part may import the parts named, and the plain files of core/.
-ALLOWED = {
-    "mesh": set(),
-    "dataset": set(),
-    "gaussians": {"dataset"},
-    "render": {"dataset", "gaussians"},
-    "training": {"dataset", "gaussians", "render", "evaluation"},
-    "field": {"dataset", "gaussians", "render"},
-    "meshing": {"mesh", "dataset", "gaussians", "render", "field"},
-    "texture": {"mesh", "dataset", "gaussians", "render", "field", "meshing"},
-    "evaluation": {"mesh", "dataset", "gaussians", "render", "field", "meshing", "texture"},
-    "setup": {"jobs"},
-    "jobs": {
-        "dataset", "gaussians", "render", "training", "field", "meshing", "texture", "evaluation",
-        "regions",
-    },
+# From the bottom to the top: a file imports its own folder and those before it, never one after it.
+FOLDERS = (
+    "core",
+    "core/settings", "core/ply", "core/kernels", "core/processes", "core/imaging",
+    "core/dataset", "core/dataset/frames", "core/dataset/photos", "core/dataset/readers",
+    "core/dataset/poses", "core/dataset/loading",
+    "core/mesh", "core/gaussians", "core/regions", "core/mesh/simplification",
+    "core/render/types", "core/render/simd", "core/render/projection", "core/render/tiling",
+    "core/render/isosurface", "core/render/raster", "core/render/query", "core/render/reference",
+    "core/render/cuda", "core/render",
+    "core/field/vacancy", "core/field",
+    "core/training/optimizer", "core/training/losses", "core/training/density",
+    "core/training/appearance", "core/training/selection", "core/training/initialisation",
+    "core/training", "core/training/cost",
+    "core/meshing/tetrahedra", "core/meshing/points", "core/meshing/cleanup",
+    "core/meshing/checks", "core/meshing", "core/meshing/tiles", "core/meshing/cost",
+    "core/texture/atlas", "core/texture/unwrap", "core/texture/bake", "core/texture/cost",
+    "core/texture/files", "core/texture/detail", "core/texture",
+    "core/evaluation/surface", "core/evaluation/alignment", "core/evaluation/layouts",
+    "core/evaluation/views", "core/evaluation/report", "core/evaluation",
+    "core/jobs/store", "core/jobs/stages", "core/jobs", "core/jobs/commands", "core/setup",
+    "ops/common", "ops/cameras", "ops/regions", "ops/placement", "ops/results", "ops/export",
+    "ops/worker", "ops/jobs", "ops/training", "ops/dataset", "ops/meshing", "ops",
+    "ui/common", "ui/worker", "ui/jobs", "ui/dataset", "ui/training", "ui/regions", "ui/meshing",
+    "ui/results", "ui/placement", "ui",
+    "command_line/options", "command_line", "",
+)  # fmt: skip
+
+# What a part may not reach although it stands below: part -> parts.
+KEPT_APART = {
+    "field": {"training"}, "meshing": {"training"}, "texture": {"training"},
+    "evaluation": {"training"},
 }  # fmt: skip
+
+MOST_MODULES = 12
+"""Modules of a folder, ``__init__.py`` not counted."""
 
 # Blender's own process has only the standard library and numpy: what it loads may import no more.
 BLENDER_SIDE = (
-    "core.jobs.client", "core.jobs.evaluate", "core.jobs.job_file", "core.dataset.check",
-    "core.settings", "core.setup.install", "core.worker_environment", "core.regions.box",
-    "core.regions.region_file", "core.names",
+    "core.jobs.client", "core.jobs.commands.evaluate_command", "core.jobs.store.job_file",
+    "core.dataset.loading.check", "core.settings", "core.setup.install",
+    "core.processes.worker_environment", "core.regions.box", "core.regions.region_file",
+    "core.names",
 )  # fmt: skip
 HEAVY = ("torch", "numba", "scipy", "pycolmap", "xatlas", "trimesh", "shull", "igl")
 
 
-def imports_of(path: Path) -> list[tuple[int, str]]:
-    """Return (level, dotted name) of every import statement, also those inside functions."""
-    found = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found += [(0, alias.name) for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            names = [node.module] if node.module else [alias.name for alias in node.names]
-            found += [(node.level, name) for name in names]
-    return found
-
-
-def resolved(path: Path, level: int, name: str) -> tuple[str, ...]:
-    """Return the parts of an import below the package, or () for something outside of it."""
-    if level == 0:
-        return ()
-    here = path.relative_to(PACKAGE).parent.parts
-    return (*here[: len(here) - (level - 1)], *name.split("."))
-
-
 def python_files(folder: Path) -> list[Path]:
-    files = sorted(folder.rglob("*.py"))
+    files = sorted(p for p in folder.rglob("*.py") if "__pycache__" not in p.parts)
     assert files
     return files
 
 
+def imports_of(path: Path) -> list[tuple[int, str, list[str]]]:
+    """Return (level, module, names) of every import, also of those inside functions."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found += [(0, alias.name, []) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            found.append((node.level, node.module or "", [alias.name for alias in node.names]))
+    return found
+
+
+def modules_named(package: Path, path: Path) -> list[str]:
+    """Return the modules of the package that a file imports, as paths below it without ``.py``."""
+    found = []
+    for level, module, names in imports_of(path):
+        if level == 0:
+            continue
+        here = path.relative_to(package).parent.parts
+        base = (*here[: len(here) - (level - 1)], *(module.split(".") if module else ()))
+        for name in names:
+            for parts in ((*base, name), base, (*base, "__init__")):
+                if package.joinpath(*parts).with_suffix(".py").is_file():
+                    found.append("/".join(parts))
+                    break
+            else:
+                found.append("/".join((*base, name)) + " (which does not exist)")
+    return found
+
+
+def folder_of(module: str) -> str:
+    """Return the folder of a module's path, ``""`` for the package's own files.
+
+    A package's ``__init__`` stands for the folder it opens.
+    """
+    parent = str(PurePosixPath(module).parent)
+    return "" if parent == "." else parent
+
+
+def upward(package: Path, order: Iterable[str]) -> list[str]:
+    """Return the imports that run up, and those of or from folders that have no place."""
+    place = {folder: k for k, folder in enumerate(order)}
+    wrong = []
+    for path in python_files(package):
+        me = path.relative_to(package).with_suffix("").as_posix()
+        mine = folder_of(me)
+        if mine not in place:
+            wrong.append(f"{mine} has no place in FOLDERS")
+            continue
+        for module in modules_named(package, path):
+            other = folder_of(module)
+            if place.get(other, len(place)) > place[mine]:
+                wrong.append(f"{me} imports {module}")
+    return wrong
+
+
+def circles(package: Path) -> list[list[str]]:
+    """Return the groups of modules that import one another (Tarjan's components)."""
+    edges = {
+        path.relative_to(package).with_suffix("").as_posix(): modules_named(package, path)
+        for path in python_files(package)
+    }
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found = []
+
+    def visit(node: str) -> None:
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for other in edges.get(node, ()):
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            group = stack[stack.index(node) :]
+            del stack[stack.index(node) :]
+            if len(group) > 1 or node in edges.get(node, ()):
+                found.append(sorted(group))
+
+    for node in edges:
+        if node not in index:
+            visit(node)
+    return found
+
+
 def test_imports_run_down() -> None:
+    assert upward(PACKAGE, FOLDERS) == []
+
+
+def test_every_folder_of_the_plan_exists() -> None:
+    assert [folder for folder in FOLDERS if not (PACKAGE / folder / "__init__.py").is_file()] == []
+
+
+def test_no_circles() -> None:
+    assert circles(PACKAGE) == []
+
+
+def test_parts_that_are_kept_apart() -> None:
     wrong = []
     for path in python_files(CORE):
         part = path.relative_to(CORE).parts[0]
-        for level, name in imports_of(path):
-            target = resolved(path, level, name)
-            if len(target) < 2 or target[0] != "core" or target[1] not in ALLOWED:
-                continue
-            if part not in ALLOWED:
-                wrong.append(f"{path.name} (plain file of core) imports {target[1]}")
-            elif target[1] != part and target[1] not in ALLOWED[part]:
-                wrong.append(f"{path.relative_to(CORE)} imports {'.'.join(target)}")
+        for module in modules_named(PACKAGE, path):
+            parts = module.split("/")
+            if parts[0] == "core" and len(parts) > 2 and parts[1] in KEPT_APART.get(part, ()):
+                wrong.append(f"{path.relative_to(CORE)} imports {module}")
     assert wrong == []
 
 
-def test_core_never_reaches_blender() -> None:
+def test_folders_are_small_and_say_what_they_are_for() -> None:
     wrong = []
-    for path in python_files(CORE):
-        for level, name in imports_of(path):
-            outside = level == 0 and name.split(".")[0] in ("bpy", "mathutils", "gpu", "bmesh")
-            target = resolved(path, level, name)
-            if outside or (target and target[0] in ("ops", "ui", "registration", "batch")):
-                wrong.append(f"{path.relative_to(CORE)} imports {name}")
+    for folder in {path.parent for path in python_files(PACKAGE)}:
+        count = sum(path.name != "__init__.py" for path in folder.glob("*.py"))
+        if count > MOST_MODULES:
+            wrong.append(f"{folder.name} has {count} modules")
+        first = folder / "__init__.py"
+        if not first.is_file() or not ast.get_docstring(ast.parse(first.read_text("utf-8"))):
+            wrong.append(f"{folder.name} does not say what lives there")
+    assert wrong == []
+
+
+def write_package(folder: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_arrows_and_circles_are_found(tmp_path: Path) -> None:
+    package = write_package(
+        tmp_path,
+        {
+            "__init__.py": "",
+            "low/__init__.py": "",
+            "low/a.py": "def late():\n    from ..high.b import c\n",
+            "high/__init__.py": "",
+            "high/b.py": "from ..low.a import (\n    late,\n)\nfrom ..other import d\n",
+        },
+    )
+    assert upward(package, ("low", "high", "")) == [
+        "high/b imports other/d (which does not exist)",
+        "low/a imports high/b",
+    ]
+    assert circles(package) == [["high/b", "low/a"]]
+    assert upward(package, ("low", "")) == [
+        "high has no place in FOLDERS",
+        "high has no place in FOLDERS",
+        "low/a imports high/b",
+    ]
+
+
+def test_core_never_reaches_blender() -> None:
+    wrong = [
+        f"{path.relative_to(CORE)} imports {module}"
+        for path in python_files(CORE)
+        for level, module, _ in imports_of(path)
+        if level == 0 and module.split(".")[0] in ("bpy", "mathutils", "gpu", "bmesh")
+    ]
     assert wrong == []
 
 
 def test_only_relative_imports_inside_the_package() -> None:
     wrong = [
-        f"{path.relative_to(PACKAGE)} imports {name}"
+        f"{path.relative_to(PACKAGE)} imports {module}"
         for path in python_files(PACKAGE)
-        for level, name in imports_of(path)
-        if level == 0 and name.split(".")[0] == PACKAGE.name
+        for level, module, _ in imports_of(path)
+        if level == 0 and module.split(".")[0] == PACKAGE.name
     ]
     assert wrong == []
 
@@ -105,10 +242,10 @@ def test_only_relative_imports_inside_the_package() -> None:
 @pytest.mark.parametrize("layer", ["ops", "ui"])
 def test_blender_layers_import_nothing_heavy(layer: str) -> None:
     wrong = [
-        f"{path.relative_to(PACKAGE)} imports {name}"
+        f"{path.relative_to(PACKAGE)} imports {module}"
         for path in python_files(PACKAGE / layer)
-        for level, name in imports_of(path)
-        if level == 0 and name.split(".")[0] in HEAVY
+        for level, module, _ in imports_of(path)
+        if level == 0 and module.split(".")[0] in HEAVY
     ]
     assert wrong == []
 

@@ -18,12 +18,12 @@ import igl
 import numpy as np
 import trimesh
 
-from gaussian_wrapping_addon.core.evaluation.surface.distance import distances_to_mesh
+from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
+from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
+from gaussian_wrapping_addon.core.mesh.simplification.decimation import decimate
+from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
 from gaussian_wrapping_addon.core.mesh.topology import normals_and_areas
-from gaussian_wrapping_addon.core.meshing.decimation import decimate
-from gaussian_wrapping_addon.core.meshing.mesh_check import check_mesh
-from gaussian_wrapping_addon.core.meshing.mesh_file import load_mesh
-from gaussian_wrapping_addon.core.meshing.sampling import sample_triangles
+from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
 from gaussian_wrapping_addon.core.progress import Progress
 
 Mesh = tuple[np.ndarray, np.ndarray]

@@ -23,23 +23,25 @@ from typing import Any
 import numpy as np
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.load import load_scene
+from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.evaluation.surface.distance import distances_to_mesh
 from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
 from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth, read_truth
-from gaussian_wrapping_addon.core.field.sightings import find_sightings
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.depth_samples import find_sightings
+from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
+from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import mesh_statistics
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
-from gaussian_wrapping_addon.core.meshing.region import Region, automatic_region, parse_region
-from gaussian_wrapping_addon.core.meshing.sampling import sample_triangles
-from gaussian_wrapping_addon.core.meshing.statistics import mesh_statistics
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.regions.automatic_region import automatic_region
+from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.region import parse_region
 from gaussian_wrapping_addon.core.settings import SPACINGS, MeshingSettings
 
 _logger = logging.getLogger(__name__)

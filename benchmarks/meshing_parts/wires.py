@@ -17,8 +17,8 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField
-from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 
 from ..meshing_study.trained import open_trained
 

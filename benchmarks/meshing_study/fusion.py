@@ -14,10 +14,10 @@ import numpy as np
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ResourceError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.meshing.candidate_surface import MARGIN_SHARE
-from gaussian_wrapping_addon.core.meshing.region import Region
+from gaussian_wrapping_addon.core.meshing.points.candidate_surface import MARGIN_SHARE
+from gaussian_wrapping_addon.core.regions.convex_region import Region
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .trained import Trained
 

@@ -17,18 +17,18 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from gaussian_wrapping_addon.core.evaluation.surface.distance import distances_to_mesh
 from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.isosurface_residual import level_errors
+from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import finite, read_json, write_json
-from gaussian_wrapping_addon.core.meshing.level_error import level_errors
-from gaussian_wrapping_addon.core.meshing.mesh_check import check_mesh
-from gaussian_wrapping_addon.core.meshing.mesh_file import load_mesh
-from gaussian_wrapping_addon.core.meshing.region import Region
-from gaussian_wrapping_addon.core.meshing.sampling import sample_triangles
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads
+from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
+from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
+from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.regions.convex_region import Region
 
 from ..speed_error.plan import THRESHOLD_SHARES
 from ..speed_error.score import SURFACE_SAMPLES

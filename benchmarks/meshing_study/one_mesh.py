@@ -18,17 +18,17 @@ from typing import Any
 import numpy as np
 
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.field.sightings import find_sightings
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.depth_samples import find_sightings
+from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.meshing.clean_up import clean_up
-from gaussian_wrapping_addon.core.meshing.mesh_file import save_mesh
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads
+from gaussian_wrapping_addon.core.mesh.mesh_file import save_mesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.meshing.cleanup.clean_up import clean_up
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.parallel import default_threads
-from gaussian_wrapping_addon.core.peak_memory import largest_helper_bytes, own_peak_bytes
+from gaussian_wrapping_addon.core.processes.peak_memory import largest_helper_bytes, own_peak_bytes
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 

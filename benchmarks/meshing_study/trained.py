@@ -10,7 +10,9 @@ from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.meshing.region import Region, automatic_region, read_region
+from gaussian_wrapping_addon.core.regions.automatic_region import automatic_region
+from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.region import read_region
 
 from ..speed_error.score import stage_folder
 

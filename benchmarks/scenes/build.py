@@ -14,7 +14,7 @@ from PIL import Image
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.meshing.region import write_region
+from gaussian_wrapping_addon.core.regions.region import write_region
 
 from .catalogue import THIN_SHARE, SceneContent, SceneKind, scene_content, scene_kind
 from .colmap_project import write_colmap

@@ -11,7 +11,7 @@ import numpy as np
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.meshing.region import Region
+from gaussian_wrapping_addon.core.regions.convex_region import Region
 
 from . import furniture
 from .geometry import Part, read_obj, scaled_to

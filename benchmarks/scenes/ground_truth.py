@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.meshing.region import Region
+from gaussian_wrapping_addon.core.regions.convex_region import Region
 
 from .visibility import START_SHARE, RayScene, count_views
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.meshing.region import Region
+from gaussian_wrapping_addon.core.regions.convex_region import Region
 
 from .build import BuildSize
 from .catalogue import SceneContent, SceneKind, scene_content, scene_kind

@@ -11,14 +11,14 @@ from PIL import Image, ImageDraw
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
-from gaussian_wrapping_addon.core.evaluation.surface.distance import distances_to_mesh
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
 from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import (
     BACKGROUND,
     TexturedRenderer,
 )
 from gaussian_wrapping_addon.core.files import read_json
-from gaussian_wrapping_addon.core.texture.depth_buffer import depth_buffer
+from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
+from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
 
 from .plan import THRESHOLD_SHARES
 from .score import read_textured, stage_folder, test_views

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gaussian_wrapping_addon.core.dataset.load import load_scene
-from gaussian_wrapping_addon.core.evaluation.pose_error import pose_errors
+from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
+from gaussian_wrapping_addon.core.evaluation.alignment.pose_error import pose_errors
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.progress import Progress
 

@@ -30,19 +30,19 @@ from gaussian_wrapping_addon.core.evaluation.surface.field_errors import (
 )
 from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
 from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth, read_truth
-from gaussian_wrapping_addon.core.evaluation.views.lpips import lpips_if_ready
 from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
-from gaussian_wrapping_addon.core.evaluation.views.view_metrics import score_images
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import finite, read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.imaging.lpips import lpips_if_ready
+from gaussian_wrapping_addon.core.imaging.view_metrics import score_images
+from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.textured_mesh import AtlasMaps, TexturedMesh
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types import RenderOptions
-from gaussian_wrapping_addon.core.texture.depth_buffer import depth_buffer
-from gaussian_wrapping_addon.core.texture.file_checks import atlas_file
-from gaussian_wrapping_addon.core.texture.textured_mesh import AtlasMaps, TexturedMesh
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.texture.files.file_checks import atlas_file
 
 from .plan import THRESHOLD_SHARES
 

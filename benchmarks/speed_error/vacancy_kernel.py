@@ -16,8 +16,8 @@ import numpy as np
 
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.field.brute_force import brute_force_vacancy
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.vacancy.brute_force import brute_force_vacancy
+from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.photos import PhotoStore
+from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
 from gaussian_wrapping_addon.core.evaluation.views.side_by_side import write_side_by_side
 from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import TexturedRenderer
 from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.limits import MAX_IMAGE_SIDE_PX
-from gaussian_wrapping_addon.core.meshing.mesh_file import load_mesh
+from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
-from gaussian_wrapping_addon.core.texture.face_graph import face_graph
-from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
+from gaussian_wrapping_addon.core.mesh.face_graph import face_graph
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
+from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
 
 from ..scenes.visibility import RayScene
 from .photographed import Pattern

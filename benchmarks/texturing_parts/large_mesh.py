@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh

@@ -12,7 +12,7 @@ import numpy as np
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 
 from ..scenes.geometry import read_obj, scaled_to
 from ..scenes.viewpoints import around_thing

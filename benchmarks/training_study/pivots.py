@@ -16,12 +16,12 @@ from typing import Any
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
-from gaussian_wrapping_addon.core.meshing.region import read_region
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.regions.region import read_region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 
 from ..speed_error.plan import THRESHOLD_SHARES

@@ -17,8 +17,8 @@ from pathlib import Path
 import llvmlite.binding
 import numpy as np
 
-from gaussian_wrapping_addon.core.parallel import even_bounds, run_chunks
-from gaussian_wrapping_addon.core.render.blend import Images, RenderBuffers, ScreenView
+from gaussian_wrapping_addon.core.kernels.parallel import even_bounds, run_chunks
+from gaussian_wrapping_addon.core.render.raster.blend import Images, RenderBuffers, ScreenView
 
 SOURCE = Path(__file__).with_name("raster.cpp")
 _CACHE = Path(__file__).resolve().parents[2] / ".cache" / "yardstick"

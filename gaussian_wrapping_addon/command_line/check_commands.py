@@ -21,7 +21,7 @@ def add_check(commands: Commands) -> None:
 
 
 def _check(options: Namespace) -> int:
-    from ..core.dataset.check import check_input
+    from ..core.dataset.loading.check import check_input
     from ..core.errors import EXIT_BAD_DATA, EXIT_DONE
 
     findings = check_input(options.input)
@@ -39,7 +39,7 @@ def add_doctor(commands: Commands) -> None:
 
 def _doctor(_options: Namespace) -> int:
     from ..core.errors import EXIT_BAD_DATA, EXIT_DONE
-    from ..core.jobs.doctor import find_and_diagnose
+    from ..core.jobs.commands.doctor import find_and_diagnose
 
     findings = find_and_diagnose()
     for finding in findings:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ..core.settings import declared
-from .setting_options import add_option
+from .options.setting_options import add_option
 
 
 class Commands(Protocol):

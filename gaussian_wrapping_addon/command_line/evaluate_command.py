@@ -58,7 +58,7 @@ def _floats(text: str) -> list[float]:
 
 def _evaluate(options: Namespace) -> int:
     from ..core.jobs.client import worker_python
-    from ..core.jobs.evaluate import run_in_worker
+    from ..core.jobs.commands.evaluate_command import run_in_worker
     from ..core.settings import JobSettings
 
     JobSettings(seed=options.seed, threads=options.threads).validated()

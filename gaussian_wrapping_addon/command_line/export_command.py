@@ -47,8 +47,8 @@ def _export(options: Namespace) -> int:
     from ..core.errors import UsageError
     from ..core.export_formats import BLENDER_FORMATS, EXPORT_FORMATS
     from ..core.jobs.client import worker_python
-    from ..core.jobs.evaluate import run_in_worker
-    from ..core.jobs.export_files import result_of
+    from ..core.jobs.commands.evaluate_command import run_in_worker
+    from ..core.jobs.commands.export_files import result_of
 
     formats = list(dict.fromkeys(f for f in options.format.split(",") if f))
     wrong = [f for f in formats if f not in EXPORT_FORMATS]
@@ -73,13 +73,13 @@ def _export(options: Namespace) -> int:
             "regions": options.region, "levels": options.lods, "shading": options.shading,
         }  # fmt: skip
         code = run_in_worker(
-            request, python=worker_python(), module="jobs.export_files", what="export"
+            request, python=worker_python(), module="jobs.commands.export_files", what="export"
         )
         if code:
             return code
     if by_blender:
-        from ..ops.export_objects import ObjectExport
-        from ..ops.export_result import export_result
+        from ..ops.export.export_objects import ObjectExport
+        from ..ops.export.export_result import export_result
 
         requests = [ObjectExport(f, out, options.placed, options.pack) for f in by_blender]
         paths = export_result(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ..core.jobs.client import JobClient
-    from ..core.jobs.job_file import JobFile
+    from ..core.jobs.store.job_file import JobFile
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -42,7 +42,7 @@ def require_bpy(job: JobFile, options: Namespace) -> None:
 def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     """Show progress until the worker ends; then write the Blender files. Return the exit code."""
     from ..core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
-    from ..core.jobs.blend_file import shown_result
+    from ..core.jobs.store.blend_file import shown_result
 
     before = shown_result(client.folder.result)  # the worker writes it last
     shown_s, shown, interrupted_s = 0.0, ("", ""), 0.0
@@ -94,12 +94,12 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
 
 def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Namespace) -> int:
     """Write the Blender files; one that shows the result ``before`` does not stay."""
-    from ..core.jobs.blend_file import NAME, set_aside_stale
+    from ..core.jobs.store.blend_file import NAME, set_aside_stale
 
     if options.no_blend:
         set_aside_stale(result, before)
     else:
-        from ..ops.blend_writer import write_blend
+        from ..ops.results.blend_writer import write_blend
 
         try:
             write_blend(result, result / NAME)
@@ -107,7 +107,7 @@ def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Names
             set_aside_stale(result, before)
             raise
     if "usd" in job.settings.export:
-        from ..ops.blend_writer import export_usd
+        from ..ops.results.blend_writer import export_usd
 
         export_usd(result)
     from ..core.evaluation.report.report import headline

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from .common import Commands, add_no_blend, add_out, add_threads
 from .follow import follow, require_bpy
-from .meshing_options import (
+from .options.meshing_options import (
     add_method_options,
     add_region_options,
     method_settings,
@@ -33,11 +33,11 @@ def add_mesh(commands: Commands) -> None:
 
 def _mesh(options: Namespace) -> int:
     from ..core.jobs.client import JobClient, worker_python
-    from ..core.jobs.earlier_job import finished_job
-    from ..core.jobs.job_file import make_job
-    from ..core.jobs.job_folder import JobFolder
-    from ..core.jobs.more import no_finished_training
-    from ..core.jobs.stages import read_done
+    from ..core.jobs.store.continue_training import no_finished_training
+    from ..core.jobs.store.job_file import make_job
+    from ..core.jobs.store.job_folder import JobFolder
+    from ..core.jobs.store.rollback import finished_job
+    from ..core.jobs.store.stage_folder import read_done
 
     folder = JobFolder(options.out.resolve())
     earlier = finished_job(folder)
@@ -62,7 +62,7 @@ def add_estimate_mesh(commands: Commands) -> None:
 
 def _estimate_mesh(options: Namespace) -> int:
     from ..core.jobs.client import worker_python
-    from ..core.jobs.evaluate import run_in_worker
+    from ..core.jobs.commands.evaluate_command import run_in_worker
     from ..core.names import AUTOMATIC_REGIONS
     from ..core.settings import JobSettings, MeshingSettings, to_json
 
@@ -76,7 +76,10 @@ def _estimate_mesh(options: Namespace) -> int:
         "threads": options.threads,
     }
     return run_in_worker(
-        request, python=worker_python(), module="jobs.mesh_estimate", what="estimate"
+        request,
+        python=worker_python(),
+        module="jobs.commands.estimate_mesh_command",
+        what="estimate",
     )
 
 
@@ -96,7 +99,7 @@ def add_work_tiles(commands: Commands) -> None:
 def _work_tiles(options: Namespace) -> int:
     from ..core.errors import UsageError
     from ..core.jobs.client import worker_python
-    from ..core.jobs.evaluate import run_in_worker
+    from ..core.jobs.commands.evaluate_command import run_in_worker
     from ..core.settings import JobSettings
 
     JobSettings(threads=options.threads).validated()
@@ -106,5 +109,5 @@ def _work_tiles(options: Namespace) -> int:
         "out": str(options.out.resolve()), "threads": options.threads, "wait_s": options.wait,
     }  # fmt: skip
     return run_in_worker(
-        request, python=worker_python(), module="jobs.tile_worker", what="work on tiles"
+        request, python=worker_python(), module="jobs.commands.tile_worker", what="work on tiles"
     )

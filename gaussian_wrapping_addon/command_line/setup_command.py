@@ -47,11 +47,15 @@ def add_set_up_worker(commands: Commands) -> None:
 
 def _set_up_worker(options: Namespace) -> int:
     from ..core.errors import EXIT_DONE, UsageError
+    from ..core.processes.worker_environment import (
+        WorkerEnvironment,
+        default_root,
+        known_environments,
+    )
+    from ..core.processes.worker_requirements import read_requirements, requirements_file
     from ..core.setup.commands import SetupRequest, all_commands, as_line, check_folders
     from ..core.setup.install import remove
     from ..core.setup.pythons import find_pythons, probe
-    from ..core.worker_environment import WorkerEnvironment, default_root, known_environments
-    from ..core.worker_requirements import read_requirements, requirements_file
 
     known = [e.root for e in known_environments() if e.is_ours()]
     change = options.repair or options.remove

@@ -11,9 +11,9 @@ from pathlib import Path
 from ..core.settings import declared
 from .common import Commands, add_no_blend, add_out
 from .follow import follow, require_bpy
-from .meshing_options import add_method_options, add_region_options, region_settings
-from .setting_options import add_option
-from .training_options import add_training_options, training_settings
+from .options.meshing_options import add_method_options, add_region_options, region_settings
+from .options.setting_options import add_option
+from .options.training_options import add_training_options, training_settings
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -33,10 +33,10 @@ def add_wrap(commands: Commands) -> None:
 
 
 def _wrap(options: Namespace) -> int:
-    from ..core.dataset.check import check_input
+    from ..core.dataset.loading.check import check_input
     from ..core.errors import DatasetError
     from ..core.jobs.client import JobClient, worker_python
-    from ..core.jobs.job_file import make_job
+    from ..core.jobs.store.job_file import make_job
 
     settings = training_settings(options)
     job = make_job("wrap", options.input, region_settings(settings, options))
@@ -61,9 +61,9 @@ def add_more(commands: Commands) -> None:
 
 def _more(options: Namespace) -> int:
     from ..core.jobs.client import JobClient, worker_python
-    from ..core.jobs.earlier_job import finished_job
-    from ..core.jobs.job_folder import JobFolder
-    from ..core.jobs.more import job_with_more
+    from ..core.jobs.store.continue_training import job_with_more
+    from ..core.jobs.store.job_folder import JobFolder
+    from ..core.jobs.store.rollback import finished_job
 
     folder = JobFolder(options.out.resolve())
     job = job_with_more(folder, finished_job(folder), options.iterations)
@@ -83,8 +83,8 @@ def add_resume(commands: Commands) -> None:
 
 def _resume(options: Namespace) -> int:
     from ..core.jobs.client import JobClient, worker_python
-    from ..core.jobs.job_file import read_job
-    from ..core.jobs.job_folder import JobFolder
+    from ..core.jobs.store.job_file import read_job
+    from ..core.jobs.store.job_folder import JobFolder
 
     job = read_job(JobFolder(options.out.resolve()).job_path)
     require_bpy(job, options)
@@ -109,10 +109,13 @@ def add_estimate(commands: Commands) -> None:
 
 def _estimate(options: Namespace) -> int:
     from ..core.jobs.client import worker_python
-    from ..core.jobs.evaluate import run_in_worker
-    from ..core.jobs.job_file import make_job
+    from ..core.jobs.commands.evaluate_command import run_in_worker
+    from ..core.jobs.store.job_file import make_job
 
     job = make_job("wrap", options.input, training_settings(options))
     return run_in_worker(
-        job.to_json(), python=worker_python(), module="jobs.estimate", what="estimate"
+        job.to_json(),
+        python=worker_python(),
+        module="jobs.commands.estimate_command",
+        what="estimate",
     )

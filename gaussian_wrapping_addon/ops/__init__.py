@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blender operators, thin: they read properties, call ``core.jobs``, import results."""
+"""Operators of Blender, thin, one folder a feature; they read properties and call ``core``."""

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Properties, panels and preferences; no logic."""
+"""Properties, panels and preferences, one folder a feature; no logic."""

@@ -7,8 +7,8 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ..core.settings import declared
-from .setting_properties import property_of
-from .worker_setup_view import draw_doctor, draw_setup
+from .common.setting_properties import property_of
+from .worker.worker_setup_view import draw_doctor, draw_setup
 
 
 class GWRAP_preferences(bpy.types.AddonPreferences):

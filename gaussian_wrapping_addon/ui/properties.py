@@ -3,8 +3,8 @@
 
 Settings of a job come from their declarations (``setting_properties.py``). Regions have
 ``Object.gwrap`` (``region_properties.py``). All other marks of objects are plain custom properties
-(``ops/tags.py``), which also exist where the add-on is not enabled. No property has a callback: in
-Blender 4.2 one that ever had crashes the process at exit.
+(``ops/common/tags.py``), which also exist where the add-on is not enabled. No property has a
+callback: in Blender 4.2 one that ever had crashes the process at exit.
 """
 
 from typing import Final
@@ -18,9 +18,9 @@ from bpy.props import (
     StringProperty,
 )
 
-from .region_properties import GWRAP_PG_region
-from .setting_properties import with_settings
-from .training_properties import GWRAP_PG_training
+from .common.setting_properties import with_settings
+from .regions.region_properties import GWRAP_PG_region
+from .training.training_properties import GWRAP_PG_training
 
 _RESOLUTIONS: Final = (
     ("AUTOMATIC", "Automatic", "As fine as the photos allow within the preset"),

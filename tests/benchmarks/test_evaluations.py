@@ -12,10 +12,10 @@ from benchmarks.evaluations import count_evaluations, reached_rows
 from benchmarks.kernel_speed import agreement, kernel_variant, runs_of
 from benchmarks.workload import surface_gaussians, view
 from benchmarks.yardstick.build import NO_COMPILER, compilers, host_instruction_sets, yardsticks
-from gaussian_wrapping_addon.core.render.blend import Images, ScreenView
-from gaussian_wrapping_addon.core.render.projection import RawArrays
+from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
+from gaussian_wrapping_addon.core.render.raster.blend import Images, ScreenView
 from gaussian_wrapping_addon.core.render.render import project_view
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 TILE = 16
 

@@ -13,9 +13,9 @@ from benchmarks.exact import as_float64, exact_images, exact_tiles
 from benchmarks.exact_gradients import IMAGES, TRAINED, exact_gradients, linear_loss
 from benchmarks.hard_scenes import HardScene, hard_scenes
 from benchmarks.scene_errors import gradient_error, leaves, scene_errors
-from gaussian_wrapping_addon.core.render.reference import render_reference
+from gaussian_wrapping_addon.core.render.reference.reference import render_reference
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from tests.core.render.scenes import look_at, random_gaussians
 
 SCENES = hard_scenes()

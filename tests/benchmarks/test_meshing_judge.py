@@ -19,10 +19,10 @@ from benchmarks.meshing_study.fusion import depth_in_region, require_open3d
 from benchmarks.meshing_study.judge import distances, inner, solidity
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ResourceError
-from gaussian_wrapping_addon.core.meshing.candidate_surface import MARGIN_SHARE
-from gaussian_wrapping_addon.core.meshing.mesh_check import check_mesh
-from gaussian_wrapping_addon.core.meshing.region import Region
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.points.candidate_surface import MARGIN_SHARE
+from gaussian_wrapping_addon.core.regions.convex_region import Region
 
 
 def sphere(radius: float) -> SurfaceMesh:

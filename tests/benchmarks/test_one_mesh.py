@@ -16,8 +16,8 @@ from benchmarks.meshing_study.trained import Trained
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.meshing.mesh_check import check_mesh
-from gaussian_wrapping_addon.core.meshing.mesh_file import load_mesh
+from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
+from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
 from tests.core.field.field_scenes import cameras_around, shell_arrays
 from tests.core.meshing.meshing_scenes import cube
 

@@ -35,12 +35,12 @@ from benchmarks.scenes.torus_and_plate import (
     torus_content,
 )  # fmt: skip
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.load import load_scene
+from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.meshing.mesh_check import check_mesh
-from gaussian_wrapping_addon.core.meshing.region import read_region
+from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
+from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.texture.depth_buffer import depth_buffer
+from gaussian_wrapping_addon.core.regions.region import read_region
 
 for _module in ("bpy", "embreex"):
     if importlib.util.find_spec(_module) is None:
@@ -248,7 +248,7 @@ def test_truth_is_the_same_every_time(folders: dict[str, Path], tmp_path: Path) 
 def test_thickness_and_views_of_a_plate() -> None:
     from benchmarks.scenes.geometry import box
     from benchmarks.scenes.viewpoints import look_at
-    from gaussian_wrapping_addon.core.meshing.region import Region
+    from gaussian_wrapping_addon.core.regions.convex_region import Region
 
     plate = box("plate", (-1, -1, 0), (1, 1, 0.1), "oak")
     mesh = (plate.vertices, plate.faces)

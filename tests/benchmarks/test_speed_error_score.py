@@ -14,13 +14,14 @@ from PIL import Image
 
 from benchmarks.speed_error.pictures import write_comparison
 from benchmarks.speed_error.score import judge, judge_truth
-from gaussian_wrapping_addon.core.dataset.load import load_scene
+from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import save_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.meshing.region import Region, write_region
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.region import write_region
 from tests.core.field.field_scenes import unit_sphere
 from tests.synthetic import write_ball_scene
 

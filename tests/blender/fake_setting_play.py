@@ -16,8 +16,9 @@ os.environ["BLENDER_USER_RESOURCES"] = str(Path("profile").resolve())
 import bpy
 
 import gaussian_wrapping_addon
-from gaussian_wrapping_addon.ops.training_choices import job_settings, meshing_choices
-from gaussian_wrapping_addon.ui import mesh_panel, texture_panel, train_advanced_panel
+from gaussian_wrapping_addon.ops.jobs.panel_settings import job_settings, meshing_choices
+from gaussian_wrapping_addon.ui.meshing import mesh_panel, texture_panel
+from gaussian_wrapping_addon.ui.training import train_advanced_panel
 from tests.blender.fake_layout import draw
 
 PANELS = {

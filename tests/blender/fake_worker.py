@@ -18,8 +18,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from gaussian_wrapping_addon.core.jobs.job_file import read_job
-from gaussian_wrapping_addon.core.jobs.job_folder import (
+from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     JobFolder,
     JobStatus,
     process_start_ticks,
@@ -45,7 +45,7 @@ def picture() -> np.ndarray:
 
 
 def main() -> int:
-    if sys.argv[-2] == "jobs.estimate":
+    if sys.argv[-2] == "jobs.commands.estimate_command":
         return estimate()
     folder = JobFolder(Path(sys.argv[-2]))
     parent = int(sys.argv[-1])

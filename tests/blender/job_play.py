@@ -12,8 +12,9 @@ from pathlib import Path
 
 import bpy
 
-from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
-from gaussian_wrapping_addon.ops import job_timer, tags, watched_jobs
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
+from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.jobs import job_timer, watched_jobs
 
 WAIT_S = float(os.environ.get("GW_WAIT_S", "40"))
 """Longest wait for a state; more where the real worker is at work."""

@@ -18,8 +18,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import bpy
 
 import gaussian_wrapping_addon
-from gaussian_wrapping_addon.ops import job_attach, preferred_worker, watched_jobs
-from gaussian_wrapping_addon.ui import train_panel
+from gaussian_wrapping_addon.ops.jobs import job_attach, watched_jobs
+from gaussian_wrapping_addon.ops.worker import preferred_worker
+from gaussian_wrapping_addon.ui.training import train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import meshes, play_to, play_until, start_wrap, status_of
 

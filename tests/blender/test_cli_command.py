@@ -16,11 +16,13 @@ import pytest
 
 import gaussian_wrapping_addon
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
-from gaussian_wrapping_addon.core.jobs.job_file import make_job, write_job
-from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.settings import preset
-from gaussian_wrapping_addon.ops import cli_command, job_timer, known_jobs, watched_jobs
-from gaussian_wrapping_addon.ui import train_panel
+from gaussian_wrapping_addon.ops import cli_command
+from gaussian_wrapping_addon.ops.common import known_jobs
+from gaussian_wrapping_addon.ops.jobs import job_timer, watched_jobs
+from gaussian_wrapping_addon.ui.training import train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import (
     meshes,

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 from mathutils import Vector
 
-from gaussian_wrapping_addon.core.meshing.decimation import decimate
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.simplification.decimation import decimate
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.tangent_frame import tangent_frames
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
-from gaussian_wrapping_addon.core.texture.dense_surface import DenseSurface
-from gaussian_wrapping_addon.core.texture.glb import glb_bytes
-from gaussian_wrapping_addon.core.texture.normal_map import bake_normal_map
-from gaussian_wrapping_addon.core.texture.tangent_frame import tangent_frames
-from gaussian_wrapping_addon.core.texture.unwrap import unwrap
-from gaussian_wrapping_addon.ops import tags
-from gaussian_wrapping_addon.ops.materials import create_material, load_texture, set_shading
-from gaussian_wrapping_addon.ops.mesh_data import build_mesh
-from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.detail.dense_surface import DenseSurface
+from gaussian_wrapping_addon.core.texture.detail.normal_map import bake_normal_map
+from gaussian_wrapping_addon.core.texture.files.glb import glb_bytes
+from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
+from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.common.mesh_data import build_mesh
+from gaussian_wrapping_addon.ops.results.materials import create_material, load_texture, set_shading
+from gaussian_wrapping_addon.ops.results.scene_objects import import_result
 from tests.blender.synthetic_result import cube_mesh, png_bytes, write_region_result, write_result
 from tests.core.texture.detail_scenes import bumpy_ball, degrees_between
 

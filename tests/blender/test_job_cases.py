@@ -37,21 +37,16 @@ from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs import client as client_module
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE, JobClient
-from gaussian_wrapping_addon.core.jobs.job_file import read_job
-from gaussian_wrapping_addon.core.jobs.job_folder import (
+from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     JobFolder,
     JobStatus,
     process_start_ticks,
 )
-from gaussian_wrapping_addon.ops import (
-    background,
-    job_attach,
-    job_timer,
-    live_preview,
-    watched_jobs,
-)
-from gaussian_wrapping_addon.ops.result_files import read_result
-from gaussian_wrapping_addon.ui import train_panel
+from gaussian_wrapping_addon.ops.common import background
+from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, live_preview, watched_jobs
+from gaussian_wrapping_addon.ops.results.result_files import read_result
+from gaussian_wrapping_addon.ui.training import train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.job_play import (
     meshes,

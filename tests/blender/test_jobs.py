@@ -20,17 +20,14 @@ import pytest
 
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
-from gaussian_wrapping_addon.core.jobs.job_file import read_job
-from gaussian_wrapping_addon.ops import (
-    background,
-    job_attach,
-    job_timer,
-    known_jobs,
-    preferred_worker,
-    tags,
-    watched_jobs,
-)
-from gaussian_wrapping_addon.ui import dataset_panel, mesh_panel, report_panel, train_panel
+from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
+from gaussian_wrapping_addon.ops.common import background, known_jobs, tags
+from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, watched_jobs
+from gaussian_wrapping_addon.ops.worker import preferred_worker
+from gaussian_wrapping_addon.ui.dataset import dataset_panel
+from gaussian_wrapping_addon.ui.meshing import mesh_panel
+from gaussian_wrapping_addon.ui.results import report_panel
+from gaussian_wrapping_addon.ui.training import train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.synthetic_result import BOX_SCENE, WORLD_FROM_SCENE
 
@@ -503,7 +500,7 @@ def test_check_photos_lists_findings(photos: Path, monkeypatch: pytest.MonkeyPat
     ]
     check = ModuleType("check")
     check.check_input = lambda source: found if source == photos else []  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "gaussian_wrapping_addon.core.dataset.check", check)
+    monkeypatch.setitem(sys.modules, "gaussian_wrapping_addon.core.dataset.loading.check", check)
     assert not bpy.ops.gwrap.check_photos.poll()
     bpy.context.scene.gwrap.source = str(photos)
     bpy.ops.gwrap.check_photos()

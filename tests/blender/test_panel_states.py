@@ -19,22 +19,16 @@ import pytest
 from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
-from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
-from gaussian_wrapping_addon.ops import (
-    background,
-    job_attach,
-    job_timer,
-    panel_state,
-    photo_check,
-    tags,
-    training_estimate,
-    watched_jobs,
-)
-from gaussian_wrapping_addon.ops.panel_state import PRIMARY, Stage
-from gaussian_wrapping_addon.ops.report_data import ReportData, report_of
-from gaussian_wrapping_addon.ops.scene_objects import import_result
-from gaussian_wrapping_addon.ops.training_choices import choices_key
-from gaussian_wrapping_addon.ops.training_estimate import Estimate
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
+from gaussian_wrapping_addon.ops.common import background, tags
+from gaussian_wrapping_addon.ops.dataset import photo_check
+from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, panel_state, watched_jobs
+from gaussian_wrapping_addon.ops.jobs.panel_settings import choices_key
+from gaussian_wrapping_addon.ops.jobs.panel_state import PRIMARY, Stage
+from gaussian_wrapping_addon.ops.results.report_data import ReportData, report_of
+from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from gaussian_wrapping_addon.ops.training import training_estimate
+from gaussian_wrapping_addon.ops.training.training_estimate import Estimate
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.fake_worker import LIVE
 from tests.blender.job_play import write_fake_python

@@ -10,19 +10,18 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon import registration
-from gaussian_wrapping_addon.core.jobs.doctor import Diagnosis
-from gaussian_wrapping_addon.core.jobs.job_folder import STATES, JobStatus
-from gaussian_wrapping_addon.ops import doctor, job_timer, tags
-from gaussian_wrapping_addon.ops.scene_objects import import_result
-from gaussian_wrapping_addon.ui import (
-    mesh_panel,
-    preferences,
-    result_panel,
-    scene_panel,
-    texture_panel,
-    train_panel,
-)
-from gaussian_wrapping_addon.ui.text import progress_text, time_span
+from gaussian_wrapping_addon.core.jobs.commands.doctor import Diagnosis
+from gaussian_wrapping_addon.core.jobs.store.job_folder import STATES, JobStatus
+from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.jobs import job_timer
+from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from gaussian_wrapping_addon.ops.worker import worker_check
+from gaussian_wrapping_addon.ui import preferences
+from gaussian_wrapping_addon.ui.common.text import progress_text, time_span
+from gaussian_wrapping_addon.ui.meshing import mesh_panel, texture_panel
+from gaussian_wrapping_addon.ui.placement import scene_panel
+from gaussian_wrapping_addon.ui.results import result_panel
+from gaussian_wrapping_addon.ui.training import train_panel
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.synthetic_result import write_result
 
@@ -176,7 +175,7 @@ def test_result_panel_survives_edited_properties(tmp_path: Path, text: str) -> N
 
 def test_preferences_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [Diagnosis("torch", False, "cannot be imported", "pip install torch")]
-    monkeypatch.setattr(doctor, "_findings", [*found, Diagnosis("numpy", True, "1.26.4")])
+    monkeypatch.setattr(worker_check, "_findings", [*found, Diagnosis("numpy", True, "1.26.4")])
     layout = FakeLayout()
     names = preferences.GWRAP_preferences.__annotations__
     owner = SimpleNamespace(properties=set(names))
@@ -185,7 +184,7 @@ def test_preferences_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "pip install torch" in layout.texts
     assert "gwrap.set_up_worker" in layout.operators
     assert {a[1] for name, a, _ in layout.log if name == "prop"} == set(names)
-    assert doctor.as_text().splitlines()[0].startswith("BAD  torch: cannot be imported")
+    assert worker_check.as_text().splitlines()[0].startswith("BAD  torch: cannot be imported")
 
 
 @pytest.mark.parametrize(

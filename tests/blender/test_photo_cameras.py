@@ -13,16 +13,16 @@ from mathutils import Vector
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.ops import tags
-from gaussian_wrapping_addon.ops.camera_objects import (
+from gaussian_wrapping_addon.ops.cameras.camera_objects import (
     CLIP_END,
     CLIP_START,
     cameras_under,
     create_camera,
     look_through,
 )
-from gaussian_wrapping_addon.ops.placement import place
-from gaussian_wrapping_addon.ops.scene_objects import ImportedResult, import_result
+from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.placement.placement import place
+from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, import_result
 from tests.blender.synthetic_result import CAMERAS, png_bytes, rotation_about, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
-from gaussian_wrapping_addon.ops import tags
-from gaussian_wrapping_addon.ops.region_box import (
+from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.regions.region_box import (
     LEAST_HALF,
     cage_frame,
     cage_matrix,
@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.ops.region_box import (
     set_cage_matrix,
     steadied,
 )
-from gaussian_wrapping_addon.ops.region_objects import hull_in_blender
+from gaussian_wrapping_addon.ops.regions.region_objects import hull_in_blender
 
 pytestmark = pytest.mark.usefixtures("addon")
 

@@ -13,10 +13,14 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
-from gaussian_wrapping_addon.core.jobs.job_file import read_job
-from gaussian_wrapping_addon.ops import tags
-from gaussian_wrapping_addon.ops.region_hull import MOST_CANDIDATES, convex_hull
-from gaussian_wrapping_addon.ops.region_objects import is_convex, local_hull, region_from_object
+from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
+from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.regions.region_hull import MOST_CANDIDATES, convex_hull
+from gaussian_wrapping_addon.ops.regions.region_objects import (
+    is_convex,
+    local_hull,
+    region_from_object,
+)
 from tests.blender.job_play import (
     play_to,
     play_until,
@@ -157,7 +161,7 @@ def test_36_a_dented_mesh_is_told_that_its_hull_counts(monkeypatch: pytest.Monke
     thing = bpy.context.view_layer.objects.active
     assert not is_convex(thing)
     told: list[tuple[set[str], str]] = []
-    from gaussian_wrapping_addon.ops.region_operators import GWRAP_OT_use_as_region
+    from gaussian_wrapping_addon.ops.regions.region_operators import GWRAP_OT_use_as_region
 
     class Fake:
         def report(self, kind: set[str], text: str) -> None:

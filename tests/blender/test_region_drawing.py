@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
-from gaussian_wrapping_addon.ops import region_watch, tags
-from gaussian_wrapping_addon.ops.region_objects import create_region
-from gaussian_wrapping_addon.ui import region_drawing
+from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.regions import region_watch
+from gaussian_wrapping_addon.ops.regions.region_objects import create_region
+from gaussian_wrapping_addon.ui.regions import region_drawing
 
 pytestmark = pytest.mark.usefixtures("addon")
 

@@ -17,10 +17,11 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.helper_process import child_command
+from gaussian_wrapping_addon.core.processes.helper_process import child_command
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
-from gaussian_wrapping_addon.ops import background, estimate_child, region_estimate, tags
-from gaussian_wrapping_addon.ops.region_objects import create_region
+from gaussian_wrapping_addon.ops.common import background, estimate_child, tags
+from gaussian_wrapping_addon.ops.meshing import region_estimate
+from gaussian_wrapping_addon.ops.regions.region_objects import create_region
 
 pytestmark = pytest.mark.usefixtures("addon")
 

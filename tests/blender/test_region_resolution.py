@@ -9,10 +9,10 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.meshing import resolution
-from gaussian_wrapping_addon.ops import region_resolution
-from gaussian_wrapping_addon.ops.region_resolution import checked_edge_length, own_lengths
-from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.core.meshing.points import resolution
+from gaussian_wrapping_addon.ops.regions import region_resolution
+from gaussian_wrapping_addon.ops.regions.region_resolution import checked_edge_length, own_lengths
+from gaussian_wrapping_addon.ops.results.scene_objects import import_result
 from tests.blender.synthetic_result import WORLD_FROM_SCENE, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")

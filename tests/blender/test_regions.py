@@ -14,9 +14,9 @@ from mathutils import Euler, Matrix
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError, WrapError
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS, CUBE_TRIANGLES
 from gaussian_wrapping_addon.core.regions.region_file import parse_region_file, region_to_json
-from gaussian_wrapping_addon.ops import tags
-from gaussian_wrapping_addon.ops.region_objects import create_region, region_from_object
-from gaussian_wrapping_addon.ops.scene_objects import ImportedResult, import_result
+from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.regions.region_objects import create_region, region_from_object
+from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, import_result
 from tests.blender.synthetic_result import WORLD_FROM_SCENE, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -243,7 +243,7 @@ def test_a_solid_that_is_no_box_comes_back_as_a_mesh(
 
 def test_our_file_is_what_the_worker_reads(result: ImportedResult, tmp_path: Path) -> None:
     pytest.importorskip("scipy")
-    from gaussian_wrapping_addon.core.meshing.region import read_region
+    from gaussian_wrapping_addon.core.regions.region import read_region
 
     path = tmp_path / "box.json"
     bpy.context.view_layer.objects.active = result.regions[0]

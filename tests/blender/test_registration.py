@@ -12,7 +12,9 @@ import pytest
 
 import gaussian_wrapping_addon
 from gaussian_wrapping_addon import registration
-from gaussian_wrapping_addon.ops import background, job_attach, job_timer, worker_setup
+from gaussian_wrapping_addon.ops.common import background
+from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer
+from gaussian_wrapping_addon.ops.worker import worker_setup
 
 REPOSITORY = Path(gaussian_wrapping_addon.__file__).resolve().parents[1]
 

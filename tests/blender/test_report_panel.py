@@ -12,14 +12,15 @@ import bpy
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.ops import known_jobs, report_operators, tags
-from gaussian_wrapping_addon.ops.report_data import (
+from gaussian_wrapping_addon.ops.common import known_jobs, tags
+from gaussian_wrapping_addon.ops.results import report_operators
+from gaussian_wrapping_addon.ops.results.report_data import (
     MAX_WARNINGS,
     figures_of_report,
     report_of,
 )
-from gaussian_wrapping_addon.ops.scene_objects import import_result
-from gaussian_wrapping_addon.ui.report_panel import _MAX_WARNINGS, GWRAP_PT_report
+from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from gaussian_wrapping_addon.ui.results.report_panel import _MAX_WARNINGS, GWRAP_PT_report
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.blender.synthetic_result import png_bytes, write_result
 from tests.core.evaluation.report.report_examples import REGION, full_region, full_summary

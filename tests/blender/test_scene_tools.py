@@ -13,14 +13,19 @@ import bpy
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.placement_file import FILE_NAME, read_placement
+from gaussian_wrapping_addon.core.dataset.frames.placement_file import FILE_NAME, read_placement
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.ops import known_jobs, placement, tags
-from gaussian_wrapping_addon.ops.blend_writer import export_usd, write_blend
-from gaussian_wrapping_addon.ops.region_objects import matrix_of, region_from_object, transformed
-from gaussian_wrapping_addon.ops.region_resolution import own_lengths
-from gaussian_wrapping_addon.ops.scene_objects import ImportedResult, import_result
+from gaussian_wrapping_addon.ops.common import known_jobs, tags
+from gaussian_wrapping_addon.ops.placement import placement
+from gaussian_wrapping_addon.ops.regions.region_objects import (
+    matrix_of,
+    region_from_object,
+    transformed,
+)
+from gaussian_wrapping_addon.ops.regions.region_resolution import own_lengths
+from gaussian_wrapping_addon.ops.results.blend_writer import export_usd, write_blend
+from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, import_result
 from tests.blender.synthetic_result import (
     WORLD_FROM_SCENE,
     rotation_about,

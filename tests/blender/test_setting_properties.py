@@ -9,13 +9,9 @@ import bpy
 import pytest
 
 from gaussian_wrapping_addon.core.settings import JobSettings, declarations, declared
-from gaussian_wrapping_addon.ui import (
-    mesh_panel,
-    preferences,
-    texture_panel,
-    train_advanced_panel,
-    train_panel,
-)
+from gaussian_wrapping_addon.ui import preferences
+from gaussian_wrapping_addon.ui.meshing import mesh_panel, texture_panel
+from gaussian_wrapping_addon.ui.training import train_advanced_panel, train_panel
 from tests.blender.fake_layout import draw
 from tests.fake_setting import GROUPS, copy_with_fake_setting, said_by
 

@@ -15,8 +15,8 @@ import pytest
 import gaussian_wrapping_addon
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
-from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
-from gaussian_wrapping_addon.ops import job_timer, watched_jobs
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
+from gaussian_wrapping_addon.ops.jobs import job_timer, watched_jobs
 from tests.blender.job_play import play_until, start_wrap, status_of, write_fake_python
 
 STALL_S = 0.05

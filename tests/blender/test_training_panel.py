@@ -16,8 +16,8 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError, WorkerError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE, JobClient
-from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, read_job, write_job
-from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job, write_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.core.settings import (
     DECISIONS,
     MASK_MODES,
@@ -25,17 +25,12 @@ from gaussian_wrapping_addon.core.settings import (
     preset,
     to_json,
 )
-from gaussian_wrapping_addon.ops import (
-    background,
-    job_timer,
-    known_jobs,
-    live_preview,
-    training_choices,
-    training_estimate,
-)
-from gaussian_wrapping_addon.ops.live_figures import live_rows
-from gaussian_wrapping_addon.ops.scene_objects import import_result
-from gaussian_wrapping_addon.ui import train_advanced_panel, train_panel
+from gaussian_wrapping_addon.ops.common import background, known_jobs
+from gaussian_wrapping_addon.ops.jobs import job_timer, live_preview, panel_settings
+from gaussian_wrapping_addon.ops.jobs.live_figures import live_rows
+from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from gaussian_wrapping_addon.ops.training import training_estimate
+from gaussian_wrapping_addon.ui.training import train_advanced_panel, train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.fake_worker import LIVE, picture
 from tests.blender.synthetic_result import npy_bytes, write_result
@@ -73,7 +68,7 @@ def choices_of(name: str) -> set[str]:
 def test_untouched_choices_are_the_preset() -> None:
     for name in ("draft", "standard", "fine"):
         bpy.context.scene.gwrap.preset = name.upper()
-        assert training_choices.job_settings(bpy.context.scene, 3) == preset(name, threads=3)
+        assert panel_settings.job_settings(bpy.context.scene, 3) == preset(name, threads=3)
     for name in MODEL_SELECTION:
         assert choices_of(name) == set(DECISIONS)
     assert choices_of("mask_mode") == set(MASK_MODES)
@@ -92,15 +87,15 @@ def test_each_choice_changes_its_setting_and_no_other(tmp_path: Path) -> None:
     }
     for name, value in changes.items():
         setattr(training(), name, value)
-        found = to_json(training_choices.job_settings(bpy.context.scene, 0).validated())
+        found = to_json(panel_settings.job_settings(bpy.context.scene, 0).validated())
         wanted = value.lower() if isinstance(value, str) else value
         assert found == {**base, "training": {**base["training"], name: wanted}}
         training().property_unset(name)
     training().start_splat = str(splat)
-    found = to_json(training_choices.job_settings(bpy.context.scene, 0))
+    found = to_json(panel_settings.job_settings(bpy.context.scene, 0))
     assert found == {**base, "start_splat": str(splat)}
     assert bpy.ops.gwrap.reset_training() == {"FINISHED"}
-    assert to_json(training_choices.job_settings(bpy.context.scene, 0)) == base
+    assert to_json(panel_settings.job_settings(bpy.context.scene, 0)) == base
 
 
 @pytest.mark.parametrize(
@@ -114,7 +109,7 @@ def test_each_choice_changes_its_setting_and_no_other(tmp_path: Path) -> None:
 def test_a_splat_that_cannot_be_used_is_refused(path: str, words: str) -> None:
     training().start_splat = path
     with pytest.raises(UsageError, match=words):
-        training_choices.job_settings(bpy.context.scene, 0)
+        panel_settings.job_settings(bpy.context.scene, 0)
 
 
 def test_the_panel_shows_every_choice_and_reads_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -333,7 +328,7 @@ def test_estimate_asks_the_worker_and_shows_its_words(
         assert text in texts
     asked = JobFile.from_json(json.loads(worker.read_text()))
     assert asked.source == str(worker.parent)
-    assert asked.settings == training_choices.job_settings(bpy.context.scene, 0)
+    assert asked.settings == panel_settings.job_settings(bpy.context.scene, 0)
     training().iterations = 433
     assert "4 to 6 min" not in draw(TRAIN).texts, "it was about other choices"
     training().iterations = 432

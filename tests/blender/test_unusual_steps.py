@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.ops import tags
-from gaussian_wrapping_addon.ops.scene_objects import import_result
+from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.results.scene_objects import import_result
 from tests.blender.job_play import meshes, play_to, play_until, start_wrap, write_fake_python
 from tests.blender.synthetic_result import write_region_result
 

@@ -13,16 +13,17 @@ from types import SimpleNamespace
 import bpy
 import pytest
 
-from gaussian_wrapping_addon.core import worker_environment
 from gaussian_wrapping_addon.core.jobs import client as job_client
-from gaussian_wrapping_addon.core.jobs.job_folder import JobStatus
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
+from gaussian_wrapping_addon.core.processes import worker_environment
+from gaussian_wrapping_addon.core.processes.worker_environment import WorkerEnvironment
+from gaussian_wrapping_addon.core.processes.worker_requirements import requirements_file
 from gaussian_wrapping_addon.core.setup.commands import SetupRequest
 from gaussian_wrapping_addon.core.setup.install import SetupTask
 from gaussian_wrapping_addon.core.setup.pythons import FoundPython, probe
-from gaussian_wrapping_addon.core.worker_environment import WorkerEnvironment
-from gaussian_wrapping_addon.core.worker_requirements import requirements_file
-from gaussian_wrapping_addon.ops import doctor, worker_setup, worker_setup_operators
-from gaussian_wrapping_addon.ui import dataset_panel, worker_setup_view
+from gaussian_wrapping_addon.ops.worker import worker_check, worker_setup, worker_setup_operators
+from gaussian_wrapping_addon.ui.dataset import dataset_panel
+from gaussian_wrapping_addon.ui.worker import worker_setup_view
 from tests.blender.fake_layout import FakeLayout, draw
 from tests.core.setup.wheels import write_wheel
 
@@ -43,7 +44,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         monkeypatch.setattr(worker_setup.state, name, value)
     yield folder
     worker_setup.stop()
-    doctor.stop()
+    worker_check.stop()
 
 
 def drawn() -> FakeLayout:
@@ -149,7 +150,7 @@ def test_a_set_up_from_start_to_end_in_blender(
     real = probe(sys.executable)
     request = SetupRequest(str(root), real.path, str(requirements), "cpu", str(tmp_path / "wheels"))
     asked = []
-    monkeypatch.setattr(doctor, "start", asked.append)
+    monkeypatch.setattr(worker_check, "start", asked.append)
     no_worker(monkeypatch)
     longest_s = 0.0
     worker_setup.start(request)

@@ -13,7 +13,7 @@ from .camera import Camera
 class PhotoSource(Protocol):
     """Cameras, photos and masks of the scene's views at sizes divided by whole numbers.
 
-    :class:`~.photos.PhotoStore` is one.
+    :class:`~.photos.photo_store.PhotoStore` is one.
     """
 
     def camera(self, index: int, divisor: int = 1) -> Camera:

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 
 from ..dataset.camera import Camera
+from ..dataset.readers.source_kind import read_poses, source_kind
 from ..dataset.similarity import Similarity
-from ..dataset.source_kind import read_poses, source_kind
 from ..errors import DatasetError, ParseError, UsageError
 from ..files import read_json
 from ..progress import Progress
-from .alignment import IcpResult, icp
+from .alignment.pose_error import pose_errors
+from .alignment.similarity_alignment import IcpResult, icp
 from .layouts.dtu import align_to_scan, is_dtu_folder, read_dtu, score_dtu
 from .layouts.mesh_input import is_cloud, read_cloud, read_mesh
 from .layouts.tanks import SAMPLES as TANKS_SAMPLES
 from .layouts.tanks import align_to_log, is_tanks_folder, read_tanks, score_tanks
-from .pose_error import pose_errors
 from .surface.dtu_chamfer import DENSITY_MM, MAX_DISTANCE_MM, PATCH_MM
 from .surface.samples import SurfaceSamples, sample_uniformly
 from .surface.scores import MIN_THIN_SHARE, PROTOCOLS, score_protocols

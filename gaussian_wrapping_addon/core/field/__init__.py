@@ -1,2 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vacancy, vector and normal field, projection of points onto the isosurface."""
+"""Fields of the trained Gaussians: vector field, isosurface, depth-map samples.
+
+In: points and Gaussians. Out: values, and points moved onto the isosurface vacancy = 0.5.
+"""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..compiled import inline, kernel
+from ..kernels.compiled import inline, kernel
 
 COORDINATE_MASK = (1 << 21) - 1
 """Cells 2^21 apart on one axis share a list: harmless, as callers test each box anyway."""

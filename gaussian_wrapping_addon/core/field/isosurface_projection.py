@@ -13,7 +13,7 @@ import numpy as np
 from .. import tolerances
 from ..dataset.camera import Camera
 from ..progress import Progress
-from .vacancy import SETTLED, VacancyResult
+from .vacancy.vacancy import SETTLED, VacancyResult
 from .vector_field import MIN_SLOPE, VectorFieldResult
 
 TOLERANCE = 0.01

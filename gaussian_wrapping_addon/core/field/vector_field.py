@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .. import tolerances
-from ..compiled import kernel, part
 from ..gaussians.model import GaussianArrays
-from ..parallel import default_threads, even_bounds, run_chunks
+from ..kernels.compiled import kernel, part
+from ..kernels.parallel import default_threads, even_bounds, run_chunks
 from .box_grid import EMPTY_KEY, build_box_grid, cell_key, hash_key
 
 TAIL = 1e-4

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..dataset.splat_header import EXPECTED, SplatHeader, read_splat_header
+from ..dataset.readers.splat_header import EXPECTED, SplatHeader, read_splat_header
 from ..errors import ParseError
 from ..ply.table import read_vertices
 from ..report_warning import LEFT_OUT_HINT, ReportWarning

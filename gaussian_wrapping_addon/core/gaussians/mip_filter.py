@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from .. import tolerances
-from ..compiled import kernel
 from ..dataset.camera import Camera
-from ..parallel import default_threads, even_bounds, run_chunks
+from ..kernels.compiled import kernel
+from ..kernels.parallel import default_threads, even_bounds, run_chunks
 
 FILTER_VARIANCE_PX = 0.05
 """Variance of the filter in squared pixels of the closest camera. The usual 0.2 (docs/method.md,

@@ -15,13 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, cannot_be_written
-from ..helper_process import child_command
+from ..processes.helper_process import child_command
 from ..processes.spawn import kill_group, spawn
-from ..worker_environment import ready_worker
-from .earlier_job import keep_finished
-from .job_file import JobFile, read_job, refuse_replacing, write_job
-from .job_folder import JobFolder, JobStatus, process_alive
-from .smaller import killed_hint, killed_mesh_hint
+from ..processes.worker_environment import ready_worker
+from .stages.oom_retry import killed_hint, killed_mesh_hint
+from .store.job_file import JobFile, read_job, refuse_replacing, write_job
+from .store.job_folder import JobFolder, JobStatus, process_alive
+from .store.rollback import keep_finished
 
 WORKER_MODULE = "jobs.worker"
 PYTHON_VARIABLE = "GAUSSIAN_WRAPPING_PYTHON"

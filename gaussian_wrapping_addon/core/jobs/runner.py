@@ -13,16 +13,23 @@ from typing import Any
 
 from ..errors import MeshingError
 from ..export_formats import RESULT_FORMATS
+from ..kernels.parallel import default_threads
 from ..machine import describe_machine
 from ..names import region_names
-from ..parallel import default_threads
-from ..peak_memory import peak_memory_bytes
+from ..processes.peak_memory import peak_memory_bytes
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
-from .job_file import JobFile, refuse_replacing
-from .job_folder import JobFolder
-from .mesh_stages import mesh_key
-from .stages import STAGE_VERSIONS, Stage, read_done, run_stage, source_fingerprint, stage_key
+from .stages.mesh_keys import mesh_key
+from .store.job_file import JobFile, refuse_replacing
+from .store.job_folder import JobFolder
+from .store.stage_folder import (
+    STAGE_VERSIONS,
+    Stage,
+    read_done,
+    run_stage,
+    source_fingerprint,
+    stage_key,
+)
 
 _logger = logging.getLogger(__name__)
 
@@ -113,7 +120,7 @@ def run_job(
         regions.append((name, meshed, textured))
 
     progress = overall.stage("export", _Span(1.0 - SHARES["export"], 1.0))
-    from .export import export_results
+    from .stages.export_stage import export_results
 
     summary = {
         "command": job.command,
@@ -129,9 +136,9 @@ def run_job(
 
 
 def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: int) -> Stage:
-    from ..dataset.load import load_scene
+    from ..dataset.loading.load import load_scene
     from ..dataset.scene_file import save_scene
-    from .splat_scene import is_splat, make_splat_scene
+    from .stages.splat_scene import is_splat, make_splat_scene
 
     source = Path(job.source)
     key = stage_key(
@@ -167,7 +174,7 @@ def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: in
 
 def _trained_before(folder: JobFolder, job: JobFile) -> Stage | None:
     """Return the newest finished cameras that the job's training was finished on."""
-    from .training_stage import training_keys
+    from .stages.training_stage import training_keys
 
     found: list[tuple[float, int, Stage]] = []
     for path in sorted(folder.stages.glob("cameras-*")):
@@ -183,7 +190,7 @@ def _trained_before(folder: JobFolder, job: JobFile) -> Stage | None:
 def _run_training(
     folder: JobFolder, job: JobFile, cameras: Stage, overall: _Overall, threads: int
 ) -> Stage:
-    from .training_stage import run_training
+    from .stages.training_stage import run_training
 
     span = _Span(SHARES["cameras"], SHARES["cameras"] + SHARES["train"])
     progress = overall.stage("train", span)
@@ -209,17 +216,17 @@ def _run_meshing(
         import numpy as np
 
         from ..dataset.scene_file import load_saved_scene
-        from ..field.sightings import find_sightings
+        from ..field.depth_samples import find_sightings
         from ..field.vector_field import VectorField
         from ..gaussians.gaussian_file import load_gaussians
-        from ..meshing.clean_up import clean_up
-        from ..meshing.mesh_check import check_mesh
-        from ..meshing.mesh_file import save_mesh
-        from ..meshing.open_boundary import opened
-        from ..meshing.region import write_region
-        from ..meshing.statistics import mesh_statistics
-        from .region_field import field_figures, region_field, requested_region
-        from .region_meshing import (
+        from ..mesh.mesh_file import save_mesh
+        from ..meshing.checks.mesh_check import check_mesh
+        from ..meshing.checks.mesh_statistics import mesh_statistics
+        from ..meshing.cleanup.clean_up import clean_up
+        from ..meshing.cleanup.open_boundary import opened
+        from ..regions.region import write_region
+        from .stages.region_field import field_figures, region_field, requested_region
+        from .stages.region_meshing import (
             mesh_by_pivots_in_stage,
             mesh_in_stage,
             remove_tiles,
@@ -296,18 +303,18 @@ def _run_texture(
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         from ..dataset.photo_source import PhotoSource
-        from ..dataset.photos import PhotoStore
+        from ..dataset.photos.photo_store import PhotoStore
         from ..dataset.scene_file import load_saved_scene
         from ..evaluation.views.photo_comparison import compare_with_photos
         from ..evaluation.views.preview import write_preview
         from ..files import read_json
         from ..limits import MAX_IMAGE_SIDE_PX
-        from ..meshing.mesh_file import load_mesh
-        from ..meshing.region import parse_region
-        from ..texture.export import file_offset, write_textured
-        from ..texture.levels import levels_of_detail
+        from ..mesh.mesh_file import load_mesh
+        from ..regions.region import parse_region
+        from ..texture.detail.levels_of_detail import levels_of_detail
+        from ..texture.files.textured_files import file_offset, write_textured
         from ..texture.texture_mesh import texture_mesh
-        from .region_meshing import free_bytes
+        from .stages.region_meshing import free_bytes
 
         scene = load_saved_scene(cameras.folder)
         photos = PhotoStore(scene, MAX_IMAGE_SIDE_PX)
@@ -317,7 +324,7 @@ def _run_texture(
         source: PhotoSource = photos
         if texture.source == "gaussians":
             from ..gaussians.gaussian_file import load_gaussians
-            from ..texture.gaussian_photos import GaussianPhotos
+            from ..texture.bake.gaussian_photos import GaussianPhotos
 
             trained_file = trained.folder / "gaussians.npz"
             source = GaussianPhotos(load_gaussians(trained_file), photos, threads=threads)

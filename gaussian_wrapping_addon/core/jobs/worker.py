@@ -25,11 +25,11 @@ from ..errors import (
     WrapError,
     cannot_be_written,
 )
-from ..helper_process import end_helpers
+from ..processes.helper_process import end_helpers
 from ..progress import COMPILING, ProgressEvent
-from .earlier_job import forget_finished, put_back
-from .job_file import read_job
-from .job_folder import JobFolder, JobStatus, process_start_ticks
+from .store.job_file import read_job
+from .store.job_folder import JobFolder, JobStatus, process_start_ticks
+from .store.rollback import forget_finished, put_back
 
 _logger = logging.getLogger(__name__)
 

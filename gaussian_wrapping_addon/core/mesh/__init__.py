@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Triangle meshes by themselves: topology and simplification, without Gaussians or cameras.
+"""Triangle meshes: the data class, its file between stages, sampling, components, depth buffer.
 
-In: vertices and faces as numpy arrays. Out: measures, tables, and faces over the same vertices.
+In: vertices and faces. Out: figures and arrays about them. Knows neither Gaussians nor fields.
 """

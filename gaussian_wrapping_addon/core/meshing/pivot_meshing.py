@@ -14,25 +14,25 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import MeshingError
-from ..field.sightings import Sightings
+from ..field.depth_samples import Sightings
+from ..field.isosurface_residual import level_errors
 from ..gaussians.model import GaussianArrays
+from ..mesh.components import compacted, without_floaters
+from ..mesh.surface_mesh import SurfaceMesh
 from ..mesh.topology import edge_lengths
 from ..progress import Progress
+from ..regions.cap_planes import cap_planes
+from ..regions.convex_region import Region
 from ..report_warning import ReportWarning
 from ..settings import MeshingSettings
-from .candidate_surface import no_surface, pivot_cloud
-from .cap_planes import cap_planes
-from .components import compacted, without_floaters
-from .convex_region import Region
-from .degenerate import remove_degenerate
-from .delaunay import delaunay, far_points
-from .extraction import tetrahedron_neighbours
-from .level_error import level_errors
-from .marching_tetrahedra import bisect, marching_closed
-from .pivots import PIVOTS
-from .spacing import footprints
-from .surface_mesh import SurfaceMesh
-from .tetrahedron_cut import cut_to_region
+from .cleanup.degenerate import remove_degenerate
+from .points.candidate_surface import no_surface, pivot_cloud
+from .points.pivots import PIVOTS
+from .points.spacing import footprints
+from .tetrahedra.boundary_faces import tetrahedron_neighbours
+from .tetrahedra.delaunay import delaunay, far_points
+from .tetrahedra.marching_tetrahedra import bisect, marching_closed
+from .tetrahedra.tetrahedron_cut import cut_to_region
 
 _logger = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ def mesh_by_pivots(
         ``pivots``, the number for each Gaussian, and ``min_component_share`` are read. An edge
         length or a number of points does not apply; the provenance says so.
     sightings : Sightings, optional
-        Where the cameras see the isosurface in the region (:mod:`.sightings`).
+        Where the cameras see the isosurface in the region (:mod:`.depth_samples`).
 
     Returns
     -------

@@ -14,26 +14,26 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import MeshingError
-from ..field.sightings import Sightings
+from ..field.depth_samples import Sightings
+from ..field.isosurface_residual import level_errors
 from ..gaussians.model import GaussianArrays
+from ..mesh.components import compacted, without_floaters
+from ..mesh.simplification.edge_flips import flip_edges
+from ..mesh.simplification.vertex_selection import select_vertices
+from ..mesh.surface_mesh import SurfaceMesh
 from ..mesh.topology import edge_lengths
 from ..progress import Progress
+from ..regions.convex_region import Region
 from ..settings import MeshingSettings
-from .candidate_surface import candidate_surface
-from .classification import classify, on_one_sheet
-from .components import compacted, without_floaters
-from .convex_region import Region
-from .degenerate import remove_degenerate
-from .delaunay import delaunay, far_points
-from .edge_flips import flip_edges
-from .extraction import boundary_faces, tetrahedron_neighbours
-from .level_error import level_errors
-from .repair import split_nonmanifold
-from .resolution import Dense, checked_request, dense_request, nominal_edge
-from .small_handles import without_small_handles
-from .surface_mesh import SurfaceMesh
-from .surface_points import KIND_CAP, KIND_JUMP, KIND_SURFACE, SurfacePoints, SurfaceSampler
-from .vertex_selection import select_vertices
+from .cleanup.degenerate import remove_degenerate
+from .cleanup.repair import split_nonmanifold
+from .cleanup.small_handles import without_small_handles
+from .points.candidate_surface import candidate_surface
+from .points.resolution import Dense, checked_request, dense_request, nominal_edge
+from .points.surface_points import KIND_CAP, KIND_JUMP, KIND_SURFACE, SurfacePoints, SurfaceSampler
+from .tetrahedra.boundary_faces import boundary_faces, tetrahedron_neighbours
+from .tetrahedra.classification import classify, on_one_sheet
+from .tetrahedra.delaunay import delaunay, far_points
 
 _logger = logging.getLogger(__name__)
 
@@ -65,8 +65,8 @@ def mesh_region(
     """Mesh the surface ``vacancy = 0.5`` inside a region; the boundary closes the solid.
 
     With adaptive spacing a denser mesh is made, and of its vertices those stay that the shape needs
-    (:mod:`.vertex_selection`). What stands where no camera looks, ``vacancy`` says. With neither an
-    edge length nor a number of points the mesh gets about 50 thousand faces.
+    (:mod:`..mesh.simplification.vertex_selection`). What stands where no camera looks, ``vacancy``
+    says. With neither an edge length nor a number of points the mesh gets about 50 thousand faces.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def mesh_region(
         Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices
         as that one. 0 leaves it to ``settings.points``.
     sightings : Sightings, optional
-        Where the cameras see the isosurface in the region (:mod:`.sightings`).
+        Where the cameras see the isosurface in the region (:mod:`.depth_samples`).
 
     Returns
     -------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""PLY files: a bounded reader of headers, and of the vertices as a table of numbers.
+"""PLY files: one bounded reader of headers and vertex tables.
 
-In: a path. Out: the header's elements and properties; a structured array of the vertices.
+In: a file that nobody has checked. Out: columns of numbers, or a typed error.
 """

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Child processes: how they are started and ended.
+"""Child processes: where the worker's Python is, how children start, what they may use.
 
-In: argument lists. Out: processes in groups of their own.
+In: a module's name and its arguments. Out: a process with a deadline and a memory limit, or a
+typed error.
 """

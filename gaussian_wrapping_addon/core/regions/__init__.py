@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Region files and boxes, for Blender and the worker alike: standard library and numpy only.
+"""Regions of interest: convex bodies, their file, the automatic choices.
 
-In: bounding-volume JSON, or corners of a solid.
-Out: checked corners in world coordinates, boxes as matrices, JSON.
+In: region files, corners of solids, cameras, Gaussians. Out: convex bodies. ``region_file.py``,
+``volume.py`` and ``box.py`` need numpy only and serve Blender as well.
 """

@@ -1,2 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussians and a camera in, images out: projection, tiles, kernels, isosurface depth."""
+"""Gaussians and a camera in, images and gradients out.
+
+``render.py`` is for autograd, ``view_renderer.py`` for the trainer; the folders hold the steps.
+"""

@@ -14,13 +14,15 @@ from torch import Tensor
 
 from ..dataset.camera import Camera
 from ..gaussians.model import OrientedGaussians
-from ..parallel import default_threads
-from .array_store import ArrayStore
-from .blend import Images, RenderBuffers, ScreenView
+from ..kernels.array_store import ArrayStore
+from ..kernels.parallel import default_threads
 from .cuda.cuda_render import render_cuda
-from .projection import RawArrays, RawGradients, project_backward, project_gaussians
-from .tiles import TileBinning
-from .types import ImageGradients, Render, RenderOptions, RenderStatistics
+from .projection.projection import RawArrays, RawGradients, project_backward, project_gaussians
+from .raster.blend import Images, RenderBuffers, ScreenView
+from .tiling.tiles import TileBinning
+from .types.gradients import ImageGradients
+from .types.images import Render, RenderStatistics
+from .types.options import RenderOptions
 from .view_renderer import ViewPass, ViewRenderer, band_view, take_screen
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
@@ -37,7 +39,7 @@ def render(
     options: RenderOptions | None = None,
     buffers: RenderBuffers | None = None,
 ) -> Render:
-    """Render by the definition of :func:`~.reference.render_reference`, in float32.
+    """Render by the definition of :func:`~.reference.reference.render_reference`, in float32.
 
     Differentiable with respect to every tensor of ``gaussians`` except ``filter_3d``. Images and
     gradients are bitwise the same for any number of threads.

@@ -13,20 +13,28 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import UsageError
-from ..parallel import CHUNKS_PER_THREAD, balanced_bounds, default_threads, even_bounds, run_chunks
-from .array_store import ArrayStore
-from .blend import Images, RenderBuffers, ScreenView, blend, pair_gradients
-from .block_masks import mask_kernel
-from .pair_sums import add_pair_gradients, add_pair_weights, mark_seen, take_screen_gradients
-from .projection import (
+from ..kernels.array_store import ArrayStore
+from ..kernels.parallel import (
+    CHUNKS_PER_THREAD,
+    balanced_bounds,
+    default_threads,
+    even_bounds,
+    run_chunks,
+)
+from .projection.projection import (
     RawArrays,
     ScreenGaussians,
     project_backward_visible,
     project_gaussians,
 )
-from .raster_math import ROW_VALUES, vector_lanes
-from .tiles import TileBinning, TileLists
-from .types import ImageGradients, RenderOptions, RenderStatistics, VisibleGradients
+from .raster.blend import Images, RenderBuffers, ScreenView, blend, pair_gradients
+from .raster.pair_sums import add_pair_gradients, add_pair_weights, mark_seen, take_screen_gradients
+from .simd.raster_math import ROW_VALUES, vector_lanes
+from .tiling.block_masks import mask_kernel
+from .tiling.tiles import TileBinning, TileLists
+from .types.gradients import ImageGradients, VisibleGradients
+from .types.images import RenderStatistics
+from .types.options import RenderOptions
 
 PAIR_BYTES = 4 * ROW_VALUES + 32
 """Of one pair: its gradient, its place in the lists, which pixels it reaches, blending weights."""
@@ -101,7 +109,8 @@ class ViewPass:
     ----------
     color, normal, geometric_normal : (h, w, 3) float32
     alpha, depth : (h, w) float32
-        The images of :class:`~.types.Render`. They must not be written to before :meth:`backward`.
+        The images of :class:`~.types.images.Render`. They must not be written to before
+        :meth:`backward`.
     gaussians, screen : RawArrays, ScreenGaussians
         What was rendered, and its projection.
     ids : (v,) int32

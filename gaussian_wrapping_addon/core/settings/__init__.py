@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Settings of a job: one declaration each, shared by panel, command line and worker.
+"""Settings of a job, each declared once: default, range, option, panel property, help.
 
-In: words and numbers from the command line, from Blender's properties and from ``job.json``. Out:
-frozen dataclasses whose values are checked. Standard library only, so that Blender can load it.
+In: values from command line, panel or job file. Out: frozen dataclasses that have been validated.
+Standard library only, so that Blender can load it.
 """
 
 from .choices import (

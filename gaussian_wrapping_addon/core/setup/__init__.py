@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes and removes the private environment that workers run in, with venv and pip.
+"""Makes and removes the worker's private environment. Standard library only.
 
-``pythons`` finds interpreters to make it from, ``commands`` has what is run, ``install`` runs it.
-Standard library only.
+In: a Python and the pinned requirements. Out: an environment that jobs can run in.
 """

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import UsageError
-from ..worker_environment import MARKER, WorkerEnvironment, venv_python
+from ..processes.worker_environment import MARKER, WorkerEnvironment, venv_python
 from .pythons import FoundPython
 
 CPU = "cpu"

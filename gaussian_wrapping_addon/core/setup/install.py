@@ -32,10 +32,10 @@ from ..errors import (
     cannot_be_written,
 )
 from ..files import write_json
-from ..helper_process import child_command
-from ..jobs.job_folder import JobFolder, JobStatus
+from ..jobs.store.job_folder import JobFolder, JobStatus
+from ..processes.helper_process import child_command
 from ..processes.spawn import child_environment, spawn
-from ..worker_environment import (
+from ..processes.worker_environment import (
     FOLDERS,
     MARKER,
     PACKAGES,
@@ -44,7 +44,7 @@ from ..worker_environment import (
     forget,
     remember,
 )
-from ..worker_requirements import read_requirements
+from ..processes.worker_requirements import read_requirements
 from .commands import CUDA, Command, SetupRequest, all_commands, as_line, check_folders
 from .pythons import probe
 

@@ -13,24 +13,24 @@ from .. import limits
 from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
 from ..errors import MeshingError, UsageError
+from ..mesh.face_graph import FaceGraph, face_graph
+from ..mesh.surface_mesh import SurfaceMesh
+from ..mesh.textured_mesh import AtlasMaps, TexturedMesh
 from ..mesh.topology import area_vectors
-from ..meshing.surface_mesh import SurfaceMesh
 from ..progress import Progress
 from ..report_warning import ReportWarning
 from ..settings import TextureSettings
-from .atlas_colors import CONTINUED_POINTS, AtlasColors, continue_colors
-from .atlas_points import atlas_points, blocks_of
-from .atlas_raster import AtlasRaster
-from .bake import bake, look_at_photos, survey_points
-from .detail import bake_detail, merged_statistics, wants_normal_map
-from .face_graph import FaceGraph, face_graph
-from .photo_samples import SurfaceArrays, SurfacePoints
-from .stretch import texture_stretch
-from .texture_memory import fit_into_memory
-from .texture_size import gutter_for, plan_textures, wanted_side
-from .texture_tally import Tally
-from .textured_mesh import AtlasMaps, TexturedMesh
-from .unwrap import Unwrap, unwrap
+from .atlas.atlas_raster import AtlasRaster
+from .bake.atlas_colors import CONTINUED_POINTS, AtlasColors, continue_colors
+from .bake.atlas_points import atlas_points, blocks_of
+from .bake.bake import bake, look_at_photos, survey_points
+from .bake.coverage_statistics import Tally
+from .bake.photo_samples import SurfaceArrays, SurfacePoints
+from .cost.texture_memory import fit_into_memory
+from .cost.texture_size import gutter_for, plan_textures, wanted_side
+from .detail.detail import bake_detail, merged_statistics, wants_normal_map
+from .unwrap.stretch import texture_stretch
+from .unwrap.unwrap import Unwrap, unwrap
 
 _logger = logging.getLogger(__name__)
 

@@ -1,2 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Losses, density control, wrapping rounds, schedule, trainer, checkpoints."""
+"""From a scene to trained Gaussians: trainer, iteration, rounds, schedule, checkpoint.
+
+In: a scene, photos, settings. Out: a :class:`.result.TrainingResult`. Only jobs import this.
+"""

@@ -13,20 +13,21 @@ import numpy as np
 from ..dataset.camera import Camera
 from ..dataset.photo_source import PhotoSource
 from ..gaussians.model import OrientedGaussians
-from ..render.array_store import ArrayStore
-from ..render.projection import RawArrays
-from ..render.types import ImageGradients, RenderOptions, VisibleGradients
+from ..kernels.array_store import ArrayStore
+from ..render.projection.projection import RawArrays
+from ..render.types.gradients import ImageGradients, VisibleGradients
+from ..render.types.options import RenderOptions
 from ..render.view_renderer import ViewPass, ViewRenderer
-from .background import background_gradient, composited, draw_background
-from .exposure import exposure_rate
-from .losses import color_loss, normal_losses
-from .multi_view import (
+from .appearance.background import background_gradient, composited, draw_background
+from .appearance.photo_exposure import exposure_rate
+from .losses.footprint_regulariser import add_overlap_price
+from .losses.losses import color_loss, normal_losses
+from .losses.multi_view import (
     MultiViewOptions,
     add_image_gradients,
     merge_gradients,
     multi_view_losses,
 )
-from .overlap_price import add_overlap_price
 from .schedule import Schedule
 from .state import TrainingState
 from .windows import Window, windows

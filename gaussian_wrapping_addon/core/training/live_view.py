@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from ..dataset.photo_source import PhotoSource
-from ..evaluation.views.view_metrics import psnr
 from ..files import write_bytes
 from ..gaussians.model import OrientedGaussians
-from ..render.projection import RawArrays
-from ..render.types import RenderOptions
+from ..imaging.view_metrics import psnr
+from ..render.projection.projection import RawArrays
+from ..render.types.options import RenderOptions
 from ..render.view_renderer import ViewRenderer
 from ..settings import TrainingSettings
 
@@ -87,7 +87,7 @@ def measure_held_out(
         Whose memory to use; not that of a view whose gradient is still to be asked.
     exposure_correction : callable, optional
         Applied to each render before it is measured
-        (:func:`~.exposure.corrected_for_measuring`).
+        (:func:`~.appearance.photo_exposure.corrected_for_measuring`).
     check : callable, optional
         Called before each view; what it raises ends the measuring.
 

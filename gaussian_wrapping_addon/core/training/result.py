@@ -10,7 +10,7 @@ from typing import Any
 
 from ..gaussians.model import OrientedGaussians
 from ..report_warning import ReportWarning
-from .needs import Needs
+from .selection.model_selection import Needs
 
 
 @dataclass(frozen=True)

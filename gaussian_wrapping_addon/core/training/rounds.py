@@ -15,16 +15,16 @@ from ..gaussians.mip_filter import mip_filter
 from ..gaussians.model import OrientedGaussians
 from ..progress import Progress
 from .cancelling import checked
-from .contribution import contributions, least_contributors, prune_contributors
-from .density_control import densify_and_prune, reset_opacity
-from .harmonics_need import harmonics_need
-from .harmonics_trial import NeedView
+from .density.contribution import contributions, least_contributors, prune_contributors
+from .density.density_control import densify_and_prune, reset_opacity
+from .density.wrapping import WrapView, normal_errors, start_orientation, wrap
 from .iteration import Stepper
 from .live_view import divisor_for
-from .needs import wrapping_need
 from .schedule import Schedule
+from .selection.harmonics_selection import harmonics_need
+from .selection.harmonics_trial import NeedView
+from .selection.model_selection import wrapping_need
 from .state import TrainingState
-from .wrapping import WrapView, normal_errors, start_orientation, wrap
 
 _logger = logging.getLogger(__name__)
 

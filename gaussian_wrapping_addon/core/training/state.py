@@ -11,11 +11,11 @@ import torch
 
 from ..gaussians.model import OrientedGaussians
 from ..report_warning import ReportWarning, read_warnings
-from .density_control import DensityStatistics
-from .exposure import Exposure
-from .growth_need import GrowthHistory
-from .needs import Needs
-from .optimizer import TRAINED, Adam
+from .appearance.photo_exposure import Exposure
+from .density.density_control import DensityStatistics
+from .optimizer.adam import TRAINED, Adam
+from .selection.growth_selection import GrowthHistory
+from .selection.model_selection import Needs
 
 _MOMENTS = ("first", "second")
 _STATISTICS = ("gradient", "gradient_abs", "views")

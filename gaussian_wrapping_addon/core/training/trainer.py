@@ -15,30 +15,30 @@ import torch
 from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
 from ..errors import Cancelled, DatasetError, WrapError
-from ..evaluation.views.lpips import lpips_if_ready
-from ..evaluation.views.view_metrics import score_images
 from ..gaussians.initialisation import initial_gaussians
 from ..gaussians.model import OrientedGaussians
-from ..parallel import default_threads
+from ..imaging.lpips import lpips_if_ready
+from ..imaging.view_metrics import score_images
+from ..kernels.parallel import default_threads
 from ..progress import Progress
-from ..render.projection import RawArrays
-from ..render.types import RenderOptions
+from ..render.projection.projection import RawArrays
+from ..render.types.options import RenderOptions
 from ..report_warning import ReportWarning
 from ..settings import TrainingSettings
-from .background import inside_masks
+from .appearance.background import inside_masks
+from .appearance.photo_exposure import Exposure, corrected_for_measuring
 from .cancelling import CheckedPhotos
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
-from .exposure import Exposure, corrected_for_measuring
-from .exposure_need import exposure_need
-from .image_need import image_need, photo_detail
+from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import Correction, LiveView, measure_held_out, spread
-from .needs import Decision, Needs, decide, multi_view_need
-from .neighbours import find_neighbours
+from .losses.neighbours import find_neighbours
 from .result import HeldOutFigure, TrainingResult
 from .rounds import Inside, Rounds
 from .schedule import SMALLEST_SIDE_PX, Schedule
-from .splat_start import start_from_splat, wrapping_settings
+from .selection.exposure_selection import exposure_need
+from .selection.image_size_selection import image_need, photo_detail
+from .selection.model_selection import Decision, Needs, decide, multi_view_need
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
@@ -111,7 +111,7 @@ def train(
         0 threads uses every core. The result does not depend on ``threads``.
     start_splat : Path, optional
         PLY of Gaussians in the world frame of the photos, to start from; then the training is short
-        and adds no Gaussians (:func:`~.splat_start.wrapping_settings`).
+        and adds no Gaussians (:func:`~.initialisation.splat_start.wrapping_settings`).
     inside : callable, optional
         Tells which points (n, 3), scene frame, lie where ``settings.region_weight`` applies.
 

@@ -34,9 +34,10 @@ from gaussian_wrapping_addon.core.evaluation.layouts.mesh_input import (
 )
 from gaussian_wrapping_addon.core.evaluation.surface.samples import sample_uniformly
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
-from gaussian_wrapping_addon.core.jobs.evaluate import job_cameras, job_mesh
-from gaussian_wrapping_addon.core.meshing.region import Region, write_region
+from gaussian_wrapping_addon.core.jobs.commands.evaluate_command import job_cameras, job_mesh
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.region import write_region
 from tests.core.evaluation.layouts.written_layouts import (
     JOB_FROM_TRUTH,
     bumpy_sphere,

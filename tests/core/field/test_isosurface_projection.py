@@ -10,7 +10,6 @@ import pytest
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.field.brute_force import brute_force_vacancy
 from gaussian_wrapping_addon.core.field.isosurface_projection import (
     MAX_TRAVEL_SIGMAS,
     TOLERANCE,
@@ -18,7 +17,8 @@ from gaussian_wrapping_addon.core.field.isosurface_projection import (
     ProjectionStatus,
     project_to_isosurface,
 )
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField, VacancyResult
+from gaussian_wrapping_addon.core.field.vacancy.brute_force import brute_force_vacancy
+from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField, VacancyResult
 from gaussian_wrapping_addon.core.field.vector_field import VectorField, VectorFieldResult
 from gaussian_wrapping_addon.core.progress import Progress
 from tests.core.field.field_scenes import (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.field.stable import log_gaussian, log_one_minus, odds
+from gaussian_wrapping_addon.core.field.vacancy.stable_logs import log_gaussian, log_one_minus, odds
 from gaussian_wrapping_addon.core.field.vector_field import TAIL, VectorField
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from tests.core.field.field_scenes import (

@@ -10,14 +10,18 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.dataset import load
+from gaussian_wrapping_addon.core.dataset.loading import load
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs import runner
-from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job
-from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.stages import Stage, source_fingerprint, stage_key
-from gaussian_wrapping_addon.core.jobs.training_stage import training_keys
+from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
+    Stage,
+    source_fingerprint,
+    stage_key,
+)
 from gaussian_wrapping_addon.core.settings import JobSettings
 
 

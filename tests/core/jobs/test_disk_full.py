@@ -17,17 +17,17 @@ import pytest
 from gaussian_wrapping_addon.core import files
 from gaussian_wrapping_addon.core.errors import EXIT_RESOURCES, ResourceError
 from gaussian_wrapping_addon.core.files import read_json, write_json
-from gaussian_wrapping_addon.core.jobs.job_file import JobFile, write_job
-from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.meshing.mesh_file import save_mesh
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, write_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.mesh.mesh_file import save_mesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings
-from gaussian_wrapping_addon.core.texture import charts
-from gaussian_wrapping_addon.core.texture.export import write_glb, write_textured
-from gaussian_wrapping_addon.core.texture.mesh_ply import write_mesh_ply
-from gaussian_wrapping_addon.core.texture.unwrap import unwrap
+from gaussian_wrapping_addon.core.texture.files.mesh_ply import write_mesh_ply
+from gaussian_wrapping_addon.core.texture.files.textured_files import write_glb, write_textured
+from gaussian_wrapping_addon.core.texture.unwrap import charts
+from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
 from gaussian_wrapping_addon.core.training.checkpoint import load_checkpoint, save_checkpoint
-from tests.core.texture.test_export import UTM, cube
+from tests.core.texture.files.test_textured_files import UTM, cube
 from tests.core.training.test_checkpoint import filled
 
 ROOT = Path(__file__).resolve().parents[3]

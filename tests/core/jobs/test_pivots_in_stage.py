@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import ResourceError
-from gaussian_wrapping_addon.core.field.sightings import Sightings
-from gaussian_wrapping_addon.core.jobs import region_meshing
+from gaussian_wrapping_addon.core.field.depth_samples import Sightings
+from gaussian_wrapping_addon.core.jobs.stages import region_meshing
 from gaussian_wrapping_addon.core.meshing import pivot_meshing
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import MeshingSettings

@@ -11,8 +11,9 @@ import numpy as np
 
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.files import read_json
-from gaussian_wrapping_addon.core.jobs.region_field import requested_region
-from gaussian_wrapping_addon.core.meshing.region import Region, write_region
+from gaussian_wrapping_addon.core.jobs.stages.region_field import requested_region
+from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.region import write_region
 
 COS, SIN = np.cos(0.7), np.sin(0.7)
 

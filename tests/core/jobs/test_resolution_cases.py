@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.job_file import make_job, read_job
-from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, read_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 
 from .finished_sphere import write_cube, write_finished_sphere
 

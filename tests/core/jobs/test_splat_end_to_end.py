@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import even_directions
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
-from gaussian_wrapping_addon.core.dataset.splat_source import even_directions
 from tests.core.gaussians.splat_files import permuted, splat_columns, write_ply
 from tests.core.training.splat_shells import AXES, shell_of_discs
 

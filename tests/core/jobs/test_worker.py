@@ -14,11 +14,15 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import EXIT_RESOURCES, ParseError, UsageError
 from gaussian_wrapping_addon.core.files import read_json, write_json
-from gaussian_wrapping_addon.core.helper_process import child_command
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.job_file import JobFile, make_job, write_job
-from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus, process_start_ticks
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, write_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
+    JobFolder,
+    JobStatus,
+    process_start_ticks,
+)
 from gaussian_wrapping_addon.core.jobs.worker import parent_to_watch
+from gaussian_wrapping_addon.core.processes.helper_process import child_command
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings
 
 BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"

@@ -13,15 +13,21 @@ import pytest
 
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.job_folder import MARKER, JobFolder, JobStatus, process_alive
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
+    MARKER,
+    JobFolder,
+    JobStatus,
+    process_alive,
+)
 
 DEAF = """
 import os, sys, threading, time
 from pathlib import Path
-from gaussian_wrapping_addon.core import helper_process, limits
+from gaussian_wrapping_addon.core import limits
+from gaussian_wrapping_addon.core.processes import helper_process
 from gaussian_wrapping_addon.core.jobs import worker
-from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus, process_start_ticks
-import subprocess
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus,
+process_start_ticks import subprocess
 limits.CANCEL_ALONE_S = 0.2
 worker.PARENT_POLL_S = 0.05
 folder = JobFolder(Path(sys.argv[1]))

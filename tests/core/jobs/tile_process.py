@@ -6,8 +6,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from gaussian_wrapping_addon.core.jobs.claims import Claims, Task, work_through
-from gaussian_wrapping_addon.core.jobs.tile_tasks import tile_tasks
+from gaussian_wrapping_addon.core.jobs.stages.tile_tasks import tile_tasks
+from gaussian_wrapping_addon.core.jobs.store.claims import Claims, Task, work_through
 from gaussian_wrapping_addon.core.meshing.tiles.plan import Field
 from gaussian_wrapping_addon.core.meshing.tiles.store import load_plan
 from gaussian_wrapping_addon.core.progress import Progress

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.meshing.mesh_check import check_mesh
-from gaussian_wrapping_addon.core.meshing.open_boundary import opened
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.cleanup.open_boundary import opened
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import BRACKET_SHARE, mesh_by_pivots
-from gaussian_wrapping_addon.core.meshing.pivots import PIVOTS
-from gaussian_wrapping_addon.core.meshing.region import Region
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.meshing.points.pivots import PIVOTS
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.regions.convex_region import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.field.field_scenes import make_arrays
 from tests.core.meshing.meshing_scenes import (

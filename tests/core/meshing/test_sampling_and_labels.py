@@ -9,18 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gaussian_wrapping_addon.core.meshing.classification import regularised
-from gaussian_wrapping_addon.core.meshing.pivots import (
+from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles, thin
+from gaussian_wrapping_addon.core.meshing.points.pivots import (
     directional_sigma,
     nine_pivots,
     reaching,
     representative,
     two_pivots,
 )
-from gaussian_wrapping_addon.core.meshing.sampling import (
-    sample_triangles,
-    thin,
-)
+from gaussian_wrapping_addon.core.meshing.tetrahedra.classification import regularised
 from tests.core.field.field_scenes import make_arrays, random_arrays
 from tests.core.meshing.meshing_scenes import cube
 

@@ -9,18 +9,17 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.field.vacancy import VacancyResult
-from gaussian_wrapping_addon.core.meshing.candidate_surface import CandidateSurface
+from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyResult
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
+from gaussian_wrapping_addon.core.meshing.points.candidate_surface import CandidateSurface
+from gaussian_wrapping_addon.core.meshing.points.region_caps import no_caps
+from gaussian_wrapping_addon.core.meshing.points.spacing import Spacing
+from gaussian_wrapping_addon.core.meshing.points.surface_points import SurfacePoints
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
-from gaussian_wrapping_addon.core.meshing.region import Region
-from gaussian_wrapping_addon.core.meshing.region_caps import no_caps
-from gaussian_wrapping_addon.core.meshing.sampling import sample_triangles
-from gaussian_wrapping_addon.core.meshing.spacing import Spacing
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.surface_points import SurfacePoints
 from gaussian_wrapping_addon.core.meshing.tiles import tiled_mesh
-from gaussian_wrapping_addon.core.meshing.tiles.fillers import CLEAR_RADII, lattice
 from gaussian_wrapping_addon.core.meshing.tiles.plan import Field, TilePlan
+from gaussian_wrapping_addon.core.meshing.tiles.steiner_points import CLEAR_RADII, lattice
 from gaussian_wrapping_addon.core.meshing.tiles.tile_faces import (
     TileFaces,
     circumradii,
@@ -32,6 +31,7 @@ from gaussian_wrapping_addon.core.meshing.tiles.tile_points import AllPoints, ga
 from gaussian_wrapping_addon.core.meshing.tiles.tiled_mesh import mesh_in_tiles
 from gaussian_wrapping_addon.core.meshing.tiles.tiling import Tiling, cut_evenly
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.regions.convex_region import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 
 from .meshing_scenes import (

@@ -8,12 +8,12 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection import (
+from gaussian_wrapping_addon.core.render.projection.projection import (
     RawArrays,
     ScreenGaussians,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .scenes import isotropic, look_at
 

@@ -15,11 +15,8 @@ from hypothesis.extra import numpy as hnp
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.depth_query import (
-    query_depth,
-    query_transmittance,
-)
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.query.depth_query import query_depth, query_transmittance
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .comparisons import leaves
 from .query_scenes import SHAPES, scene

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.render.blend import (
-    Images,
-    RenderBuffers,
-    blend,
-    blend_backward,
+from gaussian_wrapping_addon.core.render.projection.projection import (
+    RawArrays,
+    RawGradients,
+    project_backward,
 )
-from gaussian_wrapping_addon.core.render.depth_query import (
+from gaussian_wrapping_addon.core.render.query.depth_query import (
     add_query_gradients,
     query_depth,
     query_transmittance,
@@ -21,17 +20,18 @@ from gaussian_wrapping_addon.core.render.depth_query import (
     query_view_of,
     solve_depths,
 )
-from gaussian_wrapping_addon.core.render.projection import (
-    RawArrays,
-    RawGradients,
-    project_backward,
+from gaussian_wrapping_addon.core.render.raster.blend import (
+    Images,
+    RenderBuffers,
+    blend,
+    blend_backward,
 )
-from gaussian_wrapping_addon.core.render.reference import (
+from gaussian_wrapping_addon.core.render.reference.reference import (
     reference_depth_at,
     reference_transmittance_at,
 )
 from gaussian_wrapping_addon.core.render.render import project_view, render
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .comparisons import leaves, relative_l2
 from .query_scenes import EYE, SHAPES, Oracle, random_positions, scene

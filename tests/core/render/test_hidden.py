@@ -13,13 +13,14 @@ import torch
 from gaussian_wrapping_addon.core import tolerances
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection import (
+from gaussian_wrapping_addon.core.render.projection.projection import (
     RawArrays,
     project_arrays,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
-from gaussian_wrapping_addon.core.render.types import ImageGradients, RenderOptions
+from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
+from gaussian_wrapping_addon.core.render.types.gradients import ImageGradients
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 
 from .scenes import look_at, random_gaussians

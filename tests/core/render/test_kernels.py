@@ -9,21 +9,24 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render import raster_math, reference, view_renderer
-from gaussian_wrapping_addon.core.render.blend import (
+from gaussian_wrapping_addon.core.render import view_renderer
+from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
+from gaussian_wrapping_addon.core.render.raster.blend import (
     Images,
     RenderBuffers,
     blend,
     blend_backward,
 )
-from gaussian_wrapping_addon.core.render.projection import RawArrays
-from gaussian_wrapping_addon.core.render.reference import render_reference
-from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
+from gaussian_wrapping_addon.core.render.reference import reference
+from gaussian_wrapping_addon.core.render.reference.reference import render_reference
+from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
 from gaussian_wrapping_addon.core.render.render import (
     project_view,
     render,
 )
-from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
+from gaussian_wrapping_addon.core.render.simd import raster_math
+from gaussian_wrapping_addon.core.render.types.images import Render
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .comparisons import leaves, relative_l2
 from .first_principles import IMAGES, TRAINED

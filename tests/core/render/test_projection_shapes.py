@@ -11,7 +11,7 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection import (
+from gaussian_wrapping_addon.core.render.projection.projection import (
     RawArrays,
     RawGradients,
     project_backward,

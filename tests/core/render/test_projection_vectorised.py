@@ -11,7 +11,7 @@ import llvmlite.binding
 import numba
 import pytest
 
-from gaussian_wrapping_addon.core.render import (
+from gaussian_wrapping_addon.core.render.projection import (
     projection_activation,
     projection_backward,
     projection_kernels,

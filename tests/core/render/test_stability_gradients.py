@@ -15,16 +15,16 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.projection import (
+from gaussian_wrapping_addon.core.render.projection.projection import (
     RawArrays,
     RawGradients,
     project_backward,
     project_gaussians,
 )
-from gaussian_wrapping_addon.core.render.reference import render_reference
-from gaussian_wrapping_addon.core.render.reference_projection import reference_projection
+from gaussian_wrapping_addon.core.render.reference.reference import render_reference
+from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .comparisons import (
     gradients_of,

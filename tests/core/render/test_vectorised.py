@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.render import raster_backward, raster_forward
-from gaussian_wrapping_addon.core.render.depth_query import query_depth
-from gaussian_wrapping_addon.core.render.depth_query_gradient import pull_range
-from gaussian_wrapping_addon.core.render.depth_query_kernels import query_kernel
-from gaussian_wrapping_addon.core.render.raster_math import aligned_zeros, vector_lanes
+from gaussian_wrapping_addon.core.render.query.depth_query import query_depth
+from gaussian_wrapping_addon.core.render.query.depth_query_gradient import pull_range
+from gaussian_wrapping_addon.core.render.query.depth_query_kernels import query_kernel
+from gaussian_wrapping_addon.core.render.raster import raster_backward, raster_forward
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.simd.raster_math import aligned_zeros, vector_lanes
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .comparisons import leaves
 from .query_scenes import scene

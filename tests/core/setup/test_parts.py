@@ -8,14 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core import worker_requirements
 from gaussian_wrapping_addon.core.errors import ResourceError, UsageError, WorkerError
 from gaussian_wrapping_addon.core.jobs import client as job_client
+from gaussian_wrapping_addon.core.processes import worker_requirements
+from gaussian_wrapping_addon.core.processes.worker_environment import interpreter_of
+from gaussian_wrapping_addon.core.processes.worker_requirements import (
+    Requirement,
+    read_requirements,
+)
 from gaussian_wrapping_addon.core.setup import commands, install, pythons
 from gaussian_wrapping_addon.core.setup.commands import SetupRequest
 from gaussian_wrapping_addon.core.setup.pythons import FoundPython
-from gaussian_wrapping_addon.core.worker_environment import interpreter_of
-from gaussian_wrapping_addon.core.worker_requirements import Requirement, read_requirements
 
 
 def fake_python(folder: Path, version: str, name: str = "python3", bits: int = 64) -> str:

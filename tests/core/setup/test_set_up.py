@@ -21,14 +21,17 @@ from gaussian_wrapping_addon.core.errors import (
     EXIT_USAGE,
     UsageError,
 )
-from gaussian_wrapping_addon.core.helper_process import child_command
 from gaussian_wrapping_addon.core.jobs import client as job_client
-from gaussian_wrapping_addon.core.jobs.doctor import find_and_diagnose
-from gaussian_wrapping_addon.core.jobs.job_folder import JobFolder, JobStatus, process_alive
+from gaussian_wrapping_addon.core.jobs.commands.doctor import find_and_diagnose
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus, process_alive
+from gaussian_wrapping_addon.core.processes.helper_process import child_command
+from gaussian_wrapping_addon.core.processes.worker_environment import (
+    WorkerEnvironment,
+    interpreter_of,
+)
 from gaussian_wrapping_addon.core.setup import install, pythons
 from gaussian_wrapping_addon.core.setup.commands import SetupRequest
 from gaussian_wrapping_addon.core.setup.install import SetupTask
-from gaussian_wrapping_addon.core.worker_environment import WorkerEnvironment, interpreter_of
 from tests.core.setup.wheels import write_wheel
 
 DEADLINE_S = 100.0
@@ -51,7 +54,7 @@ def own_packages() -> dict[str, float]:
 
 def imported(request: SetupRequest, module: str) -> str:
     """Ask the environment for a module's version, in the way a worker is started."""
-    command = child_command("jobs.doctor", python=request.environment.worker())
+    command = child_command("jobs.commands.doctor", python=request.environment.worker())
     entry = command.index("-u")
     code = (
         "import sys; f = sys._xoptions.get('gwrap_packages'); f and sys.path.insert(0, f);"
@@ -261,7 +264,7 @@ def test_without_a_venv_only_the_child_sees_packages(quick: SetupRequest) -> Non
     assert environment.marker()["kind"] == "packages"
     assert environment.is_ready()
     assert environment.worker() == quick.root
-    assert child_command("jobs.doctor", python=quick.root)[:2] == [quick.python, "-I"]
+    assert child_command("jobs.commands.doctor", python=quick.root)[:2] == [quick.python, "-I"]
     assert imported(quick, "gwalpha") == "1.2"
     plain = subprocess.run(
         [quick.python, "-I", "-c", "import gwalpha"], capture_output=True, check=False

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 
 BUMPS = 18.0
 """Radians along a unit: about 20 bumps around the equator."""

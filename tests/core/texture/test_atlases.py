@@ -25,19 +25,19 @@ from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import EXIT_RESOURCES, ResourceError
 from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import TexturedRenderer
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.export import write_textured
-from gaussian_wrapping_addon.core.texture.levels import levels_of_detail
-from gaussian_wrapping_addon.core.texture.texture_memory import (
+from gaussian_wrapping_addon.core.texture.cost.texture_memory import (
     fit_into_memory,
     texture_memory_bytes,
 )
+from gaussian_wrapping_addon.core.texture.cost.texture_size import plan_textures
+from gaussian_wrapping_addon.core.texture.detail.levels_of_detail import levels_of_detail
+from gaussian_wrapping_addon.core.texture.files.textured_files import write_textured
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
-from gaussian_wrapping_addon.core.texture.texture_size import plan_textures
-from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
-from gaussian_wrapping_addon.core.texture.unwrap import unwrap
+from gaussian_wrapping_addon.core.texture.unwrap.unwrap import unwrap
 
 SIDES = {1: 512, 2: 362, 3: 296}
 """About as many texels in all."""
@@ -116,7 +116,7 @@ def test_several_atlases_bring_the_texture_back_as_one_does(
 
 @pytest.mark.parametrize("atlases", [2, 3])
 def test_what_two_photos_show_is_baked(atlases: int, baked: Bakes, photos: RenderedPhotos) -> None:
-    from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
+    from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
 
     textured = baked[atlases]
     for number, maps in enumerate(textured.atlases):
@@ -173,7 +173,7 @@ def test_charts_of_one_sheet_are_cut_to_fill_several_atlases(tmp_path: Path) -> 
 
 
 def test_the_fallback_unwrap_spreads_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from gaussian_wrapping_addon.core.texture import charts
+    from gaussian_wrapping_addon.core.texture.unwrap import charts
 
     monkeypatch.setattr(charts, "CHARTS_HELPER", "texture.no_such_helper")
     found = unwrap(spot(), 256, 2, tmp_path, Progress(), atlases=3)

@@ -31,17 +31,17 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError, ResourceError, UsageError
-from gaussian_wrapping_addon.core.jobs.export_files import ExportRequest, export_files
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.jobs.commands.export_files import ExportRequest, export_files
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.names import file_stem
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.texture import charts
-from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
-from gaussian_wrapping_addon.core.texture.unwrap import Unwrap, unwrap
-from tests.core.jobs.test_export_files import write_result
+from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.unwrap import charts
+from gaussian_wrapping_addon.core.texture.unwrap.unwrap import Unwrap, unwrap
+from tests.core.jobs.commands.test_export_files import write_result
 from tests.core.texture.test_texture_mesh import run
-from tests.core.texture.test_unwrap import MESHES, noisy
 from tests.core.texture.texture_scenes import look_at, photograph, ring, sphere, sphere_hit, waves
+from tests.core.texture.unwrap.test_unwrap import MESHES, noisy
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -187,7 +187,7 @@ def test_48_memory(tmp_path: Path) -> None:
     script = (
         "import resource, sys\n"
         "from pathlib import Path\n"
-        "from gaussian_wrapping_addon.core.jobs.answer import answer\n"
+        "from gaussian_wrapping_addon.core.jobs.commands.worker_call import answer\n"
         "from tests.core.texture.test_texture_mesh import run\n"
         "from tests.core.texture.texture_scenes import *\n"
         "photos = photograph(ring(2, 3.0, 0.0), [(sphere_hit, waves)])\n"

@@ -26,12 +26,12 @@ from benchmarks.texturing_parts.photographed import (
     uneven,
 )
 from benchmarks.texturing_parts.solid_texture import SolidTexture
+from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture import bake
-from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.bake import bake
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
-from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
 
 SIZE_PX = 512
 

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError, UsageError
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.face_graph import face_graph
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
-from gaussian_wrapping_addon.core.texture.atlas_raster import raster_atlas
-from gaussian_wrapping_addon.core.texture.bake import Baked
-from gaussian_wrapping_addon.core.texture.exposure import solve_gains
-from gaussian_wrapping_addon.core.texture.face_graph import face_graph
-from gaussian_wrapping_addon.core.texture.fill import surface_positions
-from gaussian_wrapping_addon.core.texture.photo_samples import SurfaceArrays, SurfacePoints
+from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
+from gaussian_wrapping_addon.core.texture.bake.bake import Baked
+from gaussian_wrapping_addon.core.texture.bake.coverage_statistics import Tally
+from gaussian_wrapping_addon.core.texture.bake.fill import surface_positions
+from gaussian_wrapping_addon.core.texture.bake.photo_gains import solve_gains
+from gaussian_wrapping_addon.core.texture.bake.photo_samples import SurfaceArrays, SurfacePoints
+from gaussian_wrapping_addon.core.texture.cost.texture_size import automatic_size, gutter_for
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
-from gaussian_wrapping_addon.core.texture.texture_size import automatic_size, gutter_for
-from gaussian_wrapping_addon.core.texture.texture_tally import Tally
-from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
-from gaussian_wrapping_addon.core.texture.unwrap import Unwrap
+from gaussian_wrapping_addon.core.texture.unwrap.unwrap import Unwrap
 from tests.core.texture.texture_scenes import (
     FakePhotos,
     box,

@@ -11,7 +11,7 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.training.multi_view import _Pair
+from gaussian_wrapping_addon.core.training.losses.multi_view import _Pair
 from tests.core.render.scenes import look_at
 
 NORMAL = np.array([0.0, 0.0, 1.0])

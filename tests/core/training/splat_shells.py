@@ -8,7 +8,7 @@ import math
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.dataset.splat_source import even_directions
+from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import even_directions
 from gaussian_wrapping_addon.core.gaussians.initialisation import SH_C0
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 

@@ -15,15 +15,15 @@ from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.cancelling import CheckedPhotos, checked
-from gaussian_wrapping_addon.core.training.contribution import contributions
-from gaussian_wrapping_addon.core.training.harmonics_need import harmonics_need
-from gaussian_wrapping_addon.core.training.harmonics_trial import NeedView
-from gaussian_wrapping_addon.core.training.optimizer import Adam
-from gaussian_wrapping_addon.core.training.wrapping import (
+from gaussian_wrapping_addon.core.training.density.contribution import contributions
+from gaussian_wrapping_addon.core.training.density.wrapping import (
     WrapView,
     normal_errors,
     start_orientation,
 )
+from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
+from gaussian_wrapping_addon.core.training.selection.harmonics_selection import harmonics_need
+from gaussian_wrapping_addon.core.training.selection.harmonics_trial import NeedView
 from tests.core.training.small_scene import sphere_gaussians, sphere_scene
 
 VIEWS = 5

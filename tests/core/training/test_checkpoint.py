@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.core.training.checkpoint import (
     remove_checkpoints,
     save_checkpoint,
 )
-from gaussian_wrapping_addon.core.training.optimizer import TRAINED
+from gaussian_wrapping_addon.core.training.optimizer.adam import TRAINED
 from gaussian_wrapping_addon.core.training.state import TrainingState
 from tests.core.render.scenes import random_gaussians
 from tests.core.training.small_scene import sphere_scene

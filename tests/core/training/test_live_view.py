@@ -12,10 +12,10 @@ import pytest
 from PIL import Image
 
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.evaluation.views.view_metrics import psnr
+from gaussian_wrapping_addon.core.imaging.view_metrics import psnr
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.render.reference import render_reference
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.reference.reference import render_reference
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import live_view
 from gaussian_wrapping_addon.core.training.cancelling import checked

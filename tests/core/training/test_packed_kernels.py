@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.evaluation.views import ssim_kernels
-from gaussian_wrapping_addon.core.training import adam_kernels, loss_kernels
-from gaussian_wrapping_addon.core.training.losses import color_loss, normal_losses
-from gaussian_wrapping_addon.core.training.optimizer import Adam
+from gaussian_wrapping_addon.core.imaging import ssim_kernels
+from gaussian_wrapping_addon.core.training.losses import loss_kernels
+from gaussian_wrapping_addon.core.training.losses.losses import color_loss, normal_losses
+from gaussian_wrapping_addon.core.training.optimizer import adam_kernels
+from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
 from tests.core.render.scenes import look_at, random_gaussians
 from tests.core.render.test_vectorised import PACKED, SINGLE
-from tests.core.training.test_optimizer import all_rates, random_gradients
+from tests.core.training.optimizer.test_adam import all_rates, random_gradients
 
 
 @functools.cache

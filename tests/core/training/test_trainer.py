@@ -16,7 +16,7 @@ from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, UsageEr
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import iteration, rounds, trainer

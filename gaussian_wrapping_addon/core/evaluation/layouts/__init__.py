@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Readers of what a mesh is compared with."""
+"""Ground truths as their owners have them: Tanks and Temples, DTU, plain files."""

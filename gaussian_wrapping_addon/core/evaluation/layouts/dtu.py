@@ -23,7 +23,7 @@ import numpy as np
 from ...dataset.camera import Camera
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError, ParseError
-from ..alignment import umeyama
+from ..alignment.similarity_alignment import umeyama
 from ..surface.dtu_chamfer import (
     DENSITY_MM,
     PATCH_MM,

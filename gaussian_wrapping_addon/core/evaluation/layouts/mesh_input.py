@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...dataset.point_file import read_point_ply
+from ...dataset.readers.point_file import read_point_ply
 from ...errors import ParseError, WorkerError
 from ...ply.header import read_ply_header
 

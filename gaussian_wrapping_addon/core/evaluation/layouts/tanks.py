@@ -23,7 +23,7 @@ from ...dataset.camera import Camera
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError, ParseError, UsageError
 from ...progress import Progress
-from ..alignment import RansacResult, refine_as_tanks, umeyama_ransac
+from ..alignment.similarity_alignment import RansacResult, refine_as_tanks, umeyama_ransac
 from ..surface.samples import (
     sample_legacy,
     sample_uniformly,

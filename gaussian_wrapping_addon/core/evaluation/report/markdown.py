@@ -11,10 +11,11 @@ from typing import Any
 
 from ...files import resolve_inside
 from ...names import REPORT_FOLDER
-from .estimate import estimate_lines
+from .estimate_section import estimate_lines
 from .figures import figure_rows
-from .needs import needs_lines
-from .region import Picture, note_lines, region_lines, region_summary
+from .region_section import Picture, note_lines, region_lines, region_summary
+from .report_warnings import FEW_HELD_OUT, collect_warnings, warning_lines
+from .selection_section import needs_lines
 from .text import (
     NOT_MEASURED,
     bar,
@@ -30,7 +31,6 @@ from .text import (
     table,
     words,
 )
-from .warnings import FEW_HELD_OUT, collect_warnings, warning_lines
 
 CURVE = "learning-curve.svg"
 

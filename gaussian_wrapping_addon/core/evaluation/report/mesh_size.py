@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ...dataset.similarity import Similarity
+from ...mesh.components import face_components, volumes_and_areas
 from ...mesh.topology import edge_lengths
-from ...meshing.components import face_components, volumes_and_areas
 
 
 def sizes_in_world(

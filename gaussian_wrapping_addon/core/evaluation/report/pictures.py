@@ -14,8 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from ...dataset.photo_source import PhotoSource
 from ...files import write_bytes
 from ...gaussians.model import OrientedGaussians
-from ...render.projection import RawArrays
-from ...render.types import RenderOptions
+from ...render.projection.projection import RawArrays
+from ...render.types.options import RenderOptions
 from ...render.view_renderer import ViewRenderer
 from .plot import Panel, Series, write_svg
 from .text import items, measured, part

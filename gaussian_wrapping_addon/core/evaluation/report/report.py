@@ -8,9 +8,9 @@ from typing import Any
 
 from ...files import finite, write_bytes, write_json
 from .markdown import report_markdown
-from .region import closedness
+from .region_section import closedness
+from .report_warnings import collect_warnings
 from .text import duration, items, measured, number, part, percent, plural
-from .warnings import collect_warnings
 
 
 def write_report(

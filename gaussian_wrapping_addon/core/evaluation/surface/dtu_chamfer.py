@@ -16,8 +16,8 @@ import numpy as np
 from ...errors import MeshingError, ResourceError, UsageError
 from ...files import finite
 from ...limits import MAX_POINTS
-from ...meshing.sampling import thin
-from .distance import distances_to_cloud
+from ...mesh.distance import distances_to_cloud
+from ...mesh.surface_sampling import thin
 
 DENSITY_MM = 0.2
 """Predicted points are no denser than this, and a resampled mesh has no wider gaps."""

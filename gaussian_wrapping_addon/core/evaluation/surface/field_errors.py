@@ -12,12 +12,12 @@ import numpy as np
 
 from ...dataset.camera import Camera
 from ...errors import UsageError
-from ...field.vacancy import VacancyField
+from ...field.vacancy.vacancy import VacancyField
 from ...gaussians.model import OrientedGaussians
-from ...parallel import default_threads
+from ...kernels.parallel import default_threads
+from ...mesh.depth_buffer import depth_buffer
 from ...render.render import render
-from ...render.types import RenderOptions
-from ...texture.depth_buffer import depth_buffer
+from ...render.types.options import RenderOptions
 
 PROBE_REACH = 2.0
 """Vacancy is probed along each normal this many largest thresholds to both sides."""

@@ -11,7 +11,7 @@ import numpy as np
 from ...dataset.camera import Camera
 from ...dataset.similarity import Similarity
 from ...errors import MeshingError, UsageError
-from ...texture.depth_buffer import depth_buffer
+from ...mesh.depth_buffer import depth_buffer
 
 DEGENERATE_SHARE = 1e-12
 """A face whose doubled area is below this share of its longest edge squared has no direction."""

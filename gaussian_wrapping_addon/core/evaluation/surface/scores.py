@@ -17,8 +17,8 @@ import numpy as np
 from ...dataset.camera import Camera
 from ...errors import UsageError
 from ...files import finite
-from ...parallel import default_threads
-from .distance import distances_to_cloud, distances_to_mesh
+from ...kernels.parallel import default_threads
+from ...mesh.distance import distances_to_cloud, distances_to_mesh
 from .samples import (
     SurfaceSamples,
     choose_per_cell,
@@ -237,7 +237,7 @@ def score_protocols(
         See :func:`~.samples.sample_uniformly`.
     threads : int
         Threads to use, 0 for every core; the result does not depend on it. The distances to meshes
-        take every core whatever is said here (see :func:`~.distance.distances_to_mesh`).
+        take every core whatever is said here (see :func:`~...mesh.distance.distances_to_mesh`).
     protocols : sequence of str
         Out of :data:`PROTOCOLS`.
     step_px : float, optional

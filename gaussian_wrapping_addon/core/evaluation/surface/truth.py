@@ -11,7 +11,8 @@ from zipfile import BadZipFile
 import numpy as np
 
 from ...errors import DatasetError, ParseError
-from ...meshing.region import Region, read_region
+from ...regions.convex_region import Region
+from ...regions.region import read_region
 from .samples import SurfaceSamples
 
 TRUTH_FILE = "truth.npz"

@@ -1,2 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far a picture is from its photo, and the pictures themselves."""
+"""The textured mesh seen from cameras, beside photos.
+
+In: a textured mesh, cameras, photos. Out: pictures and figures.
+"""

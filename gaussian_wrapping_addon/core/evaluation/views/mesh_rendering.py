@@ -15,11 +15,11 @@ import numpy as np
 
 from ...dataset.camera import Camera
 from ...errors import UsageError
-from ...parallel import default_threads
-from ...texture.textured_mesh import TexturedMesh
-from .lpips import Lpips, lpips_ready
+from ...imaging.lpips import Lpips, lpips_ready
+from ...imaging.view_metrics import ViewScores, has_windows, score_images
+from ...kernels.parallel import default_threads
+from ...mesh.textured_mesh import TexturedMesh
 from .textured_rendering import TexturedRenderer
-from .view_metrics import ViewScores, has_windows, score_images
 
 OnView = Callable[[str, np.ndarray, np.ndarray], None]
 
@@ -99,9 +99,9 @@ def render_views(
 ) -> MeshRenderingScore:
     """Render the mesh from each camera and compare with the camera's photo.
 
-    PSNR, SSIM and LPIPS are those of :func:`~.view_metrics.score_images` over the pixels that
-    count. The rendering is antialiased by ``SUPERSAMPLING`` squared rays a pixel, unlit, both sides
-    of the surface shown.
+    PSNR, SSIM and LPIPS are those of :func:`~...imaging.view_metrics.score_images` over the pixels
+    that count. The rendering is antialiased by ``SUPERSAMPLING`` squared rays a pixel, unlit, both
+    sides of the surface shown.
 
     Parameters
     ----------

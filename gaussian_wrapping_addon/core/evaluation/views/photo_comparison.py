@@ -13,13 +13,13 @@ import numpy as np
 
 from ...dataset.photo_source import PhotoSource
 from ...dataset.scene import Scene
-from ...parallel import default_threads
+from ...imaging.lpips import lpips_if_ready
+from ...kernels.parallel import default_threads
+from ...mesh.textured_mesh import TexturedMesh
 from ...progress import Progress
-from ...texture.textured_mesh import TexturedMesh
-from .lpips import lpips_if_ready
+from .held_out_texture import texture_without
 from .mesh_rendering import render_views
 from .side_by_side import write_side_by_side
-from .texture_without import texture_without
 
 MAX_PHOTOS = 8
 LONG_SIDE_PX = 800

@@ -11,10 +11,10 @@ import numpy as np
 from ...dataset.camera import Camera
 from ...dataset.photo_source import PhotoSource
 from ...dataset.scene import Scene
+from ...kernels.parallel import default_threads
+from ...mesh.depth_buffer import depth_buffer
+from ...mesh.textured_mesh import TexturedMesh
 from ...mesh.topology import area_vectors
-from ...parallel import default_threads
-from ...texture.depth_buffer import depth_buffer
-from ...texture.textured_mesh import TexturedMesh
 from .side_by_side import write_side_by_side
 from .textured_rendering import TexturedRenderer
 

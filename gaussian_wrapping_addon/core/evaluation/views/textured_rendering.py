@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ...compiled import kernel
 from ...dataset.camera import Camera
-from ...parallel import default_threads, even_bounds, run_chunks
-from ...texture.depth_buffer import depth_buffer
-from ...texture.sampling import Pyramid, pyramid, trilinear
-from ...texture.textured_mesh import TexturedMesh
+from ...imaging.trilinear import Pyramid, pyramid, trilinear
+from ...kernels.compiled import kernel
+from ...kernels.parallel import default_threads, even_bounds, run_chunks
+from ...mesh.depth_buffer import depth_buffer
+from ...mesh.textured_mesh import TexturedMesh
 
 BACKGROUND = (92, 92, 94)
 SUPERSAMPLING = 3

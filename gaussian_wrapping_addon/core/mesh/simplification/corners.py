@@ -12,7 +12,7 @@ int64 (of :mod:`.link_condition`). All are changed in place.
 
 from __future__ import annotations
 
-from ...compiled import kernel, part
+from ...kernels.compiled import kernel, part
 from .counters import FACES_LEFT, VERTICES_LEFT
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compiled import kernel, part
+from ...kernels.compiled import kernel, part
 from .corners import drop_dead, merge
 from .counters import DONE, EMPTY, FULL, HEAP_ROOM, HEAP_SIZE, PAUSED, VERTICES_LEFT
 from .heap import drop_first, take_in_last

@@ -8,7 +8,7 @@ entry with the least (cost, tie) comes first; ``counts[HEAP_SIZE]`` entries are 
 
 from __future__ import annotations
 
-from ...compiled import part
+from ...kernels.compiled import part
 from .counters import HEAP_SIZE
 
 

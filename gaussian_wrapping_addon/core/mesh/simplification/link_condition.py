@@ -8,7 +8,7 @@ ring are marked with numbers that only grow, so that no mark has to be erased.
 
 from __future__ import annotations
 
-from ...compiled import part
+from ...kernels.compiled import part
 from .counters import TICK
 
 

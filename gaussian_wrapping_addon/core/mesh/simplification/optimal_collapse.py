@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compiled import kernel, part
+from ...kernels.compiled import kernel, part
 from .corners import drop_dead, merge
 from .counters import DONE, EMPTY, FACES_LEFT, FULL, HEAP_ROOM, HEAP_SIZE, PAUSED, SEQUENCE
 from .heap import drop_first, take_in_last

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...compiled import part
+from ...kernels.compiled import part
 from .quadrics import error_of_both
 
 BEST, FIRST, SECOND = 0, 1, 2

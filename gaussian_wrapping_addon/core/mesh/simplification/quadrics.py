@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...compiled import kernel, part
+from ...kernels.compiled import kernel, part
 
 COLUMNS = 11
 """Of a quadric."""

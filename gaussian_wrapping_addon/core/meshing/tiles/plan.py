@@ -11,16 +11,16 @@ import numpy as np
 
 from ... import limits
 from ...dataset.camera import Camera
+from ...mesh.surface_sampling import POINTS_PER_SQUARE
 from ...progress import Progress
+from ...regions.convex_region import Region
 from ...report_warning import ReportWarning
-from ..candidate_surface import CandidateSurface
-from ..convex_region import Region
-from ..region_caps import Caps, cap_points
-from ..resolution import Dense, Request, dense_request, nominal_edge
-from ..sampling import POINTS_PER_SQUARE
-from ..spacing import Spacing
-from ..surface_points import SurfaceSampler
-from .fillers import CLEAR_CAP_RADII, CLEAR_RADII, lattice, lattice_side
+from ..points.candidate_surface import CandidateSurface
+from ..points.region_caps import Caps, cap_points
+from ..points.resolution import Dense, Request, dense_request, nominal_edge
+from ..points.spacing import Spacing
+from ..points.surface_points import SurfaceSampler
+from .steiner_points import CLEAR_CAP_RADII, CLEAR_RADII, lattice, lattice_side
 from .tiling import Tiling, cut_evenly
 
 TILE_POINTS = 75_000

@@ -12,12 +12,12 @@ import numpy as np
 
 from ...errors import ParseError
 from ...files import read_json, write_bytes, write_json
+from ...regions.convex_region import Region
 from ...report_warning import read_warnings
-from ..candidate_surface import CandidateSurface
-from ..convex_region import Region
-from ..region_caps import Caps
-from ..spacing import Spacing
-from ..surface_points import SurfacePoints
+from ..points.candidate_surface import CandidateSurface
+from ..points.region_caps import Caps
+from ..points.spacing import Spacing
+from ..points.surface_points import SurfacePoints
 from .plan import TilePlan
 from .tile_faces import TileFaces
 from .tile_points import AllPoints

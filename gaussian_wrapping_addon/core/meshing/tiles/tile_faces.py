@@ -2,8 +2,8 @@
 """Labels of the tetrahedra of one tile, and its part of the faces between inside and outside.
 
 Each tetrahedron inside the region belongs to the tile of its corner with the smallest number. All
-tiles know it as the same one (:mod:`.fillers`), and only its owner says whether it is solid. So
-the faces of all tiles together bound a set of whole tetrahedra of one triangulation: they are
+tiles know it as the same one (:mod:`.steiner_points`), and only its owner says whether it is solid.
+So the faces of all tiles together bound a set of whole tetrahedra of one triangulation: they are
 closed, whatever the labels are.
 """
 
@@ -16,9 +16,9 @@ import numpy as np
 
 from ...errors import MeshingError
 from ...progress import Progress
-from ..classification import classify, on_one_sheet
-from ..delaunay import delaunay, far_points
-from ..extraction import OUTWARD_FACES, tetrahedron_neighbours
+from ..tetrahedra.boundary_faces import OUTWARD_FACES, tetrahedron_neighbours
+from ..tetrahedra.classification import classify, on_one_sheet
+from ..tetrahedra.delaunay import delaunay, far_points
 from .plan import Field, TilePlan
 from .tile_points import AllPoints
 

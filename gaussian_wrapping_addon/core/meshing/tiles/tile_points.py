@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ...mesh.surface_sampling import EDGE_PER_RADIUS, thin
 from ...progress import Progress
-from ..resolution import Request
-from ..sampling import EDGE_PER_RADIUS, thin
-from ..surface_points import (
+from ..points.resolution import Request
+from ..points.surface_points import (
     KIND_CAP,
     KIND_JUMP,
     PRIORITY_SURFACE,
     SurfacePoints,
     SurfaceSampler,
 )
-from .fillers import CLEAR_CAP_RADII, CLEAR_RADII, clear_of
 from .plan import JITTER_SHARE, Field, TilePlan
+from .steiner_points import CLEAR_CAP_RADII, CLEAR_RADII, clear_of
 
 KIND_FILLER = 4
 """A filler that ended between inside and outside, where the field is undecided in depth."""

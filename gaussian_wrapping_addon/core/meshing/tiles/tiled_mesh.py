@@ -11,15 +11,15 @@ import numpy as np
 
 from ...dataset.camera import Camera
 from ...errors import MeshingError
-from ...field.sightings import Sightings
+from ...field.depth_samples import Sightings
 from ...gaussians.model import GaussianArrays
+from ...mesh.surface_mesh import SurfaceMesh
 from ...progress import Progress
+from ...regions.convex_region import Region
 from ...settings import MeshingSettings
-from ..candidate_surface import candidate_surface
-from ..convex_region import Region
+from ..points.candidate_surface import candidate_surface
+from ..points.resolution import checked_request
 from ..primal_adaptive import counts, distance_to_level, finished, selected, tidied
-from ..resolution import checked_request
-from ..surface_mesh import SurfaceMesh
 from .plan import Field, TilePlan, make_plan
 from .tile_faces import TileFaces, joined_faces, tile_faces
 from .tile_points import KIND_FILLER, AllPoints, gather, tile_points

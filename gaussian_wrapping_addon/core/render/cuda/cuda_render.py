@@ -19,7 +19,8 @@ from ... import tolerances
 from ...dataset.camera import Camera
 from ...errors import ResourceError, UsageError
 from ...gaussians.model import OrientedGaussians
-from ..types import Render, RenderOptions, RenderStatistics
+from ..types.images import Render, RenderStatistics
+from ..types.options import RenderOptions
 from .kernels import Kernels, device_kernels
 from .tile_lists import (
     ROW_VALUES,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ...errors import DeviceError
-from ..projection_kernels import CAMERA_VALUES
+from ..projection.projection_kernels import CAMERA_VALUES
 from .compiler import compile_text, find_nvrtc
 from .driver import DriverModule, load_driver
 from .source import KERNELS, THREADS_PER_BLOCK, cuda_source

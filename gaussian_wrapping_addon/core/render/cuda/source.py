@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 from ... import tolerances
-from ..raster_math import FRONT_SIGMAS
+from ..simd.raster_math import FRONT_SIGMAS
 
 PARTS = (
     "common.cu",
@@ -68,7 +68,7 @@ _SINGLE = {
     "SOLVER_LEVEL_FAR": 0.05,
     "SOLVER_FLAT": 0.02,
     "SOLVER_LEAST_SLOPE": 1e-12,
-    # As in core/field/vacancy_kernels.py.
+    # As in core/field/vacancy/vacancy_kernels.py.
     "FACTOR_MIN": 1e-7,
     "TRANSMITTANCE_LOST": 1e-4,
 }

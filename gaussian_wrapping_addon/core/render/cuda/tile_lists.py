@@ -13,8 +13,8 @@ from ... import tolerances
 from ...dataset.camera import Camera
 from ...errors import ResourceError
 from ...gaussians.model import OrientedGaussians
-from ..projection import pack_camera, used_degree
-from ..types import RenderOptions
+from ..projection.projection import pack_camera, used_degree
+from ..types.options import RenderOptions
 from .kernels import CameraValues, Kernels
 from .source import THREADS_PER_BLOCK
 

@@ -13,8 +13,8 @@ from scipy.io import savemat
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.evaluation.surface.samples import sample_uniformly
-from gaussian_wrapping_addon.core.jobs.job_folder import MARKER
-from gaussian_wrapping_addon.core.texture.export import write_mesh_ply
+from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER
+from gaussian_wrapping_addon.core.texture.files.textured_files import write_mesh_ply
 
 Mesh = tuple[np.ndarray, np.ndarray]
 

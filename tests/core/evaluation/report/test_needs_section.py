@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
-from gaussian_wrapping_addon.core.evaluation.report.needs import needs_lines
+from gaussian_wrapping_addon.core.evaluation.report.selection_section import needs_lines
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.needs import Decision, Needs, decide
+from gaussian_wrapping_addon.core.training.selection.model_selection import Decision, Needs, decide
 from tests.core.evaluation.report.report_examples import full_summary
 
 NAMES = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size")

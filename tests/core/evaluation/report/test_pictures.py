@@ -26,9 +26,9 @@ from gaussian_wrapping_addon.core.evaluation.report.pictures import (
     write_held_out,
     write_learning_curve,
 )
-from gaussian_wrapping_addon.core.evaluation.views.view_metrics import psnr
-from gaussian_wrapping_addon.core.render.projection import RawArrays
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.imaging.view_metrics import psnr
+from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from tests.core.training.small_scene import sphere_gaussians, sphere_scene
 

@@ -16,6 +16,10 @@ import pytest
 from gaussian_wrapping_addon.core.evaluation.report.figures import figure_rows
 from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
 from gaussian_wrapping_addon.core.evaluation.report.report import headline, write_report
+from gaussian_wrapping_addon.core.evaluation.report.report_warnings import (
+    FEW_HELD_OUT,
+    collect_warnings,
+)
 from gaussian_wrapping_addon.core.evaluation.report.text import (
     NOT_MEASURED,
     bar,
@@ -24,10 +28,6 @@ from gaussian_wrapping_addon.core.evaluation.report.text import (
     number,
     percent,
     table,
-)
-from gaussian_wrapping_addon.core.evaluation.report.warnings import (
-    FEW_HELD_OUT,
-    collect_warnings,
 )
 from gaussian_wrapping_addon.core.files import finite
 from gaussian_wrapping_addon.core.report_warning import ReportWarning, read_warnings

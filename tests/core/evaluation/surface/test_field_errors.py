@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.core.evaluation.surface.field_errors import (
     depth_errors,
     vacancy_errors,
 )
-from gaussian_wrapping_addon.core.field.vacancy import VacancyField
+from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from tests.core.field.field_scenes import camera_at, unit_sphere
 from tests.poses import look_at_pose

@@ -10,7 +10,6 @@ import pytest
 import trimesh
 
 from gaussian_wrapping_addon.core.errors import MeshingError, UsageError
-from gaussian_wrapping_addon.core.evaluation.surface.distance import distances_to_mesh
 from gaussian_wrapping_addon.core.evaluation.surface.samples import (
     SurfaceSamples,
     choose_per_cell,
@@ -20,7 +19,8 @@ from gaussian_wrapping_addon.core.evaluation.surface.samples import (
     scan_virtually,
     thin_out,
 )
-from gaussian_wrapping_addon.core.texture.depth_buffer import NEAR_DEPTH
+from gaussian_wrapping_addon.core.mesh.depth_buffer import NEAR_DEPTH
+from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
 from tests.core.evaluation.surface.surface_scenes import (
     ball,
     camera_at,

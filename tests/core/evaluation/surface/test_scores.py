@@ -12,7 +12,6 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gaussian_wrapping_addon.core.errors import MeshingError, UsageError
-from gaussian_wrapping_addon.core.evaluation.surface import distance as surface_distance
 from gaussian_wrapping_addon.core.evaluation.surface import scores as surface_scores
 from gaussian_wrapping_addon.core.evaluation.surface.samples import (
     SurfaceSamples,
@@ -28,8 +27,9 @@ from gaussian_wrapping_addon.core.evaluation.surface.scores import (
     score_surface,
 )
 from gaussian_wrapping_addon.core.evaluation.surface.truth import RegionCrop, Truth
-from gaussian_wrapping_addon.core.meshing.region import Region
-from gaussian_wrapping_addon.core.parallel import default_threads
+from gaussian_wrapping_addon.core.kernels.parallel import default_threads
+from gaussian_wrapping_addon.core.mesh import distance as surface_distance
+from gaussian_wrapping_addon.core.regions.convex_region import Region
 from tests.core.evaluation.surface.surface_scenes import (
     Mesh,
     ball,

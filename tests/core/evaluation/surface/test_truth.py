@@ -11,7 +11,8 @@ import pytest
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
 from gaussian_wrapping_addon.core.evaluation.surface.samples import SurfaceSamples, sample_uniformly
 from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth, read_truth
-from gaussian_wrapping_addon.core.meshing.region import Region, write_region
+from gaussian_wrapping_addon.core.regions.convex_region import Region
+from gaussian_wrapping_addon.core.regions.region import write_region
 from tests.core.evaluation.surface.surface_scenes import ball
 
 

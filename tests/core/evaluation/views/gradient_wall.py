@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from tests.core.texture.texture_scenes import look_at
 
 

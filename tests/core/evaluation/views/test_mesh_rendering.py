@@ -13,15 +13,15 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.evaluation.views import mesh_rendering
-from gaussian_wrapping_addon.core.evaluation.views.lpips import PLACES_VARIABLE, Lpips
 from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
 from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import (
     BACKGROUND,
     TexturedRenderer,
 )
-from gaussian_wrapping_addon.core.evaluation.views.view_metrics import PSNR_CAP_DB
-from gaussian_wrapping_addon.core.meshing.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
+from gaussian_wrapping_addon.core.imaging.lpips import PLACES_VARIABLE, Lpips
+from gaussian_wrapping_addon.core.imaging.view_metrics import PSNR_CAP_DB
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from tests.core.evaluation.views.gradient_wall import CAMERAS, gradient_wall
 from tests.core.evaluation.views.lpips_weights import random_states, write
 from tests.core.texture.texture_scenes import look_at, ring, shoot, sphere_hit, waves

@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.evaluation.views import lpips, photo_comparison
+from gaussian_wrapping_addon.core.evaluation.views import photo_comparison
+from gaussian_wrapping_addon.core.evaluation.views.held_out_texture import texture_without
 from gaussian_wrapping_addon.core.evaluation.views.photo_comparison import (
     LONG_SIDE_PX,
     MAX_PHOTOS,
@@ -21,7 +22,7 @@ from gaussian_wrapping_addon.core.evaluation.views.photo_comparison import (
     compare_with_photos,
 )
 from gaussian_wrapping_addon.core.evaluation.views.side_by_side import GAP_PX
-from gaussian_wrapping_addon.core.evaluation.views.texture_without import texture_without
+from gaussian_wrapping_addon.core.imaging import lpips
 from gaussian_wrapping_addon.core.progress import Progress
 from tests.core.evaluation.views.gradient_wall import gradient_wall, wall_color, wall_hit
 from tests.core.texture.texture_scenes import FakePhotos, look_at, photograph, scene_of

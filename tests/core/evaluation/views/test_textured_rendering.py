@@ -11,7 +11,7 @@ from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import (
     BACKGROUND,
     TexturedRenderer,
 )
-from gaussian_wrapping_addon.core.texture.textured_mesh import TexturedMesh
+from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from tests.core.evaluation.views.gradient_wall import CAMERAS, gradient_wall, wall_color, wall_hit
 from tests.core.texture.texture_scenes import look_at, photograph
 

@@ -24,8 +24,8 @@ from gaussian_wrapping_addon.core.mesh.simplification.quadrics import (
     error_of_both,
     error_of_one,
 )
-from gaussian_wrapping_addon.core.meshing.mesh_check import check_mesh
-from gaussian_wrapping_addon.core.meshing.vertex_selection import select_vertices
+from gaussian_wrapping_addon.core.mesh.simplification.vertex_selection import select_vertices
+from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 RNG = np.random.default_rng(0)

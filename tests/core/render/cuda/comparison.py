@@ -15,7 +15,8 @@ from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.cuda.cuda_render import render_with
 from gaussian_wrapping_addon.core.render.cuda.kernels import Argument, Kernels
-from gaussian_wrapping_addon.core.render.types import Render, RenderOptions
+from gaussian_wrapping_addon.core.render.types.images import Render
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 IMAGES = ("color", "normal", "geometric_normal", "alpha", "depth")

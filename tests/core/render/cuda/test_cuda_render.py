@@ -12,7 +12,7 @@ from gaussian_wrapping_addon.core.render.cuda import cuda_render, kernels
 from gaussian_wrapping_addon.core.render.cuda.cuda_render import render_cuda
 from gaussian_wrapping_addon.core.render.cuda.kernels import cuda_available
 from gaussian_wrapping_addon.core.render.render import render
-from gaussian_wrapping_addon.core.render.types import RenderOptions
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from ..scenes import isotropic, look_at, random_gaussians
 from .comparison import (

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Options that become settings of meshes and textures, of all commands that make one."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import Any
+
+from ...core.errors import UsageError
+from ...core.settings import JobSettings, MeshingSettings, with_values
+from .setting_options import add_options, declared_options, given_settings, option_of
+
+_NOT_OF_PIVOTS: dict[str, tuple[Any, ...]] = {
+    "edge_length": (0.0,),
+    "points": (0,),
+    "spacing": (),
+    "tiles": ("auto", "off"),
+}
+"""Settings that the method pivots ignores, and values of them that ask for nothing: an edge length
+or number of 0, and tiles that pivots do without anyway."""
+
+
+def add_method_options(parser: ArgumentParser) -> None:
+    """Add how a mesh is made, and how finely."""
+    add_options(parser, "method")
+
+
+def method_settings(options: Namespace) -> dict[str, Any]:
+    """Return the meshing settings, by name, that :func:`add_method_options` was given.
+
+    What was not given has its default, not that of an earlier mesh.
+
+    Raises
+    ------
+    UsageError
+        An option is given that the method ignores.
+    """
+    values = given_settings(options, "method")
+    given = {path.removeprefix("meshing."): value for path, value in values.items()}
+    method = given.get("method", MeshingSettings().method)
+    if method == "pivots":
+        for name, idle in _NOT_OF_PIVOTS.items():
+            if name in given and given[name] not in idle:
+                option = option_of(f"meshing.{name}")
+                raise UsageError(
+                    f"{option} {given[name]} does not go with --method pivots, which is as fine "
+                    "as the Gaussians lie and makes the mesh whole.",
+                    f"Leave one of the two out; --method pam heeds {option}.",
+                )
+    elif "pivots" in given:
+        raise UsageError(
+            f"--pivots {given['pivots']} does not go with --method {method}.",
+            "Add --method pivots, or leave --pivots out.",
+        )
+    return {
+        entry.name: given.get(entry.name, entry.default) for entry in declared_options("method")
+    }
+
+
+def add_region_options(parser: ArgumentParser) -> None:
+    """Add what ``wrap`` and ``mesh`` share: regions, the field, clean-up, texture, files."""
+    add_options(parser, "region")
+
+
+def region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
+    """Return settings with what :func:`add_method_options` and :func:`add_region_options` gave.
+
+    What was not given has its default, not that of an earlier mesh.
+
+    Raises
+    ------
+    UsageError
+        An option is given that the method ignores, or a text cannot be read.
+    """
+    given = given_settings(options, "region")
+    values = {entry.path: entry.default for entry in declared_options("region")}
+    values |= {f"meshing.{name}": value for name, value in method_settings(options).items()}
+    values |= given
+    if options.threads is not None:
+        values["threads"] = options.threads
+    return with_values(settings, values)

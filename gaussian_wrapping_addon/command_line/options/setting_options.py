@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Options of the command line, made from the declarations of the settings."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import Any
+
+from ...core.settings import Declaration, JobSettings, declarations
+from ...core.settings.declaration import Scope
+
+
+def declared_options(scope: Scope) -> tuple[Declaration, ...]:
+    """Return the settings that have an option in a scope."""
+    return tuple(
+        entry
+        for entry in declarations(JobSettings)
+        if entry.option is not None and entry.scope == scope
+    )
+
+
+def add_options(parser: ArgumentParser, scope: Scope) -> None:
+    """Add the options of a scope. What is not given stays ``None``."""
+    exclusive: dict[str, Any] = {}
+    for entry in declared_options(scope):
+        assert entry.option is not None
+        target: Any = parser
+        if entry.option.exclusive:
+            if entry.option.exclusive not in exclusive:
+                exclusive[entry.option.exclusive] = parser.add_mutually_exclusive_group()
+            target = exclusive[entry.option.exclusive]
+        add_option(target, entry)
+
+
+def add_option(parser: Any, entry: Declaration, **changes: Any) -> None:
+    """Add the option of one setting to a parser or a group of it.
+
+    Parameters
+    ----------
+    changes : dict
+        Keywords of ``add_argument`` that are other than declared.
+    """
+    option = entry.option
+    assert option is not None
+    keywords: dict[str, Any] = {
+        "dest": entry.path,
+        "help": (option.help or entry.help).replace("%", "%%"),
+    }
+    if option.flag:
+        keywords |= {"action": "store_const", "const": option.flag}
+    else:
+        # Without choices, argparse would show the dotted path.
+        shown = option.metavar or option.name.lstrip("-").replace("-", "_").upper()
+        keywords["metavar"] = option.metavar or (None if entry.choices else shown)
+        keywords["choices"] = entry.choices or None
+        if option.parse is None and entry.kind in (int, float):
+            keywords["type"] = entry.kind
+    if option.many:
+        keywords |= {"nargs": "+", "action": "extend"}
+    parser.add_argument(option.name, **(keywords | changes))
+
+
+def given_settings(options: Namespace, scope: Scope) -> dict[str, Any]:
+    """Return the settings, by path, whose options were given.
+
+    Raises
+    ------
+    UsageError
+        A text cannot be read.
+    """
+    values = {}
+    for entry in declared_options(scope):
+        assert entry.option is not None
+        value = getattr(options, entry.path)
+        if value is not None:
+            values[entry.path] = entry.option.parse(value) if entry.option.parse else value
+    return values
+
+
+def option_of(path: str) -> str:
+    """Return the option that gives a setting, ``""`` where there is none."""
+    options = {e.path: e.option.name for e in declarations(JobSettings) if e.option is not None}
+    return options.get(path, "")

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Options that become training settings, of ``wrap`` and ``estimate``."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+
+from ...core.settings import MODEL_SELECTION, JobSettings, preset, with_values
+from .setting_options import add_options, given_settings, option_of
+
+_NEEDS = {"auto": "auto", "all": "on", "none": "off"}
+"""Words of ``--needs`` and what they set."""
+
+
+def add_training_options(parser: ArgumentParser) -> None:
+    """Add preset, seed, threads and everything that changes the training's settings."""
+    add_options(parser, "training")
+    names = ", ".join(option_of(f"training.{name}") for name in MODEL_SELECTION)
+    parser.add_argument(
+        "--needs",
+        choices=tuple(_NEEDS),
+        help=f"model selection: sets {names}, each of which wins over this option; "
+        "auto: by what the photos show; all: on; none: off",
+    )
+
+
+def training_settings(options: Namespace) -> JobSettings:
+    """Return the preset's settings with what :func:`add_training_options` was given.
+
+    Ranges are checked where the job is made.
+    """
+    values = given_settings(options, "training")
+    if options.needs is not None:
+        selected = {f"training.{name}": _NEEDS[options.needs] for name in MODEL_SELECTION}
+        values = {**selected, **values}
+    chosen = preset(values.pop("preset", JobSettings().preset))
+    return with_values(chosen, values)

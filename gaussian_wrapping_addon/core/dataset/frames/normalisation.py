@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Choose the scene frame: Z up, camera centres' mean at 0, cameras within a fixed radius."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...errors import DatasetError
+from ...limits import MIN_IMAGES
+from ...tolerances import SCENE_RADIUS
+from ..similarity import Similarity
+
+RADIUS_MARGIN = 1.1
+"""The largest camera distance times this becomes ``SCENE_RADIUS`` (docs/method.md, section 1.7)."""
+FAR_CAMERA_FACTOR = 30.0
+"""A camera this many median distances from the median position was solved wrongly."""
+_SAME_PLACE = 1e-12
+"""Share of the coordinates' size below which positions cannot be told apart in float64."""
+_LEVEL_TILT = 0.15
+"""Mean |sin| of the angle between level camera axes and the horizon: about 9 degrees."""
+_SPREAD = 0.03
+"""Smallest share of the middle eigenvalue in the largest: directions fan out by 20 degrees."""
+_CLEAR = 0.2
+"""Largest share of the smallest eigenvalue in the middle one: the plane is clear of the noise."""
+_FLAT = 0.05
+"""Thickness over width of a camera path that counts as plane."""
+MEAN_UP = "mean camera up"
+"""The rule of :func:`up_direction` where nothing better than the mean was found."""
+_AGREE = np.cos(np.radians(50.0))
+"""Directions further from the cameras' mean up than this are not the up direction."""
+
+
+@dataclass(frozen=True)
+class SceneFrame:
+    """The similarity to the scene frame, the cameras to keep, and how up was found."""
+
+    scene_from_world: Similarity
+    keep: np.ndarray
+    """(n,) bool; cameras left out stand impossibly far away."""
+    up_rule: str
+    collinear: bool
+    """Whether all camera centres lie on one line."""
+
+
+def find_scene_frame(rotations: np.ndarray, centers: np.ndarray) -> SceneFrame:
+    """Compute the scene frame of posed cameras.
+
+    Parameters
+    ----------
+    rotations : (n, 3, 3) float64
+        ``cam_from_world`` rotations, camera axes x right, y down, z forward.
+    centers : (n, 3) float64
+        Camera centres, world frame; may be far from the origin.
+
+    Returns
+    -------
+    SceneFrame
+
+    Raises
+    ------
+    DatasetError
+        All cameras stand at one place, or too few are left.
+    """
+    keep = near_cameras(centers)
+    if int(keep.sum()) < MIN_IMAGES:
+        raise DatasetError(
+            f"Only {int(keep.sum())} cameras stand within reach of each other; "
+            f"{MIN_IMAGES} are needed.",
+            "Solve the cameras again.",
+        )
+    kept = centers[keep]
+    middle = np.median(kept, axis=0)
+    offsets = kept - middle  # subtract first: coordinates may be huge
+    mean = middle + offsets.mean(0)
+    offsets = kept - mean
+    reach = float(np.linalg.norm(offsets, axis=1).max())
+    size = float(np.abs(centers[keep]).max())
+    if reach <= _SAME_PLACE * max(size, 1e-300):
+        raise DatasetError(
+            "All photos were taken from one place, so that no depth can be measured.",
+            "Walk around the object while taking photos.",
+        )
+    up, rule = up_direction(rotations[keep], offsets)
+    rotation = _rotation_to_z(up, rotations[keep])
+    scale = SCENE_RADIUS / (RADIUS_MARGIN * reach)
+    spread = np.linalg.svd(offsets, compute_uv=False)
+    return SceneFrame(
+        Similarity(scale, rotation, -scale * (rotation @ mean)),
+        keep,
+        rule,
+        bool(spread[1] < 1e-3 * spread[0]),
+    )
+
+
+def near_cameras(centers: np.ndarray) -> np.ndarray:
+    """Tell which of the (n, 3) camera centres stand within reach of the others, (n,) bool."""
+    finite = np.isfinite(centers).all(1)
+    if not finite.any():
+        return finite
+    middle = np.median(centers[finite], axis=0)
+    distances = np.linalg.norm(np.where(finite[:, None], centers - middle, 0.0), axis=1)
+    typical = float(np.median(distances[finite]))
+    if typical <= _SAME_PLACE * max(float(np.abs(middle).max()), 1e-300):
+        return finite
+    return finite & (distances <= FAR_CAMERA_FACTOR * typical)
+
+
+def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, str]:
+    """Estimate which way is up from how people hold cameras.
+
+    The mean of the cameras' own up axes gives the sign and a first guess, which a constant pitch
+    over part of a circle tilts. Level cameras have horizontal x axes whatever their pitch, so
+    the direction most nearly orthogonal to all of these is preferred; then the normal of a plane
+    camera path. Both only count where they are well determined and agree with the first guess.
+
+    Parameters
+    ----------
+    rotations : (n, 3, 3) float64, cam_from_world
+    offsets : (n, 3) float64
+        Camera centres relative to their mean.
+
+    Returns
+    -------
+    up : (3,) float64, unit length, world frame
+    rule : str
+        ``"level cameras"``, ``"plane camera path"`` or ``"mean camera up"``.
+    """
+    ups = -rotations[:, 1, :]  # (n, 3): y points down
+    guess = _robust_mean(ups)
+    rights = rotations[:, 0, :]  # (n, 3)
+    level, values = _least_aligned(rights)
+    tilt = float(np.median(np.abs(rights @ level)))
+    fans_out = values[1] > _SPREAD * values[2] and values[0] < _CLEAR * values[1]
+    if fans_out and tilt < _LEVEL_TILT and abs(level @ guess) > _AGREE:
+        return _signed(level, guess), "level cameras"
+    if len(offsets) >= 8:
+        normal, values = _least_aligned(offsets)
+        flat = values[0] < _FLAT**2 * values[1] and values[1] > _SPREAD * values[2]
+        if flat and abs(normal @ guess) > _AGREE:
+            return _signed(normal, guess), "plane camera path"
+    return guess, MEAN_UP
+
+
+def _robust_mean(directions: np.ndarray) -> np.ndarray:
+    """Return the unit vector with the least sum of distances to (n, 3) unit vectors."""
+    best = directions.mean(0)
+    for _ in range(30):
+        gaps = np.linalg.norm(directions - best, axis=1)
+        weights = 1.0 / np.maximum(gaps, 1e-3)
+        best = (weights[:, None] * directions).sum(0) / weights.sum()
+    length = np.linalg.norm(best)
+    if length < 1e-6:  # the cameras look every way: any direction is as good
+        return directions[0] / np.linalg.norm(directions[0])
+    return best / length
+
+
+def _least_aligned(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the direction most nearly orthogonal to (n, 3) vectors, and the eigenvalues upwards.
+
+    Cauchy weights on the sine of the angle keep a few rolled cameras from tilting the result.
+    """
+    lengths = np.linalg.norm(vectors, axis=1)
+    unit = vectors / np.maximum(lengths, 1e-300)[:, None]
+    weights = np.ones(len(vectors))
+    values, axes = np.zeros(3), np.eye(3)
+    for _ in range(20):
+        values, axes = np.linalg.eigh((vectors * weights[:, None]).T @ vectors)
+        sines = unit @ axes[:, 0]
+        spread = max(1.5 * float(np.median(np.abs(sines))), 1e-3)
+        weights = 1.0 / (1.0 + (sines / spread) ** 2)
+    return axes[:, 0], np.maximum(values, 0.0)
+
+
+def _signed(direction: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    return direction if direction @ guess >= 0 else -direction
+
+
+def _rotation_to_z(up: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return the (3, 3) rotation that turns ``up`` to +Z and the mean view towards +Y.
+
+    The heading comes from the cameras too, so that the scene frame does not depend on the axes of
+    the input.
+    """
+    forward = rotations[:, 2, :].sum(0)
+    ahead = forward - up * (up @ forward)
+    if np.linalg.norm(ahead) < 1e-3 * len(rotations):
+        first = rotations[0, 2, :] if abs(rotations[0, 2, :] @ up) < 0.99 else -rotations[0, 1, :]
+        ahead = first - up * (up @ first)
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, up)
+    return np.stack([right, ahead, up])

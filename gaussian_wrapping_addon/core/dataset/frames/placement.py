@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Steps that place a scene: true scale, ground at z = 0 with up along +Z, origin.
+
+Each step is a similarity that is applied after the placement so far. None of them ever scales
+axes differently, and each can be made again: a step from points that are placed already is the
+identity.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...errors import UsageError
+from ..similarity import Similarity
+
+SAME_PLACE = 1e-6
+"""Distance over size of the coordinates below which two points are one: Blender's coordinates
+are single precision, so that such a distance holds hardly one digit."""
+COLLINEAR = 0.01
+"""Second over first extent below which points count as lying on one line: the plane through them
+would turn freely about it within the error of picking."""
+SMALLEST_SCALE, LARGEST_SCALE = 1e-9, 1e9
+"""Bounds of a placement's scale. Beyond them single precision coordinates lose the scene, and a
+distance was mistyped."""
+SIMILAR = 1e-4
+"""Share by which the axes of a matrix may differ in length, and be off a right angle: object
+matrices are single precision, and a hierarchy adds up a few roundings."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane with an upper side."""
+
+    point: np.ndarray
+    """(3,) float64, a point on it."""
+    normal: np.ndarray
+    """(3,) float64, unit length, pointing up."""
+
+
+def scale_step(points: np.ndarray, length: float) -> Similarity:
+    """Scale about the origin so that two points stand ``length`` apart.
+
+    About the origin, so that a ground at z = 0 and a chosen origin stay.
+
+    Parameters
+    ----------
+    points : (2, 3) float64
+    length : float
+        True distance, in the unit that the placement leads to.
+
+    Raises
+    ------
+    UsageError
+        There are not two points, they lie in one place, or the length is no positive number.
+    """
+    points = _finite(points)
+    if len(points) != 2:
+        raise UsageError(
+            f"{_count(len(points))} picked.", "Pick two points whose distance you know."
+        )
+    if not (math.isfinite(length) and length > 0.0):
+        raise UsageError(f"{length:g} is no distance.", "Type a length greater than zero.")
+    distance = float(np.linalg.norm(points[1] - points[0]))
+    if distance <= SAME_PLACE * float(np.abs(points).max()):
+        raise UsageError("The two points lie in one place.", "Pick two points that are far apart.")
+    return Similarity(length / distance)
+
+
+def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
+    """Return the plane through three points, or the nearest one to more.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+    above : (k, 3) float64
+        What stands above the plane, such as camera centres. With none, or with as many below as
+        above, up is the side nearer to +Z.
+
+    Raises
+    ------
+    UsageError
+        Fewer than three points, or all of them on one line.
+    """
+    points = _finite(points)
+    if len(points) < 3:
+        raise UsageError(
+            f"{_count(len(points))} picked.", "Pick three points or more on the ground."
+        )
+    center = points.mean(0)
+    offsets = points - center
+    _, extents, axes = np.linalg.svd(offsets, full_matrices=False)  # (3,), (3, 3)
+    if extents[0] <= SAME_PLACE * float(np.abs(points).max()):
+        raise UsageError("The points lie in one place.", "Pick three points that are far apart.")
+    if extents[1] <= COLLINEAR * extents[0]:
+        raise UsageError(
+            "The points lie on one line.", "Pick a third point well to the side of the line."
+        )
+    normal = np.cross(axes[0], axes[1])
+    side = float(np.median((np.asarray(above, np.float64) - center) @ normal)) if len(above) else 0
+    if abs(side) <= SAME_PLACE * extents[0]:
+        side = normal[2]
+    return Plane(center, normal if side >= 0.0 else -normal)
+
+
+def ground_step(plane: Plane) -> Similarity:
+    """Turn the plane's normal to +Z by the shortest way and lay the plane on z = 0.
+
+    The plane's point keeps its x and y.
+    """
+    rotation = turn_to_z(plane.normal)
+    target = np.array([plane.point[0], plane.point[1], 0.0])
+    return Similarity(1.0, rotation, target - rotation @ plane.point)
+
+
+def origin_step(point: np.ndarray) -> Similarity:
+    """Move ``point``, (3,) float64, to the origin."""
+    return Similarity(1.0, np.eye(3), -_finite(np.reshape(point, (1, 3)))[0])
+
+
+def turn_to_z(direction: np.ndarray) -> np.ndarray:
+    """Return the (3, 3) rotation of least angle that turns a unit vector to +Z."""
+    if direction[2] >= 0.0:
+        return _least_turn(direction)
+    # Near -Z the axis is not determined: a half turn about X first, which is one of the shortest.
+    half_turn = np.diag([1.0, -1.0, -1.0])
+    return _least_turn(half_turn @ direction) @ half_turn
+
+
+def _least_turn(direction: np.ndarray) -> np.ndarray:
+    x, y, z = direction / np.linalg.norm(direction)
+    axis = np.array([y, -x, 0.0])  # direction cross Z
+    cross = np.array([[0.0, 0.0, axis[1]], [0.0, 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1.0 + z)
+
+
+def similarity_of_matrix(matrix: np.ndarray, name: str) -> Similarity:
+    """Return the similarity that a (4, 4) matrix is.
+
+    Parameters
+    ----------
+    matrix : (4, 4) float64
+    name : str
+        Of the object, for the message.
+
+    Raises
+    ------
+    UsageError
+        The matrix is not finite, has no size, mirrors, or scales its axes differently.
+    """
+    matrix = np.asarray(matrix, np.float64)
+    linear = matrix[:3, :3]
+    hint = "Clear its scale (Alt S)."
+    if not np.isfinite(matrix).all():
+        raise UsageError(f"{name} has a position that is not finite.", "Clear its transform.")
+    rotation, stretches, axes = np.linalg.svd(linear)
+    if stretches[0] <= 0.0 or stretches[2] < (1.0 - SIMILAR) * stretches[0]:
+        raise UsageError(f"{name} is scaled differently along its axes.", hint)
+    rotation = rotation @ axes
+    if np.linalg.det(rotation) < 0.0:
+        raise UsageError(f"{name} is mirrored.", hint)
+    return Similarity(float(stretches.mean()), rotation, matrix[:3, 3].copy())
+
+
+def check_scale(placement: Similarity) -> None:
+    """Refuse a placement whose scale single precision cannot carry.
+
+    Raises
+    ------
+    UsageError
+        The scale lies outside of :data:`SMALLEST_SCALE` to :data:`LARGEST_SCALE`.
+    """
+    if not SMALLEST_SCALE <= placement.scale <= LARGEST_SCALE:
+        raise UsageError(
+            f"The scene would be scaled by {placement.scale:.3g}.", "Check the distance typed."
+        )
+
+
+def _count(number: int) -> str:
+    return "No point is" if number == 0 else "One point is" if number == 1 else f"{number} are"
+
+
+def _finite(points: np.ndarray) -> np.ndarray:
+    points = np.asarray(points, np.float64).reshape(-1, 3)
+    if not np.isfinite(points).all():
+        raise UsageError("A picked point is not finite.", "Pick another point.")
+    return points

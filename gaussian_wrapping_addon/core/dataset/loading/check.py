@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Quick findings about an input before any long work: needs numpy only, solves nothing."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ...errors import DatasetError, WrapError
+from ...limits import MIN_IMAGES
+from ...ply.table import vertex_layout
+from ..frames.normalisation import find_scene_frame
+from ..photos.photo_finder import PhotoIndex, find_mask, list_photos, photo_root
+from ..photos.photo_header import read_photo_header
+from ..readers.source_kind import SPLAT, SourceKind, read_poses, source_kind
+from ..readers.splat_header import read_splat_header
+from .splat_cameras import WITH_PHOTOS, WITHOUT_PHOTOS
+
+Severity = Literal["error", "warning", "fact"]
+
+_SHARE_OF_BAD = 0.2
+_MIN_GOOD_SIDE_PX = 200
+_SHORT = {"photos": "cameras to be solved", SPLAT: "splat without photos"}
+"""What is said of kinds whose name is no heading."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence about an input."""
+
+    severity: Severity
+    message: str
+    hint: str = ""
+    short: str = ""
+    """What a heading says of it: joined, the short words of all findings name the input."""
+
+
+def check_input(source: Path) -> list[Finding]:
+    """Look at an input without decoding photos or solving cameras.
+
+    Returns
+    -------
+    list of Finding
+        An ``"error"`` means that loading would be refused.
+    """
+    findings: list[Finding] = []
+    try:
+        source = Path(source).resolve()
+        kind = source_kind(source)
+        findings.append(
+            Finding(
+                "fact",
+                f"The input is of kind: {kind.kind}.",
+                short=_SHORT.get(kind.kind, kind.kind),
+            )
+        )
+        if kind.kind == SPLAT:
+            _check_splat(source, findings)
+        elif kind.kind == "photos":
+            _check_photos(kind, findings)
+        else:
+            _check_poses(kind, findings)
+    except WrapError as error:
+        findings.append(Finding("error", error.message, error.hint))
+    except OSError as error:
+        findings.append(Finding("error", f"{source} cannot be read: {error.strerror}."))
+    return findings
+
+
+def _check_splat(path: Path, findings: list[Finding]) -> None:
+    header = read_splat_header(path)
+    vertex_layout(path, header.ply, "Export or download the splat again.")
+    if header.count == 0:
+        raise DatasetError(f"{path.name} holds no Gaussians.", "Export the splat again.")
+    kind = "surfels" if header.axes == 2 else "Gaussians"
+    findings.append(
+        Finding(
+            "fact",
+            f"{header.count} {kind} with harmonics of degree {header.degree}.",
+            short=f"{header.count:,} {kind}",
+        )
+    )
+    findings.append(Finding("warning", WITHOUT_PHOTOS, WITH_PHOTOS))
+
+
+def _check_photos(kind: SourceKind, findings: list[Finding]) -> None:
+    root = photo_root(kind.folder)
+    photos = list_photos(root)
+    names = [path.relative_to(root).as_posix() for path in photos]
+    _check_files(kind, photos, names, findings)
+    findings.append(
+        Finding("fact", "The input has no camera poses; they will be solved from the photos.")
+    )
+
+
+def _check_poses(kind: SourceKind, findings: list[Finding]) -> None:
+    if kind.kind == "COLMAP model" and kind.transforms is not None:
+        findings.append(
+            Finding("fact", f"{kind.transforms.name} is present too; the COLMAP model is used.")
+        )
+    model = read_poses(kind)
+    findings += [Finding("warning", said.text, said.hint) for said in model.warnings]
+    findings.append(
+        Finding("fact", f"{len(model.photos)} posed photos, {len(model.points)} sparse points.")
+    )
+    index = PhotoIndex(kind.photo_roots)
+    matches = {p.name: index.find(p.name) for p in model.photos}
+    missing = [name for name, match in matches.items() if match is None]
+    if len(missing) == len(matches):
+        raise DatasetError(
+            f"None of the {len(matches)} photos that the {kind.kind} names was found.",
+            f"Looked for {missing[0]} in {', '.join(str(r) for r in kind.photo_roots)}.",
+        )
+    if missing:
+        findings.append(
+            Finding(
+                "warning",
+                f"{len(missing)} of {len(matches)} photos were not found, such as {missing[0]}.",
+            )
+        )
+    found = {name: match.path for name, match in matches.items() if match is not None}
+    _check_files(kind, list(found.values()), list(found), findings)
+    rotations = np.array([p.cam_from_world[:, :3] for p in model.photos])
+    translations = np.array([p.cam_from_world[:, 3] for p in model.photos])
+    frame = find_scene_frame(rotations, -np.einsum("nji,nj->ni", rotations, translations))
+    far = int((~frame.keep).sum())
+    if far:
+        findings.append(Finding("warning", f"{far} cameras stand far away from all others."))
+    if frame.collinear:
+        findings.append(Finding("warning", "All cameras stand on one line; depth will be weak."))
+
+
+def _check_files(
+    kind: SourceKind, photos: list[Path], names: list[str], findings: list[Finding]
+) -> None:
+    """Check headers: readable, large enough, enough of them."""
+    bad: list[DatasetError] = []
+    sizes: Counter[str] = Counter()
+    small = unknown = 0
+    for path in photos:
+        try:
+            header = read_photo_header(path)
+        except DatasetError as error:
+            bad.append(error)
+            continue
+        if header is None:
+            unknown += 1
+            continue
+        width, height = header.upright_size
+        sizes[f"{width} x {height}"] += 1
+        small += max(width, height) < _MIN_GOOD_SIDE_PX
+    good = len(photos) - len(bad)
+    if bad and len(bad) > _SHARE_OF_BAD * len(photos):
+        raise DatasetError(
+            f"{len(bad)} of {len(photos)} photos cannot be read. First: {bad[0].message}",
+            bad[0].hint,
+        )
+    if good < MIN_IMAGES:
+        count = "1 photo is" if good == 1 else f"{good} photos are"
+        raise DatasetError(
+            f"Only {count} usable; at least {MIN_IMAGES} are needed.",
+            "Add photos of the same thing from other places.",
+        )
+    if bad:
+        text = f"{len(bad)} photos cannot be read and are not used. First: {bad[0].message}"
+        findings.append(Finding("warning", text, bad[0].hint))
+    if small:
+        findings.append(
+            Finding("warning", f"{small} photos are smaller than {_MIN_GOOD_SIDE_PX} pixels.")
+        )
+    if unknown:
+        findings.append(
+            Finding("fact", f"{unknown} photos are of a format that is only checked on loading.")
+        )
+    listed = ", ".join(f"{count} of {size}" for size, count in sizes.most_common(3))
+    message = f"{good} photos: {listed or 'sizes not known yet'}."
+    # Before the kind: "80 photos, COLMAP model".
+    findings.insert(0, Finding("fact", message, short=f"{good} photos"))
+    masked = sum(find_mask(kind.mask_roots, name) is not None for name in names)
+    if masked:
+        findings.append(Finding("fact", f"{masked} of {len(names)} photos have a mask."))

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From an input path to a :class:`~..scene.Scene`: poses, photos, frame, start points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import DatasetError
+from ...limits import MIN_IMAGES
+from ...progress import Progress
+from ...report_warning import LEFT_OUT_HINT, ReportWarning
+from ...tolerances import SCENE_RADIUS
+from ..camera import Camera
+from ..frames.normalisation import find_scene_frame
+from ..photos.photo_finder import list_photos, photo_root
+from ..poses.pose_solver import solve_poses
+from ..readers.source_kind import SourceKind, read_poses, source_kind
+from ..readers.source_model import SourceModel
+from ..scene import Scene, View
+from ..similarity import Similarity
+from .start_points import MIN_POINTS, make_start_points
+from .views import PreparedView, prepare_views
+
+POINT_REACH = 100.0 * SCENE_RADIUS
+"""Sparse points further than this from the cameras are triangulation errors."""
+
+
+def load_scene(
+    source: Path,
+    work_folder: Path,
+    progress: Progress,
+    *,
+    seed: int = 0,
+    threads: int = 0,
+) -> Scene:
+    """Load photos and cameras, solving and undistorting where needed.
+
+    Parameters
+    ----------
+    source : Path
+        Folder of photos, COLMAP project (``images/`` and ``sparse/0``), ``transforms.json`` or a
+        folder that holds it. Nothing is written there.
+    work_folder : Path
+        Undistorted photos, masks and the solved cameras are written here.
+    progress : Progress
+    seed : int
+    threads : int
+        0 uses every core.
+
+    Returns
+    -------
+    Scene
+        In the scene frame; ``warnings`` and ``facts`` tell what was read, left out and solved.
+
+    Raises
+    ------
+    DatasetError, ParseError
+        The input cannot be used; names what and where.
+    """
+    source = Path(source).resolve()
+    work_folder = Path(work_folder).resolve()
+    kind = source_kind(source)
+    work_folder.mkdir(parents=True, exist_ok=True)
+    progress.update(0.0, "reading the input")
+    warnings: list[ReportWarning] = []
+    facts: dict[str, Any] = {"kind": kind.kind}
+    if kind.kind == "photos":
+        model = _solve(kind, work_folder, progress.span(0.0, 0.8), seed, threads)
+        prepare_span = progress.span(0.8, 1.0)
+    else:
+        model = read_poses(kind)
+        prepare_span = progress.span(0.0, 1.0 if len(model.points) >= MIN_POINTS else 0.3)
+        if kind.kind == "COLMAP model" and kind.transforms is not None:
+            facts["also_present"] = f"{kind.transforms.name} (not used: the COLMAP model is)"
+    warnings.extend(model.warnings)
+    facts.update(model.facts)
+    require_enough(len(model.photos))
+    views, notes, counts = prepare_views(model, kind, work_folder, prepare_span, threads=threads)
+    warnings.extend(notes)
+    facts.update(counts)
+    require_enough(len(views))
+    views, scene_from_world, frame_facts = _frame(views, warnings)
+    facts.update(frame_facts)
+    cameras = [_camera(view).moved(scene_from_world) for view in views]
+    points, colors = _points(model, scene_from_world, warnings)
+    if len(points) < MIN_POINTS:
+        points, colors, facts["start_points"] = make_start_points(
+            cameras,
+            [view.photo_path for view in views],
+            [view.mask_path for view in views],
+            work_folder,
+            progress.span(0.3, 1.0),
+            warnings,
+            seed=seed,
+            threads=threads,
+        )
+    facts["views"], facts["points"] = len(views), len(points)
+    facts["photo_sizes"] = sorted({f"{c.width} x {c.height}" for c in cameras})[:4]
+    progress.update(1.0, f"{len(views)} photos and {len(points)} points are ready")
+    return Scene(
+        tuple(
+            View(camera, view.photo_path, view.mask_path)
+            for camera, view in zip(cameras, views, strict=True)
+        ),
+        points,
+        colors,
+        scene_from_world.inverse(),
+        tuple(warnings),
+        facts,
+    )
+
+
+def require_enough(count: int) -> None:
+    """Raise :class:`DatasetError` where fewer than ``MIN_IMAGES`` photos are usable."""
+    if count < MIN_IMAGES:
+        photos = "photo is" if count == 1 else "photos are"
+        raise DatasetError(
+            f"Only {count} {photos} usable; at least {MIN_IMAGES} are needed.",
+            "Add photos of the same thing from other places.",
+        )
+
+
+def _solve(
+    kind: SourceKind, work_folder: Path, progress: Progress, seed: int, threads: int
+) -> SourceModel:
+    root = photo_root(kind.folder)
+    photos = list_photos(root)
+    require_enough(len(photos))
+    return solve_poses(
+        root, photos, kind.mask_roots, work_folder, progress, seed=seed, threads=threads
+    )
+
+
+def _frame(
+    views: list[PreparedView], warnings: list[ReportWarning]
+) -> tuple[list[PreparedView], Similarity, dict[str, Any]]:
+    """Choose the scene frame and leave out cameras that stand impossibly far away."""
+    rotations = np.array([view.cam_from_world[:, :3] for view in views])  # (n, 3, 3)
+    translations = np.array([view.cam_from_world[:, 3] for view in views])  # (n, 3)
+    centers = -np.einsum("nji,nj->ni", rotations, translations)
+    frame = find_scene_frame(rotations, centers)
+    far = [view.name for view, keep in zip(views, frame.keep, strict=True) if not keep]
+    if far:
+        text = (
+            f"{len(far)} cameras stand far away from all others and were left out: "
+            f"{', '.join(far[:3])}."
+        )
+        warnings.append(
+            ReportWarning("cameras-far-away", text, "Check the poses of these cameras.")
+        )
+    if frame.collinear:
+        warnings.append(
+            ReportWarning(
+                "cameras-on-a-line",
+                "All cameras stand on one line; depth and the up direction are weak.",
+                "Take photos from other heights and directions too.",
+            )
+        )
+    kept = [view for view, keep in zip(views, frame.keep, strict=True) if keep]
+    return kept, frame.scene_from_world, {"up_from": frame.up_rule}
+
+
+def _camera(view: PreparedView) -> Camera:
+    fx, fy, cx, cy = view.pinhole.params
+    return Camera(
+        view.name, view.pinhole.width, view.pinhole.height, fx, fy, cx, cy, view.cam_from_world
+    )
+
+
+def _points(
+    model: SourceModel, scene_from_world: Similarity, warnings: list[ReportWarning]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bring the input's sparse points to the scene frame and drop impossible ones."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = scene_from_world.points(model.points.reshape(-1, 3))
+        near = np.linalg.norm(points, axis=1) <= POINT_REACH
+    if not near.all():
+        text = f"{int((~near).sum())} sparse points lie impossibly far; left out."
+        warnings.append(ReportWarning("points-far-away", text, LEFT_OUT_HINT))
+    return points[near], model.point_colors[near]

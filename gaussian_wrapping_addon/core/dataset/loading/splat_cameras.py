@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Cameras for a splat that comes without photos: around its middle, looking at it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...errors import DatasetError
+from ...tolerances import SCENE_RADIUS
+from ..camera import Camera
+from ..frames.normalisation import RADIUS_MARGIN
+from ..similarity import Similarity
+
+PHOTO_SIDE_PX = 800
+FIELD_OF_VIEW_DEG = 50.0
+
+FAR_VIEWS, NEAR_VIEWS = 28, 20
+"""The far views hold the whole, the near ones its middle at more pixels."""
+
+FAR_MARGIN = 1.05
+NEAR_DISTANCE = 1.7
+"""Distance of the near views in radii; the far ones stand where the sphere fits their frame."""
+
+MIN_OPACITY = 0.1
+"""Fainter Gaussians tell nothing about where the splat is."""
+
+WHOLE_SHARE, MIDDLE_SHARE = 0.98, 0.5
+TAIL = 3.0
+"""Where the radius of :data:`WHOLE_SHARE` is more than this many times that of
+:data:`MIDDLE_SHARE`, the splat has surroundings, and this bounds what the cameras stand around."""
+
+WITHOUT_PHOTOS = (
+    "A splat without photos is wrapped from made-up views around its middle: surroundings and "
+    "rooms seen from inside are not covered, and errors of the splat stay."
+)
+WITH_PHOTOS = "Where its photos exist, give them as the input and the splat as the start."
+
+
+@dataclass(frozen=True)
+class SplatExtent:
+    """Where a splat is, frame of the file."""
+
+    center: np.ndarray
+    """(3,) float64."""
+    radius: float
+    has_surroundings: bool
+    """Whether much of it lies farther away than ``radius``."""
+
+
+def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
+    """Return the robust middle and radius of the opaque Gaussians.
+
+    Parameters
+    ----------
+    means : (n, 3)
+        Finite.
+    opacities : (n,)
+        Effective, in [0, 1]; the weight of each.
+
+    Raises
+    ------
+    DatasetError
+        Everything is transparent, or lies at one place.
+    """
+    solid = opacities >= MIN_OPACITY
+    if not solid.any():
+        raise DatasetError(
+            "All Gaussians of the splat are transparent.",
+            "Check that opacities are stored as logits.",
+        )
+    points = np.asarray(means, np.float64)[solid]
+    weights = np.asarray(opacities, np.float64)[solid]
+    first = points[0]  # subtract first: coordinates may be huge
+    local = points - first
+    center = np.array([_quantile(local[:, k], weights, 0.5) for k in range(3)])
+    distance = np.linalg.norm(local - center, axis=1)
+    middle = _quantile(distance, weights, MIDDLE_SHARE)
+    whole = _quantile(distance, weights, WHOLE_SHARE)
+    if not whole > 0.0:
+        raise DatasetError("All Gaussians of the splat lie at one place.", "Export it again.")
+    has_surroundings = middle > 0.0 and whole > TAIL * middle
+    radius = TAIL * middle if has_surroundings else whole
+    return SplatExtent(center + first, float(radius), bool(has_surroundings))
+
+
+def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order][min(np.searchsorted(total, share * total[-1]), len(values) - 1)])
+
+
+def cameras_around(extent: SplatExtent) -> list[Camera]:
+    """Return cameras on two spheres around a splat that look at its middle, frame of the file."""
+    half = math.radians(0.5 * FIELD_OF_VIEW_DEG)
+    focal_px = 0.5 * PHOTO_SIDE_PX / math.tan(half)
+    far = FAR_MARGIN / math.sin(half)
+    cameras: list[Camera] = []
+    for count, distance in ((FAR_VIEWS, far), (NEAR_VIEWS, NEAR_DISTANCE)):
+        for direction in even_directions(count):
+            eye = extent.center + distance * extent.radius * direction
+            cameras.append(
+                Camera(
+                    f"view_{len(cameras):03d}.png",
+                    PHOTO_SIDE_PX,
+                    PHOTO_SIDE_PX,
+                    focal_px,
+                    focal_px,
+                    0.5 * PHOTO_SIDE_PX,
+                    0.5 * PHOTO_SIDE_PX,
+                    _looking(eye, -direction),
+                )
+            )
+    return cameras
+
+
+def _looking(eye: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """(3, 4) ``cam_from_world`` with Z up; no direction of the lattice is a pole."""
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.concatenate([rotation, -(rotation @ eye)[:, None]], axis=1)
+
+
+def scene_frame(cameras: list[Camera]) -> Similarity:
+    """Return ``scene_from_world``: the axes stay the file's, only place and size change."""
+    centers = np.stack([camera.center for camera in cameras])
+    mean = centers[0] + (centers - centers[0]).mean(axis=0)
+    reach = float(np.linalg.norm(centers - mean, axis=1).max())
+    scale = SCENE_RADIUS / (RADIUS_MARGIN * reach)
+    return Similarity(scale, np.eye(3), -scale * mean)
+
+
+def even_directions(count: int) -> np.ndarray:
+    """Return (count, 3) unit vectors of a spherical Fibonacci lattice; none is a pole."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    angle = np.arange(count) * math.pi * (3.0 - math.sqrt(5.0))
+    across = np.sqrt(1.0 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)

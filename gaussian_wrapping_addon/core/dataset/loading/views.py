@@ -1,0 +1,356 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From posed photos to pinhole views: find, decode, bring upright, undistort, mask."""
+
+from __future__ import annotations
+
+import math
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import DatasetError
+from ...files import resolve_inside
+from ...imaging.bicubic import sample_bicubic
+from ...kernels.parallel import default_threads
+from ...progress import Progress
+from ...report_warning import UNREADABLE_HINT, ReportWarning
+from ..photos.photo_file import (
+    MASK_THRESHOLD,
+    DecodedPhoto,
+    apply_orientation,
+    photo_header,
+    read_mask,
+    read_photo,
+    write_mask,
+    write_photo,
+)
+from ..photos.photo_finder import PhotoIndex, find_mask
+from ..photos.photo_header import PhotoHeader
+from ..poses.pose_solver import refuse_if_many_bad
+from ..readers.source_kind import SourceKind
+from ..readers.source_model import LensCamera, PosedPhoto, SourceModel
+from .undistort import pinhole_of, sampling_map
+
+MIN_PHOTO_SIDE_PX = 16
+_SMALLEST_MASKED_SHARE = 1e-4
+"""A mask that leaves less than this share of the pixels leaves nothing to learn from."""
+
+
+@dataclass(frozen=True)
+class PreparedView:
+    """A photo that matches its pinhole camera, pose still in the world frame."""
+
+    name: str
+    pinhole: LensCamera
+    cam_from_world: np.ndarray
+    photo_path: Path
+    mask_path: Path | None
+
+
+@dataclass
+class _Notes:
+    """What happened to single photos, for counted warnings."""
+
+    missing: list[str] = field(default_factory=list)
+    bad: list[str] = field(default_factory=list)
+    renamed: int = 0
+    rescaled: int = 0
+    wrong_masks: list[str] = field(default_factory=list)
+    fully_masked: list[str] = field(default_factory=list)
+    masked: int = 0
+    undistorted: int = 0
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+
+def prepare_views(
+    model: SourceModel,
+    kind: SourceKind,
+    work_folder: Path,
+    progress: Progress,
+    *,
+    threads: int = 0,
+) -> tuple[list[PreparedView], list[ReportWarning], dict[str, int]]:
+    """Make every posed photo a pinhole view; photos that fit already are used where they lie.
+
+    Written files: ``work_folder/images/*.jpg`` (undistorted, or brought upright and to 8 bits) and
+    ``work_folder/masks/*.png``.
+
+    Returns
+    -------
+    views : list of PreparedView
+        In the order of the names.
+    warnings : list of ReportWarning
+    facts : dict
+
+    Raises
+    ------
+    DatasetError
+        No photo found, more than a fifth undecodable, or sizes that do not match the cameras.
+    """
+    threads = threads or default_threads()
+    notes = _Notes()
+    index = PhotoIndex(kind.photo_roots)
+    found: list[tuple[PosedPhoto, Path]] = []
+    taken: set[Path] = set()
+    for posed in sorted(model.photos, key=lambda p: p.name):
+        match = index.find(posed.name)
+        if match is None or match.path in taken:
+            notes.missing.append(posed.name)
+            continue
+        taken.add(match.path)
+        notes.renamed += match.how != "exact"
+        found.append((posed, match.path))
+    if not found:
+        searched = ", ".join(str(root) for root in kind.photo_roots)
+        raise DatasetError(
+            f"None of the {len(model.photos)} photos that the {model.kind} names was found.",
+            f"Looked for {notes.missing[0]} in {searched}.",
+        )
+    (work_folder / "images").mkdir(parents=True, exist_ok=True)
+    (work_folder / "masks").mkdir(exist_ok=True)
+    maps = _MapCache()
+    views: list[PreparedView] = []
+
+    def one(i: int) -> PreparedView | None:
+        posed, path = found[i]
+        return _prepare(i, posed, path, model, kind, work_folder, maps, notes)
+
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for i, view in enumerate(pool.map(one, range(len(found)))):
+                if view is not None:
+                    views.append(view)
+                refuse_if_many_bad(notes.bad, len(found))
+                progress.update((i + 1) / len(found), f"preparing photo {i + 1} of {len(found)}")
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return views, _warnings(notes, len(model.photos), model.kind), _facts(notes)
+
+
+def _prepare(
+    index: int,
+    posed: PosedPhoto,
+    path: Path,
+    model: SourceModel,
+    kind: SourceKind,
+    work_folder: Path,
+    maps: _MapCache,
+    notes: _Notes,
+) -> PreparedView | None:
+    """Prepare one photo; ``None`` where it cannot be used, which ``notes`` then says."""
+    try:
+        header = photo_header(path)
+        if min(header.width, header.height) < MIN_PHOTO_SIDE_PX:
+            raise DatasetError(f"{path.name} is {header.width} x {header.height} pixels.")
+        photo = read_photo(path, upright=False)
+    except DatasetError as error:
+        with notes.lock:
+            notes.bad.append(error.message)
+        return None
+    if photo.color.shape[:2] != (header.height, header.width):
+        with notes.lock:
+            notes.bad.append(f"{path.name} decodes to another size than its header says.")
+        return None
+    # COLMAP reads pixels as they are stored; other programs turn them by EXIF first.
+    prefers_stored = model.kind == "COLMAP model"
+    lens, upright, rescaled = fit_lens(posed, header, path.name, prefers_stored=prefers_stored)
+    color, alpha = photo.color, photo.alpha
+    if upright:
+        color = apply_orientation(color, header.orientation)
+        alpha = None if alpha is None else apply_orientation(alpha, header.orientation)
+    mask = _find_mask(posed, path, kind, color.shape[:2], alpha, header, upright, notes)
+    pinhole = pinhole_of(lens)
+    photo_path = path
+    if not lens.is_pinhole:
+        where = maps.get(lens, pinhole)
+        color = sample_bicubic(color, where)
+        if mask is not None:
+            mask = sample_bicubic(np.where(mask, 255, 0).astype(np.uint8)[..., None], where)
+            mask = mask[..., 0] >= MASK_THRESHOLD
+    if not lens.is_pinhole or not _is_plain(photo, header):
+        photo_path = work_folder / "images" / f"{index:06d}.jpg"
+        write_photo(photo_path, color)
+    mask_path = None
+    with notes.lock:
+        notes.rescaled += rescaled
+        notes.undistorted += not lens.is_pinhole
+        if mask is not None and mask.mean() < _SMALLEST_MASKED_SHARE:
+            notes.fully_masked.append(posed.name)
+            return None
+        notes.masked += mask is not None
+    if mask is not None:
+        mask_path = work_folder / "masks" / f"{index:06d}.png"
+        write_mask(mask_path, mask)
+    return PreparedView(posed.name, pinhole, posed.cam_from_world, photo_path, mask_path)
+
+
+def _is_plain(photo: DecodedPhoto, header: PhotoHeader) -> bool:
+    """Whether the file as it lies shows the prepared pixels to every program."""
+    return photo.plain and header.orientation == 1
+
+
+def fit_lens(
+    posed: PosedPhoto, header: PhotoHeader, file_name: str, *, prefers_stored: bool
+) -> tuple[LensCamera, bool, bool]:
+    """Fit the intrinsics of the input to the size of the photo.
+
+    Returns
+    -------
+    lens : LensCamera
+        Of exactly the photo's size.
+    upright : bool
+        Whether the EXIF orientation has to be applied.
+    rescaled : bool
+        Whether the photo is a scaled copy of what the input describes.
+
+    Raises
+    ------
+    DatasetError
+        The photo has other proportions than its camera.
+    """
+    stored, upright = (header.width, header.height), header.upright_size
+    if posed.lens is None:
+        assert posed.angle_x is not None
+        width, height = upright
+        focal = 0.5 * width / math.tan(0.5 * posed.angle_x)
+        lens = LensCamera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
+        return lens, True, False
+    lens = posed.lens
+    choices = [(stored, False), (upright, True)]
+    if not prefers_stored or header.orientation == 1:
+        choices.reverse()
+    for size, turn in choices:
+        if size == (lens.width, lens.height):
+            return lens, turn, False
+    for size, turn in choices:
+        if _same_proportions(size, lens):
+            return lens.resized(*size), turn, True
+    turned = _same_proportions(upright[::-1], lens)
+    raise DatasetError(
+        f"{file_name} is {upright[0]} x {upright[1]} pixels, its camera {lens.width} x "
+        f"{lens.height}" + (": the photo is rotated by 90 degrees." if turned else "."),
+        "Use the photos that the cameras were solved with, or scaled copies of them.",
+    )
+
+
+def _same_proportions(size: tuple[int, int], lens: LensCamera) -> bool:
+    """Whether ``size`` is the camera's size times one factor, up to rounding to whole pixels."""
+    slack = lens.width + lens.height
+    return abs(size[0] * lens.height - size[1] * lens.width) < slack
+
+
+def _find_mask(
+    posed: PosedPhoto,
+    path: Path,
+    kind: SourceKind,
+    shape: tuple[int, ...],
+    alpha: np.ndarray | None,
+    header: PhotoHeader,
+    upright: bool,
+    notes: _Notes,
+) -> np.ndarray | None:
+    """Return the (h, w) bool mask of a photo, of exactly its size, or ``None``."""
+    mask_path = None
+    if posed.mask_name is not None:
+        mask_path = resolve_inside(kind.folder, posed.mask_name)
+        if mask_path is None or not mask_path.is_file():
+            mask_path = None
+            with notes.lock:
+                notes.wrong_masks.append(f"{posed.mask_name} is missing")
+    else:
+        mask_path = find_mask(kind.mask_roots, posed.name) or find_mask(kind.mask_roots, path.name)
+    mask = None if alpha is None else alpha >= MASK_THRESHOLD
+    if mask_path is None:
+        return mask
+    try:
+        stored = read_mask(mask_path)
+        if upright and stored.shape != shape and stored.shape == (header.height, header.width):
+            stored = apply_orientation(stored, header.orientation)
+        if stored.shape != shape:
+            stored = _resized_mask(stored, shape, mask_path)
+    except DatasetError as error:
+        with notes.lock:
+            notes.wrong_masks.append(error.message)
+        return mask
+    from_file = stored >= MASK_THRESHOLD
+    combined = from_file if mask is None else from_file & mask
+    return None if combined.all() else combined
+
+
+def _resized_mask(mask: np.ndarray, shape: tuple[int, ...], path: Path) -> np.ndarray:
+    from PIL import Image
+
+    same = LensCamera("SIMPLE_PINHOLE", mask.shape[1], mask.shape[0], (1.0, 0.0, 0.0))
+    if not _same_proportions((shape[1], shape[0]), same):
+        raise DatasetError(
+            f"Mask {path.name} is {mask.shape[1]} x {mask.shape[0]} pixels, its photo "
+            f"{shape[1]} x {shape[0]}."
+        )
+    resized = Image.fromarray(mask).resize((shape[1], shape[0]), Image.Resampling.NEAREST)
+    return np.asarray(resized)
+
+
+class _MapCache:
+    """Sampling maps of the last lenses; photos of one lens share one."""
+
+    _KEPT = 2
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._maps: dict[LensCamera, np.ndarray] = {}
+
+    def get(self, lens: LensCamera, pinhole: LensCamera) -> np.ndarray:
+        # The lock is held while computing: two threads would compute the same map.
+        with self._lock:
+            if lens not in self._maps:
+                while len(self._maps) >= self._KEPT:
+                    del self._maps[next(iter(self._maps))]
+                self._maps[lens] = sampling_map(lens, pinhole)
+            return self._maps[lens]
+
+
+def _warnings(notes: _Notes, stated: int, kind: str) -> list[ReportWarning]:
+    out = []
+
+    def say(code: str, items: list[str], text: str, hint: str = "") -> None:
+        if items:
+            listed = ", ".join(sorted(items)[:3]) + (" ..." if len(items) > 3 else "")
+            out.append(ReportWarning(code, f"{len(items)} {text}: {listed}.", hint))
+
+    say(
+        "photos-not-found",
+        notes.missing,
+        f"of the {stated} photos that the {kind} names were not found",
+    )
+    say(
+        "photos-unreadable",
+        [m.rstrip(".") for m in notes.bad],
+        "photos cannot be read and are not used",
+        UNREADABLE_HINT,
+    )
+    say("masks-not-used", [m.rstrip(".") for m in notes.wrong_masks], "masks were not used")
+    say(
+        "photos-masked-altogether",
+        notes.fully_masked,
+        "photos are masked altogether and are not used",
+    )
+    if notes.renamed:
+        text = (
+            f"{notes.renamed} photos were found under a name that differs in case, extension or "
+            "folder."
+        )
+        out.append(ReportWarning("photos-renamed", text))
+    return out
+
+
+def _facts(notes: _Notes) -> dict[str, int]:
+    counts = {
+        "photos_undistorted": notes.undistorted,
+        "photos_rescaled": notes.rescaled,
+        "photos_masked": notes.masked,
+    }
+    return {name: count for name, count in counts.items() if count}

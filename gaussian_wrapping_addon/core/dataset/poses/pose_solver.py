@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Solve camera poses from photos, or start points from posed photos, in a helper process.
+
+The photos are decoded here, brought upright, limited in size and written under plain names; the
+native solver sees only these files. Its result is a COLMAP model read by our own reader.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import DatasetError
+from ...files import write_json
+from ...kernels.parallel import default_threads
+from ...limits import MIN_IMAGES
+from ...machine import total_memory_bytes
+from ...processes.helper_process import run_helper
+from ...progress import Progress
+from ...report_warning import UNREADABLE_HINT, ReportWarning
+from ..camera import Camera
+from ..photos.photo_exif import read_lens_exif
+from ..photos.photo_file import DecodedPhoto, read_mask, read_photo, write_photo
+from ..photos.photo_finder import find_mask
+from ..readers.colmap_reader import ModelFiles, read_model
+from ..readers.source_model import PosedPhoto, SourceModel
+from .match_pairs import pairs_by_order, pairs_by_pose
+
+MAX_SIFT_PX = 1600
+"""Long side of the photos that features are searched in."""
+SHARE_OF_BAD_PHOTOS = 0.2
+"""More undecodable photos than this refuse the data set."""
+_HELPER = "dataset.poses.pose_solver_helper"
+_MEMORY_SHARE = 0.9
+_LEAST_MEMORY_BYTES = 8 << 30
+"""The limit counts reserved addresses too; below this the solver's threads may not even start."""
+
+
+@dataclass(frozen=True)
+class _SolverPhoto:
+    """One photo as the solver sees it."""
+
+    name: str
+    """Name under ``images/`` of the task folder."""
+    width: int
+    height: int
+    full_width: int
+    full_height: int
+    lens_key: tuple[str, ...]
+    focal_px: float | None
+    """Focal length from EXIF, in pixels of this size."""
+
+
+def solve_poses(
+    root: Path,
+    photos: Sequence[Path],
+    mask_roots: list[Path],
+    work_folder: Path,
+    progress: Progress,
+    *,
+    seed: int = 0,
+    threads: int = 0,
+) -> SourceModel:
+    """Solve cameras and sparse points of photos without poses (structure from motion).
+
+    Parameters
+    ----------
+    root : Path
+        Folder that the photo names are relative to.
+    photos : sequence of Path
+    mask_roots : list of Path
+        Folders of masks; features on black pixels are not used.
+    work_folder : Path
+        Temporary files and ``cameras/`` (the COLMAP model) are written here.
+
+    Returns
+    -------
+    SourceModel
+        Photos that could not be placed are left out, with a counted warning. World is the
+        solver's own frame. The same for the same seed with one thread; with more, the native
+        matcher has been seen to differ once in about 60 runs.
+
+    Raises
+    ------
+    DatasetError
+        Too few photos decode, or fewer than ``MIN_IMAGES`` can be placed.
+    """
+    folder = _fresh_folder(work_folder)
+    prepared: list[_SolverPhoto] = []
+    names: list[str] = []
+    bad: list[str] = []
+    for i, path in enumerate(photos):
+        name = path.relative_to(root).as_posix()
+        try:
+            decoded = read_photo(path)
+        except DatasetError as error:
+            bad.append(error.message)
+            refuse_if_many_bad(bad, len(photos))
+            continue
+        prepared.append(_write_solver_photo(folder, i, decoded, path, find_mask(mask_roots, name)))
+        names.append(name)
+        progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
+    if len(prepared) < MIN_IMAGES:
+        raise DatasetError(
+            f"Only {len(prepared)} photos can be read; {MIN_IMAGES} are needed.", "Add photos."
+        )
+    groups: dict[tuple[Any, ...], list[_SolverPhoto]] = {}
+    for photo in prepared:
+        key = (photo.full_width, photo.full_height, *photo.lens_key)
+        groups.setdefault(key, []).append(photo)
+    task = {
+        "mode": "solve",
+        "seed": seed,
+        "threads": threads or default_threads(),
+        "groups": [
+            {
+                "width": group[0].width,
+                "height": group[0].height,
+                "focal_px": group[0].focal_px,
+                "names": [p.name for p in group],
+            }
+            for group in groups.values()
+        ],
+        "pairs": [[prepared[i].name, prepared[j].name] for i, j in pairs_by_order(len(prepared))],
+    }
+    write_json(folder / "task.json", task)
+    run_helper(_HELPER, folder, progress.span(0.08, 1.0), memory_bytes=_memory_limit_bytes())
+    model = read_model(ModelFiles(folder / "model", ".bin"))
+    _keep_model(folder, work_folder)
+    return _with_source_names(model, prepared, names, bad, len(photos))
+
+
+def _with_source_names(
+    model: SourceModel,
+    prepared: list[_SolverPhoto],
+    names: list[str],
+    bad: list[str],
+    offered: int,
+) -> SourceModel:
+    """Give the solved photos their own names and full-size intrinsics."""
+    of_name = {p.name: (p, name) for p, name in zip(prepared, names, strict=True)}
+    photos: list[PosedPhoto] = []
+    for posed in model.photos:
+        photo, name = of_name[posed.name]
+        assert posed.lens is not None
+        lens = posed.lens.resized(photo.full_width, photo.full_height)
+        photos.append(dataclasses.replace(posed, name=name, lens=lens))
+    photos.sort(key=lambda p: p.name)
+    if len(photos) < MIN_IMAGES:
+        raise DatasetError(
+            f"Only {len(photos)} of {offered} photos could be placed; {MIN_IMAGES} are needed.",
+            "Take more photos with more overlap, from a textured object that does not move.",
+        )
+    warnings = list(model.warnings)
+    placed = {p.name for p in photos}
+    lost = [name for name in names if name not in placed]
+    if lost:
+        listed = ", ".join(lost[:5]) + (" ..." if len(lost) > 5 else "")
+        warnings.append(
+            ReportWarning(
+                "photos-not-placed",
+                f"{len(lost)} of {len(names)} photos could not be placed and are not used: "
+                f"{listed}.",
+                "Take more photos with more overlap there, or remove blurred ones.",
+            )
+        )
+    if bad:
+        text = f"{len(bad)} photos cannot be read and are not used: {bad[0]}"
+        warnings.append(ReportWarning("photos-unreadable", text, UNREADABLE_HINT))
+    facts = {
+        "photos": offered,
+        "photos_placed": len(photos),
+        "photos_with_focal_length": sum(p.focal_px is not None for p in prepared),
+        **{k: v for k, v in model.facts.items() if k != "images_in_model"},
+    }
+    return dataclasses.replace(
+        model, kind="photos", photos=tuple(photos), warnings=tuple(warnings), facts=facts
+    )
+
+
+def triangulate_points(
+    cameras: Sequence[Camera],
+    photos: Sequence[Path],
+    masks: Sequence[Path | None],
+    work_folder: Path,
+    progress: Progress,
+    *,
+    seed: int = 0,
+    threads: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Triangulate features of photos whose pinhole cameras are known and stay fixed.
+
+    Returns
+    -------
+    points : (n, 3) float64
+        In the frame of ``cameras``; may be empty.
+    colors : (n, 3) uint8
+    """
+    folder = _fresh_folder(work_folder)
+    entries = []
+    for i, (camera, path) in enumerate(zip(cameras, photos, strict=True)):
+        prepared = _write_solver_photo(folder, i, read_photo(path), None, masks[i])
+        small = camera.resized(prepared.width, prepared.height)
+        entries.append(
+            {
+                "name": prepared.name,
+                "width": small.width,
+                "height": small.height,
+                "params": [small.fx, small.fy, small.cx, small.cy],
+                "cam_from_world": np.asarray(small.cam_from_world).tolist(),
+            }
+        )
+        progress.update(0.08 * (i + 1) / len(photos), f"reading photo {i + 1} of {len(photos)}")
+    pairs = pairs_by_pose(
+        np.array([c.center for c in cameras]), np.array([c.forward for c in cameras])
+    )
+    task = {
+        "mode": "triangulate",
+        "seed": seed,
+        "threads": threads or default_threads(),
+        "photos": entries,
+        "pairs": [[entries[i]["name"], entries[j]["name"]] for i, j in pairs],
+    }
+    write_json(folder / "task.json", task)
+    run_helper(_HELPER, folder, progress.span(0.08, 1.0), memory_bytes=_memory_limit_bytes())
+    model = read_model(ModelFiles(folder / "model", ".bin"))
+    shutil.rmtree(folder)
+    return model.points, model.point_colors
+
+
+def refuse_if_many_bad(bad: Sequence[str], offered: int) -> None:
+    """Raise :class:`DatasetError` once more than a fifth of the photos cannot be read."""
+    if len(bad) > SHARE_OF_BAD_PHOTOS * offered:
+        raise DatasetError(
+            f"{len(bad)} of {offered} photos cannot be read. First: {bad[0]}",
+            "Restore the photos, or remove the bad ones.",
+        )
+
+
+def _write_solver_photo(
+    folder: Path, index: int, decoded: DecodedPhoto, source: Path | None, mask: Path | None
+) -> _SolverPhoto:
+    """Write one upright photo of limited size; ``source`` is asked for its lens."""
+    from PIL import Image
+
+    full_height, full_width = decoded.color.shape[:2]
+    factor = min(1.0, MAX_SIFT_PX / max(full_width, full_height))
+    size = (max(1, round(full_width * factor)), max(1, round(full_height * factor)))
+    color = decoded.color
+    if factor < 1.0:
+        color = np.asarray(Image.fromarray(color).resize(size, Image.Resampling.LANCZOS))
+    name = f"{index:06d}.jpg"
+    write_photo(folder / "images" / name, color)
+    visible = decoded.alpha if mask is None else read_mask(mask)
+    if visible is not None:
+        resized = Image.fromarray(visible).resize(size, Image.Resampling.NEAREST)
+        resized.save(folder / "masks" / f"{name}.png")
+    key: tuple[str, ...] = ()
+    focal_px = None
+    if source is not None:
+        lens = read_lens_exif(source, full_width, full_height)
+        key = lens.key
+        focal_px = None if lens.focal_px is None else lens.focal_px * factor
+    return _SolverPhoto(name, size[0], size[1], full_width, full_height, key, focal_px)
+
+
+def _fresh_folder(work_folder: Path) -> Path:
+    folder = work_folder / "pose_solver"
+    if folder.exists():
+        shutil.rmtree(folder)
+    (folder / "images").mkdir(parents=True)
+    (folder / "masks").mkdir()
+    return folder
+
+
+def _keep_model(folder: Path, work_folder: Path) -> None:
+    """Keep the solved model as ``cameras/``, drop features and temporary photos."""
+    kept = work_folder / "cameras"
+    if kept.exists():
+        shutil.rmtree(kept)
+    os.replace(folder / "model", kept)
+    shutil.rmtree(folder)
+
+
+def _memory_limit_bytes() -> int | None:
+    """Return a share of the machine's memory, or ``None`` where it is not known."""
+    total = total_memory_bytes()
+    return max(int(_MEMORY_SHARE * total), _LEAST_MEMORY_BYTES) if total else None

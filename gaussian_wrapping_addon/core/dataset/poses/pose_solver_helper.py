@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Helper process of :mod:`.pose_solver`: features, matching, mapping or triangulation (pycolmap).
+
+Reads ``task.json``, ``images/`` and ``masks/`` of its folder, writes ``model/`` (COLMAP binary).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import DatasetError
+from ...files import read_json
+from ...processes.helper_process import emit
+
+DEFAULT_FOCAL_FACTORS = (1.2, 0.85, 1.7, 2.5)
+"""Focal lengths over the long side that are tried where EXIF gives none, the commonest first."""
+_ENOUGH_PLACED = 0.8
+"""Share of placed photos at which no other focal length is tried."""
+_LENIENT_BELOW = 0.5
+"""Share of placed photos below which weaker evidence is accepted for a first pair and for poses."""
+_MAX_FEATURES = 8192
+_MAX_FEATURES_POSED = 4096
+_MATCHING_BLOCKS = 3
+_MATCHING_BLOCK_PAIRS = 1500
+"""Every block builds the search index of each of its photos anew: few, large blocks are quick."""
+
+_EXTRACT_END, _MATCH_END = 0.5, 0.85
+
+
+def main(folder: Path) -> None:
+    """Do the task of ``folder``."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 1
+    task = read_json(folder / "task.json")
+    pycolmap.set_random_seed(task["seed"])
+    if task["mode"] == "solve":
+        _solve(folder, task)
+    else:
+        _triangulate(folder, task)
+
+
+def _solve(folder: Path, task: dict[str, Any]) -> None:
+    import pycolmap
+
+    database = folder / "database.db"
+    guessed: list[int] = []
+    names_of_camera: dict[int, list[str]] = {}
+    with pycolmap.Database.open(database) as db:
+        for group in task["groups"]:
+            width, height = group["width"], group["height"]
+            focal_px = group["focal_px"]
+            start_px = focal_px or DEFAULT_FOCAL_FACTORS[0] * max(width, height)
+            camera = pycolmap.Camera(
+                model="SIMPLE_RADIAL",
+                width=width,
+                height=height,
+                params=[start_px, width / 2, height / 2, 0.0],
+            )
+            camera.has_prior_focal_length = focal_px is not None
+            camera_id = db.write_camera(camera)
+            names_of_camera[camera_id] = group["names"]
+            if focal_px is None:
+                guessed.append(camera_id)
+    _extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES)
+    _match(folder, database, task)
+    best, total = None, sum(len(names) for names in names_of_camera.values())
+    factors = DEFAULT_FOCAL_FACTORS if guessed else DEFAULT_FOCAL_FACTORS[:1]
+    attempts = [(factor, False) for factor in factors] + [(factors[0], True)]
+    for factor, lenient in attempts:
+        if best is not None and best.num_reg_images() >= total * (
+            _LENIENT_BELOW if lenient else _ENOUGH_PLACED
+        ):
+            break
+        with pycolmap.Database.open(database) as db:
+            for camera_id in guessed:
+                camera = db.read_camera(camera_id)
+                start_px = factor * max(camera.width, camera.height)
+                camera.params = [start_px, camera.width / 2, camera.height / 2, 0.0]
+                db.update_camera(camera)
+        found = _map(folder, database, task, total, lenient=lenient)
+        if found is not None and (best is None or found.num_reg_images() > best.num_reg_images()):
+            best = found
+    if best is None:
+        raise DatasetError(
+            f"No two of the {total} photos could be placed relative to each other.",
+            "Take more photos with more overlap, from a textured object that does not move.",
+        )
+    _write(folder, best)
+
+
+def _extract(
+    folder: Path,
+    database: Path,
+    names_of_camera: dict[int, list[str]],
+    threads: int,
+    max_features: int,
+) -> None:
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = threads
+    options.use_gpu = False
+    options.sift.max_num_features = max_features
+    reader = pycolmap.ImageReaderOptions()
+    if any((folder / "masks").iterdir()):
+        reader.mask_path = folder / "masks"
+    total = sum(len(names) for names in names_of_camera.values())
+    done = 0
+    for camera_id, names in names_of_camera.items():
+        reader.existing_camera_id = camera_id
+        # Entered in order first: extraction would number the photos as its threads finish.
+        pycolmap.import_images(
+            database,
+            folder / "images",
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=names,
+            options=reader,
+        )
+        for begin in range(0, len(names), 2 * threads):
+            block = names[begin : begin + 2 * threads]
+            emit(
+                fraction=_EXTRACT_END * done / total,
+                message=f"searching features, photo {done + 1} of {total}",
+            )
+            pycolmap.extract_features(
+                database,
+                folder / "images",
+                image_names=block,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+            done += len(block)
+
+
+def _match(folder: Path, database: Path, task: dict[str, Any]) -> None:
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = task["threads"]
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = task["seed"]
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = folder / "pairs.txt"
+    pairs = task["pairs"]
+    step = max(1, min(-(-len(pairs) // _MATCHING_BLOCKS), _MATCHING_BLOCK_PAIRS))
+    for begin in range(0, len(pairs), step):
+        emit(
+            fraction=_EXTRACT_END + (_MATCH_END - _EXTRACT_END) * begin / len(pairs),
+            message=f"matching photos, pair {begin + 1} of {len(pairs)}",
+        )
+        block = pairs[begin : begin + step]
+        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in block))
+        pycolmap.match_image_pairs(
+            database,
+            matching_options=matching,
+            pairing_options=pairing,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+
+
+def _mapping_options(seed: int) -> Any:
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    for part in (options, options.mapper, options.triangulation):
+        part.random_seed = seed
+    # One thread: the order of sums in bundle adjustment, and so the result, stays the same.
+    options.num_threads = 1
+    options.mapper.num_threads = 1
+    return options
+
+
+def _map(folder: Path, database: Path, task: dict[str, Any], total: int, *, lenient: bool) -> Any:
+    """Return the largest reconstruction, or ``None``."""
+    import pycolmap
+
+    options = _mapping_options(task["seed"])
+    options.min_model_size = 3
+    if lenient:
+        options.mapper.init_min_num_inliers = 40
+        options.mapper.init_min_tri_angle = 5.0
+        options.mapper.abs_pose_min_num_inliers = 15
+    placed = 2
+
+    def next_photo() -> None:
+        nonlocal placed
+        placed += 1
+        share = min(placed / total, 1.0)
+        emit(
+            fraction=_MATCH_END + (1.0 - _MATCH_END) * share,
+            message=f"placing photo {min(placed, total)} of {total}",
+        )
+
+    output = folder / "models"
+    output.mkdir(exist_ok=True)
+    emit(fraction=_MATCH_END, message="choosing the first two photos")
+    found = pycolmap.incremental_mapping(
+        database, folder / "images", output, options, next_image_callback=next_photo
+    )
+    # Ties go to the model found first, whatever the order of the dictionary.
+    ordered = [found[key] for key in sorted(found)]
+    return max(ordered, key=lambda model: model.num_reg_images(), default=None)
+
+
+def _triangulate(folder: Path, task: dict[str, Any]) -> None:
+    import pycolmap
+
+    database = folder / "database.db"
+    photos_of_lens: dict[tuple[float, ...], list[str]] = {}
+    for photo in task["photos"]:
+        lens = (photo["width"], photo["height"], *photo["params"])
+        photos_of_lens.setdefault(lens, []).append(photo["name"])
+    names_of_camera: dict[int, list[str]] = {}
+    with pycolmap.Database.open(database) as db:
+        for (width, height, *params), names in photos_of_lens.items():
+            camera = pycolmap.Camera(
+                model="PINHOLE", width=int(width), height=int(height), params=params
+            )
+            camera.has_prior_focal_length = True
+            names_of_camera[db.write_camera(camera)] = names
+    _extract(folder, database, names_of_camera, task["threads"], _MAX_FEATURES_POSED)
+    _match(folder, database, task)
+    pose_of_name = {p["name"]: np.array(p["cam_from_world"]) for p in task["photos"]}
+    posed = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as db:
+        for camera in db.read_all_cameras():
+            posed.add_camera_with_trivial_rig(camera)
+        for stored in db.read_all_images():
+            image = pycolmap.Image(
+                name=stored.name, camera_id=stored.camera_id, image_id=stored.image_id
+            )
+            pose = pycolmap.Rigid3d(pose_of_name[stored.name])
+            posed.add_image_with_trivial_frame(image, pose)
+    emit(fraction=_MATCH_END, message="triangulating points")
+    options = _mapping_options(task["seed"])
+    # Poses must stay what the input says: bundle adjustment may move points only.
+    solved = pycolmap.triangulate_points(
+        posed, database, folder / "images", folder, clear_points=True, options=options
+    )
+    solved.extract_colors_for_all_images(folder / "images")
+    _write(folder, solved)
+
+
+def _write(folder: Path, model: Any) -> None:
+    output = folder / "model"
+    output.mkdir()
+    model.write_binary(output)
+    emit(fraction=1.0, message="cameras are solved")

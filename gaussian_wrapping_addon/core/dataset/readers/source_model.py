@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Posed photos as an input states them: lens models, poses, sparse points, before any photo."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ... import limits
+from ...report_warning import ReportWarning
+from ...tolerances import QUATERNION_MIN_NORM
+
+LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": (
+        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+        *("k3", "k4", "k5", "k6"),
+    ),
+    "FOV": ("fx", "fy", "cx", "cy", "omega"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "THIN_PRISM_FISHEYE": (
+        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+        *("k3", "k4", "sx1", "sy1"),
+    ),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        *("fx", "fy", "cx", "cy", "k0", "k1", "k2", "k3"),
+        *("k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"),
+    ),
+    "SIMPLE_DIVISION": ("f", "cx", "cy", "k"),
+    "DIVISION": ("fx", "fy", "cx", "cy", "k"),
+    "SIMPLE_FISHEYE": ("f", "cx", "cy"),
+    "FISHEYE": ("fx", "fy", "cx", "cy"),
+    "EUCM": ("fx", "fy", "cx", "cy", "alpha", "beta"),
+}
+"""COLMAP's lens models in the order of their numbers."""
+
+LENS_NAMES = tuple(LENS_PARAMETERS)
+
+_FOCAL_SHARE = (1e-3, 1e3)
+"""Focal length over the photo's long side: 0.001 is a 179.9 degree lens, 1000 a telescope."""
+_PRINCIPAL_POINT_SIDES = 10.0
+"""A principal point further out than this many photo sides is a broken file."""
+_MAX_DISTORTION = 1e3
+
+
+@dataclass(frozen=True)
+class LensCamera:
+    """A camera with its lens model, as written in the input (COLMAP names and order)."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """``(fx, fy)`` in pixels."""
+        names = LENS_PARAMETERS[self.model]
+        return (self.params[0], self.params[1] if names[1] == "fy" else self.params[0])
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """``(cx, cy)`` in pixels, first pixel's centre at (0.5, 0.5)."""
+        at = LENS_PARAMETERS[self.model].index("cx")
+        return (self.params[at], self.params[at + 1])
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """Every parameter after the principal point."""
+        return self.params[LENS_PARAMETERS[self.model].index("cy") + 1 :]
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether straight lines stay straight, so that the photo can be used as it is."""
+        if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
+            return True
+        polynomial = "FISHEYE" not in self.model and self.model not in ("FOV", "EUCM")
+        return polynomial and not any(self.distortion)
+
+    def problem(self) -> str:
+        """Return what makes this camera unusable, or an empty text."""
+        if self.model not in LENS_PARAMETERS:
+            return f"camera model {self.model} is not supported"
+        wanted = len(LENS_PARAMETERS[self.model])
+        if len(self.params) != wanted:
+            return f"{self.model} has {wanted} parameters, not {len(self.params)}"
+        side = limits.MAX_IMAGE_SIDE_PX
+        if not (0 < self.width <= side and 0 < self.height <= side):
+            return f"image size {self.width} x {self.height} is out of range"
+        if self.width * self.height > limits.MAX_IMAGE_PIXELS:
+            return f"image size {self.width} x {self.height} has too many pixels"
+        if not all(math.isfinite(p) for p in self.params):
+            return "a parameter is not a finite number"
+        longest = max(self.width, self.height)
+        low, high = _FOCAL_SHARE[0] * longest, _FOCAL_SHARE[1] * longest
+        if not all(low <= f <= high for f in self.focal):
+            return f"focal length {self.focal[0]:g} x {self.focal[1]:g} px is out of range"
+        if any(abs(c) > _PRINCIPAL_POINT_SIDES * longest for c in self.principal_point):
+            return "the principal point lies far outside the image"
+        if any(abs(p) > _MAX_DISTORTION for p in self.distortion):
+            return "a distortion parameter is out of range"
+        return ""
+
+    def resized(self, width: int, height: int) -> LensCamera:
+        """Return the camera of the same photo resampled to ``width`` x ``height`` pixels."""
+        sx, sy = width / self.width, height / self.height
+        model, names, params = self.model, LENS_PARAMETERS[self.model], list(self.params)
+        if names[1] != "fy" and not math.isclose(sx, sy, rel_tol=1e-12):
+            model, names, params = _with_two_focal_lengths(self)
+        two = names[1] == "fy"
+        at = names.index("cx")
+        params[0] *= sx
+        if two:
+            params[1] *= sy
+        params[at] *= sx
+        params[at + 1] *= sy
+        return LensCamera(model, int(width), int(height), tuple(params))
+
+
+def _with_two_focal_lengths(camera: LensCamera) -> tuple[str, tuple[str, ...], list[float]]:
+    """Rewrite a one-focal-length model as the model that can be stretched, where there is one."""
+    f, cx, cy, *k = camera.params
+    k = [*k, 0.0, 0.0, 0.0, 0.0]
+    model, params = {
+        "SIMPLE_PINHOLE": ("PINHOLE", [f, f, cx, cy]),
+        "SIMPLE_RADIAL": ("OPENCV", [f, f, cx, cy, k[0], 0.0, 0.0, 0.0]),
+        "RADIAL": ("OPENCV", [f, f, cx, cy, k[0], k[1], 0.0, 0.0]),
+        "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", [f, f, cx, cy, k[0], 0.0, 0.0, 0.0]),
+        "RADIAL_FISHEYE": ("OPENCV_FISHEYE", [f, f, cx, cy, k[0], k[1], 0.0, 0.0]),
+        "SIMPLE_DIVISION": ("DIVISION", [f, f, cx, cy, k[0]]),
+        "SIMPLE_FISHEYE": ("FISHEYE", [f, f, cx, cy]),
+    }[camera.model]
+    return model, LENS_PARAMETERS[model], params
+
+
+@dataclass(frozen=True)
+class PosedPhoto:
+    """One photo of the input: its name there, its lens, its pose."""
+
+    name: str
+    lens: LensCamera | None
+    """``None`` until the photo's own size completes the intrinsics (``angle_x`` is then set)."""
+    cam_from_world: np.ndarray
+    """(3, 4) float64, COLMAP axes (x right, y down, z forward)."""
+    mask_name: str | None = None
+    angle_x: float | None = None
+    """Horizontal field of view in radians, where the input gives nothing else."""
+
+
+@dataclass(frozen=True)
+class SourceModel:
+    """Everything an input says about cameras and points, world frame, float64."""
+
+    kind: str
+    """``"COLMAP model"``, ``"transforms.json"`` or ``"photos"``."""
+    photos: tuple[PosedPhoto, ...]
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """(n, 3) float64."""
+    point_colors: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    """(n, 3) uint8."""
+    warnings: tuple[ReportWarning, ...] = ()
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray | None:
+    """Return the (3, 3) rotation of a Hamilton quaternion w x y z; ``None`` if zero or NaN."""
+    q = np.asarray(quaternion, np.float64)
+    largest = np.abs(q).max()
+    if not np.isfinite(q).all() or largest < QUATERNION_MIN_NORM:
+        return None
+    q = q / largest  # the squares of a huge quaternion would overflow
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
+    """Return the quaternion w x y z (w >= 0) of a (3, 3) rotation.
+
+    The largest eigenvector of Bar-Itzhack's symmetric matrix: no case distinction, no loss of
+    precision near half turns.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
+    matrix = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    quaternion = np.linalg.eigh(matrix)[1][:, -1]
+    return quaternion if quaternion[0] >= 0 else -quaternion

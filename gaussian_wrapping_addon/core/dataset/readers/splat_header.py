@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Tell from its header whether a file is a 3D Gaussian splat, and of which known variant."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...errors import DatasetError, ParseError
+from ...ply.header import PlyHeader, read_ply_header
+
+MAX_FILE_DEGREE = 4
+"""Highest degree of the harmonics that files are known to have."""
+
+EXPECTED = (
+    "A 3D Gaussian splat has x, y, z, f_dc_0..2 (or red, green, blue), opacity, scale_0..2 and "
+    "rot_0..3, as Inria's code, gsplat, nerfstudio and SuperSplat (uncompressed) write them."
+)
+
+_UNPACK = "Open it in a splat editor, such as SuperSplat, and export it as an uncompressed PLY."
+
+OTHER_FORMATS = {
+    ".spz": "SPZ",
+    ".splat": "antimatter15 .splat",
+    ".ksplat": "KSPLAT",
+    ".sog": "SOG",
+}
+"""Splats in formats that are not read, by suffix."""
+
+
+@dataclass(frozen=True)
+class SplatHeader:
+    """A splat file as its header describes it."""
+
+    ply: PlyHeader
+    degree: int
+    """Of the harmonics, 0 to 4."""
+    axes: int
+    """3, or 2 for surfels (2D Gaussian splatting)."""
+    colors: tuple[str, ...]
+    """Names of the three columns of constant colour: ``f_dc_*``, or ``red green blue``."""
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return self.ply.elements[0].count
+
+    @property
+    def names(self) -> frozenset[str]:
+        """All properties of a Gaussian."""
+        return frozenset(self.ply.elements[0].names)
+
+
+def is_splat_path(path: Path) -> bool:
+    """Tell by its suffix whether a file may be a splat; refuse formats that are not read.
+
+    Raises
+    ------
+    DatasetError
+        A splat in a compressed or other format.
+    """
+    suffix = path.suffix.lower()
+    if suffix in OTHER_FORMATS:
+        raise DatasetError(
+            f"{path.name} is a splat in the format {OTHER_FORMATS[suffix]}, which is not read.",
+            _UNPACK,
+        )
+    return suffix == ".ply"
+
+
+def read_splat_header(path: Path) -> SplatHeader:
+    """Read the header of a splat PLY, with its properties in any order and others beside them.
+
+    Raises
+    ------
+    ParseError
+        Not a splat: names what is missing and what is expected; compressed variants are named.
+    DatasetError
+        By its suffix another splat format.
+    """
+    is_splat_path(path)
+    ply = read_ply_header(path, EXPECTED)
+    elements = {element.name: element for element in ply.elements}
+    if "chunk" in elements or any("packed" in n for e in ply.elements for n in e.names):
+        raise ParseError(path, "header", "a compressed splat PLY, which is not read.", _UNPACK)
+    if "vertex" not in elements:
+        raise ParseError(path, "header", "the element vertex is missing.", EXPECTED)
+    if ply.elements[0].name != "vertex":
+        raise ParseError(path, "header", "the vertices do not come first.", EXPECTED)
+    names = set(elements["vertex"].names)
+    if "f_dc_0" not in names and {"red", "green", "blue"} <= names:
+        colors: tuple[str, ...] = ("red", "green", "blue")
+    else:
+        colors = ("f_dc_0", "f_dc_1", "f_dc_2")
+    wanted = [
+        *("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"),
+        *colors,
+    ]
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise ParseError(
+            path, "header", f"not a splat but {_described(elements, names)}: property "
+            f"{', '.join(missing[:3])} is missing.", EXPECTED,
+        )  # fmt: skip
+    axes = 3 if "scale_2" in names else 2
+    return SplatHeader(ply, _degree(path, names), axes, colors)
+
+
+def _degree(path: Path, names: set[str]) -> int:
+    rest = {name for name in names if re.fullmatch(r"f_rest_\d+", name)}
+    for degree in range(MAX_FILE_DEGREE + 1):
+        count = 3 * ((degree + 1) ** 2 - 1)
+        if len(rest) == count and rest == {f"f_rest_{i}" for i in range(count)}:
+            return degree
+    raise ParseError(
+        path, "header", f"{len(rest)} f_rest properties fit no degree from 0 to "
+        f"{MAX_FILE_DEGREE} (0, 9, 24, 45 or 72 of them, numbered from 0).",
+        "Export the splat again.",
+    )  # fmt: skip
+
+
+def _described(elements: Container[str], names: set[str]) -> str:
+    """Say in a word what a PLY without Gaussians is."""
+    if "face" in elements:
+        return "a mesh"
+    return "a point cloud" if {"x", "y", "z"} <= names else "another PLY"

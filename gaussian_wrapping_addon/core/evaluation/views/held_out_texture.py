@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A mesh's texture baked again without some photos, so that these may judge it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+
+from ...dataset.camera import Camera
+from ...dataset.photo_source import PhotoSource
+from ...dataset.scene import Scene
+from ...mesh.face_graph import face_graph, uv_charts
+from ...mesh.textured_mesh import TexturedMesh
+from ...progress import Progress
+from ...settings import TextureSettings
+from ...texture.texture_mesh import texture_mesh
+from ...texture.unwrap.unwrap import Unwrap
+
+MIN_SIZE_PX = 256
+
+
+class _Subset:
+    """Some photos of a store, numbered anew."""
+
+    def __init__(self, photos: PhotoSource, indices: list[int]) -> None:
+        self._photos = photos
+        self._indices = indices
+
+    def camera(self, index: int, divisor: int = 1) -> Camera:
+        return self._photos.camera(self._indices[index], divisor)
+
+    def photo(self, index: int, divisor: int = 1) -> np.ndarray:
+        return self._photos.photo(self._indices[index], divisor)
+
+    def mask(self, index: int, divisor: int = 1) -> np.ndarray | None:
+        return self._photos.mask(self._indices[index], divisor)
+
+
+def texture_without(
+    textured: TexturedMesh,
+    scene: Scene,
+    photos: PhotoSource,
+    names: Collection[str],
+    reduction: int,
+    work_folder: Path,
+    progress: Progress,
+    *,
+    threads: int,
+) -> TexturedMesh:
+    """Bake the colours again from all photos but the named ones, on the same UVs.
+
+    Parameters
+    ----------
+    textured : TexturedMesh
+        Scene frame.
+    names : collection of str
+        Photos to leave out; some must remain.
+    reduction : int
+        How many times coarser than the photos the pictures are that will be compared: the texture
+        is smaller by the largest power of two that is no more.
+    work_folder : Path
+        For temporary files, none of which stays.
+
+    Returns
+    -------
+    TexturedMesh
+        Without normal map and occlusion, which unlit pictures do not show.
+    """
+    kept = [i for i, view in enumerate(scene.views) if view.camera.name not in names]
+    full_px = len(textured.albedo)
+    size_px = full_px
+    while size_px >= 2 * MIN_SIZE_PX and full_px // size_px * 2 <= reduction:
+        size_px //= 2
+    mesh, uvs = textured.mesh, textured.corner_uvs
+    graph = face_graph(mesh.vertices, mesh.faces)
+    gutter_px = float(textured.statistics.get("gutter_px", 1.0)) * size_px / full_px
+    charts = uv_charts(graph, mesh.faces, uvs)
+    unwrapped = Unwrap(uvs, charts, "kept", gutter_px, face_atlas=textured.face_atlas)
+    settings = TextureSettings(
+        size_px=size_px,
+        gutter_px=max(1, math.floor(gutter_px)),
+        normal_map="off",
+        ambient_occlusion="off",
+    )
+    part = dataclasses.replace(scene, views=tuple(scene.views[i] for i in kept))
+    return texture_mesh(
+        mesh, part, _Subset(photos, kept), settings, work_folder, progress,
+        threads=threads, unwrapped=unwrapped,
+    )  # fmt: skip

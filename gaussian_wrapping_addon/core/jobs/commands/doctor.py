@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Findings about an environment: can this Python run a worker, and what is missing."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import json
+import platform
+import shutil
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from ...errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError, WrapError
+from ...machine import total_memory_bytes
+from ...processes.helper_process import child_command, emit
+from ...processes.spawn import run_to_end
+from ...processes.worker_requirements import read_requirements, requirements_file
+
+MIN_PYTHON = (3, 11)
+MIN_MEMORY_BYTES = 4 * 2**30
+MIN_DISK_BYTES = 2 * 2**30
+DOCTOR_DEADLINE_S = 120.0
+
+REQUIRED = {
+    "numpy": "numpy", "torch": "torch", "numba": "numba", "scipy": "scipy", "shull": "shull",
+    "pycolmap": "pycolmap", "xatlas": "xatlas",
+    "PIL": "pillow", "trimesh": "trimesh", "igl": "libigl",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """One line of the doctor: ``good`` tells whether it stands in the way of a job."""
+
+    subject: str
+    good: bool
+    finding: str
+    hint: str = ""
+
+
+def diagnose(folder: str = ".") -> list[Diagnosis]:
+    """Examine the interpreter that runs this."""
+    found = [
+        Diagnosis(
+            "Python",
+            sys.version_info[:2] >= MIN_PYTHON,
+            f"{platform.python_version()} at {sys.executable}",
+            "Use Python 3.11 or newer.",
+        )
+    ]
+    found += _packages()
+    found.append(_device())
+    found.append(_memory())
+    free_bytes = shutil.disk_usage(folder).free
+    found.append(
+        Diagnosis(
+            "Disk",
+            free_bytes > MIN_DISK_BYTES,
+            f"{free_bytes / 2**30:.1f} GiB free",
+            "Free at least 2 GiB.",
+        )
+    )
+    return found
+
+
+def _packages() -> list[Diagnosis]:
+    """Compare every pinned package with the list, and import it."""
+    modules = {package: module for module, package in REQUIRED.items()}
+    found = []
+    for requirement in read_requirements(requirements_file()):
+        name = requirement.name
+        hint = f"Press Set Up Worker, or: pip install {name}{requirement.versions}"
+        try:
+            module = importlib.import_module(modules.get(name, name))
+            version = importlib.metadata.version(name)
+        except Exception as error:  # a broken binary package can raise anything
+            found.append(Diagnosis(name, False, f"cannot be imported: {error}", hint))
+            continue
+        good = requirement.allows(version)
+        wanted = "" if good else f", but {requirement.versions} is wanted"
+        found.append(Diagnosis(name, good, f"{version}{_build(module)}{wanted}", hint))
+    return found
+
+
+def _build(module: Any) -> str:
+    """Return for which device torch was built; nothing for other packages."""
+    if getattr(module, "__name__", "") != "torch":
+        return ""
+    cuda = getattr(module.version, "cuda", None)
+    return f", built for CUDA {cuda}" if cuda else ", built for the processor"
+
+
+def _device() -> Diagnosis:
+    try:
+        import torch
+    except Exception:  # the line of torch says what it is
+        return Diagnosis("Device", False, "torch is missing", "Press Set Up Worker.")
+    if torch.cuda.is_available():
+        return Diagnosis(
+            "Device", True, f"{torch.cuda.get_device_name(0)} is present; jobs run on the processor"
+        )
+    return Diagnosis("Device", True, "no CUDA device; jobs run on the processor")
+
+
+def _memory() -> Diagnosis:
+    total_bytes = total_memory_bytes()
+    if not total_bytes:
+        return Diagnosis("Memory", True, "unknown")
+    return Diagnosis(
+        "Memory",
+        total_bytes >= MIN_MEMORY_BYTES,
+        f"{total_bytes / 2**30:.1f} GiB",
+        "At least 4 GiB are needed.",
+    )
+
+
+def main(arguments: list[str]) -> int:
+    """Write the findings about this interpreter to stdout, one JSON object a line."""
+    findings = diagnose(arguments[0] if arguments else ".")
+    for finding in findings:
+        emit(**asdict(finding))
+    return EXIT_DONE if all(f.good for f in findings) else EXIT_BAD_DATA
+
+
+def diagnose_worker(python: str) -> list[Diagnosis]:
+    """Examine another interpreter, in a child process.
+
+    Raises
+    ------
+    WorkerError
+        The interpreter does not start or gives no answer.
+    """
+    try:
+        command = child_command("jobs.commands.doctor", python=python)
+        _, output, last_words = run_to_end(command, DOCTOR_DEADLINE_S)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise WorkerError(
+            f"{python} does not run: {error}.", "Press Set Up Worker, or choose another Python."
+        ) from None
+    findings: list[Diagnosis] = []
+    for line in output.splitlines():
+        try:
+            values: Any = json.loads(line)
+            findings.append(Diagnosis(**values))
+        except (ValueError, TypeError):
+            continue
+    if not findings:
+        words = last_words.strip().splitlines()
+        raise WorkerError(
+            f"{python} gave no answer: {words[-1] if words else 'no output'}.",
+            "Press Set Up Worker, or choose a Python 3.11 or newer with the worker's packages.",
+        )
+    return findings
+
+
+def find_and_diagnose(preference: str = "") -> list[Diagnosis]:
+    """Examine the interpreter that jobs would use; where there is none, say what to do."""
+    from ..client import worker_python
+
+    try:
+        return diagnose_worker(worker_python(preference))
+    except WrapError as error:
+        return [Diagnosis("Worker", False, error.message, error.hint)]

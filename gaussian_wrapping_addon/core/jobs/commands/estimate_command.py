@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``estimate`` of the command line: what a training will take, told by the worker's Python.
+
+Speaks as :mod:`~.evaluate_command` does: one JSON object a line on stdout.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...errors import DatasetError
+from ...report_warning import ReportWarning
+from ..store.job_file import JobFile
+from .worker_call import answer
+
+if TYPE_CHECKING:
+    from ...training.cost.training_estimate import SceneFacts
+
+
+def main(arguments: list[str]) -> int:
+    """Estimate the job of ``arguments = [job file as JSON]``; return the exit code."""
+    return answer(lambda: _estimate(JobFile.from_json(json.loads(arguments[0]))))
+
+
+def _estimate(job: JobFile) -> list[str | ReportWarning]:
+    from ...kernels.parallel import default_threads
+    from ...training.cost.machine_speed import machine_speed, renderer_is_compiled
+    from ...training.cost.training_estimate import (
+        MESH_AND_TEXTURE_SHARE,
+        estimate,
+        judge,
+        this_machine,
+    )
+    from ...training.initialisation.splat_start import wrapping_settings
+    from ..stages.splat_scene import start_splat_of
+
+    facts = input_facts(Path(job.source))
+    training = job.settings.training
+    if start_splat_of(job) is not None:
+        training = wrapping_settings(training)
+    threads = job.settings.threads or default_threads()
+    compiled = renderer_is_compiled()
+    speed = machine_speed(threads) if compiled else 1.0
+    machine = this_machine(Path.cwd(), threads, speed)
+    expected = estimate(facts, training, machine)
+    low, high = MESH_AND_TEXTURE_SHARE
+    points = f"{facts.points} sparse points" if facts.points else "camera poses still to be solved"
+    lines = [
+        f"{facts.photos} photos, long side {facts.long_side_px} px, {points}",
+        f"training ({job.settings.preset}, {threads} threads): {expected.span()}",
+        f"memory: {expected.memory_bytes / 2**30:.1f} GB",
+        f"disk: {expected.disk_bytes / 2**30:.2f} GB",
+        f"Gaussians: up to {expected.gaussians:,}",
+        f"mesh and texture: {100 * low:.0f} to {100 * high:.0f} % more",
+    ]
+    if not facts.points:
+        lines.append("solving the cameras: minutes before")
+    if not compiled:
+        lines.append("not timed here: the first job compiles the renderer, about a minute, once")
+    return [*lines, *judge(expected, machine)]
+
+
+def input_facts(source: Path) -> SceneFacts:
+    """Return the facts of an input, read from headers and poses alone.
+
+    Raises
+    ------
+    DatasetError
+        The input holds no photo that can be read.
+    """
+    from ...dataset.loading.splat_cameras import FAR_VIEWS, NEAR_VIEWS, PHOTO_SIDE_PX
+    from ...dataset.photos.photo_file import photo_header
+    from ...dataset.photos.photo_finder import PhotoIndex, find_mask, list_photos, photo_root
+    from ...dataset.readers.source_kind import SPLAT, read_poses, source_kind
+    from ...dataset.readers.splat_header import read_splat_header
+    from ...training.cost.training_estimate import SceneFacts
+    from ..stages.splat_scene import MAX_START_POINTS
+
+    kind = source_kind(source.resolve())
+    if kind.kind == SPLAT:
+        header = read_splat_header(source)
+        views = FAR_VIEWS + NEAR_VIEWS
+        points = min(header.count, MAX_START_POINTS)
+        return SceneFacts(views, float(PHOTO_SIDE_PX**2), PHOTO_SIDE_PX, points)
+    points = 0
+    if kind.kind == "photos":
+        root = photo_root(kind.folder)
+        named = {p.relative_to(root).as_posix(): p for p in list_photos(root)}
+    else:
+        model = read_poses(kind)
+        points, index = len(model.points), PhotoIndex(kind.photo_roots)
+        matches = {photo.name: index.find(photo.name) for photo in model.photos}
+        named = {name: match.path for name, match in matches.items() if match is not None}
+    sizes = []
+    for path in named.values():
+        try:
+            sizes.append(photo_header(path).upright_size)
+        except DatasetError:
+            continue  # loading leaves it out, or refuses, with words
+    if not sizes:
+        raise DatasetError(
+            f"{source} holds no photo that can be read.", "See what batch.py check finds."
+        )
+    return SceneFacts(
+        len(sizes),
+        sum(width * height for width, height in sizes) / len(sizes),
+        max(max(size) for size in sizes),
+        points,
+        any(find_mask(kind.mask_roots, name) is not None for name in named),
+    )

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``estimate-mesh`` of the command line: what a region's mesh will take, from a finished training.
+
+Runs in the worker's Python. Speaks as :mod:`~.evaluate_command` does: one JSON object a line on
+stdout.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from ...errors import MeshingError, UsageError
+from ...kernels.parallel import default_threads
+from ...names import AUTOMATIC_REGIONS
+from ...progress import Progress
+from ...report_warning import ReportWarning
+from ...settings import MeshingSettings, from_json
+from ..stages.region_meshing import expected_by_pivots, expected_mesh, free_bytes
+from ..store.continue_training import no_finished_training
+from ..store.job_folder import JobFolder
+from ..store.stage_folder import read_done
+from .worker_call import answer
+
+MOST_VIEWS = 24
+"""Photos whose cameras look for the surface: more cover little more of it."""
+MOST_SIGHTINGS = 60_000
+
+
+def main(arguments: list[str]) -> int:
+    """Estimate ``arguments = [{"out", "region", "meshing", "threads"} as JSON]``."""
+    return answer(lambda: _lines(json.loads(arguments[0])))
+
+
+def _newest(stages: Path, name: str) -> Path:
+    """Return the stage that was finished last."""
+    done = [(values["finished_unix_s"], path) for path in sorted(stages.glob(f"{name}-*"))
+            if (values := read_done(path)) is not None]  # fmt: skip
+    if not done:
+        raise no_finished_training(stages.parent)
+    return max(done)[1]
+
+
+def _lines(request: dict[str, Any]) -> list[str | ReportWarning]:
+    from ...dataset.scene_file import load_saved_scene
+    from ...field.depth_samples import find_sightings
+    from ...field.vacancy.vacancy import VacancyField
+    from ...gaussians.gaussian_file import load_gaussians
+    from ...meshing.points.resolution import checked_request
+    from ...regions.automatic_region import automatic_region, whole_region
+    from ...regions.region import read_region
+
+    folder = JobFolder(Path(request["out"]))
+    if not folder.is_job():
+        raise UsageError(f"{folder.root} holds no job.", "Choose the folder given as --out.")
+    meshing = from_json(MeshingSettings, request["meshing"], "meshing")
+    threads = int(request["threads"]) or default_threads()
+    if request["region"] not in AUTOMATIC_REGIONS:
+        world_region = read_region(Path(request["region"]))
+    scene = load_saved_scene(_newest(folder.stages, "cameras"))
+    gaussians = load_gaussians(_newest(folder.stages, "train") / "gaussians.npz")
+    arrays = gaussians.arrays()
+    if request["region"] not in AUTOMATIC_REGIONS:
+        region = world_region.transformed(scene.world_from_scene.inverse())
+    else:
+        automatic = request["region"] == "auto"
+        region = automatic_region(scene) if automatic else whole_region(scene, arrays)
+    cameras = scene.cameras[:: max(1, -(-len(scene.cameras) // MOST_VIEWS))]
+    edge_length = meshing.edge_length / scene.world_from_scene.scale
+    notes = checked_request(edge_length, meshing.points, region).notes  # refuses before any work
+    sightings = find_sightings(
+        gaussians, cameras, lambda points: region.contains(points, 0.0), Progress(),
+        most=MOST_SIGHTINGS, threads=threads,
+    )  # fmt: skip
+    if len(sightings) == 0:
+        raise MeshingError(
+            f"The cameras see no surface in region {region.name!r}.",
+            "Draw the region around something that was photographed.",
+        )
+    vacancy = VacancyField(arrays, scene.cameras, threads=threads)
+    memory_bytes = free_bytes(folder.root, threads)
+    if meshing.method == "pivots":
+        by_pivots = expected_by_pivots(vacancy, arrays, region, meshing, sightings)
+        by_pivots.refuse(memory_bytes)
+        return [*by_pivots.lines()]
+    expected = expected_mesh(vacancy, scene.cameras, region, meshing, edge_length, sightings)
+    tiled = meshing.tiles != "off" and (meshing.tiles != "auto" or expected.tiles_for(memory_bytes))
+    expected.refuse(memory_bytes, tiled=tiled)
+    how = "it would be meshed in tiles" if tiled else "it would be meshed whole"
+    return [*expected.lines(), how, *notes]

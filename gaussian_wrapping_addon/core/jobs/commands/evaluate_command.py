@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``evaluate`` of the command line: judges a mesh or a job in the worker's Python.
+
+The caller's side needs neither scipy nor libigl; the child reports on stdout, one JSON object a
+line: ``{"message"}`` while it works, ``{"line"}`` for the table, ``{"warning", "code"}``,
+``{"error", "hint"}`` at the end.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ...errors import (
+    EXIT_CANCELLED,
+    EXIT_DONE,
+    EXIT_OTHER,
+    DatasetError,
+    ParseError,
+    UsageError,
+    WorkerError,
+    cannot_be_written,
+)
+from ...files import read_json, write_json
+from ...processes.helper_process import child_command, emit
+from ...processes.spawn import kill_group, spawn
+from ..store.job_folder import MARKER, JobFolder
+from .worker_call import answer
+
+if TYPE_CHECKING:
+    from ...dataset.camera import Camera
+
+_logger = logging.getLogger("gaussian_wrapping")
+
+LAST_WORDS_BYTES = 2000
+
+
+def run_in_worker(
+    request: dict[str, Any],
+    *,
+    python: str,
+    module: str = "jobs.commands.evaluate_command",
+    what: str = "evaluation",
+) -> int:
+    """Start the child, show what it says, and return its exit code.
+
+    Parameters
+    ----------
+    request : dict
+        ``mesh`` (path of a mesh or a job folder), ``region``, ``cameras``, ``out``, and the
+        entries of :class:`~.command.EvaluationRequest`; plain JSON values.
+    python : str
+        The worker's interpreter.
+    module, what : str
+        The child's module, and what errors call it: others speak the same way.
+
+    Raises
+    ------
+    WorkerError
+        It does not start, or ends without a word.
+    """
+    text = json.dumps(request, allow_nan=False)
+    with tempfile.TemporaryFile() as words:
+        try:
+            process = spawn(child_command(module, text, python=python), stderr=words)
+        except OSError as error:
+            raise WorkerError(
+                f"{python} does not run: {error}.", "Choose another Python."
+            ) from None
+        spoken = False
+        try:
+            assert process.stdout is not None
+            for raw in process.stdout:
+                spoken = _show(raw) or spoken
+            code = process.wait()
+        except KeyboardInterrupt:
+            _logger.info("cancelled")
+            return EXIT_CANCELLED
+        finally:
+            kill_group(process)
+        if code not in (EXIT_DONE, *range(EXIT_OTHER, EXIT_CANCELLED + 1)) or (code and not spoken):
+            words.seek(max(0, words.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
+            last = words.read().decode(errors="replace").strip().splitlines()
+            reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
+            raise WorkerError(
+                f"The {what} {reason}: {last[-1] if last else 'no output'}.",
+                "See whether batch.py doctor finds something.",
+            )
+        return code
+
+
+def _show(raw: bytes) -> bool:
+    """Log one line of the child; tell whether it was its error."""
+    try:
+        values = json.loads(raw)
+    except ValueError:
+        return False
+    if not isinstance(values, dict):
+        return False
+    if "error" in values:
+        _logger.error("error: %s", f"{values['error']} {values.get('hint', '')}".strip())
+        return True
+    if "warning" in values:
+        _logger.info("warning: %s", values["warning"])
+    elif "line" in values:
+        _logger.info("%s", values["line"])
+    elif "message" in values:
+        _logger.info("[%5.1f %%] %s", 100 * float(values.get("fraction", 0)), values["message"])
+    return False
+
+
+def main(arguments: list[str]) -> int:
+    """Evaluate ``arguments = [request as JSON]`` in this process; return the exit code."""
+
+    from ...texture.files.file_checks import writing
+
+    def work() -> list[str]:
+        request = json.loads(arguments[0])
+        out = Path(request["out"]) if request["out"] else None
+        if out is not None:
+            _refuse_output(out)
+        report, lines = _evaluate(request)
+        if out is not None:
+            with writing(out):
+                write_json(out, report)
+            lines.append(f"written to {out}")
+        return lines
+
+    return answer(work, "Use fewer --samples or close other programs.")
+
+
+def _refuse_output(out: Path) -> None:
+    """Refuse a file that cannot be written: before the work, not after it."""
+    if out.is_dir():
+        raise UsageError(f"{out} is a folder.", "Give a file for the figures.")
+    if not (out.parent.is_dir() and os.access(out.parent, os.W_OK)):
+        reason = errno.EACCES if out.parent.is_dir() else errno.ENOENT
+        raise cannot_be_written(out, OSError(reason, os.strerror(reason)))
+
+
+def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return the report and its table."""
+    from ...evaluation.command import EvaluationRequest, evaluate_mesh, read_cameras, table
+    from ...evaluation.layouts.mesh_input import read_mesh
+    from ...kernels.parallel import default_threads
+    from ...machine import describe_machine
+    from ...processes.peak_memory import peak_memory_bytes
+    from ...progress import Progress, ProgressEvent
+
+    begun_s, begun_unix_s = time.monotonic(), time.time()
+
+    def shares(name: str) -> tuple[Any, ...] | None:
+        return None if asked[name] is None else tuple(asked[name])
+
+    request = EvaluationRequest(
+        Path(asked["truth"]), asked["layout"], asked["scan"], shares("shares"),
+        shares("distances"), asked["align"], shares("protocols"), asked["samples"], asked["seed"],
+        asked["threads"] or default_threads(),
+    ).checked()  # fmt: skip
+    source = Path(asked["mesh"])
+    cameras: list[Camera] = []
+    if source.is_dir():
+        path = job_mesh(source, asked["region"])
+        cameras = job_cameras(source)
+    else:
+        if asked["region"]:
+            raise UsageError(f"{source.name} has no regions.", "Leave --region, or give a job.")
+        path = source
+    if asked["cameras"]:
+        place = Path(asked["cameras"])
+        cameras = job_cameras(place) if (place / MARKER).exists() else read_cameras(place)
+
+    def say(event: ProgressEvent) -> None:
+        emit(fraction=event.fraction, message=event.message)
+
+    vertices, faces = read_mesh(path)
+    result = evaluate_mesh(vertices, faces, cameras, request, Progress("evaluate", say))
+    report = {
+        "version": 1,
+        "started_unix_s": begun_unix_s,
+        "seconds": time.monotonic() - begun_s,
+        "mesh": {"path": str(path.resolve()), "vertices": len(vertices), "faces": len(faces)},
+        "truth": str(request.truth.resolve()),
+        "cameras": len(cameras),
+        "asked": {**asdict(request), "truth": str(request.truth)},
+        **result,
+        "machine": describe_machine(request.threads),
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+    return report, [f"{path.name}: {len(vertices)} vertices, {len(faces)} faces", *table(result)]
+
+
+def job_mesh(folder: Path, region: str | None) -> Path:
+    """Return the world-frame mesh of a job's region.
+
+    Raises
+    ------
+    UsageError
+        The folder is no job; it has several regions and none was named, or lacks the one named.
+    DatasetError
+        The job has no results.
+    """
+    if not (folder / MARKER).exists():
+        raise UsageError(
+            f"{folder.name} is no job folder.", "Give the folder of --out, or a mesh file."
+        )
+    found = {path.parent.name: path for path in sorted(folder.glob("result/*/mesh.ply"))}
+    if not found:
+        raise DatasetError(f"The job {folder.name} has no mesh yet.", "Resume it first.")
+    if region is None and len(found) > 1:
+        raise UsageError(
+            f"The job {folder.name} has the regions {', '.join(found)}.", "Say which: --region."
+        )
+    if region is not None and region not in found:
+        raise UsageError(
+            f"The job {folder.name} has no region {region}.", f"It has {', '.join(found)}."
+        )
+    return found[region] if region is not None else next(iter(found.values()))
+
+
+def job_cameras(folder: Path) -> list[Camera]:
+    """Return the cameras of a job's ``result/scene.json``, in world coordinates.
+
+    Raises
+    ------
+    DatasetError
+        The job has no results yet.
+    ParseError
+        The file is not what a job writes.
+    """
+    from ...dataset.camera import Camera
+    from ...dataset.similarity import Similarity
+
+    path = JobFolder(folder).result / "scene.json"
+    if not path.is_file():
+        raise DatasetError(f"The job {folder.name} has no {path.name} yet.", "Resume it first.")
+    values = read_json(path)
+    try:
+        world_from_scene = Similarity.from_json(values["world_from_scene"])
+        return [
+            Camera.from_json({k: v for k, v in entry.items() if k != "photo"}).moved(
+                world_from_scene
+            )
+            for entry in values["cameras"]
+        ]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ParseError(
+            path, "cameras", f"not as expected ({error}).", "Export the job again with resume."
+        ) from None

@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``export`` of the command line: results as GLB, OBJ, PLY and splat, each with its sidecar.
+
+Runs in the worker's Python and needs no Blender (USD and FBX do: ``ops/export/export_objects.py``).
+Speaks as :mod:`~.evaluate_command` does: one JSON object a line on stdout.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...dataset.frames.file_frame import FileFrame, file_offset
+from ...dataset.frames.placement_file import FILE_NAME, read_placement
+from ...dataset.similarity import Similarity
+from ...errors import DatasetError, ParseError, UsageError
+from ...export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
+from ...files import read_json, write_bytes
+from ...names import SPLAT_STEM, file_stems
+from ...texture.files.file_checks import atlas_file
+from ..store.job_folder import MARKER
+from ..store.sidecar import write_sidecar
+from .worker_call import answer
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+SPLAT_NAME = f"{SPLAT_STEM}.ply"
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """What is to be written of a result."""
+
+    result: Path
+    """The result folder."""
+    out: Path
+    """Made where it is missing; files of the same names are replaced."""
+    formats: tuple[str, ...]
+    """Among :data:`WORKER_FORMATS`."""
+    placed: bool = False
+    """Whether coordinates are those of the scene as placed in Blender, else the input's world."""
+    regions: tuple[str, ...] = ()
+    """Names; none for all."""
+    levels: bool = False
+    """Whether levels of detail are written too."""
+    shading: str = "auto"
+    """Of GLB: lit, unlit, or lit where there is a normal map or occlusion."""
+
+
+@dataclass(frozen=True)
+class StoredMesh:
+    """One mesh of a result folder."""
+
+    region: str
+    level: int
+    folder: Path
+    vertices: np.ndarray  # (v, 3) float64, scene frame
+    faces: np.ndarray  # (f, 3) int32
+    corner_uvs: np.ndarray  # (f, 3, 2) float32
+    stem: str
+    """Name of its files, without their endings."""
+    face_atlas: np.ndarray | None = None  # (f,) uint8, None where there is one atlas
+
+    def maps(self, name: str) -> list[Path]:
+        """Return the files of a map, one for each atlas; none where the mesh has no such map."""
+        atlases = 1 if self.face_atlas is None else int(self.face_atlas.max()) + 1
+        paths = [self.folder / atlas_file(name, number) for number in range(atlases)]
+        return paths if paths[0].is_file() else []
+
+
+def result_of(folder: Path) -> Path:
+    """Return the result folder of a job folder, or of itself.
+
+    Raises
+    ------
+    UsageError
+        The folder is no job's.
+    DatasetError
+        The job has no result yet.
+    """
+    for path in (folder / "result", folder):
+        if (path / "scene.json").is_file():
+            return path.resolve()
+    if (folder / MARKER).exists():
+        raise DatasetError(f"The job {folder} has no result yet.", "Resume it first.")
+    raise UsageError(f"{folder} holds no job's result.", "Give the folder of a finished job.")
+
+
+def frames_of(result: Path) -> tuple[Similarity, Similarity]:
+    """Return ``world_from_scene`` and ``blender_from_scene`` of a result.
+
+    Raises
+    ------
+    ParseError
+        ``scene.json`` or ``placement.json`` does not hold one.
+    """
+    path = result / "scene.json"
+    try:
+        world_from_scene = Similarity.from_json(read_json(path)["world_from_scene"])
+        if not (np.isfinite(world_from_scene.matrix()).all() and world_from_scene.scale > 0.0):
+            raise ValueError("a number is not finite")
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise ParseError(
+            path, "world_from_scene", f"not a transform ({error}).", "Run the job again."
+        ) from None
+    placement = result / FILE_NAME
+    found = read_placement(placement, world_from_scene) if placement.is_file() else None
+    return world_from_scene, found or Similarity()
+
+
+def export_files(request: ExportRequest) -> Iterator[Path]:
+    """Write every file of a request; yield each, whole, its sidecar beside it.
+
+    Raises
+    ------
+    UsageError
+        An unknown format, shading or region.
+    DatasetError, ParseError
+        The result is not whole.
+    MeshingError
+        A mesh or a Gaussian is not finite; nothing of it is written.
+    ResourceError
+        The folder cannot be written.
+    """
+    from ...texture.files.file_checks import writing
+
+    for name, known in (("formats", WORKER_FORMATS), ("shading", SHADINGS)):
+        asked = getattr(request, name)
+        wrong = sorted({*([asked] if isinstance(asked, str) else asked)} - set(known))
+        if wrong:
+            raise UsageError(f"{wrong[0]!r} is not written here.", f"Use {', '.join(known)}.")
+    frames = frames_of(request.result)
+    if "splat" in request.formats:
+        _splat_of(request.result)  # before anything is written
+    if request.out.exists() and not request.out.is_dir():
+        raise UsageError(f"{request.out} is a file.", "Give a folder for the exports.")
+    with writing(request.out):
+        request.out.mkdir(parents=True, exist_ok=True)
+    wanted = [f for f in request.formats if f != "splat"]
+    if wanted:
+        for mesh in _meshes(request):
+            for name in wanted:
+                yield _write_mesh(request, mesh, name, *frames)
+    if "splat" in request.formats:
+        yield _write_splat(request, *frames)
+
+
+def _meshes(request: ExportRequest) -> Iterator[StoredMesh]:
+    known = sorted(path.parent.name for path in request.result.glob("*/mesh.npz"))
+    missing = sorted(set(request.regions) - set(known))
+    if not known:
+        raise DatasetError(f"{request.result} holds no mesh.", "Mesh a region first.")
+    if missing:
+        raise UsageError(
+            f"{request.result} holds no mesh {missing[0]}.", f"Use {', '.join(known)}."
+        )
+    places = {(r, n): path for r in known for n, path in _levels(request.result / r)}
+    stems = file_stems(places)
+    for region in dict.fromkeys(request.regions or known):
+        for (owner, level), folder in places.items():
+            if owner == region and (request.levels or level == 0):
+                yield _read_mesh(region, level, folder, stems[region, level])
+
+
+def _levels(folder: Path) -> Iterator[tuple[int, Path]]:
+    """Give the number and the folder of each level that a region has."""
+    level, place = 0, folder
+    while (place / "mesh.npz").is_file():
+        yield level, place
+        level += 1
+        place = folder / f"lod{level}"
+
+
+def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
+    from ...texture.files.file_checks import check_face_atlas, check_mesh
+
+    path = folder / "mesh.npz"
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            vertices, faces, corner_uvs = (
+                np.asarray(arrays[n], t)
+                for n, t in (("vertices", "f8"), ("faces", "i4"), ("corner_uvs", "f4"))
+            )
+            face_atlas = arrays["face_atlas"] if "face_atlas" in arrays.files else None
+        if face_atlas is not None:
+            face_atlas = check_face_atlas(face_atlas, len(faces))
+        if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+            raise ValueError("not lists of triples")
+        if corner_uvs.shape != (len(faces), 3, 2):
+            raise ValueError("UVs are not those of the faces")
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ParseError(
+            path, "whole file", f"not a mesh file ({error}).", "Mesh the region again."
+        ) from None
+    mesh = StoredMesh(region, level, folder, vertices, faces, corner_uvs, stem, face_atlas)
+    check_mesh(vertices, faces, corner_uvs, name=f"mesh {mesh.stem}")
+    return mesh
+
+
+def _write_mesh(
+    request: ExportRequest,
+    mesh: StoredMesh,
+    format: str,
+    world_from_scene: Similarity,
+    blender_from_scene: Similarity,
+) -> Path:
+    from ...texture.files.file_checks import writing
+    from ...texture.files.mesh_ply import vertex_colors, write_mesh_ply
+    from ...texture.files.textured_files import write_glb, write_obj
+
+    target_from_scene = blender_from_scene if request.placed else world_from_scene
+    frame = FileFrame(format, target_from_scene)
+    if not request.placed and not EXPORT_FORMATS[format].doubles:
+        # That of the finest level, so that all levels lie over each other.
+        finest = mesh
+        if mesh.level:
+            finest = _read_mesh(mesh.region, 0, mesh.folder.parent, mesh.stem)
+        frame = FileFrame(
+            format, target_from_scene, file_offset(target_from_scene.points(finest.vertices))
+        )
+    local = frame.local(mesh.vertices)
+    path = request.out / f"{mesh.stem}{EXPORT_FORMATS[format].suffix}"
+    textures: list[str] = []
+    missing = mesh.folder / "albedo.png"
+    shading = "lit"
+    if format == "ply":
+        albedos = [np.asarray(_image(file)) for file in mesh.maps("albedo") or [missing]]
+        colors = vertex_colors(len(local), mesh.faces, mesh.corner_uvs, albedos, mesh.face_atlas)
+        write_mesh_ply(path, local, mesh.faces, colors)
+    elif format == "obj":
+        sources = {name: mesh.maps(name) for name in ("albedo", "normal")}
+        beside = {n: [f"{mesh.stem}-{f.name}" for f in files] for n, files in sources.items()}
+        textures = [*beside["albedo"], *beside["normal"]]
+        for file in [*sources["albedo"], *sources["normal"]]:
+            data, copy = _png(file), request.out / f"{mesh.stem}-{file.name}"
+            with writing(copy):
+                write_bytes(copy, data)
+        write_obj(
+            path, local @ frame.turn.T, mesh.faces, mesh.corner_uvs,
+            beside["albedo"], beside["normal"], mesh.face_atlas,
+        )  # fmt: skip
+    else:
+        maps = {
+            f"{name}_png": [_png(file) for file in files]
+            for name in ("normal", "occlusion")
+            if (files := mesh.maps(name))
+        }
+        albedo_png = [_png(file) for file in mesh.maps("albedo") or [missing]]
+        shading = request.shading
+        if shading == "auto":
+            shading = "lit" if maps else "unlit"
+        write_glb(
+            path, local, mesh.faces, mesh.corner_uvs, albedo_png, frame.offset,
+            normal_png=maps.get("normal_png"), occlusion_png=maps.get("occlusion_png"),
+            shading=shading, face_atlas=mesh.face_atlas,
+        )  # fmt: skip
+    contents = {
+        "region": mesh.region, "level": mesh.level, "shading": shading, "textures": textures,
+        "vertices": len(mesh.vertices), "faces": len(mesh.faces),
+    }  # fmt: skip
+    write_sidecar(
+        path, frame, world_from_scene, blender_from_scene,
+        placed=request.placed, result=request.result, contents=contents,
+    )  # fmt: skip
+    return path
+
+
+def _image(path: Path) -> Image:
+    """Read an RGB image, so that nothing broken is handed on."""
+    from PIL import Image
+
+    try:
+        return Image.open(path).convert("RGB")
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise ParseError(
+            path, "whole file", f"not an image ({error}).", "Mesh the region again."
+        ) from None
+
+
+def _png(path: Path) -> bytes:
+    """Return the bytes of an image that can be read."""
+    _image(path)
+    return path.read_bytes()
+
+
+def _splat_of(result: Path) -> Path:
+    path = result / "gaussians.ply"
+    if not path.is_file():
+        raise DatasetError(f"{result} holds no gaussians.ply.", "Run the job again.")
+    return path
+
+
+def _write_splat(
+    request: ExportRequest, world_from_scene: Similarity, blender_from_scene: Similarity
+) -> Path:
+    from ...gaussians.splat_ply import read_splat_ply, write_viewer_ply
+    from ...texture.files.file_checks import writing
+    from ...training.initialisation.splat_motion import move_gaussians
+
+    found = read_splat_ply(_splat_of(request.result))
+    target_from_scene = blender_from_scene if request.placed else world_from_scene
+    offset = np.zeros(3)
+    if not request.placed:
+        offset = file_offset(target_from_scene.points(found.gaussians.means.double().numpy()))
+    frame = FileFrame("splat", target_from_scene, offset)
+    moved = move_gaussians(found.gaussians, frame.file_from_scene())
+    path = request.out / SPLAT_NAME
+    with writing(path):
+        write_viewer_ply(path, moved)
+    write_sidecar(
+        path, frame, world_from_scene, blender_from_scene,
+        placed=request.placed, result=request.result,
+        contents={"gaussians": len(moved), "dropped": found.dropped, "filter": "baked in"},
+    )  # fmt: skip
+    return path
+
+
+def main(arguments: list[str]) -> int:
+    """Export ``arguments = [the request as JSON]`` in this process; return the exit code."""
+
+    def work() -> Iterator[str]:
+        asked = json.loads(arguments[0])
+        request = ExportRequest(
+            Path(asked["result"]), Path(asked["out"]), tuple(asked["formats"]), asked["placed"],
+            tuple(asked["regions"]), asked["levels"], asked["shading"],
+        )  # fmt: skip
+        yield from (f"written: {path}" for path in export_files(request))
+
+    return answer(work)

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``work-tiles`` of the command line: helps a job that meshes a region in tiles.
+
+Runs in the worker's Python, on this machine or on another one that sees the same job folder. Speaks
+as :mod:`~.evaluate_command` does: one JSON object a line on stdout.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+from ...errors import UsageError, WrapError
+from ...kernels.parallel import default_threads
+from ...progress import Progress
+from ..stages.region_meshing import open_lists, work_on_list
+from ..store.job_folder import JobFolder
+from .worker_call import answer
+
+POLL_S = 0.5
+
+
+def main(arguments: list[str]) -> int:
+    """Work for ``arguments = [{"out": folder, "threads": n, "wait_s": s} as JSON]``."""
+
+    def work() -> list[str]:
+        request = json.loads(arguments[0])
+        folder = JobFolder(Path(request["out"]))
+        done = help_with_tiles(folder, int(request["threads"]), float(request["wait_s"]))
+        return [f"{done} parts done here"]
+
+    return answer(work)
+
+
+def help_with_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
+    """Work on every open tile list of a job; return how many parts were done here.
+
+    Parameters
+    ----------
+    wait_s : float
+        How long to wait for a list, at most.
+
+    Raises
+    ------
+    UsageError
+        There is no job, or no list to work on.
+    """
+    if not folder.is_job():
+        raise UsageError(f"{folder.root} is no job folder.", "Give the --out of a job.")
+    until_s = time.monotonic() + wait_s
+    progress = Progress("mesh", None, folder.cancel_path.exists)
+    while not (lists := open_lists(folder)):
+        progress.check()
+        if time.monotonic() >= until_s:
+            raise UsageError(
+                f"{folder.root} has no tiles to work on.",
+                "Start mesh --tiles N there first, or give --wait.",
+            )
+        time.sleep(POLL_S)
+    done: list[str] = []
+    for path in lists:
+        try:
+            work_on_list(folder.stages, path, progress, done, threads=threads or default_threads())
+        except (WrapError, OSError):
+            # The job has joined the tiles and removed their files while we looked.
+            if path in open_lists(folder):
+                raise
+    return len(done)

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The last stage: gather results of all regions into ``result/`` and write the report."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from ...dataset.similarity import Similarity
+from ...evaluation.report.markdown import CURVE
+from ...evaluation.report.report import write_report
+from ...files import finite, read_json, resolve_inside, write_json
+from ...names import REPORT_FOLDER
+from ...progress import Progress
+from ..store.job_file import JobFile
+from ..store.job_folder import JobFolder
+from ..store.result_swap import new_result
+from ..store.stage_folder import Stage
+from .scene_summary import write_scene_summary
+
+REPORTS = ("report.json", "report.md")
+"""They tell of all the other files."""
+
+
+def export_results(
+    folder: JobFolder,
+    job: JobFile,
+    cameras: Stage,
+    trained: Stage,
+    regions: list[tuple[str, Stage, Stage]],
+    summary: dict[str, Any],
+    progress: Progress,
+) -> None:
+    """Fill ``result/``; regions of earlier jobs in the same folder stay.
+
+    All of it changes at the end: where anything fails before, it is as it was.
+
+    Parameters
+    ----------
+    regions : list of (name, mesh stage, texture stage)
+    summary : dict
+        What the runner measured of the whole job.
+    """
+    from ...dataset.scene_file import load_saved_scene
+    from ...gaussians.gaussian_file import load_gaussians
+    from ...gaussians.splat_ply import write_splat_ply
+
+    with new_result(folder.result, last=REPORTS) as new:
+        progress.update(0.1, "writing the scene")
+        write_scene_summary(new / "scene.json", cameras)
+        scene = load_saved_scene(cameras.folder)
+        gaussians = load_gaussians(trained.folder / "gaussians.npz")
+        write_splat_ply(new / "gaussians.ply", gaussians, scene.world_from_scene)
+        for index, (name, meshed, textured) in enumerate(regions):
+            progress.update(0.2 + 0.6 * index / len(regions), f"writing {name}")
+            target = new / name
+            shutil.copytree(textured.folder / "files", target)
+            shutil.copy2(meshed.folder / "region.json", target / "region.json")
+            for picture in sorted(textured.folder.glob("comparison-*.jpg")):
+                shutil.copy2(picture, target / picture.name)
+            shutil.copy2(textured.folder / "preview.png", target / "preview.png")
+            figures = _region_figures(trained, meshed, textured)
+            figures["world"] = _in_world_units(meshed, figures, scene.world_from_scene)
+            write_json(target / "figures.json", _plain(figures))
+        shutil.copy2(regions[0][2].folder / "preview.png", new / "preview.png")
+        progress.update(0.9, "writing the report")
+        # A region may have the name of this folder, of this job or of an earlier one.
+        if (folder.result / REPORT_FOLDER).is_dir() and not (new / REPORT_FOLDER).exists():
+            shutil.copytree(folder.result / REPORT_FOLDER, new / REPORT_FOLDER)
+        _training_pictures(trained, new / REPORT_FOLDER)
+        # Regions of an earlier training stay on disk; this report is about this training.
+        known = {**_figures_in(folder.result), **_figures_in(new)}
+        of_training = {n: f for n, f in sorted(known.items()) if f.get("training") == trained.key}
+        whole = _plain({**summary, **_whole(cameras, trained, regions)})
+        write_report(new, whole, of_training, earlier=folder.result)
+
+
+def _figures_in(result: Path) -> dict[str, dict[str, Any]]:
+    return {path.parent.name: read_json(path) for path in sorted(result.glob("*/figures.json"))}
+
+
+def _whole(
+    cameras: Stage, trained: Stage, regions: list[tuple[str, Stage, Stage]]
+) -> dict[str, Any]:
+    stages = [cameras, trained, *(s for _, m, t in regions for s in (m, t))]
+    return {
+        "stages": [
+            {
+                "name": s.name,
+                "seconds": s.done.get("seconds"),
+                "processor_seconds": s.done.get("processor_seconds"),
+                "reused": s.reused,
+            }
+            for s in stages
+        ],
+        "cameras": {k: v for k, v in cameras.done.items() if k != "finished_unix_s"},
+        "training": {k: v for k, v in trained.done.items() if k != "finished_unix_s"},
+    }
+
+
+def _region_figures(trained: Stage, meshed: Stage, textured: Stage) -> dict[str, Any]:
+    figures = {**meshed.done, **textured.done}
+    figures["training"] = trained.key
+    figures["seconds"] = {"mesh": meshed.done["seconds"], "texture": textured.done["seconds"]}
+    return _plain(figures)
+
+
+def _in_world_units(
+    meshed: Stage, figures: dict[str, Any], world_from_scene: Similarity
+) -> dict[str, Any]:
+    from ...evaluation.report.mesh_size import sizes_in_world
+    from ...mesh.mesh_file import load_mesh
+
+    mesh = load_mesh(meshed.folder / "mesh.npz")
+    texels = figures.get("texture", {}).get("texels_used", 0)
+    return sizes_in_world(mesh.vertices, mesh.faces, world_from_scene, texels)
+
+
+def _training_pictures(trained: Stage, folder: Path) -> None:
+    """Bring the pictures of the training there; those of an earlier training go."""
+    from ...evaluation.report.pictures import write_learning_curve
+
+    # Only these files: others are not ours, or of a region of this name.
+    folder.mkdir(exist_ok=True)
+    for old in (*folder.glob("held-out-*.jpg"), folder / CURVE):
+        old.unlink(missing_ok=True)
+    for picture in trained.done.get("pictures", []):
+        source = resolve_inside(trained.folder, picture["file"])
+        if source is not None and source.is_file():
+            shutil.copy2(source, folder / source.name)
+    write_learning_curve(trained.done, folder / CURVE)
+
+
+def _plain(values: Any) -> Any:
+    """Return the values as JSON would read them back: no tuples, and nothing that is not finite."""
+    return json.loads(json.dumps(finite(values)))

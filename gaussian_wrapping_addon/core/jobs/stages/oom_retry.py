@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A training that runs out of memory is tried again one step smaller, and says so."""
+
+from __future__ import annotations
+
+import gc
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from ...errors import ParseError, ResourceError
+from ...files import read_json, write_json
+from ...report_warning import ReportWarning
+from ...settings import MeshingSettings, TrainingSettings
+
+_logger = logging.getLogger(__name__)
+
+MAX_STEPS = 2
+GAUSSIANS_STEP = 0.6
+IMAGE_STEP = 0.75
+"""A step leaves 0.6 of the Gaussians and 0.56 of the pixels: about half of the memory that grows
+with them."""
+
+MIN_GAUSSIANS = 1000
+MIN_IMAGE_PX = 96
+STEPS_FILE = "smaller.json"
+
+_TORCH_MARKS = ("out of memory", "can't allocate memory", "not enough memory")
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Trained(Generic[Result]):
+    """A result with the settings that it was trained with in the end."""
+
+    result: Result
+    settings: TrainingSettings
+    warnings: tuple[ReportWarning, ...]
+    """One for each step down."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Tell whether an error means that memory did not suffice.
+
+    A :class:`ResourceError` out of a training is a limit of the renderer: too many pairs of
+    Gaussian and tile, or a GPU that is full.
+    """
+    if isinstance(error, (MemoryError, ResourceError)):
+        return True
+    if not isinstance(error, RuntimeError):
+        return False
+    text = str(error).lower()
+    return any(mark in text for mark in _TORCH_MARKS)
+
+
+def one_smaller(settings: TrainingSettings) -> TrainingSettings | None:
+    """Return the settings one step smaller; ``None`` where they are as small as is useful."""
+    gaussians = max(MIN_GAUSSIANS, round(GAUSSIANS_STEP * settings.max_gaussians))
+    side_px = max(MIN_IMAGE_PX, round(IMAGE_STEP * settings.max_image_px))
+    gaussians = min(gaussians, settings.max_gaussians)
+    side_px = min(side_px, settings.max_image_px)
+    if (gaussians, side_px) == (settings.max_gaussians, settings.max_image_px):
+        return None
+    return replace(settings, max_gaussians=gaussians, max_image_px=side_px)
+
+
+def train_within_memory(
+    train: Callable[[TrainingSettings], Result],
+    settings: TrainingSettings,
+    folder: Path,
+    forget: Callable[[], None],
+) -> Trained[Result]:
+    """Train; after running out of memory, train again one step smaller, at most twice.
+
+    The steps are kept in the folder, so that a run that was stopped goes on as small as it was.
+
+    Parameters
+    ----------
+    train : callable
+        Given settings, trains from the start or the last checkpoint.
+    settings : TrainingSettings
+        What was asked for.
+    folder : Path
+        Of the training stage.
+    forget : callable
+        Removes what a larger training left behind (its checkpoints fit no other settings).
+
+    Raises
+    ------
+    ResourceError
+        The smallest try also ran out of memory. Whatever else ``train`` raises is passed on.
+    """
+    reasons = _read_steps(folder)
+    for _ in reasons:
+        settings = one_smaller(settings) or settings
+    while True:
+        try:
+            result = train(settings)
+            warnings = tuple(ReportWarning("memory-step-down", reason) for reason in reasons)
+            return Trained(result, settings, warnings)
+        except (MemoryError, ResourceError, RuntimeError) as error:
+            # Words only: the error itself would keep the memory of the failed training.
+            if not is_out_of_memory(error):
+                raise
+            smaller = one_smaller(settings)
+            if smaller is None or len(reasons) >= MAX_STEPS:
+                raise ResourceError(
+                    f"Memory did not suffice, even with at most {settings.max_gaussians} Gaussians "
+                    f"and photos of {settings.max_image_px} px ({_first_line(error)}).",
+                    "Close other programs, or choose a smaller preset.",
+                ) from error
+            reasons.append(_reason(error, settings, smaller))
+        _logger.warning("%s", reasons[-1])
+        forget()
+        write_json(folder / STEPS_FILE, {"reasons": reasons})
+        gc.collect()
+        settings = smaller
+
+
+def _reason(error: BaseException, before: TrainingSettings, after: TrainingSettings) -> str:
+    return (
+        f"Memory did not suffice ({_first_line(error)}): trained again with at most "
+        f"{after.max_gaussians} Gaussians and photos of {after.max_image_px} px, instead of "
+        f"{before.max_gaussians} and {before.max_image_px} px."
+    )
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0].rstrip(".") if lines else type(error).__name__
+
+
+def _read_steps(folder: Path) -> list[str]:
+    try:
+        values: Any = read_json(folder / STEPS_FILE)
+        return [str(reason) for reason in values["reasons"]][:MAX_STEPS]
+    except (OSError, ParseError, KeyError, TypeError):
+        return []
+
+
+def killed_hint(settings: TrainingSettings) -> str:
+    """Return the next step after the system has ended a worker, probably for its memory."""
+    smaller = one_smaller(settings)
+    number = settings.max_gaussians if smaller is None else smaller.max_gaussians
+    return (
+        "Close other programs and resume, which continues from the last checkpoint; or resume with "
+        f"--max-gaussians {number}, which trains anew with fewer."
+    )
+
+
+def killed_mesh_hint(meshing: MeshingSettings, *, kept: bool) -> str:
+    """Return the same for a worker that was meshing or texturing: no training would help it.
+
+    Parameters
+    ----------
+    kept : bool
+        Whether the folder has the result of an earlier job.
+    """
+    finer = "fewer --points, a larger --edge-length, or --tiles N with more tiles"
+    if meshing.method == "pivots":
+        finer = "a smaller region, or --method pam with fewer --points"
+    elif meshing.tiles == "auto":
+        finer = "fewer --points, a larger --edge-length, or --tiles N"
+    unchanged = " The earlier result is unchanged." if kept else ""
+    return f"Close other programs and resume; or use mesh with {finer}.{unchanged}"

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The vacancy that a region is meshed from: masks and unseen space as the job says."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ...errors import DeviceError
+from ...names import AUTOMATIC_REGIONS
+
+if TYPE_CHECKING:
+    from ...dataset.scene import Scene
+    from ...field.vacancy.vacancy import VacancyField
+    from ...gaussians.model import GaussianArrays
+    from ...regions.convex_region import Region
+    from ...settings import MeshingSettings, TrainingSettings
+
+_logger = logging.getLogger(__name__)
+
+
+def requested_region(
+    request: str, body: Any, scene: Scene, arrays: GaussianArrays
+) -> tuple[Region, Region]:
+    """Return the region that a job asks for, in the scene's frame and in the world's.
+
+    That of a file stays in the world's frame as it was read: taken through the scene's and back,
+    its last digits would change each time.
+
+    Parameters
+    ----------
+    request : str
+        ``"auto"``, ``"all"`` or the path of a region file.
+    body : object
+        Content of that file.
+    """
+    from ...regions.automatic_region import automatic_region, whole_region
+    from ...regions.region import parse_region
+
+    if request in AUTOMATIC_REGIONS:
+        region = automatic_region(scene) if request == "auto" else whole_region(scene, arrays)
+        return region, region.transformed(scene.world_from_scene)
+    world_region = parse_region(body, Path(request))
+    return world_region.transformed(scene.world_from_scene.inverse()), world_region
+
+
+def region_field(
+    scene: Scene,
+    arrays: GaussianArrays,
+    region: Region,
+    training: TrainingSettings,
+    meshing: MeshingSettings,
+    *,
+    threads: int,
+    device: str = "cpu",
+) -> VacancyField:
+    """Return the field in and around a region; it knows nothing beyond the mesher's halo.
+
+    Parameters
+    ----------
+    region : Region
+        Scene frame.
+    training : TrainingSettings
+        ``mask_mode`` and the size of the photos that masks are read at.
+    meshing : MeshingSettings
+        ``unseen`` is read.
+    device : str
+        Where the Gaussians were trained, as torch names it. On a GPU the field runs there too;
+        where its kernels cannot, it runs on the processor, and the log says why.
+
+    Raises
+    ------
+    DatasetError
+        A mask does not fit its photo.
+    """
+    from ...dataset.photos.photo_store import PhotoStore
+    from ...field.vacancy.vacancy import VacancyField
+    from ...meshing.points.candidate_surface import halo_bounds
+
+    photos = PhotoStore(scene, training.max_image_px)
+    options: dict[str, Any] = {
+        "threads": threads,
+        "unseen": meshing.unseen,
+        "region_bounds": halo_bounds(region),
+        "masks": [photos.mask(index) for index in range(len(photos))],
+        "mask_mode": training.mask_mode,
+    }
+    if device.startswith("cuda"):
+        from ...field.vacancy.cuda_vacancy import CudaVacancyField
+
+        try:
+            return CudaVacancyField(arrays, scene.cameras, device=device, **options)
+        except DeviceError as error:
+            _logger.warning(
+                "Vacancy is evaluated on the processor, not on the GPU: %s", error.message
+            )
+    return VacancyField(arrays, scene.cameras, **options)
+
+
+def field_figures(field: VacancyField) -> dict[str, Any]:
+    """Return what the report tells of a field that was used: how much no camera saw."""
+    return {
+        "field_device": field.device,
+        "unseen": field.unseen,
+        "field_evaluations": field.evaluations,
+        "unseen_evaluations": field.unseen_evaluations,
+    }

@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A region's mesh in its stage folder: whole or in tiles, as asked for or as memory allows."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ...errors import MeshingError
+from ...progress import Progress
+from ...settings import JobSettings, MeshingSettings, from_json, to_json
+from ..store.claims import Claims, work_through
+from ..store.job_file import read_job
+from ..store.job_folder import JobFolder
+from ..store.stage_folder import read_done
+from .mesh_keys import mesh_stages
+
+if TYPE_CHECKING:
+    from ...dataset.camera import Camera
+    from ...field.depth_samples import Sightings
+    from ...field.vacancy.vacancy import VacancyField
+    from ...field.vector_field import VectorField
+    from ...gaussians.model import GaussianArrays
+    from ...mesh.surface_mesh import SurfaceMesh
+    from ...meshing.cost.mesh_estimate import MeshEstimate
+    from ...meshing.cost.pivot_estimate import PivotEstimate
+    from ...meshing.tiles.plan import Field
+    from ...regions.convex_region import Region
+
+_logger = logging.getLogger(__name__)
+
+FOLDER = "tiles"
+"""In the stage's folder, while the tiles are worked on."""
+
+CLAIMS = "claims"
+
+MOST_LOOKED_UP = 5_000
+"""Sightings at which it is looked up what the photos resolve, about."""
+
+
+def mesh_in_stage(
+    stage_folder: Path,
+    vacancy: VacancyField,
+    vectors: VectorField,
+    arrays: GaussianArrays,
+    cameras: Sequence[Camera],
+    region: Region,
+    meshing: MeshingSettings,
+    progress: Progress,
+    *,
+    seed: int,
+    threads: int,
+    edge_length_scene: float,
+    sightings: Sightings,
+    origin: dict[str, Any],
+) -> tuple[SurfaceMesh, dict[str, Any]]:
+    """Estimate the mesh of a region, then make it, whole or in tiles.
+
+    Returns
+    -------
+    mesh : SurfaceMesh
+    expected : dict
+        The estimate, for the report.
+
+    Raises
+    ------
+    ResourceError
+        It cannot fit into memory.
+    MeshingError
+        The region holds no surface.
+    """
+    from ...meshing.primal_adaptive import mesh_region
+    from ...meshing.tiles.plan import Field
+    from ...meshing.tiles.store import LIST_NAME
+
+    expected = expected_mesh(vacancy, cameras, region, meshing, edge_length_scene, sightings)
+    for line in expected.lines():
+        _logger.info("region %s, estimated %s", region.name, line)
+    memory_bytes = free_bytes(stage_folder, threads)
+    begun = (stage_folder / FOLDER / LIST_NAME).is_file()
+    tiled = meshing.tiles != "off" and (
+        meshing.tiles != "auto" or begun or expected.tiles_for(memory_bytes)
+    )
+    expected.refuse(memory_bytes, tiled=tiled)
+    if tiled:
+        mesh = mesh_in_tiles_here(
+            stage_folder, Field(vacancy, vectors, threads), arrays, cameras, region, meshing,
+            progress, tiles=0 if meshing.tiles == "auto" else int(meshing.tiles), seed=seed,
+            edge_length_scene=edge_length_scene, sightings=sightings, origin=origin,
+        )  # fmt: skip
+    else:
+        mesh = mesh_region(
+            vacancy, vectors, arrays, cameras, region, meshing, progress, seed=seed,
+            threads=threads, edge_length_scene=edge_length_scene, sightings=sightings,
+        )  # fmt: skip
+    return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": tiled}
+
+
+def mesh_by_pivots_in_stage(
+    stage_folder: Path,
+    vacancy: VacancyField,
+    arrays: GaussianArrays,
+    cameras: Sequence[Camera],
+    region: Region,
+    meshing: MeshingSettings,
+    progress: Progress,
+    *,
+    seed: int,
+    threads: int,
+    sightings: Sightings,
+) -> tuple[SurfaceMesh, dict[str, Any]]:
+    """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
+    from ...meshing.pivot_meshing import mesh_by_pivots
+
+    expected = expected_by_pivots(vacancy, arrays, region, meshing, sightings)
+    for line in expected.lines():
+        _logger.info("region %s, estimated %s", region.name, line)
+    memory_bytes = free_bytes(stage_folder, threads)
+    expected.refuse(memory_bytes)
+    mesh = mesh_by_pivots(
+        vacancy, arrays, cameras, region, meshing, progress, seed=seed, sightings=sightings
+    )
+    return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": False}
+
+
+def expected_by_pivots(
+    vacancy: VacancyField,
+    arrays: GaussianArrays,
+    region: Region,
+    meshing: MeshingSettings,
+    sightings: Sightings,
+) -> PivotEstimate:
+    """Estimate the mesh of a region by pivots from the Gaussians and sightings in it."""
+    from ...meshing.cost.mesh_estimate import evaluation_seconds
+    from ...meshing.cost.pivot_estimate import estimate_pivots
+
+    return estimate_pivots(
+        arrays, region, meshing.pivots, len(sightings),
+        evaluation_s=evaluation_seconds(vacancy, sightings.points),
+    )  # fmt: skip
+
+
+def expected_mesh(
+    vacancy: VacancyField,
+    cameras: Sequence[Camera],
+    region: Region,
+    meshing: MeshingSettings,
+    edge_length_scene: float,
+    sightings: Sightings,
+) -> MeshEstimate:
+    """Estimate the mesh of a region from where the cameras see its surface."""
+    from ...meshing.cost.mesh_estimate import (
+        area_of,
+        estimate_mesh,
+        evaluation_seconds,
+        occupied_boundary,
+    )
+    from ...meshing.points.resolution import checked_request
+    from ...meshing.points.spacing import resolved_edges
+
+    adaptive = meshing.spacing == "adaptive"
+    some = sightings.points[:: max(1, len(sightings) // MOST_LOOKED_UP)]
+    return estimate_mesh(
+        area_of(sightings.points),
+        occupied_boundary(region, vacancy.is_empty),
+        checked_request(edge_length_scene, meshing.points, region),
+        adaptive=adaptive,
+        evaluation_s=evaluation_seconds(vacancy, sightings.points),
+        resolved=resolved_edges(some, cameras) if adaptive else None,
+    )
+
+
+def free_bytes(folder: Path, threads: int) -> int:
+    """Return how much memory a mesh may take here, 0 where the system does not tell."""
+    from ...training.cost.training_estimate import MEMORY_SHARE_LEFT, this_machine
+
+    return int(MEMORY_SHARE_LEFT * this_machine(folder, threads).memory_bytes)
+
+
+def mesh_in_tiles_here(
+    stage_folder: Path,
+    field: Field,
+    arrays: GaussianArrays,
+    cameras: Sequence[Camera],
+    region: Region,
+    meshing: MeshingSettings,
+    progress: Progress,
+    *,
+    tiles: int,
+    seed: int,
+    edge_length_scene: float,
+    sightings: Sightings | None,
+    origin: dict[str, Any],
+) -> SurfaceMesh:
+    """Mesh a region tile by tile, alone or with other processes that join in.
+
+    Finished tiles of an interrupted run are used.
+
+    Parameters
+    ----------
+    tiles : int
+        0 makes as many as the request needs.
+    origin : dict
+        With which other processes make the same field (:func:`tiles_origin`).
+    """
+    from ...meshing.tiles.store import (
+        LIST_NAME,
+        faces_path,
+        gathered_path,
+        load_faces,
+        load_gathered,
+        load_plan,
+        save_plan,
+    )
+    from ...meshing.tiles.tiled_mesh import join_tiles, plan_tiles
+    from .tile_tasks import tile_tasks
+
+    folder = stage_folder / FOLDER
+    if not (folder / LIST_NAME).is_file():
+        save_plan(
+            folder,
+            plan_tiles(
+                field, arrays, cameras, region, meshing, progress.span(0.0, 0.2), tiles=tiles,
+                seed=seed, edge_length_scene=edge_length_scene, sightings=sightings,
+            ),
+            origin,
+        )  # fmt: skip
+    plan, _ = load_plan(folder)
+    claims = Claims(folder / CLAIMS)
+    work_through(tile_tasks(folder, plan, field), claims, progress.span(0.2, 0.9))
+    parts = [load_faces(faces_path(folder, tile)) for tile in range(len(plan.tiling))]
+    everything = load_gathered(gathered_path(folder))
+    mesh = join_tiles(field, plan, everything, parts, meshing, progress.span(0.9, 1.0))
+    mesh.provenance["tile_processes"] = claims.workers()
+    return mesh
+
+
+def tiles_origin(cameras: Path, training: Path, settings: JobSettings) -> dict[str, Any]:
+    """Return with which another process makes the same field, as JSON values."""
+    return {"cameras": cameras.name, "training": training.name, "settings": to_json(settings)}
+
+
+def remove_tiles(stage_folder: Path) -> None:
+    """Remove the files of the tiles once the mesh is saved."""
+    folder = stage_folder / FOLDER
+    if not folder.is_dir():
+        return
+    aside = stage_folder / f"{FOLDER}-joined"
+    try:
+        os.replace(folder, aside)  # at once: nobody finds half a list
+    except OSError:
+        aside = folder
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def open_lists(folder: JobFolder) -> list[Path]:
+    """Return the folders of the tile lists that the job in a folder is not done with.
+
+    Lists of jobs before it, which nobody will join, do not count. Whether its worker is alive does
+    not matter: from another machine that cannot be seen.
+    """
+    from ...meshing.tiles.store import LIST_NAME
+
+    found = sorted(folder.stages.glob(f"mesh-*/{FOLDER}/{LIST_NAME}"))
+    undone = [path.parent for path in found if read_done(path.parent.parent) is None]
+    if not undone or folder.read_status().state == "DONE":
+        return []
+    owned = mesh_stages(folder, read_job(folder.job_path))
+    return [path for path in undone if path.parent.name in owned]
+
+
+def work_on_list(
+    stages: Path, folder: Path, progress: Progress, done_here: list[str], *, threads: int
+) -> None:
+    """Work on a tile list from a process of its own; note the names of the parts it did.
+
+    Raises
+    ------
+    ParseError, DatasetError
+        What the list names is not in the job folder.
+    """
+    from ...dataset.scene_file import load_saved_scene
+    from ...field.vector_field import VectorField
+    from ...files import resolve_inside
+    from ...gaussians.gaussian_file import load_gaussians
+    from ...meshing.tiles.plan import Field
+    from ...meshing.tiles.store import load_plan
+    from .region_field import region_field
+    from .tile_tasks import tile_tasks
+
+    plan, origin = load_plan(folder)
+    places = [resolve_inside(stages, str(origin.get(key, ""))) for key in ("cameras", "training")]
+    if None in places:
+        raise MeshingError("The tile list names no stages of this job.", "Mesh the region again.")
+    cameras, training = (place for place in places if place is not None)
+    scene = load_saved_scene(cameras)
+    gaussians = load_gaussians(training / "gaussians.npz")
+    arrays = gaussians.arrays()
+    settings = from_json(JobSettings, origin.get("settings"), "settings").validated()
+    vacancy = region_field(
+        scene, arrays, plan.region, settings.training, settings.meshing, threads=threads,
+        device=str(gaussians.means.device),
+    )  # fmt: skip
+    field = Field(vacancy, VectorField(arrays, threads=threads), threads)
+    tasks = tile_tasks(folder, plan, field)
+    work_through(tasks, Claims(folder / CLAIMS), progress, done_here=done_here)

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``result/scene.json``: cameras, photo paths and frame of a scene, for Blender."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...files import write_json
+from ..store.stage_folder import Stage
+
+
+def write_scene_summary(path: Path, cameras: Stage) -> None:
+    """Write ``result/scene.json``: what Blender needs of the scene (docs/architecture.md)."""
+    from ...dataset.scene_file import load_saved_scene
+    from ...tolerances import SCENE_RADIUS
+
+    scene = load_saved_scene(cameras.folder)
+    write_json(
+        path,
+        {
+            "version": 1,
+            "world_from_scene": scene.world_from_scene.to_json(),
+            "radius": SCENE_RADIUS,
+            "cameras": [
+                {**view.camera.to_json(), "photo": str(view.photo_path)} for view in scene.views
+            ],
+        },
+    )

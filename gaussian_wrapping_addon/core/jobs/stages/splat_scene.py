@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A splat without photos as a scene: cameras made up around it, photos rendered from it."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from ...dataset.loading.splat_cameras import (
+    WITHOUT_PHOTOS,
+    cameras_around,
+    scene_frame,
+    splat_extent,
+)
+from ...dataset.readers.source_kind import SPLAT
+from ...dataset.readers.splat_header import is_splat_path
+from ...dataset.scene import Scene, View
+from ...files import write_bytes
+from ...progress import Progress
+from ...report_warning import ReportWarning
+from ..store.job_file import JobFile
+
+MAX_START_POINTS = 30_000
+"""So many middles of opaque Gaussians stand for the sparse points of a reconstruction."""
+
+SOLID = 0.5
+"""Opacity of the Gaussians that do."""
+
+
+def start_splat_of(job: JobFile) -> Path | None:
+    """Return the splat that a job's training starts from: the one asked for, or the input."""
+    if job.settings.start_splat:
+        return Path(job.settings.start_splat)
+    source = Path(job.source)
+    return source if is_splat(source) else None
+
+
+def is_splat(source: Path) -> bool:
+    """Tell whether an input is a splat of its own."""
+    return source.is_file() and is_splat_path(source)
+
+
+def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads: int = 0) -> Scene:
+    """Render a splat from made-up cameras into ``folder/images`` and return the scene.
+
+    The scene frame keeps the axes of the file. The background is black, as in training.
+
+    Raises
+    ------
+    ParseError, DatasetError
+        The file is not a splat, or shows nothing.
+    """
+    import torch
+
+    from ...gaussians.foreign_splat import read_foreign_splat
+    from ...gaussians.initialisation import SH_C0
+    from ...render.render import render
+    from ...render.types.options import RenderOptions
+    from ...training.initialisation.splat_motion import move_gaussians
+    from ...training.initialisation.splat_start import baked, fit_filter
+
+    progress.update(0.0, "reading the splat")
+    splat = read_foreign_splat(source)
+    world = baked(splat.gaussians)
+    means, opacities = world.means.numpy(), torch.sigmoid(world.opacity_logits).numpy()
+    extent = splat_extent(means, opacities)
+    around = cameras_around(extent)
+    scene_from_world = scene_frame(around)
+    cameras = [camera.moved(scene_from_world) for camera in around]
+    gaussians = fit_filter(move_gaussians(world, scene_from_world), cameras, threads=threads)
+    images = folder / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    options = RenderOptions(depth=False, threads=threads)
+    views = []
+    for index, camera in enumerate(cameras):
+        progress.update(index / len(cameras), f"rendering view {index + 1} of {len(cameras)}")
+        with torch.no_grad():
+            color = render(gaussians, camera, options).color.numpy()
+        path = images / camera.name
+        write_bytes(path, _png(color))
+        views.append(View(camera, path))
+    near = np.linalg.norm(means - extent.center, axis=1) <= extent.radius
+    chosen = np.nonzero((opacities >= SOLID) & near)[0]
+    chosen = chosen[:: max(1, -(-len(chosen) // MAX_START_POINTS))]
+    colors = np.clip(0.5 + SH_C0 * world.sh[chosen, 0].numpy(), 0.0, 1.0)  # (m, 3)
+    warnings = [*splat.warnings, ReportWarning("without-photos", WITHOUT_PHOTOS)]
+    if extent.has_surroundings:
+        text = "The splat reaches far beyond its middle; only the middle is covered by the views."
+        warnings.append(ReportWarning("surroundings-not-covered", text))
+    facts = {"kind": SPLAT, "views": len(views), "points": len(chosen), **splat.facts}
+    progress.update(1.0, f"{len(views)} views are rendered")
+    return Scene(
+        tuple(views),
+        scene_from_world.points(means[chosen]),
+        np.round(255.0 * colors).astype(np.uint8),
+        scene_from_world.inverse(),
+        tuple(warnings),
+        facts,
+    )
+
+
+def _png(color: np.ndarray) -> bytes:
+    from PIL import Image
+
+    stream = io.BytesIO()
+    pixels = np.round(255.0 * np.clip(color, 0.0, 1.0)).astype(np.uint8)
+    Image.fromarray(pixels).save(stream, "PNG", compress_level=1)
+    return stream.getvalue()

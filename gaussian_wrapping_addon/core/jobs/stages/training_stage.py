@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The stage that trains: estimate first, go on from a shorter training, smaller where it must."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ...errors import DatasetError
+from ...progress import COMPILING, Progress
+from ...report_warning import ReportWarning
+from ...settings import RESULT_FREE, TrainingSettings, to_json
+from ..store.continue_training import (
+    bring_checkpoints,
+    checkpoints,
+    lineage,
+    nothing_to_continue,
+    shorter_training,
+)
+from ..store.job_file import JobFile
+from ..store.job_folder import JobFolder
+from ..store.stage_folder import Stage, note_interrupted, run_stage, stage_key
+from .oom_retry import STEPS_FILE, train_within_memory
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ...dataset.scene import Scene
+    from ...training.result import TrainingResult
+
+_logger = logging.getLogger(__name__)
+
+
+def start_fingerprint(path: str) -> list[Any]:
+    """Return what a training's key says of the file that it starts from; empty for none.
+
+    Raises
+    ------
+    DatasetError
+        The file is not there.
+    """
+    if not path:
+        return []
+    try:
+        state = Path(path).stat()
+    except OSError as error:
+        raise DatasetError(
+            f"The start splat {path} cannot be read: {error.strerror}.",
+            "Put the file back, or start the job without it.",
+        ) from None
+    return [path, state.st_size, state.st_mtime_ns]
+
+
+def training_keys(version: int, cameras_key: str, job: JobFile) -> tuple[str, str]:
+    """Return the stage's key, and the key without the extra iterations."""
+    training = to_json(job.settings.training)
+    described = {k: v for k, v in training.items() if k not in RESULT_FREE}
+    start = start_fingerprint(job.settings.start_splat)
+    parts = (version, cameras_key, job.settings.seed, *([start] if start else []))
+    key = stage_key(*parts, described)
+    described.pop("extra_iterations")
+    return key, stage_key(*parts, described)
+
+
+def run_training(
+    folder: JobFolder,
+    job: JobFile,
+    cameras: Stage,
+    progress: Progress,
+    *,
+    version: int,
+    threads: int,
+) -> Stage:
+    """Train, or re-use what is trained.
+
+    Raises
+    ------
+    UsageError
+        The job is to train more, and there is nothing to go on from.
+    ResourceError
+        The disk is too full, or memory does not suffice even for a smaller training.
+    """
+    key, base_key = training_keys(version, cameras.key, job)
+    extra = job.settings.training.extra_iterations
+
+    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        if extra and not checkpoints(stage_folder):
+            shorter = shorter_training(folder.stages, base_key, extra)
+            if shorter is not None:
+                bring_checkpoints(shorter, stage_folder, (STEPS_FILE,))
+            elif job.command == "more":
+                raise nothing_to_continue(folder)
+        begun_s = time.monotonic()
+        try:
+            done = _train(stage_folder, job, cameras, progress, threads)
+        except BaseException:
+            note_interrupted(folder.stages, "train", key, time.monotonic() - begun_s)
+            raise
+        return {**done, "lineage": lineage(base_key, extra)}
+
+    return run_stage(folder.stages, "train", key, progress, work)
+
+
+def _train(
+    stage_folder: Path, job: JobFile, cameras: Stage, progress: Progress, threads: int
+) -> dict[str, Any]:
+    from ...dataset.photos.photo_store import PhotoStore
+    from ...dataset.scene_file import load_saved_scene
+    from ...evaluation.report.pictures import write_held_out
+    from ...gaussians.gaussian_file import save_gaussians
+    from ...training.checkpoint import remove_checkpoints
+    from ...training.trainer import held_out_views, train
+    from .splat_scene import start_splat_of
+
+    scene = load_saved_scene(cameras.folder)
+    estimated, warnings = _estimate(scene, job, stage_folder, progress, threads)
+
+    inside = _inside_regions(job, scene)
+
+    def attempt(settings: TrainingSettings) -> TrainingResult:
+        photos = PhotoStore(scene, settings.max_image_px)
+        return train(
+            scene, photos, settings, stage_folder, progress,
+            seed=job.settings.seed, threads=threads, start_splat=start_splat_of(job), inside=inside,
+        )  # fmt: skip
+
+    trained = train_within_memory(
+        attempt, job.settings.training, stage_folder, lambda: remove_checkpoints(stage_folder)
+    )
+    result = trained.result
+    save_gaussians(stage_folder / "gaussians.npz", result.gaussians)
+    measured = {figure.name: figure.psnr for figure in result.held_out}
+    shown = [
+        (index, scene.views[index].camera.name, measured[scene.views[index].camera.name])
+        for index in held_out_views(scene, trained.settings.holdout_every)
+        if scene.views[index].camera.name in measured
+    ]
+    photos = PhotoStore(scene, trained.settings.max_image_px)
+    pictures = write_held_out(result.gaussians, photos, shown, stage_folder, threads=threads)
+    done = result.to_json()
+    earlier = [warning.to_json() for warning in (*warnings, *trained.warnings)]
+    done["warnings"] = [*earlier, *done["warnings"]]
+    return {
+        **done,
+        "pictures": pictures,
+        "estimate": estimated,
+        "settings": to_json(trained.settings),
+    }
+
+
+def _inside_regions(job: JobFile, scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return what tells the points of the job's regions, where these count more; scene frame."""
+    from ...regions.region import parse_region
+
+    focus = job.settings.training.focus
+    if not focus:
+        return None
+    scene_from_world = scene.world_from_scene.inverse()
+    regions = [
+        parse_region(body, Path("job.json")).transformed(scene_from_world)
+        for body in json.loads(focus)
+    ]
+
+    def inside(points: np.ndarray) -> np.ndarray:
+        found = regions[0].contains(points, 0.0)
+        for region in regions[1:]:
+            found |= region.contains(points, 0.0)
+        return found
+
+    return inside
+
+
+def _estimate(
+    scene: Scene, job: JobFile, stage_folder: Path, progress: Progress, threads: int
+) -> tuple[dict[str, Any], list[ReportWarning]]:
+    """Tell what the training will take; refuse where the disk is too full.
+
+    The renderer is compiled meanwhile where that was never done here.
+    """
+    from ...training.cost.machine_speed import machine_speed, renderer_is_compiled
+    from ...training.cost.training_estimate import estimate, judge, scene_facts, this_machine
+    from ...training.initialisation.splat_start import wrapping_settings
+    from ...training.warm_up import compile_kernels
+    from .splat_scene import start_splat_of
+
+    training = job.settings.training
+    if start_splat_of(job) is not None:
+        training = wrapping_settings(training)
+    if not renderer_is_compiled():
+        progress.enter(COMPILING, "compiling the renderer, about a minute, only this once")
+        compile_kernels(training, stage_folder, progress, threads=threads)
+    progress.update(0.0, "timing this machine")
+    machine = this_machine(stage_folder, threads, machine_speed(threads))
+    done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
+    first = max(done, default=0)
+    expected = estimate(scene_facts(scene), training, machine, first=first)
+    warnings = judge(expected, machine)  # raises where the disk is too full
+    _logger.info("estimate: %s", expected.sentence())
+    for warning in warnings:
+        _logger.warning("%s", warning.text)
+    progress.update(0.0, f"training will take {expected.span()}")
+    values = {**dataclasses.asdict(expected), "speed": machine.speed}
+    return values, warnings

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Training a finished job further: its last checkpoint starts a longer training."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ...errors import DatasetError, UsageError
+from .job_file import JobFile
+from .job_folder import JobFolder
+from .stage_folder import read_done
+
+_logger = logging.getLogger(__name__)
+
+_CHECKPOINT = re.compile(r"checkpoint-(\d{1,9})\.json")
+_INSTEAD = "Train anew instead: wrap with as many --iterations as you want in all."
+
+
+def job_with_more(folder: JobFolder, job: JobFile, iterations: int) -> JobFile:
+    """Return the job that trains so many iterations more than ``job``, then meshes again.
+
+    Raises
+    ------
+    UsageError
+        The number is not positive.
+    DatasetError
+        The folder holds no finished training, or no checkpoint that training could go on from.
+    """
+    if iterations < 1:
+        raise UsageError(f"--iterations {iterations} adds nothing.", "Give a positive number.")
+    finished = [path for path in folder.stages.glob("train-*") if read_done(path) is not None]
+    if not finished:
+        raise no_finished_training(folder.root)
+    if not any(checkpoints(path) for path in finished):
+        raise DatasetError(
+            f"The training in {folder.root} has kept no checkpoint to go on from.", _INSTEAD
+        )
+    training = job.settings.training
+    longer = replace(training, extra_iterations=training.extra_iterations + iterations)
+    settings = replace(job.settings, training=longer).validated()
+    return replace(job, command="more", settings=settings)
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Return the JSON files of a stage's checkpoints, newest first."""
+    found = [p for p in folder.glob("checkpoint-*.json") if _CHECKPOINT.fullmatch(p.name)]
+    return sorted(found, key=lambda path: path.name, reverse=True)
+
+
+def lineage(base_key: str, extra_iterations: int) -> dict[str, Any]:
+    """Return what a finished training's ``done.json`` says for longer ones to find it.
+
+    Parameters
+    ----------
+    base_key : str
+        Hash of all that the stage's key depends on, but for the extra iterations.
+    """
+    return {"base": base_key, "extra_iterations": extra_iterations}
+
+
+def shorter_training(stages: Path, base_key: str, extra_iterations: int) -> Path | None:
+    """Return the longest finished training that this one continues, ``None`` without any.
+
+    Only trainings that have a checkpoint count.
+    """
+    best: tuple[int, str, Path] | None = None
+    for folder in stages.glob("train-*"):
+        values = (read_done(folder) or {}).get("lineage")
+        if not isinstance(values, dict) or values.get("base") != base_key:
+            continue
+        reached = values.get("extra_iterations")
+        if not isinstance(reached, int) or reached >= extra_iterations or not checkpoints(folder):
+            continue
+        best = max(best or (-1, "", folder), (reached, folder.name, folder))
+    return None if best is None else best[2]
+
+
+def bring_checkpoints(source: Path, target: Path, others: tuple[str, ...] = ()) -> None:
+    """Put the checkpoints of a finished stage into a new one, as hard links where that works.
+
+    Files of a stage are replaced, never written into, so that a link cannot change its origin.
+
+    Parameters
+    ----------
+    others : tuple of str
+        More files to bring, where they are there.
+    """
+    for path in reversed(checkpoints(source)):
+        # The JSON file last: without it, the arrays count for nothing.
+        for one in (path.with_suffix(".npz"), path):
+            _link(one, target / one.name)
+    for name in others:
+        if (source / name).is_file():
+            _link(source / name, target / name)
+    _logger.info("training goes on from %s", source.name)
+
+
+def _link(source: Path, target: Path) -> None:
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def no_finished_training(root: Path) -> DatasetError:
+    """Return the error of what needs a finished training, whichever command it is."""
+    return DatasetError(f"{root} holds no finished training.", "Run wrap, or resume it, first.")
+
+
+def nothing_to_continue(folder: JobFolder) -> DatasetError:
+    """Return the error of a ``more`` whose job has no training that fits it."""
+    return DatasetError(
+        f"No finished training in {folder.root} fits this job's photos and settings and has a "
+        "checkpoint.",
+        _INSTEAD,
+    )

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The job: what is asked for, the same for button, command line and bug report."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from ...errors import DatasetError, ParseError, SettingError, UsageError
+from ...files import read_json, write_json
+from ...names import AUTOMATIC_REGIONS, region_name, region_names
+from ...regions.region_file import parse_region_file, read_region_body
+from ...settings import JobSettings, MeshingSettings, from_json, to_json
+
+SCHEMA_VERSION = 1
+COMMANDS = ("wrap", "mesh", "more")
+
+
+@dataclass(frozen=True)
+class JobFile:
+    """One job. Region files are read when the job is made, so that a resume needs none of them."""
+
+    command: str
+    source: str
+    """Absolute path of the input: a folder or a transforms.json."""
+    settings: JobSettings
+    region_bodies: dict[str, Any] = field(default_factory=dict)
+    """Content of each region file, by the string that names it in ``settings.regions``."""
+    edge_lengths: dict[str, float] = field(default_factory=dict)
+    """Edge length, world units, of each region that has its own, by the same string. It decides
+    there in place of ``settings.meshing``'s edge length or number of points."""
+
+    def meshing_of(self, request: str) -> MeshingSettings:
+        """Return how a region of ``settings.regions`` is meshed."""
+        meshing = self.settings.meshing
+        if request not in self.edge_lengths:
+            return meshing
+        return replace(meshing, edge_length=self.edge_lengths[request], points=0)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        # Jobs without lengths of their own are written as before there were any.
+        own = {"edge_lengths": self.edge_lengths} if self.edge_lengths else {}
+        return {
+            **own,
+            "schema_version": SCHEMA_VERSION,
+            "command": self.command,
+            "source": self.source,
+            "settings": to_json(self.settings),
+            "region_bodies": self.region_bodies,
+        }
+
+    @classmethod
+    def from_json(cls, values: Any) -> JobFile:
+        """Build from :meth:`to_json`'s values.
+
+        Raises
+        ------
+        UsageError
+            An entry is missing, unknown, of the wrong type or out of range.
+        """
+        wanted = {"schema_version", "command", "source", "settings", "region_bodies"}
+        if not isinstance(values, dict) or set(values) - {"edge_lengths"} != wanted:
+            raise UsageError("job.json does not hold the entries of a job.", "Start the job again.")
+        if values["schema_version"] != SCHEMA_VERSION:
+            raise UsageError(
+                f"job.json has schema version {values['schema_version']!r}, not {SCHEMA_VERSION}.",
+                "Start the job again with this version of the add-on.",
+            )
+        if values["command"] not in COMMANDS or not isinstance(values["source"], str):
+            raise UsageError("job.json names no command or source.", "Start the job again.")
+        if not isinstance(values["region_bodies"], dict):
+            raise UsageError("job.json: region_bodies must be an object.", "Start the job again.")
+        settings = from_json(JobSettings, values["settings"]).validated()
+        lengths = _checked_lengths(values.get("edge_lengths", {}), settings.regions)
+        return cls(values["command"], values["source"], settings, values["region_bodies"], lengths)
+
+
+def make_job(
+    command: str,
+    source: Path,
+    settings: JobSettings,
+    edge_lengths: Mapping[str, float] | None = None,
+) -> JobFile:
+    """Check the settings, read the region files, and return the job.
+
+    Parameters
+    ----------
+    edge_lengths : mapping, optional
+        Edge lengths, world units, of regions that have their own, by their string in
+        ``settings.regions``.
+
+    Raises
+    ------
+    UsageError, DatasetError
+        A setting is out of range; the source or a region file is missing or unreadable; two
+        regions have one name.
+    """
+    settings = settings.validated()
+    own = _checked_lengths(dict(edge_lengths or {}), settings.regions)
+    lengths: dict[str, float] = {}
+    if not source.exists():
+        raise DatasetError(f"{source} does not exist.", "Check the path.")
+    names: list[str] = []
+    bodies: dict[str, Any] = {}
+    for region in settings.regions:
+        if region in AUTOMATIC_REGIONS:
+            names.append(region)
+            lengths |= {region: own[region]} if region in own else {}
+            continue
+        path = Path(region)
+        name = str(path.resolve())
+        bodies[name] = read_region_body(path)
+        parse_region_file(bodies[name], path)
+        names.append(name)
+        lengths |= {name: own[region]} if region in own else {}
+    names = list(dict.fromkeys(names))
+    region_names(names, bodies)
+    start = settings.start_splat
+    if start and not Path(start).is_file():
+        raise DatasetError(f"The start splat {start} does not exist.", "Check the path.")
+    training = settings.training
+    if command == "wrap":
+        weighted = training.region_weight != 1.0 and bodies
+        focus = json.dumps(list(bodies.values()), sort_keys=True) if weighted else ""
+        training = replace(training, focus=focus)
+    settings = replace(
+        settings,
+        training=training,
+        regions=tuple(names),
+        start_splat=str(Path(start).resolve()) if start else "",
+    )
+    return JobFile(command, str(source.resolve()), settings, bodies, lengths)
+
+
+def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:
+    """Return edge lengths of single regions, or refuse them."""
+    if not isinstance(values, dict) or not set(values) <= set(regions):
+        raise UsageError("edge_lengths must name regions of the job.", "Start the job again.")
+    for name, value in values.items():
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not number or not math.isfinite(value) or value <= 0:
+            raise SettingError(f"edge_lengths[{name!r}]", "a positive length")
+    return {name: float(value) for name, value in values.items()}
+
+
+def refuse_replacing(result: Path, job: JobFile) -> None:
+    """Refuse a job of which a region would replace the result of another region.
+
+    A region of the same name is the same region, meshed again.
+
+    Parameters
+    ----------
+    result : Path
+        The result folder of the job, which may be missing.
+
+    Raises
+    ------
+    UsageError
+        Names both: two regions of the job, or one of it and one that was meshed before.
+    ParseError
+        A region in the job file is broken.
+    """
+    region_names(job.settings.regions, job.region_bodies)
+    folders = {
+        parse_region_file(body, Path(request)).name: region_name(request, body)
+        for request, body in job.region_bodies.items()
+    }
+    refuse_other_regions(result, folders)
+
+
+def refuse_other_regions(result: Path, folders: dict[str, str]) -> None:
+    """Refuse regions whose folder in a result is that of a region with another name.
+
+    A region of the same name is the same region, meshed again.
+
+    Parameters
+    ----------
+    folders : dict
+        For the name of each region, as its file gives it, that of its folder.
+
+    Raises
+    ------
+    UsageError
+        Names both.
+    """
+    there = {path.parent.name: path for path in sorted(result.glob("*/region.json"))}
+    for wanted, name in folders.items():
+        for folder, path in there.items():
+            if folder.lower() != name.lower():
+                continue
+            try:
+                found = read_json(path).get("blender_object_name")
+            except (OSError, ParseError, AttributeError):
+                continue
+            if isinstance(found, str) and found != wanted:
+                raise UsageError(
+                    f"Region {wanted!r} would replace the result of region {found!r}: both are "
+                    f"kept in a folder {name}.",
+                    "Give it another name.",
+                )
+
+
+def read_job(path: Path) -> JobFile:
+    """Read ``job.json``."""
+    if not path.is_file():
+        raise UsageError(f"{path} does not exist.", "Choose a folder in which a job was started.")
+    return JobFile.from_json(read_json(path))
+
+
+def write_job(path: Path, job: JobFile) -> None:
+    """Write ``job.json`` atomically."""
+    write_json(path, job.to_json())

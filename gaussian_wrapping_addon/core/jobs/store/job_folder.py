@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The job folder: where everything of a job lies, its status, its lock, its cancel request.
+
+Layout: ``job.json``, ``status.json``, ``log.txt``, ``lock.json``, ``cancel`` (a file asks to
+stop), ``stages/<name>-<hash>/`` (``done.json`` last), ``result/``.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from ...errors import NO_ROOM, ParseError, UsageError, cannot_be_written
+from ...files import overwrite_json, read_json, write_json
+
+STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
+ACTIVE_STATES = ("NEW", "RUNNING", "CANCELLING")
+MARKER = ".gaussian-wrapping-job"
+
+
+@dataclass(frozen=True)
+class JobStatus:
+    """What ``status.json`` says; ``fraction`` and ``seconds_left`` are of the whole job."""
+
+    state: str = "NEW"
+    stage: str = ""
+    fraction: float = 0.0
+    message: str = ""
+    """For people only."""
+    seconds_left: float | None = None
+    error: str = ""
+    """Why it failed; of a job that was put back, why it could not be meshed again."""
+    hint: str = ""
+    exit_code: int | None = None
+    pid: int = 0
+    pid_started: int = 0
+    """Start time of the process in the system's own ticks: tells a re-used pid."""
+    heartbeat_s: float = 0.0
+    """Unix time of the last sign of life."""
+    result: str = ""
+    """Absolute path of the result folder, once there is one."""
+    figures: dict[str, float] = field(default_factory=dict)
+    """Live figures of the stage at work, such as ``iteration``, ``gaussians`` and ``psnr``."""
+    phase: str = ""
+    """For programs: what is special about the moment, such as ``progress.COMPILING``."""
+    put_back: bool = False
+    """This is the finished job from before a mesh that has failed."""
+
+    @property
+    def active(self) -> bool:
+        """Whether a worker is (or should be) at work."""
+        return self.state in ACTIVE_STATES
+
+    @classmethod
+    def from_json(cls, values: Any) -> JobStatus:
+        """Build from JSON values, ignoring entries of other versions.
+
+        Raises
+        ------
+        TypeError, ValueError
+            An entry is not of its kind: the file is not ours, or is being written.
+        """
+        given = dict(values)
+        known = {f.name: given[f.name] for f in fields(cls) if f.name in given}
+        for name, value in known.items():
+            if not _is_kind(name, value):
+                raise TypeError(f"{name} is {type(value).__name__}")
+        # Version 0.1.0 told of a job that was put back by its error alone.
+        old = known.get("state") == "DONE" and bool(known.get("error"))
+        return cls(**{"put_back": old, **known})
+
+
+_WHOLE_NUMBERS = ("pid", "pid_started", "exit_code")
+_NUMBERS = ("fraction", "seconds_left", "heartbeat_s")
+_FLAGS = ("put_back",)
+_MAY_BE_NONE = ("seconds_left", "exit_code")
+
+
+def _is_kind(name: str, value: Any) -> bool:
+    """Tell whether a value can be the field of this name of a status."""
+    if value is None:
+        return name in _MAY_BE_NONE
+    if isinstance(value, bool) or name in _FLAGS:
+        return name in _FLAGS and isinstance(value, bool)
+    if name in _WHOLE_NUMBERS:
+        return isinstance(value, int)
+    if name in _NUMBERS:
+        return isinstance(value, int | float)
+    if name == "figures":
+        return isinstance(value, dict) and all(_is_kind("fraction", v) for v in value.values())
+    return isinstance(value, str) and (name != "state" or value in STATES)
+
+
+def process_start_ticks(pid: int) -> int:
+    """Return the start time of a process in system ticks; 0 where the system does not tell."""
+    if not sys.platform.startswith("linux"):
+        return 0
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return 0
+    # The command name, in parentheses, may hold spaces; field 22 is the start time.
+    return int(text.rsplit(")", 1)[1].split()[19])
+
+
+def process_alive(pid: int, started: int) -> bool:
+    """Tell whether the process that began at ``started`` still runs (a zombie does not)."""
+    if pid <= 0:
+        return False
+    if sys.platform.startswith("linux"):
+        try:
+            text = Path(f"/proc/{pid}/stat").read_text()
+        except OSError:
+            return False
+        state = text.rsplit(")", 1)[1].split()[0]
+        return state not in ("Z", "X") and (not started or process_start_ticks(pid) == started)
+    if sys.platform == "win32":
+        return _alive_windows(pid)
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _alive_windows(pid: int) -> bool:
+    import ctypes
+
+    query_limited_information, still_active = 0x1000, 259
+    kernel32 = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
+    handle = kernel32.OpenProcess(query_limited_information, False, pid)
+    if not handle:
+        return False
+    code = ctypes.c_ulong()
+    kernel32.GetExitCodeProcess(handle, ctypes.byref(code))
+    kernel32.CloseHandle(handle)
+    return code.value == still_active
+
+
+@dataclass(frozen=True)
+class JobFolder:
+    """Paths of one job folder and the small files in it."""
+
+    root: Path
+
+    @property
+    def job_path(self) -> Path:
+        """``job.json``."""
+        return self.root / "job.json"
+
+    @property
+    def status_path(self) -> Path:
+        """``status.json``."""
+        return self.root / "status.json"
+
+    @property
+    def log_path(self) -> Path:
+        """``log.txt``."""
+        return self.root / "log.txt"
+
+    @property
+    def cancel_path(self) -> Path:
+        """A file of this name asks the worker to stop."""
+        return self.root / "cancel"
+
+    @property
+    def lock_path(self) -> Path:
+        """Names the process that works here."""
+        return self.root / "lock.json"
+
+    @property
+    def stages(self) -> Path:
+        """Folder of the stages."""
+        return self.root / "stages"
+
+    @property
+    def result(self) -> Path:
+        """Folder of the results."""
+        return self.root / "result"
+
+    def create(self) -> None:
+        """Make the folder, or accept an existing job folder or an empty folder.
+
+        Raises
+        ------
+        UsageError
+            The path is a file, or a folder with other content.
+        ResourceError
+            It cannot be written.
+        """
+        if self.root.exists() and not self.root.is_dir():
+            raise UsageError(f"{self.root} is a file.", "Choose a folder for the results.")
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            if not (self.root / MARKER).exists() and any(self.root.iterdir()):
+                raise UsageError(
+                    f"{self.root} holds other files.", "Choose a new or empty folder for results."
+                )
+            (self.root / MARKER).touch()
+            self.stages.mkdir(exist_ok=True)
+        except OSError as error:
+            raise cannot_be_written(self.root, error) from None
+
+    def is_job(self) -> bool:
+        """Whether a job was started here."""
+        return (self.root / MARKER).exists() and self.job_path.exists()
+
+    def read_status(self) -> JobStatus:
+        """Return the status; a running job whose process is gone is reported as LOST."""
+        status = self._read_file()
+        if self._gone(status):
+            # The worker may have written its last words and ended between our two looks.
+            status = self._read_file()
+        if not self._gone(status):
+            return status
+        return replace(
+            status,
+            state="LOST",
+            error="The worker process has ended without a word.",
+            hint="Resume the job; it continues from the last checkpoint.",
+        )
+
+    def _read_file(self) -> JobStatus:
+        try:
+            return JobStatus.from_json(read_json(self.status_path))
+        except (OSError, ParseError, TypeError, ValueError):
+            return JobStatus()
+
+    @staticmethod
+    def _gone(status: JobStatus) -> bool:
+        running = status.state in ("RUNNING", "CANCELLING")
+        return running and not process_alive(status.pid, status.pid_started)
+
+    def write_status(self, status: JobStatus) -> None:
+        """Write the status atomically."""
+        try:
+            write_json(self.status_path, asdict(status))
+        except OSError as error:
+            if error.errno not in NO_ROOM or status.active:
+                raise
+            # The last words of a worker that has met a full disk.
+            overwrite_json(self.status_path, asdict(status))
+
+    def lock(self) -> None:
+        """Take the folder for this process.
+
+        The lock of a dead process, or one that is broken, is taken over: locks of living ones
+        appear whole.
+
+        Raises
+        ------
+        UsageError
+            Another process is at work here.
+        """
+        mine = {"pid": os.getpid(), "started": process_start_ticks(os.getpid())}
+        owner = self._lock_owner()
+        if owner == (mine["pid"], mine["started"]):
+            return
+        self._drop_stale_lock()
+        # A hard link to a finished file appears whole or not at all, and for one process only.
+        ready = self.lock_path.with_name(f"lock.{os.getpid()}.json")
+        write_json(ready, mine)
+        try:
+            os.link(ready, self.lock_path)
+        except FileExistsError:
+            pid = (self._lock_owner() or (0, 0))[0]
+            raise UsageError(
+                f"Process {pid} is working in {self.root}.",
+                "Wait for it, cancel it, or choose another folder.",
+            ) from None
+        except OSError:
+            # A file system without hard links (exFAT): the best there is.
+            os.replace(ready, self.lock_path)
+        finally:
+            ready.unlink(missing_ok=True)
+
+    def _drop_stale_lock(self) -> None:
+        try:
+            content = self.lock_path.read_bytes()
+        except OSError:
+            return
+        owner = self._lock_owner()
+        if owner is not None and process_alive(*owner):
+            return
+        aside = self.lock_path.with_name(f"lock.{os.getpid()}.stale")
+        try:
+            os.replace(self.lock_path, aside)
+        except FileNotFoundError:
+            return
+        try:
+            if aside.read_bytes() != content:
+                # Another process has taken it over between our looks: its lock goes back.
+                os.link(aside, self.lock_path)
+        except FileExistsError:
+            pass
+        except OSError:  # no hard links
+            os.replace(aside, self.lock_path)
+        finally:
+            aside.unlink(missing_ok=True)
+
+    def _lock_owner(self) -> tuple[int, int] | None:
+        try:
+            owner = read_json(self.lock_path)
+            return int(owner["pid"]), int(owner["started"])
+        except (OSError, ParseError, KeyError, TypeError, ValueError):
+            return None
+
+    def locked(self) -> bool:
+        """Whether a living process works here."""
+        owner = self._lock_owner()
+        return owner is not None and process_alive(*owner)
+
+    def unlock(self) -> None:
+        """Give the folder free."""
+        self.lock_path.unlink(missing_ok=True)

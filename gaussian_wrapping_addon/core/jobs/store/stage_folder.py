@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Stages: a folder named by the hash of its inputs, finished when ``done.json`` lies in it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...errors import ParseError
+from ...files import read_json, write_json
+from ...progress import Progress
+from .job_folder import MARKER
+
+_logger = logging.getLogger(__name__)
+
+# Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
+STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 9, "texture": 11}
+
+HASH_CHARACTERS = 12
+INPUT_SUFFIXES = (
+    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".bin", ".txt", ".json", ".ply",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One finished stage."""
+
+    name: str
+    key: str
+    """Hash of everything that the stage's result depends on."""
+    folder: Path
+    done: dict[str, Any]
+    """Content of ``done.json``: what was measured."""
+    reused: bool
+
+
+def stage_key(*parts: Any) -> str:
+    """Hash JSON values (and keys of earlier stages) into the name of a stage."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:HASH_CHARACTERS]
+
+
+def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
+    """List the files of an input with size and modification time, for :func:`stage_key`.
+
+    Photos are not read: size and time tell a change, as in other build systems.
+    """
+    if source.is_file() and source.suffix.lower() == ".ply":
+        state = source.stat()
+        return [(source.name, state.st_size, state.st_mtime_ns)]
+    root = source if source.is_dir() else source.parent
+    found = []
+    for folder, subfolders, names in os.walk(root):
+        if MARKER in names:
+            subfolders.clear()  # a job folder beside a transforms.json is not input
+            continue
+        subfolders[:] = sorted(s for s in subfolders if not s.startswith("."))
+        for name in sorted(names):
+            path = Path(folder) / name
+            if path.suffix.lower() in INPUT_SUFFIXES and path.is_file():
+                state = path.stat()
+                found.append((path.relative_to(root).as_posix(), state.st_size, state.st_mtime_ns))
+    return [(source.name if source.is_file() else "", 0, 0), *found]
+
+
+def read_done(folder: Path) -> dict[str, Any] | None:
+    """Return the content of ``done.json``, or ``None`` where the stage is not finished."""
+    path = folder / "done.json"
+    if not path.is_file():
+        return None
+    try:
+        values = read_json(path)
+    except (OSError, ParseError):
+        return None
+    return values if isinstance(values, dict) else None
+
+
+def run_stage(
+    stages: Path,
+    name: str,
+    key: str,
+    progress: Progress,
+    work: Callable[[Path, Progress], dict[str, Any]],
+) -> Stage:
+    """Run a stage, or re-use it when its folder is finished.
+
+    Parameters
+    ----------
+    stages : Path
+        Folder of all stages.
+    name, key : str
+        Together the folder's name.
+    progress : Progress
+        Span of the stage.
+    work : callable
+        Does the work in the folder; returns what goes into ``done.json``. A folder left by an
+        interrupted run is given as it is, so that training finds its checkpoints.
+    """
+    folder = stages / f"{name}-{key}"
+    done = read_done(folder)
+    if done is not None:
+        _logger.info("stage %s is finished already (%s)", name, folder.name)
+        progress.update(1.0, f"{name}: finished before")
+        return Stage(name, key, folder, done, True)
+    folder.mkdir(parents=True, exist_ok=True)
+    begun_s, begun_processor_s = time.monotonic(), time.process_time()
+    progress.update(0.0, f"{name}: starting")
+    done = work(folder, progress)
+    seconds = _seconds_before(folder) + time.monotonic() - begun_s
+    # Of this process and this run alone, not of helpers.
+    processor_s = time.process_time() - begun_processor_s
+    done = {
+        **done,
+        "seconds": round(seconds, 3),
+        "processor_seconds": round(processor_s, 3),
+        "finished_unix_s": round(time.time(), 1),
+    }
+    write_json(folder / "done.json", done)
+    progress.update(1.0, f"{name}: finished")
+    return Stage(name, key, folder, done, False)
+
+
+def note_interrupted(stages: Path, name: str, key: str, seconds: float) -> None:
+    """Add the time of an interrupted run to the stage, so that reports count it."""
+    folder = stages / f"{name}-{key}"
+    if folder.is_dir() and read_done(folder) is None:
+        write_json(folder / "spent.json", {"seconds": _seconds_before(folder) + seconds})
+
+
+def _seconds_before(folder: Path) -> float:
+    try:
+        return float(read_json(folder / "spent.json")["seconds"])
+    except (OSError, ParseError, KeyError, TypeError, ValueError):
+        return 0.0

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Where compiled kernels are kept on disk, and when what is kept there has become stale.
+
+numba keeps the machine code of a kernel in the first folder that can be written of
+``NUMBA_CACHE_DIR``, ``__pycache__`` beside the kernel's file and the user's cache folder. Left to
+itself it compiles anew where the kernel's own file has changed. Helpers and constants of other
+files are compiled into a kernel too, so here a kernel is stale as soon as any file changes that its
+file imports, directly or not. numba itself tells apart processors, Pythons and its own versions.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import re
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from numba.core import caching
+
+_logger = logging.getLogger(__name__)
+
+_ROOT = Path(__file__).resolve().parents[2]
+_IMPORT = re.compile(r"^[ \t]*from (\.+)([\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
+_COMMENT = re.compile(r"#[^\n]*")
+
+
+@functools.cache
+def _source(path: Path) -> bytes:
+    return path.read_bytes()
+
+
+@functools.cache
+def _imported(path: Path) -> frozenset[Path]:
+    """Return the package's files that a file imports itself, relative imports only."""
+    return frozenset(p for p in _named(path) if p.is_file() and p.is_relative_to(_ROOT))
+
+
+def _named(path: Path) -> Iterator[Path]:
+    for dots, module, names in _IMPORT.findall(_source(path).decode()):
+        folder = path.parents[len(dots) - 1].joinpath(*filter(None, module.split(".")))
+        yield folder.with_suffix(".py")
+        yield folder / "__init__.py"
+        for name in _COMMENT.sub("", names).strip("()").split(","):
+            if name.strip():
+                yield folder / f"{name.split()[0]}.py"
+
+
+@functools.cache
+def source_stamp(path: Path) -> str:
+    """Return a hash of a file of the package and of all files that it imports, directly or not.
+
+    Files are read once a process: later changes need a new process, as they do for Python.
+    """
+    found, waiting = {path}, [path]
+    while waiting:
+        news = _imported(waiting.pop()) - found
+        found |= news
+        waiting += news
+    state = hashlib.sha256()
+    for one in sorted(found):
+        state.update(hashlib.sha256(_source(one)).digest())
+    return state.hexdigest()
+
+
+class _WatchesImports:
+    """A place for the cache whose content follows from :func:`source_stamp`."""
+
+    _py_file: str
+
+    def get_source_stamp(self) -> str:
+        """Return what numba compares with the stamp it has kept beside the machine code."""
+        return source_stamp(Path(self._py_file).resolve())
+
+
+class _ChosenFolder(_WatchesImports, caching.UserProvidedCacheLocator):
+    """``NUMBA_CACHE_DIR``."""
+
+
+class _BesideSource(_WatchesImports, caching.InTreeCacheLocator):
+    """``__pycache__`` beside the kernel's file."""
+
+
+class _UserFolder(_WatchesImports, caching.UserWideCacheLocator):
+    """The user's cache folder."""
+
+
+class _Places(caching.CompileResultCacheImpl):
+    """The places in order; raises ``RuntimeError`` where none can be written."""
+
+    _locator_classes = [_ChosenFolder, _BesideSource, _UserFolder]  # noqa: RUF012 - as its base
+
+
+class KernelCache(caching.FunctionCache):
+    """The cache of one kernel; where it cannot be read or written any more, they work without."""
+
+    _impl_class = _Places
+
+    def is_empty(self) -> bool:
+        """Tell whether no machine code is kept that fits the present sources."""
+        try:
+            return not self._cache_file._load_index()
+        except Exception as error:  # as in load_overload: it will be compiled anew
+            warn_without_cache(f"{type(error).__name__}: {error}")
+            return True
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return machine code that was kept, or ``None``."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # whatever a damaged file makes of unpickling
+            warn_without_cache(f"{type(error).__name__}: {error}")
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep machine code that was just compiled."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            warn_without_cache(f"{type(error).__name__}: {error}")
+
+
+_told = threading.Event()
+
+
+def warn_without_cache(reason: str) -> None:
+    """Tell once, not once a kernel, that kernels are not kept."""
+    if _told.is_set():
+        return
+    _told.set()
+    _logger.warning(
+        "Compiled kernels cannot be kept on disk, so each run compiles them anew, about a minute: "
+        "%s. Set NUMBA_CACHE_DIR to a folder that can be written.",
+        reason,
+    )

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Connected parts of a mesh, and removal of floaters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from .topology import half_edges, normals_and_areas
+
+
+def face_components(vertex_count: int, faces: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return the number of connected parts and the part of each face, (f,) int64.
+
+    Faces that share a vertex belong to one part.
+    """
+    if len(faces) == 0:
+        return 0, np.zeros(0, np.int64)
+    rows, columns = half_edges(faces)
+    shape = (vertex_count, vertex_count)
+    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=shape)
+    _, label = connected_components(graph, directed=False)
+    used, part = np.unique(label[faces[:, 0]], return_inverse=True)
+    return len(used), part.astype(np.int64)
+
+
+def volumes_and_areas(
+    vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the signed volume and the area of each part, (count,) each.
+
+    The volume is that of a closed part; a cavity inside a solid has a negative one.
+    """
+    center = vertices[faces.reshape(-1)].mean(0) if len(faces) else np.zeros(3)
+    a, b, c = (vertices[faces[:, k]] - center for k in range(3))
+    each = (a * np.cross(b, c)).sum(1) / 6.0
+    _, areas = normals_and_areas(vertices, faces)
+    return (
+        np.bincount(part, weights=each, minlength=count),
+        np.bincount(part, weights=areas, minlength=count),
+    )
+
+
+@dataclass(frozen=True)
+class Floaters:
+    """What :func:`without_floaters` did."""
+
+    faces: np.ndarray
+    """(g, 3) faces that stay."""
+    kept: int
+    removed_solids: int
+    removed_cavities: int
+    removed_area_share: float
+    """Area of all removed parts, of the total."""
+
+    @property
+    def removed(self) -> int:
+        """All removed parts: of open ones the volume tells no solid from a cavity."""
+        return self.removed_solids + self.removed_cavities
+
+
+LONG_FACTOR = 3.0
+"""A part this many times longer than its share of the area allows is no floater: a piece of wire
+has little area and may be all that is left of it."""
+LONG_FACES = 30
+"""With fewer faces a long part is a sliver between a few vertices, not a piece of anything."""
+
+
+def extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: int) -> np.ndarray:
+    """Return the diagonal of the bounding box of each part, (count,)."""
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    corners = vertices[faces]  # (f, 3, 3)
+    np.minimum.at(low, part, corners.min(1))
+    np.maximum.at(high, part, corners.max(1))
+    return np.asarray(np.linalg.norm(np.maximum(high - low, 0.0), axis=1))
+
+
+def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> Floaters:
+    """Remove parts that are small: in area and in length.
+
+    The area is below ``min_share`` of the largest part's, and the length below
+    :data:`LONG_FACTOR` times that share of the longest part's, or it has fewer than
+    :data:`LONG_FACES` faces. Small cavities go as well, which
+    fills them. A cavity whose solid goes is small itself.
+    """
+    count, part = face_components(len(vertices), faces)
+    volume, area = volumes_and_areas(vertices, faces, part, count)
+    length = extents(vertices, faces, part, count)
+    keep = area >= min_share * area.max(initial=0.0)
+    long = length >= LONG_FACTOR * min_share * length.max(initial=0.0)
+    keep |= long & (np.bincount(part, minlength=count) >= LONG_FACES)
+    removed = float(area[~keep].sum() / max(area.sum(), 1e-300))
+    return Floaters(
+        faces[keep[part]],
+        int(keep.sum()),
+        int((~keep & (volume >= 0)).sum()),
+        int((~keep & (volume < 0)).sum()),
+        removed,
+    )
+
+
+def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drop unused vertices.
+
+    Returns
+    -------
+    vertices : (w, 3)
+    faces : (f, 3) int64
+    source : (w,) int64
+        Old index of each vertex.
+    """
+    source, index = np.unique(faces, return_inverse=True)
+    return vertices[source], index.reshape(-1, 3).astype(np.int64), source

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The frame in which a tangent-space normal map is told: smooth normals, tangents at corners.
+
+What reads the map must have the same frame, to the degree. Blender and glTF both name MikkTSpace
+(Mikkelsen, "Simulation of wrinkled surfaces revisited", 2008): each face's direction of growing u,
+averaged by corner angles over neighbours that share a vertex, its UV and the UVs' orientation, in
+the plane of the vertex's normal. Normals and tangents are interpolated as they are, not to unit
+length, and the bitangent is ``sign * cross(normal, tangent)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from .topology import area_vectors, next_half_edges
+
+
+@dataclass(frozen=True)
+class TangentFrames:
+    """Frames at the corners of a mesh's faces."""
+
+    normals: np.ndarray
+    """(v, 3) float64 unit normals of the vertices."""
+    tangents: np.ndarray
+    """(f, 3, 3) float64 unit tangents of the corners, at right angles to their normals."""
+    signs: np.ndarray
+    """(f,) float64: 1, or -1 where the UVs are a mirror image of the surface."""
+
+
+def shading_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return (v, 3) float64 unit normals, weighted by angle, as Blender's smooth shading has them.
+
+    A vertex without a face with area has (0, 0, 1): files ask for unit length everywhere.
+    """
+    corners = np.asarray(vertices, np.float64)[faces]  # (f, 3, 3)
+    face_normals = _unit(area_vectors(np.asarray(vertices, np.float64), faces))
+    ahead = _unit(np.roll(corners, -1, axis=1) - corners)
+    behind = _unit(np.roll(corners, 1, axis=1) - corners)
+    weighted = _angles(ahead, behind)[..., None] * face_normals[:, None]  # (f, 3, 3)
+    normals = _unit(_summed(np.asarray(faces).ravel(), weighted.reshape(-1, 3), len(vertices)))
+    normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
+    return normals
+
+
+def tangent_frames(
+    vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray
+) -> TangentFrames:
+    """Compute the frames of a smooth-shaded mesh with UVs.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+    faces : (f, 3) int32
+    corner_uvs : (f, 3, 2) float32
+        v upwards. Corners of one vertex with equal UVs share their tangent.
+
+    Notes
+    -----
+    Faces without area, on the surface or in the atlas, add nothing to their neighbours; they hold
+    no texel, and their own tangents are any that are at right angles to the normals.
+    """
+    faces = np.asarray(faces, np.int64)
+    normals = shading_normals(vertices, faces)
+    corners = np.asarray(vertices, np.float64)[faces]  # (f, 3, 3)
+    uvs = np.asarray(corner_uvs, np.float32)
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    fine = uvs.astype(np.float64)
+    uv_first, uv_second = fine[:, 1] - fine[:, 0], fine[:, 2] - fine[:, 0]
+    area = uv_first[:, 0] * uv_second[:, 1] - uv_first[:, 1] * uv_second[:, 0]
+    signs = np.where(area > 0.0, 1.0, -1.0)
+    along = uv_second[:, 1:] * first - uv_first[:, 1:] * second
+    along = _unit(along) * (signs * (area != 0.0))[:, None]  # (f, 3), towards growing u
+    owner = normals[faces]  # (f, 3, 3)
+    ahead = _unit(_flattened(np.roll(corners, -1, axis=1) - corners, owner))
+    behind = _unit(_flattened(np.roll(corners, 1, axis=1) - corners, owner))
+    angles = _angles(ahead, behind)
+    weighted = angles[..., None] * _unit(_flattened(np.repeat(along[:, None], 3, axis=1), owner))
+    group = _groups(faces, uvs, signs)
+    total = _summed(group, weighted.reshape(-1, 3), int(group.max()) + 1)
+    tangents = _unit(total)[group].reshape(-1, 3, 3)
+    missing = ~tangents.any(axis=2)
+    if missing.any():
+        axis = np.eye(3)[np.abs(owner[missing]).argmin(axis=1)]
+        tangents[missing] = _unit(_flattened(axis, owner[missing]))
+    return TangentFrames(normals, tangents, signs)
+
+
+def _groups(faces: np.ndarray, uvs: np.ndarray, signs: np.ndarray) -> np.ndarray:
+    """(3 f,) int64: one number for corners that average their tangents.
+
+    They have the same vertex, UV and orientation, and their faces are joined by edges around the
+    vertex: pieces of a chart that touch in a point alone have tangents of their own.
+    """
+    key = np.empty(faces.size, np.dtype([("vertex", "<i8"), ("uv", "<u8")]))
+    key["vertex"] = 2 * faces.ravel() + np.repeat(signs > 0, 3)
+    key["uv"] = np.ascontiguousarray(uvs.reshape(-1, 2)).view(np.uint64)[:, 0]
+    welded = np.unique(key, return_inverse=True)[1].ravel()
+    corner = np.arange(faces.size)
+    follower = next_half_edges(corner)
+    low = np.where(welded < welded[follower], corner, follower)
+    high = corner + follower - low
+    edge = welded[low] * (int(welded.max()) + 1) + welded[high]
+    order = np.argsort(edge, kind="stable")
+    same = np.flatnonzero(edge[order[1:]] == edge[order[:-1]])
+    one, other = order[same], order[same + 1]
+    rows, columns = np.r_[low[one], high[one]], np.r_[low[other], high[other]]
+    links = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (faces.size, faces.size))
+    return connected_components(links, directed=False)[1].astype(np.int64)
+
+
+def _flattened(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Project vectors onto the planes of normals."""
+    return vectors - (vectors * normals).sum(axis=-1, keepdims=True) * normals
+
+
+def _angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Angles between unit vectors; 0 where one of them has no length."""
+    cosine = (one * other).sum(axis=-1).clip(-1.0, 1.0)
+    return np.arccos(cosine) * (one.any(axis=-1) & other.any(axis=-1))
+
+
+def _summed(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    return np.stack([np.bincount(index, values[:, axis], count) for axis in range(3)], axis=1)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Scale to unit length; what has none, or is not more than rounding, becomes 0."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    tiny = length <= 1e-300
+    return np.where(tiny, 0.0, vectors / np.where(tiny, 1.0, length))

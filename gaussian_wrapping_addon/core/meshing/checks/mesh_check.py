@@ -1,0 +1,282 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The last check of a mesh, by other means than the code that makes and measures meshes.
+
+It walks around vertices and over edges by permutations of half-edges alone and shares nothing with
+:mod:`..cleanup.repair` and :mod:`.mesh_statistics`, so that a fault there does not hide itself
+here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...regions.convex_region import Region
+
+MIN_HEIGHT_SHARE = 1e-6
+"""A face lower than this share of its longest edge counts as degenerate. Files hold float32, about
+seven digits: below that such a face has no direction any more."""
+
+ON_PLANE_SHARE = 1e-7
+"""A vertex so near the plane of a region's face lies on it, in diagonals of the region: what
+float32 can tell apart."""
+
+PARTS_TOLD = 20
+"""Parts that the report lists one by one, the largest."""
+
+
+@dataclass(frozen=True)
+class CheckedPart:
+    """One connected part (over shared vertices)."""
+
+    faces: int
+    euler: int
+    genus: int | None
+    """``None`` where the mesh is not a closed oriented 2-manifold."""
+    volume: float
+    """Negative for a cavity; in the mesh's units."""
+
+
+@dataclass(frozen=True)
+class MeshCheck:
+    """What is wrong with a mesh; every count is 0 and ``volume`` positive where nothing is."""
+
+    faces: int
+    bad_indices: int
+    """Faces that name a vertex that is not there; they are left out of all other counts."""
+    not_finite_vertices: int
+    unused_vertices: int
+    open_edges: int
+    """Edges with one face."""
+    nonmanifold_edges: int
+    """Edges with more than two faces."""
+    inconsistent_edges: int
+    """Edges whose two faces run along them the same way."""
+    nonmanifold_vertices: int
+    """Vertices whose faces are more than one ring."""
+    degenerate_faces: int
+    """Faces with a repeated corner, or lower than :data:`MIN_HEIGHT_SHARE`."""
+    euler: int
+    volume: float
+    parts: tuple[CheckedPart, ...]
+    """From the largest number of faces to the smallest."""
+    open_at_region: int | None = None
+    """Of the open edges, those that lie on one plane of the region's boundary. ``None`` where the
+    mesh is to be closed."""
+
+    @property
+    def good(self) -> bool:
+        """Whether the mesh is an oriented 2-manifold without defect.
+
+        It must be closed, with positive volume; or open on the region's planes alone, if asked so.
+        """
+        return not self.defects()
+
+    def defects(self) -> list[str]:
+        """Return the defects in words, none for a good mesh."""
+        if self.faces == 0:
+            return ["the mesh has no faces"]
+        counted = (
+            (self.bad_indices, "faces name vertices that are not there"),
+            (self.not_finite_vertices, "vertices are not finite"),
+            (self.unused_vertices, "vertices belong to no face"),
+            (self.open_edges - (self.open_at_region or 0), "edges have one face only"),
+            (self.nonmanifold_edges, "edges have more than two faces"),
+            (self.inconsistent_edges, "edges have faces of opposite orientation"),
+            (self.nonmanifold_vertices, "vertices join more than one ring of faces"),
+            (self.degenerate_faces, "faces have no area"),
+        )
+        found = [f"{words}: {count}" for count, words in counted if count]
+        if self.open_at_region is None and not self.volume > 0.0:
+            found.append("the enclosed volume is not positive")
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values, with ``good``, ``defects`` and the number of parts."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        values["parts"] = [dataclasses.asdict(part) for part in self.parts[:PARTS_TOLD]]
+        for holder in (values, *values["parts"]):
+            if not np.isfinite(holder["volume"]):
+                holder["volume"] = None
+        counts = {"part_count": len(self.parts), "good": self.good, "defects": self.defects()}
+        return {**values, **counts}
+
+
+def check_mesh(vertices: np.ndarray, faces: np.ndarray, open_at: Region | None = None) -> MeshCheck:
+    """Check a triangle mesh; anything is accepted, an empty one too.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float
+    faces : (f, 3) int
+        Counter-clockwise seen from outside.
+    open_at : Region, optional
+        The mesh may be open where an edge lies on a face of this region.
+    """
+    vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
+    faces = np.asarray(faces, np.int64).reshape(-1, 3)
+    given, count = len(faces), len(vertices)
+    faces = faces[((faces >= 0) & (faces < count)).all(1)]
+    repeated = (faces == np.roll(faces, 1, axis=1)).any(1)
+    finite = np.isfinite(vertices).all(1)
+    used = np.zeros(count, np.bool_)
+    used[faces] = True
+    edges = _Edges(faces, count)
+    part = _parts(faces, count)
+    sound = edges.open + edges.crowded + edges.turned == 0 and not repeated.any()
+    rings = _rings(edges.twin, faces, count) if sound else None
+    corners = vertices[faces]  # (f, 3, 3)
+    parts, volume = _measure_parts(corners, faces, part, edges, sound and rings == 0)
+    allowed = None if open_at is None else _on_boundary(vertices, edges.open_pairs, open_at)
+    return MeshCheck(
+        faces=given,
+        bad_indices=given - len(faces),
+        not_finite_vertices=int((~finite).sum()),
+        unused_vertices=int((~used).sum()),
+        open_edges=edges.open,
+        nonmanifold_edges=edges.crowded,
+        inconsistent_edges=edges.turned,
+        nonmanifold_vertices=_slow_rings(faces) if rings is None else rings,
+        degenerate_faces=int((repeated | _flat(corners)).sum()),
+        euler=int(used.sum()) - edges.count + len(faces),
+        volume=volume,
+        parts=parts,
+        open_at_region=allowed,
+    )
+
+
+class _Edges:
+    """Half-edge ``3 f + k`` leads from corner k of face f to the next."""
+
+    def __init__(self, faces: np.ndarray, vertex_count: int) -> None:
+        begin, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+        forward, backward = begin * vertex_count + end, end * vertex_count + begin
+        lines, self.line, sizes = np.unique(
+            np.minimum(forward, backward), return_inverse=True, return_counts=True
+        )
+        self.count = len(lines)
+        self.open, self.crowded = int((sizes == 1).sum()), int((sizes > 2).sum())
+        once = sizes[self.line] == 1
+        self.open_pairs = np.stack([begin[once], end[once]], 1)
+        """(o, 2) ends of the edges with one face."""
+        balance = np.bincount(self.line, weights=np.where(begin < end, 1.0, -1.0))
+        self.turned = int(((sizes == 2) & (balance != 0)).sum()) if len(lines) else 0
+        order = np.argsort(forward, kind="stable")
+        place = np.searchsorted(forward[order], backward)
+        self.twin = order[np.minimum(place, max(len(order) - 1, 0))]
+        """The opposite half-edge; only where the mesh is closed and consistent."""
+
+
+def _on_boundary(vertices: np.ndarray, pairs: np.ndarray, region: Region) -> int:
+    """Count the edges (o, 2) with both ends on one plane of the region."""
+    found = np.zeros(len(pairs), np.bool_)
+    for normal, offset in zip(*region.half_spaces, strict=True):
+        away = np.abs((vertices[pairs] - region.center) @ normal - offset)  # (o, 2)
+        found |= (away <= ON_PLANE_SHARE * region.diagonal).all(1)
+    return int(found.sum())
+
+
+def _rings(twin: np.ndarray, faces: np.ndarray, vertex_count: int) -> int:
+    """Count vertices with more than one ring, on a closed and consistently oriented mesh.
+
+    The half-edge before one in its face, seen from the other side, is the next one that leaves the
+    same vertex: a permutation, each of whose cycles is one ring.
+    """
+    half = np.arange(faces.size)
+    turn = twin[half - half % 3 + (half + 2) % 3]
+    lowest = _cycle_minima(turn)
+    rings = np.bincount(faces.reshape(-1)[lowest == half], minlength=vertex_count)
+    return int((rings > 1).sum())
+
+
+def _cycle_minima(step: np.ndarray) -> np.ndarray:
+    """Return the least member of the cycle of each element, by doubling the way looked ahead."""
+    lowest, ahead = np.arange(len(step)), step
+    while True:
+        better = np.minimum(lowest, lowest[ahead])
+        if np.array_equal(better, lowest):
+            return lowest
+        lowest, ahead = better, ahead[ahead]
+
+
+def _slow_rings(faces: np.ndarray) -> int:
+    """Count vertices whose faces are more than one piece, on any mesh."""
+    around: dict[int, list[tuple[int, int]]] = {}
+    for a, b, c in faces.tolist():
+        for v, first, second in ((a, b, c), (b, c, a), (c, a, b)):
+            around.setdefault(v, []).append((first, second))
+    return sum(_pieces(links) > 1 for links in around.values())
+
+
+def _pieces(links: list[tuple[int, int]]) -> int:
+    """Count the connected pieces of a few edges."""
+    leader: dict[int, int] = {}
+
+    def find(x: int) -> int:
+        while leader.setdefault(x, x) != x:
+            x = leader[x]
+        return x
+
+    for first, second in links:
+        leader[find(first)] = find(second)
+    return len({find(x) for x in leader})
+
+
+def _parts(faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """Return the least vertex of the part of each face, (f,) int64."""
+    leader = np.arange(vertex_count)
+    while True:
+        low = leader[faces].min(1)  # (f,)
+        before = leader.copy()
+        for k in range(3):
+            # Both the corner and its leader learn of the least leader of the face.
+            np.minimum.at(leader, leader[faces[:, k]], low)
+            np.minimum.at(leader, faces[:, k], low)
+        leader = leader[leader]
+        if np.array_equal(leader, before):
+            return leader[faces[:, 0]]
+
+
+def _flat(corners: np.ndarray) -> np.ndarray:
+    """(f,) bool: faces whose least height is below the tolerance; not finite ones count."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    sides = np.stack([b - a, c - b, a - c], 1)  # (f, 3, 3)
+    with np.errstate(invalid="ignore", over="ignore"):
+        longest = np.sqrt((sides**2).sum(2)).max(1, initial=0.0)
+        unit = sides / np.where(longest > 0, longest, 1.0)[:, None, None]
+        doubled = np.sqrt((np.cross(unit[:, 0], unit[:, 1]) ** 2).sum(1))
+        return np.asarray(~(doubled >= MIN_HEIGHT_SHARE))
+
+
+def _measure_parts(
+    corners: np.ndarray, faces: np.ndarray, part: np.ndarray, edges: _Edges, manifold: bool
+) -> tuple[tuple[CheckedPart, ...], float]:
+    """Return the parts, the largest first, and the volume of all."""
+    _, index, sizes = np.unique(part, return_inverse=True, return_counts=True)
+    count = len(sizes)
+    if count == 0:
+        return (), 0.0
+    with np.errstate(invalid="ignore", over="ignore"):
+        # Volumes of tetrahedra over a corner of the mesh: far origins would cost digits.
+        a, b, c = (corners[:, k] - corners[0, 0] for k in range(3))
+        each = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
+    volumes = np.bincount(index, weights=each, minlength=count)
+    line_part = np.zeros(edges.count, np.int64)
+    line_part[edges.line] = np.repeat(index, 3)
+    _, first = np.unique(faces, return_index=True)
+    vertex_count = np.bincount(index[first // 3], minlength=count)
+    eulers = vertex_count - np.bincount(line_part, minlength=count) + sizes
+    order = np.argsort(-sizes, kind="stable")
+    parts = tuple(
+        CheckedPart(
+            int(sizes[i]),
+            int(eulers[i]),
+            1 - int(eulers[i]) // 2 if manifold else None,
+            float(volumes[i]),
+        )
+        for i in order
+    )
+    return parts, float(volumes.sum())

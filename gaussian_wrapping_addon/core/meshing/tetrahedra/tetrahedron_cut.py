@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Tetrahedra cut by the planes of a region, face to face, so that a solid in them closes there.
+
+Dropping tetrahedra that reach beyond the region would leave a ragged boundary (docs/method.md,
+section 6.5). Each that a plane crosses is divided instead: its part inside becomes up to three
+tetrahedra. Which diagonal divides a four-sided face follows from the numbers of its corners alone,
+so neighbours agree on it, whatever the rounding.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...regions.convex_region import Region
+
+_REFERENCE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
+
+_PRISM_QUADS = ((0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5))
+"""Sides of the prism with the triangles 0 1 2 and 3 4 5, where k and k + 3 are opposite."""
+
+
+@dataclass(frozen=True)
+class CutTetrahedra:
+    """Tetrahedra that fill the region, as far as the given ones did."""
+
+    points: np.ndarray
+    """(n + k, 3) float64: the given points, then those on the region's planes."""
+    tetrahedra: np.ndarray
+    """(m, 4) int64, face to face, oriented as the given ones."""
+
+
+def cut_to_region(points: np.ndarray, tetrahedra: np.ndarray, region: Region) -> CutTetrahedra:
+    """Leave of tetrahedra what lies in a region.
+
+    A new point lies on each edge that a plane crosses, on that plane. Points on a plane count as
+    inside. The result depends on numbers and sides of points alone, so that it is face to face also
+    where tetrahedra have no volume.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+    tetrahedra : (m, 4) int64
+        Face to face.
+    """
+    local = points - region.center  # (n, 3)
+    for normal, offset in zip(*region.half_spaces, strict=True):
+        distance = local @ normal - offset  # (n,)
+        inside = distance <= 0.0
+        code = inside[tetrahedra] @ np.array([1, 2, 4, 8])  # (m,)
+        if (code == 15).all():
+            continue
+        crossed = np.flatnonzero((code > 0) & (code < 15))
+        pairs, slots = _crossing_edges(tetrahedra[crossed], inside, len(local))
+        share = distance[pairs[:, 0]] / (distance[pairs[:, 0]] - distance[pairs[:, 1]])
+        made = local[pairs[:, 0]] + share[:, None] * (local[pairs[:, 1]] - local[pairs[:, 0]])
+        made -= (made @ normal - offset)[:, None] * normal  # long edges leave a rounding error
+        divided = _divide(tetrahedra[crossed], code[crossed], slots + len(local))
+        tetrahedra = np.concatenate([tetrahedra[code == 15], divided])
+        local = np.concatenate([local, made])
+    new = local[len(points) :] + region.center
+    return CutTetrahedra(np.concatenate([points, new]), tetrahedra)
+
+
+_EDGES = np.array(list(itertools.combinations(range(4), 2)))
+"""(6, 2) corners of the edges of a tetrahedron."""
+
+
+def _crossing_edges(
+    tetrahedra: np.ndarray, inside: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the crossing edges (e, 2), inside point first, and the edge's number (m, 6) or -1."""
+    ends = np.sort(tetrahedra[:, _EDGES], axis=2)  # (m, 6, 2)
+    crossing = inside[ends[:, :, 0]] != inside[ends[:, :, 1]]  # (m, 6)
+    keys = ends[crossing][:, 0] * np.int64(count) + ends[crossing][:, 1]
+    unique, index = np.unique(keys, return_inverse=True)
+    slots = np.full(crossing.shape, -1, np.int64)
+    slots[crossing] = index
+    pairs = np.stack([unique // count, unique % count], 1)
+    turned = ~inside[pairs[:, 0]]
+    pairs[turned] = pairs[turned][:, ::-1]
+    return pairs, slots
+
+
+def _divide(tetrahedra: np.ndarray, codes: np.ndarray, made: np.ndarray) -> np.ndarray:
+    """Return the inside parts of crossed tetrahedra; ``made`` (m, 6) are the points on edges."""
+    nodes = np.concatenate([tetrahedra, made], 1)  # (m, 10) four corners, six edges
+    parts = []
+    for code in range(1, 15):
+        rows = np.flatnonzero(codes == code)
+        if len(rows) == 0:
+            continue
+        body = nodes[rows][:, _body(code)]  # (r, 4) or (r, 6)
+        if body.shape[1] == 4:
+            parts.append(body)
+            continue
+        lowest = body.argmin(1)
+        for first in range(6):
+            prism = body[lowest == first]
+            for quad, diagonal, pieces in _prism_parts(first):
+                chosen = np.isin(prism[:, quad].argmin(1), diagonal)
+                parts.extend(prism[chosen][:, piece] for piece in pieces)
+    return np.concatenate(parts) if parts else np.zeros((0, 4), np.int64)
+
+
+@functools.lru_cache(maxsize=16)
+def _body(code: int) -> np.ndarray:
+    """Return what is inside: a tetrahedron (4,) or a prism (6,), as nodes, positively oriented."""
+    edge = {frozenset(pair): 4 + k for k, pair in enumerate(_EDGES.tolist())}
+    inside = [k for k in range(4) if code >> k & 1]
+    outside = [k for k in range(4) if not code >> k & 1]
+    if len(inside) == 1:
+        body = inside + [edge[frozenset((inside[0], k))] for k in outside]
+    elif len(inside) == 3:
+        body = [edge[frozenset((outside[0], k))] for k in inside] + inside
+    else:
+        body = [n for a in inside for n in (a, *(edge[frozenset((a, c))] for c in outside))]
+    where = np.concatenate([_REFERENCE, _REFERENCE[_EDGES].mean(1)])[body]  # (4 or 6, 3)
+    if np.linalg.det(where[[1, 2, len(body) - 1]] - where[0]) < 0:
+        half = len(body) // 2
+        swap = [0, 1, 3, 2] if half == 2 else [0, 2, 1, 3, 5, 4]
+        body = [body[k] for k in swap]
+    return np.array(body)
+
+
+@functools.lru_cache(maxsize=8)
+def _prism_parts(
+    first: int,
+) -> tuple[tuple[list[int], list[int], tuple[list[int], ...]], ...]:
+    """Return how a prism whose corner ``first`` has the lowest number is divided.
+
+    Of each four-sided face the corner with the lowest number gets the diagonal. That corner sees
+    the two faces that it does not lie on: a triangle and one four-sided face.
+
+    Returns
+    -------
+    Two times the far four-sided face, places in it that have the lowest number in this case, and
+    the three tetrahedra.
+    """
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1.0]])
+    triangle = [3, 4, 5] if first < 3 else [0, 1, 2]
+    quad = next(list(q) for q in _PRISM_QUADS if first not in q)
+    a, b, c, d = quad
+    cases = []
+    for diagonal, halves in (([0, 2], ([a, b, c], [a, c, d])), ([1, 3], ([a, b, d], [b, c, d]))):
+        pieces = []
+        for face in (triangle, *halves):
+            piece = [first, *face]
+            if np.linalg.det(corners[piece[1:]] - corners[first]) < 0:
+                piece[2], piece[3] = piece[3], piece[2]
+            pieces.append(piece)
+        cases.append((quad, diagonal, tuple(pieces)))
+    return tuple(cases)

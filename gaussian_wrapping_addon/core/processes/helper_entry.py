@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Start of a helper process: set the memory limit, run the module, report typed failures."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+from ..errors import WrapError
+from .helper_process import emit
+from .peak_memory import own_peak_bytes
+
+_PARENT_POLL_S = 1.0
+
+
+def main(arguments: list[str]) -> int:
+    """Run ``arguments = [module, folder, memory_bytes]``; return the exit code."""
+    module, folder, memory_bytes = arguments[0], Path(arguments[1]), int(arguments[2])
+    if memory_bytes and sys.platform.startswith("linux"):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    parent = os.getppid()
+    _ask_to_end_with_parent()
+    threading.Thread(target=_end_with_parent, args=(parent,), daemon=True).start()
+    try:
+        package = __name__.rsplit(".", 1)[0]
+        importlib.import_module(f"{package}.{module}").main(folder)
+    except WrapError as error:
+        emit(error=error.message, hint=error.hint)
+        return error.exit_code
+    finally:
+        emit(peak_bytes=own_peak_bytes())
+    return 0
+
+
+def _ask_to_end_with_parent() -> None:
+    """Let Linux end us with the thread that started us: while a native call holds the GIL, no
+    thread of ours can look."""
+    if not sys.platform.startswith("linux"):
+        return
+    import ctypes
+
+    set_parent_death_signal = 1  # PR_SET_PDEATHSIG of prctl(2)
+    ctypes.CDLL(None).prctl(set_parent_death_signal, int(signal.SIGKILL), 0, 0, 0)
+
+
+def _end_with_parent(parent: int) -> None:
+    """A helper must not outlive the worker that waits for it."""
+    while os.getppid() == parent:
+        time.sleep(_PARENT_POLL_S)
+    os._exit(1)

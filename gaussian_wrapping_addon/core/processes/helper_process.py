@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Run foreign native code (xatlas, pycolmap) in a process with a deadline and a memory limit.
+
+A helper is a module with ``main(arguments) -> int``; it is given a folder, reads ``task.json`` and
+arrays there, writes its results there, and reports on stdout, one JSON object a line:
+``{"fraction": 0.5, "message": "..."}``. A typed failure is ``{"error": "...", "hint": "..."}``
+followed by exit code 3. The last line of every helper that ends in order is
+``{"peak_bytes": ...}``, its largest memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import IO, Any
+
+from .. import limits
+from ..errors import DatasetError, ResourceError, WorkerError
+from ..progress import Progress
+from .peak_memory import note_helper
+from .spawn import kill_group, spawn
+from .worker_environment import PACKAGES_OPTION, interpreter_of
+
+_logger = logging.getLogger(__name__)
+
+_POLL_S = 0.1
+_running: set[subprocess.Popen[bytes]] = set()
+_LAST_WORDS_LINES = 8
+
+
+def child_command(module: str, *arguments: str, python: str | None = None) -> list[str]:
+    """Return the argument list that runs ``core.<module>`` in a child interpreter.
+
+    Parameters
+    ----------
+    python : str or None
+        An interpreter, or the folder of a worker's environment; None for the one that runs this,
+        with the packages that it was given.
+    """
+    entry = Path(__file__).with_name("worker_main.py")
+    if python:
+        interpreter, packages = interpreter_of(python)
+    else:
+        interpreter, packages = sys.executable, str(sys._xoptions.get(PACKAGES_OPTION) or "")
+    given = ["-X", f"{PACKAGES_OPTION}={packages}"] if packages else []
+    return [interpreter, "-I", *given, "-u", str(entry), module, *arguments]
+
+
+def emit(**values: Any) -> None:
+    """Write one JSON line to stdout; helpers and the worker speak through this."""
+    sys.stdout.write(json.dumps(values, allow_nan=False) + "\n")
+    sys.stdout.flush()
+
+
+def end_helpers() -> None:
+    """Kill the helpers that run now; for a process that is about to leave without unwinding."""
+    for process in list(_running):
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            if hasattr(os, "killpg"):
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
+
+
+def run_helper(
+    module: str,
+    folder: Path,
+    progress: Progress,
+    *,
+    deadline_s: float = limits.HELPER_DEADLINE_S,
+    memory_bytes: int | None = None,
+) -> None:
+    """Run ``core.<module>`` on ``folder`` and wait, passing its progress on.
+
+    Raises
+    ------
+    Cancelled
+        The user asked to stop; the helper is ended first.
+    DatasetError
+        The helper reported a typed failure.
+    ResourceError
+        The deadline passed.
+    WorkerError
+        The helper crashed; the message names the signal and its last words.
+    """
+    command = child_command("processes.helper_entry", module, str(folder), str(memory_bytes or 0))
+    process = spawn(command)
+    _running.add(process)
+    lines: queue.Queue[tuple[str, str]] = queue.Queue()
+    assert process.stdout is not None
+    assert process.stderr is not None
+    readers = [
+        threading.Thread(target=_drain, args=(stream, name, lines), daemon=True)
+        for name, stream in (("out", process.stdout), ("err", process.stderr))
+    ]
+    for reader in readers:
+        reader.start()
+    begun_s = time.monotonic()
+    failure: dict[str, Any] = {}
+    last_words: list[str] = []
+    try:
+        while process.poll() is None or any(r.is_alive() for r in readers) or not lines.empty():
+            progress.check()
+            if time.monotonic() - begun_s > deadline_s:
+                raise ResourceError(
+                    f"{module} took longer than {deadline_s:.0f} s.", "Try a smaller input."
+                )
+            try:
+                source, line = lines.get(timeout=_POLL_S)
+            except queue.Empty:
+                continue
+            values = _parse(line) if source == "out" else None
+            if values is None:
+                last_words = [*last_words, line.rstrip()][-_LAST_WORDS_LINES:]
+                _logger.debug("%s: %s", module, line.rstrip())
+            elif "error" in values:
+                failure = values
+            elif "peak_bytes" in values:
+                note_helper(int(values["peak_bytes"]))
+            else:
+                progress.update(float(values.get("fraction", 0.0)), str(values.get("message", "")))
+    finally:
+        kill_group(process)
+        _running.discard(process)
+        for reader in readers:
+            reader.join(1.0)
+    code = process.returncode
+    if failure:
+        raise DatasetError(str(failure["error"]), str(failure.get("hint", "")))
+    if code != 0:
+        reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
+        raise WorkerError(f"{module} {reason}: {' | '.join(last_words)[-500:]}", "See the log.")
+
+
+def _drain(stream: IO[bytes], name: str, lines: queue.Queue[tuple[str, str]]) -> None:
+    for raw in stream:
+        lines.put((name, raw.decode(errors="replace")))
+
+
+def _parse(line: str) -> dict[str, Any] | None:
+    try:
+        values = json.loads(line)
+    except ValueError:
+        return None
+    return values if isinstance(values, dict) else None

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The pinned packages of ``requirements-worker.txt``."""
+
+from __future__ import annotations
+
+import operator
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import UsageError
+
+FILE_NAME = "requirements-worker.txt"
+_LINE = re.compile(r"^([A-Za-z0-9][\w.-]*)[^\S\n]*([^#;\n]*)", re.MULTILINE)
+_COMPARE = {
+    "==": operator.eq, "!=": operator.ne, ">=": operator.ge, "<=": operator.le,
+    ">": operator.gt, "<": operator.lt,
+}  # fmt: skip
+_PACKAGE_ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """One package and the versions of it that do."""
+
+    name: str
+    versions: str
+    """Such as ``==2.13.0`` or ``>=1.26,<3``; empty for any."""
+
+    def allows(self, version: str) -> bool:
+        """Tell whether an installed version does; a local part (``+cpu``) does not count."""
+        clauses = re.findall(r"([<>=!]=|[<>])([^,]+)", self.versions)
+        return all(_COMPARE[sign](_numbers(version), _numbers(wanted)) for sign, wanted in clauses)
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """Return the numbers of a version without zeros at its end: 2.13.0 is 2.13."""
+    text = re.sub(r"(\.0+)+$", "", re.split(r"[+a-zA-Z]", version)[0])
+    return tuple(int(n) for n in re.findall(r"\d+", text))
+
+
+def requirements_file() -> Path:
+    """Return the add-on's list: beside the package's files in the zip, or in the repository.
+
+    Raises
+    ------
+    UsageError
+        It is missing.
+    """
+    for folder in (_PACKAGE_ROOT, _PACKAGE_ROOT.parent):
+        if (folder / FILE_NAME).is_file():
+            return folder / FILE_NAME
+    raise UsageError(f"{FILE_NAME} is missing.", "Install the add-on's zip again.")
+
+
+def read_requirements(path: Path) -> list[Requirement]:
+    """Return the packages of a list; pip judges whether its lines are right.
+
+    Raises
+    ------
+    UsageError
+        It cannot be read or names no package.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise UsageError(
+            f"{path} cannot be read: {error.strerror}.", "Give another list."
+        ) from None
+    found = [Requirement(m[1], m[2].replace(" ", "")) for m in _LINE.finditer(text)]
+    if not found:
+        raise UsageError(f"{path} names no package.", "Give a list of packages.")
+    return found

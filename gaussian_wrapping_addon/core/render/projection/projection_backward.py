@@ -1,0 +1,393 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compiled analytic gradient of the projection, the reverse of ``projection_kernels.py``.
+
+With ``weight_k = 1 / scale_k^2`` everything the forward writes is built of
+
+    e_k = axis_k . w0,           h = sum_k axis_k e_k weight_k,     a0 = sum_k e_k^2 weight_k,
+    B = sum_k (r0, r1)_k (r0, r1)_k^T weight_k,
+    F = sum_k f_k f_k^T weight_i weight_j,   f_k = (r0 - u r2, r1 - v r2)_k,   (i, j) != k;
+
+the gradient is gathered on a0, h, B, F and (u, v, z) first, then on axes and log weights. Like the
+forward it works on blocks of Gaussians (``projection_math.py``).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ... import tolerances
+from ...kernels.compiled import inline, kernel, part
+from .harmonics_kernels import BASIS_COUNT, direction_gradient
+from .projection_activation import (
+    ACTIVATED_PLANES,
+    BASIS,
+    KEPT,
+    MEAN,
+    OPACITY,
+    ORIENTATION,
+    QUAT,
+    RAY,
+    SCALE,
+    SLOPE,
+    TANH,
+    TRANSPARENCY,
+    TURN,
+    activate_block,
+    load_raw,
+)
+from .projection_kernels import in_camera, load_camera_axes
+from .projection_math import BLOCK, QUEUE, block_scratch
+
+_QUATERNION_MIN_SQ = tolerances.QUATERNION_MIN_NORM**2
+_USED_COLUMNS = 23
+
+# Planes of the scratch array behind those of the activation: gradients on the columns of params, on
+# the basis functions, and on what is trained. The rotation's takes the rotation's place.
+_GRAD = ACTIVATED_PLANES * BLOCK
+_WEIGHT = _GRAD + _USED_COLUMNS * BLOCK
+_GRAD_MEAN = _WEIGHT + BASIS_COUNT * BLOCK
+_GRAD_SCALE = _GRAD_MEAN + 3 * BLOCK
+_GRAD_QUAT = _GRAD_SCALE + 3 * BLOCK
+_GRAD_ORIENTATION = _GRAD_QUAT + 4 * BLOCK
+_GRAD_LOGIT = _GRAD_ORIENTATION + 4 * BLOCK
+_PLANES = _GRAD_LOGIT // BLOCK + 1
+_WRITTEN_PLANES = _PLANES - _GRAD_MEAN // BLOCK
+
+_GRADIENT_MAX = 1e38
+"""Gradients beyond are not held: a third of float32's largest number, so that squared lengths and
+sums of a few views stay within float64 and float32."""
+_BASIS_MAX = 3.0  # no basis function is larger on the sphere
+
+
+@inline
+def _axis_gradient(
+    r: Any, e: Any, f0: Any, f1: Any, weight: Any, others: Any, spread: Any,
+    g_a0: Any, g_h: Any, g_b: Any, g_f: Any,
+) -> Any:  # fmt: skip
+    """Return one axis' gradients: on e, f0, f1, on its own r0 r1 r2 directly, on two log weights.
+
+    ``g_h`` (3), ``g_b`` and ``g_f`` (xx, xy, yy) are on h, B and F; ``spread`` is the gradient on
+    ``cov_zz`` times the axis' variance.
+    """
+    h_dot = g_h[0] * r[0] + g_h[1] * r[1] + g_h[2] * r[2]
+    scaled = weight * e
+    g_e = weight * h_dot + 2.0 * scaled * g_a0
+    b0, b1 = 2.0 * r[0] * g_b[0] + r[1] * g_b[1], r[0] * g_b[1] + 2.0 * r[1] * g_b[2]
+    k0, k1 = 2.0 * f0 * g_f[0] + f1 * g_f[1], f0 * g_f[1] + 2.0 * f1 * g_f[2]
+    along = r[2] * spread
+    # B and F are quadratic: half of position times slope is their share of the sum.
+    log_self = 2.0 * (r[2] * along - scaled * (h_dot + e * g_a0)) - weight * (r[0] * b0 + r[1] * b1)
+    log_others = -others * (f0 * k0 + f1 * k1)
+    return (
+        g_e, others * k0, others * k1,
+        scaled * g_h[0] + weight * b0, scaled * g_h[1] + weight * b1,
+        scaled * g_h[2] + 2.0 * along,
+        log_self, log_others,
+    )  # fmt: skip
+
+
+@part(fast=False, fused=True)
+def _shape_gradients(m: Any, camera: Any) -> None:
+    """From the gradients on columns 0-12 and 19-22 to those on mean, log scales and rotation."""
+    c = load_camera_axes(camera)
+    t0, t1, t2 = camera[9], camera[10], camera[11]
+    fx, fy = camera[15], camera[16]
+    ifx, ify = 1.0 / fx, 1.0 / fy
+    for lane in range(BLOCK):
+        x, y, z = in_camera(c, m[MEAN + lane], m[MEAN + BLOCK + lane], m[MEAN + 2 * BLOCK + lane])
+        x, y, z = x + t0, y + t1, z + t2
+        inverse_z = 1.0 / z
+        u, v = x * inverse_z, y * inverse_z
+        a = in_camera(c, m[TURN + lane], m[TURN + 3 * BLOCK + lane], m[TURN + 6 * BLOCK + lane])
+        b = in_camera(
+            c, m[TURN + BLOCK + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
+        )
+        d = in_camera(
+            c, m[TURN + 2 * BLOCK + lane], m[TURN + 5 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
+        )
+        var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
+        w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
+        others0, others1, others2 = w1 * w2, w2 * w0, w0 * w1
+        e0 = a[0] * u + a[1] * v + a[2]
+        e1 = b[0] * u + b[1] * v + b[2]
+        e2 = d[0] * u + d[1] * v + d[2]
+        ew0, ew1, ew2 = e0 * w0, e1 * w1, e2 * w2
+        a0 = e0 * ew0 + e1 * ew1 + e2 * ew2
+        hx = a[0] * ew0 + b[0] * ew1 + d[0] * ew2
+        hy = a[1] * ew0 + b[1] * ew1 + d[1] * ew2
+        hz = a[2] * ew0 + b[2] * ew1 + d[2] * ew2
+        p0, p1, p2 = a[0] * w0, b[0] * w1, d[0] * w2
+        bxx = a[0] * p0 + b[0] * p1 + d[0] * p2
+        bxy = a[1] * p0 + b[1] * p1 + d[1] * p2
+        byy = a[1] * a[1] * w0 + b[1] * b[1] * w1 + d[1] * d[1] * w2
+        fa0, fb0, fd0 = a[0] - u * a[2], b[0] - u * b[2], d[0] - u * d[2]
+        fa1, fb1, fd1 = a[1] - v * a[2], b[1] - v * b[2], d[1] - v * d[2]
+        p0, p1, p2 = fa0 * others0, fb0 * others1, fd0 * others2
+        fxx = fa0 * p0 + fb0 * p1 + fd0 * p2
+        fxy = fa1 * p0 + fb1 * p1 + fd1 * p2
+        fyy = fa1 * fa1 * others0 + fb1 * fb1 * others1 + fd1 * fd1 * others2
+        cov_zz = a[2] * a[2] * var0 + b[2] * b[2] * var1 + d[2] * d[2] * var2
+
+        # Gradient on the sums.
+        ia = 1.0 / a0
+        zz = z * z
+        scale_xx, scale_xy, scale_yy = ia * ifx * ifx, ia * ifx * ify, ia * ify * ify
+        g_fyy = m[_GRAD + 2 * BLOCK + lane] * zz * scale_xx
+        g_fxy = -2.0 * m[_GRAD + 3 * BLOCK + lane] * zz * scale_xy
+        g_fxx = m[_GRAD + 4 * BLOCK + lane] * zz * scale_yy
+        conic = g_fyy * fyy + g_fxy * fxy + g_fxx * fxx
+        g_z = m[_GRAD + 10 * BLOCK + lane] + 2.0 * conic * inverse_z
+        g_hx = m[_GRAD + 5 * BLOCK + lane] * ia * ifx
+        g_hy = m[_GRAD + 6 * BLOCK + lane] * ia * ify
+        g_bxx = m[_GRAD + 7 * BLOCK + lane] * scale_xx
+        g_bxy = 2.0 * m[_GRAD + 8 * BLOCK + lane] * scale_xy
+        g_byy = m[_GRAD + 9 * BLOCK + lane] * scale_yy
+        quotients = conic + g_hx * hx + g_hy * hy + g_bxx * bxx + g_bxy * bxy + g_byy * byy
+        g_a0 = m[_GRAD + 12 * BLOCK + lane] - quotients * ia
+        flip = 1.0 / math.sqrt(hx * hx + hy * hy + hz * hz)
+        nx, ny, nz = hx * flip, hy * flip, hz * flip
+        gx, gy, gz = in_camera(
+            c,
+            m[_GRAD + 19 * BLOCK + lane],
+            m[_GRAD + 20 * BLOCK + lane],
+            m[_GRAD + 21 * BLOCK + lane],
+        )
+        along = gx * nx + gy * ny + gz * nz
+        g_h = (
+            g_hx - (gx - along * nx) * flip,
+            g_hy - (gy - along * ny) * flip,
+            (along * nz - gz) * flip,
+        )
+        g_b, g_f = (g_bxx, g_bxy, g_byy), (g_fxx, g_fxy, g_fyy)
+        g_cov = 0.5 * m[_GRAD + 22 * BLOCK + lane] / math.sqrt(cov_zz)
+
+        # Down to axes, weights and the ray through the mean.
+        ga = _axis_gradient(a, e0, fa0, fa1, w0, others0, var0 * g_cov, g_a0, g_h, g_b, g_f)
+        gb = _axis_gradient(b, e1, fb0, fb1, w1, others1, var1 * g_cov, g_a0, g_h, g_b, g_f)
+        gd = _axis_gradient(d, e2, fd0, fd1, w2, others2, var2 * g_cov, g_a0, g_h, g_b, g_f)
+        g_u = m[_GRAD + lane] * fx + a[0] * ga[0] + b[0] * gb[0] + d[0] * gd[0]
+        g_u -= a[2] * ga[1] + b[2] * gb[1] + d[2] * gd[1]
+        g_v = m[_GRAD + BLOCK + lane] * fy + a[1] * ga[0] + b[1] * gb[0] + d[1] * gd[0]
+        g_v -= a[2] * ga[2] + b[2] * gb[2] + d[2] * gd[2]
+        m[_GRAD_SCALE + lane] = ga[6] + gb[7] + gd[7]
+        m[_GRAD_SCALE + BLOCK + lane] = gb[6] + ga[7] + gd[7]
+        m[_GRAD_SCALE + 2 * BLOCK + lane] = gd[6] + ga[7] + gb[7]
+        gx, gy = g_u * inverse_z, g_v * inverse_z
+        gz = g_z - gx * u - gy * v
+        m[_GRAD_MEAN + lane] = c[0] * gx + c[3] * gy + c[6] * gz
+        m[_GRAD_MEAN + BLOCK + lane] = c[1] * gx + c[4] * gy + c[7] * gz
+        m[_GRAD_MEAN + 2 * BLOCK + lane] = c[2] * gx + c[5] * gy + c[8] * gz
+        # The rotation's columns are the axes in the scene frame.
+        x, y = ga[3] + ga[1] + u * ga[0], ga[4] + ga[2] + v * ga[0]
+        z = ga[5] + ga[0] - u * ga[1] - v * ga[2]
+        m[TURN + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[TURN + 3 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[TURN + 6 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+        x, y = gb[3] + gb[1] + u * gb[0], gb[4] + gb[2] + v * gb[0]
+        z = gb[5] + gb[0] - u * gb[1] - v * gb[2]
+        m[TURN + BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[TURN + 4 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[TURN + 7 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+        x, y = gd[3] + gd[1] + u * gd[0], gd[4] + gd[2] + v * gd[0]
+        z = gd[5] + gd[0] - u * gd[1] - v * gd[2]
+        m[TURN + 2 * BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[TURN + 5 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[TURN + 8 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+
+
+@part(fast=False, fused=True)
+def _raw_gradients(m: Any) -> None:
+    """From the gradients on activated values to those on raw ones, and the viewing direction's."""
+    for lane in range(BLOCK):
+        w, x = m[QUAT + lane], m[QUAT + BLOCK + lane]
+        y, z = m[QUAT + 2 * BLOCK + lane], m[QUAT + 3 * BLOCK + lane]
+        square = w * w + x * x + y * y + z * z
+        degenerate = square <= _QUATERNION_MIN_SQ
+        inverse = 1.0 / math.sqrt(square)
+        inverse = 0.0 if degenerate else inverse
+        w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+        g00, g11, g22 = m[TURN + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
+        g01, g10 = m[TURN + BLOCK + lane], m[TURN + 3 * BLOCK + lane]
+        g02, g20 = m[TURN + 2 * BLOCK + lane], m[TURN + 6 * BLOCK + lane]
+        g12, g21 = m[TURN + 5 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
+        skew_x, skew_y, skew_z = g21 - g12, g02 - g20, g10 - g01
+        sum_xy, sum_xz, sum_yz = g01 + g10, g02 + g20, g12 + g21
+        gw = x * skew_x + y * skew_y + z * skew_z
+        gx = w * skew_x + y * sum_xy + z * sum_xz - 2.0 * x * (g11 + g22)
+        gy = w * skew_y + x * sum_xy + z * sum_yz - 2.0 * y * (g00 + g22)
+        gz = w * skew_z + x * sum_xz + y * sum_yz - 2.0 * z * (g00 + g11)
+        along = gw * w + gx * x + gy * y + gz * z
+        inverse = 2.0 * inverse
+        m[_GRAD_QUAT + lane] = (gw - along * w) * inverse
+        m[_GRAD_QUAT + BLOCK + lane] = (gx - along * x) * inverse
+        m[_GRAD_QUAT + 2 * BLOCK + lane] = (gy - along * y) * inverse
+        m[_GRAD_QUAT + 3 * BLOCK + lane] = (gz - along * z) * inverse
+    for lane in range(BLOCK):
+        # d(effective log scale) = kept d(log scale); the filter also dims the opacity.
+        g = m[_GRAD + 11 * BLOCK + lane] * m[OPACITY + lane]
+        m[_GRAD_LOGIT + lane] = g * m[TRANSPARENCY + lane]
+        k0, k1, k2 = m[KEPT + lane], m[KEPT + BLOCK + lane], m[KEPT + 2 * BLOCK + lane]
+        m[_GRAD_SCALE + lane] = k0 * m[_GRAD_SCALE + lane] + (1.0 - k0) * g
+        m[_GRAD_SCALE + BLOCK + lane] = k1 * m[_GRAD_SCALE + BLOCK + lane] + (1.0 - k1) * g
+        m[_GRAD_SCALE + 2 * BLOCK + lane] = k2 * m[_GRAD_SCALE + 2 * BLOCK + lane] + (1.0 - k2) * g
+        # Learned normal tanh(s) d / |d|.
+        n0, n1 = m[ORIENTATION + lane], m[ORIENTATION + BLOCK + lane]
+        n2 = m[ORIENTATION + 2 * BLOCK + lane]
+        g0, g1 = m[_GRAD + 16 * BLOCK + lane], m[_GRAD + 17 * BLOCK + lane]
+        g2 = m[_GRAD + 18 * BLOCK + lane]
+        along = g0 * n0 + g1 * n1 + g2 * n2
+        inverse = m[TANH + lane] * m[ORIENTATION + 3 * BLOCK + lane]
+        m[_GRAD_ORIENTATION + lane] = (g0 - along * n0) * inverse
+        m[_GRAD_ORIENTATION + BLOCK + lane] = (g1 - along * n1) * inverse
+        m[_GRAD_ORIENTATION + 2 * BLOCK + lane] = (g2 - along * n2) * inverse
+        m[_GRAD_ORIENTATION + 3 * BLOCK + lane] = m[SLOPE + lane] * along
+    for lane in range(BLOCK):
+        d0, d1 = m[RAY + lane], m[RAY + BLOCK + lane]
+        d2, inverse = m[RAY + 2 * BLOCK + lane], m[RAY + 3 * BLOCK + lane]
+        g0, g1, g2 = direction_gradient(m, _WEIGHT, lane, d0, d1, d2)
+        along = g0 * d0 + g1 * d1 + g2 * d2
+        m[_GRAD_MEAN + lane] += (g0 - along * d0) * inverse
+        m[_GRAD_MEAN + BLOCK + lane] += (g1 - along * d1) * inverse
+        m[_GRAD_MEAN + 2 * BLOCK + lane] += (g2 - along * d2) * inverse
+
+
+@part(fast=False, fused=True)
+def _drop_overflows(m: Any) -> None:
+    """Set what is written of a Gaussian to 0 where float32 cannot hold all of it."""
+    for lane in range(BLOCK):
+        # NaN and infinity survive a sum of sizes.
+        red, green = m[_GRAD + 13 * BLOCK + lane], m[_GRAD + 14 * BLOCK + lane]
+        blue = m[_GRAD + 15 * BLOCK + lane]
+        size = _BASIS_MAX * (abs(red) + abs(green) + abs(blue))
+        for plane in range(_WRITTEN_PLANES):
+            size += abs(m[_GRAD_MEAN + plane * BLOCK + lane])
+        held = size < _GRADIENT_MAX
+        for plane in range(_WRITTEN_PLANES):
+            at = _GRAD_MEAN + plane * BLOCK + lane
+            m[at] = m[at] if held else 0.0
+        m[_GRAD + 13 * BLOCK + lane] = red if held else 0.0
+        m[_GRAD + 14 * BLOCK + lane] = green if held else 0.0
+        m[_GRAD + 15 * BLOCK + lane] = blue if held else 0.0
+
+
+@kernel(fast=False, fused=True)
+def backward_range(
+    begin: int,
+    end: int,
+    ids: np.ndarray,
+    compact: bool,
+    means: np.ndarray,
+    log_scales: np.ndarray,
+    quats: np.ndarray,
+    opacity_logits: np.ndarray,
+    sh: np.ndarray,
+    orientation: np.ndarray,
+    filter_3d: np.ndarray,
+    degree: int,
+    camera: np.ndarray,
+    params: np.ndarray,
+    visible: np.ndarray,
+    grad_params: np.ndarray,
+    grad_means: np.ndarray,
+    grad_log_scales: np.ndarray,
+    grad_quats: np.ndarray,
+    grad_opacity_logits: np.ndarray,
+    grad_sh: np.ndarray,
+    grad_orientation: np.ndarray,
+) -> None:
+    """Write the gradients of the Gaussians ``begin .. end``, or of ``ids[begin .. end]``.
+
+    Those that are not visible, or whose gradient float32 cannot hold, have none. With ``compact``
+    row k of the ``grad_`` arrays is overwritten with the gradient of ``ids[k]``; without, ``ids``
+    is not read and the gradient of Gaussian i is added to row i.
+    """
+    m = block_scratch(_PLANES)
+    m[_WEIGHT : _WEIGHT + BASIS_COUNT * BLOCK] = 0.0
+    queue = np.empty(QUEUE + BLOCK, np.int64)
+    coefficients = (degree + 1) * (degree + 1)
+    at = begin
+    while at < end:
+        count = 0
+        while at < end and count < QUEUE:
+            i = np.int64(ids[at]) if compact else np.int64(at)
+            if visible[i]:
+                queue[count] = at
+                count += 1
+            elif compact:
+                grad_means[at] = 0.0
+                grad_log_scales[at] = 0.0
+                grad_quats[at] = 0.0
+                grad_opacity_logits[at] = 0.0
+                grad_sh[at] = 0.0
+                grad_orientation[at] = 0.0
+            at += 1
+        for pad in range(count, (count + BLOCK - 1) // BLOCK * BLOCK):
+            queue[pad] = queue[count - 1]
+        for first in range(0, count, BLOCK):
+            for lane in range(BLOCK):
+                row = queue[first + lane]
+                i = np.int64(ids[row]) if compact else row
+                load_raw(
+                    m, lane, i, means, log_scales, quats, opacity_logits, orientation, filter_3d
+                )
+                for column in range(_USED_COLUMNS):
+                    m[_GRAD + column * BLOCK + lane] = grad_params[i, column]
+            activate_block(m, camera)
+            _shape_gradients(m, camera)
+            for lane in range(min(BLOCK, count - first)):
+                row = queue[first + lane]
+                i = np.int64(ids[row]) if compact else row
+                # A colour clamped at 0 does not move.
+                red = m[_GRAD + 13 * BLOCK + lane] if params[i, 13] > 0.0 else 0.0
+                green = m[_GRAD + 14 * BLOCK + lane] if params[i, 14] > 0.0 else 0.0
+                blue = m[_GRAD + 15 * BLOCK + lane] if params[i, 15] > 0.0 else 0.0
+                for k in range(coefficients):
+                    m[_WEIGHT + k * BLOCK + lane] = (
+                        red * np.float64(sh[i, k, 0])
+                        + green * np.float64(sh[i, k, 1])
+                        + blue * np.float64(sh[i, k, 2])
+                    )
+                m[_GRAD + 13 * BLOCK + lane] = red
+                m[_GRAD + 14 * BLOCK + lane] = green
+                m[_GRAD + 15 * BLOCK + lane] = blue
+            _raw_gradients(m)
+            _drop_overflows(m)
+            for lane in range(min(BLOCK, count - first)):
+                row = queue[first + lane]
+                red, green = m[_GRAD + 13 * BLOCK + lane], m[_GRAD + 14 * BLOCK + lane]
+                blue = m[_GRAD + 15 * BLOCK + lane]
+                if compact:
+                    for k in range(coefficients):
+                        value = m[BASIS + k * BLOCK + lane]
+                        grad_sh[row, k, 0] = red * value
+                        grad_sh[row, k, 1] = green * value
+                        grad_sh[row, k, 2] = blue * value
+                    for k in range(coefficients, sh.shape[1]):
+                        grad_sh[row, k, 0] = 0.0
+                        grad_sh[row, k, 1] = 0.0
+                        grad_sh[row, k, 2] = 0.0
+                else:
+                    for k in range(coefficients):
+                        value = m[BASIS + k * BLOCK + lane]
+                        grad_sh[row, k, 0] += red * value
+                        grad_sh[row, k, 1] += green * value
+                        grad_sh[row, k, 2] += blue * value
+                if compact:
+                    grad_opacity_logits[row] = m[_GRAD_LOGIT + lane]
+                    for axis in range(3):
+                        grad_means[row, axis] = m[_GRAD_MEAN + axis * BLOCK + lane]
+                        grad_log_scales[row, axis] = m[_GRAD_SCALE + axis * BLOCK + lane]
+                    for axis in range(4):
+                        grad_quats[row, axis] = m[_GRAD_QUAT + axis * BLOCK + lane]
+                        grad_orientation[row, axis] = m[_GRAD_ORIENTATION + axis * BLOCK + lane]
+                else:
+                    grad_opacity_logits[row] += m[_GRAD_LOGIT + lane]
+                    for axis in range(3):
+                        grad_means[row, axis] += m[_GRAD_MEAN + axis * BLOCK + lane]
+                        grad_log_scales[row, axis] += m[_GRAD_SCALE + axis * BLOCK + lane]
+                    for axis in range(4):
+                        grad_quats[row, axis] += m[_GRAD_QUAT + axis * BLOCK + lane]
+                        grad_orientation[row, axis] += m[_GRAD_ORIENTATION + axis * BLOCK + lane]

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compiled gradients of ``log T`` at depths and positions: per pair of tile and Gaussian, summed.
+
+A depth's gradient is one of these over the slope of ``log T`` (docs/method.md, section 2.5).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...kernels.compiled import inline, kernel
+from ..simd.raster_math import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    DENOMINATOR_MIN,
+    HALF,
+    ONE,
+    TWO,
+    ZERO,
+    exp_short,
+    exp_wide,
+)
+from .query_spans import (
+    A0,
+    GEOMETRY,
+    OPACITY,
+    PX,
+    PY,
+    QA,
+    QB,
+    QC,
+    SPAN,
+    TILE_COLUMNS,
+    R,
+    S,
+    T,
+    U,
+    V,
+    Z,
+    fill_cell,
+    fill_tile,
+    longest_list,
+)
+
+# Columns of a span behind the Gaussians': the gradients on them.
+_G = GEOMETRY * SPAN
+_COLUMNS = 2 * GEOMETRY
+_INDEX = np.arange(SPAN, dtype=np.float32)
+
+
+@inline
+def _pull_span(span: Any, x: Any, y: Any, t: Any, weight: Any, stop: Any) -> Any:
+    """Add the gradient of ``weight log T(t)`` on a span; return that on the position."""
+    sum_x, sum_y = ZERO, ZERO
+    for j in range(SPAN):
+        qa, qb, qc = span[QA + j], span[QB + j], span[QC + j]
+        px, py = span[PX + j], span[PY + j]
+        r, s, v = span[R + j], span[S + j], span[T + j]
+        dx = x - span[U + j]
+        dy = y - span[V + j]
+        shift = dx * px + dy * py
+        num = max((dx * qa + dy * qb) * dx + dy * dy * qc, ZERO)
+        den = dx * dx * r + dx * dy * s + dy * dy * v
+        den = max(den + TWO * shift + ONE, DENOMINATOR_MIN)
+        inverse = ONE / den
+        distance = num * inverse
+        raw = exp_short(HALF * distance) * span[OPACITY + j]
+        contributes = (raw >= ALPHA_MIN) & (_INDEX[j] < stop)
+        peak = (shift + ONE) * inverse * span[Z + j]
+        ahead = max(peak - t, ZERO)
+        sharpness = span[A0 + j] * den
+        density = raw * exp_wide(HALF * sharpness * ahead * ahead)
+        free = contributes & (density < ALPHA_MAX)
+        density = density if free else ZERO
+        g_log = -weight * density / (ONE - density)
+        g_distance = -HALF * g_log
+        g_peak = -g_log * sharpness * ahead
+        g_sharpness = g_distance * ahead * ahead
+        g_num = g_distance * inverse
+        g_den = span[A0 + j] * g_sharpness - (g_num * distance + g_peak * peak * inverse)
+        g_shift = g_peak * inverse * span[Z + j] + TWO * g_den
+        g_x = g_num * (TWO * qa * dx + qb * dy) + g_den * (TWO * r * dx + s * dy) + g_shift * px
+        g_y = g_num * (TWO * qc * dy + qb * dx) + g_den * (TWO * v * dy + s * dx) + g_shift * py
+        sum_x += g_x
+        sum_y += g_y
+        span[_G + U + j] -= g_x
+        span[_G + V + j] -= g_y
+        span[_G + QA + j] += g_num * dx * dx
+        span[_G + QB + j] += g_num * dx * dy
+        span[_G + QC + j] += g_num * dy * dy
+        span[_G + PX + j] += g_shift * dx
+        span[_G + PY + j] += g_shift * dy
+        span[_G + R + j] += g_den * dx * dx
+        span[_G + S + j] += g_den * dx * dy
+        span[_G + T + j] += g_den * dy * dy
+        span[_G + Z + j] += g_peak * peak
+        span[_G + OPACITY + j] += g_log
+        span[_G + A0 + j] += g_sharpness * den
+    return sum_x, sum_y
+
+
+@kernel(fast=True)
+def pull_range(
+    first_tile: int,
+    end_tile: int,
+    params: np.ndarray,
+    boxes: np.ndarray,
+    skews: np.ndarray,
+    start: np.ndarray,
+    gaussian_ids: np.ndarray,
+    pair_slots: np.ndarray,
+    tiles_x: int,
+    shift: int,
+    cell_start: np.ndarray,
+    places: np.ndarray,
+    depths: np.ndarray,
+    weights: np.ndarray,
+    stops: np.ndarray,
+    pair_grads: np.ndarray,
+    grad_places: np.ndarray,
+) -> None:
+    """Write the gradient of ``sum weights * log T(depths)`` for the positions of tiles.
+
+    Parameters
+    ----------
+    depths, weights : (k,) float32
+    stops : (k,) int32
+        As :func:`~.depth_query_kernels.query_kernel` wrote them.
+    pair_grads : (pairs, 13) float32
+        Zero; each pair adds up at its slot, cell after cell.
+    grad_places : (k, 2) float32
+    """
+    longest = longest_list(first_tile, end_tile, start, shift, cell_start)
+    room = (longest + SPAN - 1) // SPAN
+    tile_spans = np.empty((room, TILE_COLUMNS * SPAN), np.float32)
+    spans = np.empty((room, _COLUMNS * SPAN), np.float32)
+    fronts = np.empty(room + 1, np.float32)
+    members = np.empty(longest, np.int64)
+    filled = -1
+    for cell in range(first_tile << (2 * shift), end_tile << (2 * shift)):
+        idle = True
+        for p in range(cell_start[cell], cell_start[cell + 1]):
+            grad_places[p, 0] = ZERO
+            grad_places[p, 1] = ZERO
+            idle &= weights[p] == ZERO
+        if idle:
+            continue
+        tile = cell >> (2 * shift)
+        if tile != filled:
+            fill_tile(tile, tiles_x, params, boxes, skews, start, gaussian_ids, tile_spans)
+            filled = tile
+        total = fill_cell(
+            _COLUMNS, cell & ((1 << (2 * shift)) - 1), shift,
+            start[tile + 1] - start[tile], tile_spans, spans, fronts, members,
+        )  # fmt: skip
+        for at in range((total + SPAN - 1) // SPAN):
+            spans[at, _G:] = ZERO
+        reached = 0
+        for p in range(cell_start[cell], cell_start[cell + 1]):
+            if weights[p] == ZERO:
+                continue
+            x, y, t = places[p, 0], places[p, 1], depths[p]
+            sum_x, sum_y = ZERO, ZERO
+            for at in range((total + SPAN - 1) // SPAN):
+                if fronts[at] >= t or at * SPAN >= stops[p]:
+                    break
+                stop = np.float32(stops[p] - at * SPAN)
+                reached = max(reached, at + 1)
+                g_x, g_y = _pull_span(spans[at], x, y, t, weights[p], stop)
+                sum_x += g_x
+                sum_y += g_y
+            grad_places[p, 0] = sum_x
+            grad_places[p, 1] = sum_y
+        for g in range(min(total, reached * SPAN)):
+            out = pair_grads[pair_slots[start[tile] + members[g]]]
+            span = spans[g // SPAN]
+            lane = g % SPAN
+            for column in range(10):
+                out[column] += span[_G + column * SPAN + lane]
+            out[10] += span[_G + Z + lane] / span[Z + lane]
+            out[11] += span[_G + OPACITY + lane] / span[OPACITY + lane]
+            out[12] += span[_G + A0 + lane]
+
+
+@kernel(fast=False)
+def add_pair_gradients(
+    first: int, end: int, pair_grads: np.ndarray, pair_offsets: np.ndarray, grad_params: np.ndarray
+) -> None:
+    """Add the pairs of the Gaussians ``first .. end``, in the order of their slots."""
+    total = np.zeros(GEOMETRY, np.float32)
+    for i in range(first, end):
+        if pair_offsets[i] == pair_offsets[i + 1]:
+            continue
+        total[:] = ZERO
+        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
+            for column in range(GEOMETRY):
+                total[column] += pair_grads[slot, column]
+        for column in range(GEOMETRY):
+            grad_params[i, column] += total[column]

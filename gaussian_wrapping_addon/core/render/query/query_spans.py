@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The Gaussians that reach a cell of a tile, laid out so that loops over them are vectors.
+
+Vectors run over the Gaussians of a cell, not over positions, so that one position costs no more
+than one of many. The Gaussians that reach a cell are laid out in *spans* of 32: 32 values of one
+column after those of another, all of a span inside one array at constant offsets, which is what
+lets LLVM vectorise.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ...kernels.compiled import inline, part
+from ..simd.raster_math import FAR, FRONT_SIGMAS, ONE, PREFETCH_AHEAD, ZERO
+from ..simd.vector_runs import lowest_bit, positive_run, prefetch_row
+from ..tiling.area_lists import PIXEL_MARGIN, SHARE_MARGIN, TILE
+
+GEOMETRY = 13
+"""Leading columns of params that a ray's transmittance depends on."""
+
+SPAN = 32
+RUN = 16
+"""Values of a span that are tested at once."""
+# Columns of a span: the Gaussians; kernels add columns of their own behind these.
+U, V, QA, QB, QC = 0, SPAN, 2 * SPAN, 3 * SPAN, 4 * SPAN
+PX, PY, R, S, T = 5 * SPAN, 6 * SPAN, 7 * SPAN, 8 * SPAN, 9 * SPAN
+Z, OPACITY, A0 = 10 * SPAN, 11 * SPAN, 12 * SPAN
+# Columns of a span of a tile: the Gaussians, where they begin in depth, and their ellipses.
+_FRONT, _CENTER_X, _CENTER_Y, _SKEW = 13 * SPAN, 14 * SPAN, 15 * SPAN, 16 * SPAN
+_EXTREME, _INVERSE, _ACROSS, _MARGIN = 17 * SPAN, 18 * SPAN, 19 * SPAN, 20 * SPAN
+_TOUCHED = 21 * SPAN
+TILE_COLUMNS = 22
+_FLOAT_MARGIN = np.float32(4e-6)
+"""Several roundings of a float32, in shares of what is rounded."""
+
+
+@part(fast=False)
+def fill_tile(
+    tile: int,
+    tiles_x: int,
+    params: np.ndarray,
+    boxes: np.ndarray,
+    skews: np.ndarray,
+    start: np.ndarray,
+    gaussian_ids: np.ndarray,
+    spans: np.ndarray,
+) -> None:
+    """Lay out the Gaussians of a tile and their ellipses in ``spans (s, 22 * 32) float32``."""
+    left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
+    count = start[tile + 1] - start[tile]
+    for k in range(count):
+        ahead = start[tile] + min(k + PREFETCH_AHEAD, count - 1)
+        prefetch_row(params, np.int64(gaussian_ids[ahead]))
+        i = gaussian_ids[start[tile] + k]
+        span = spans[k // SPAN]
+        lane = k % SPAN
+        for column in range(GEOMETRY):
+            span[column * SPAN + lane] = params[i, column]
+        span[_FRONT + lane] = params[i, 10] - FRONT_SIGMAS * params[i, 22]
+        half_x = 0.5 * (np.float64(boxes[i, 2]) - np.float64(boxes[i, 0]))
+        half_y = 0.5 * (np.float64(boxes[i, 3]) - np.float64(boxes[i, 1]))
+        skew = np.float64(skews[i])
+        if math.isinf(skew) or not (half_x > 0.0 and half_y > 0.0):
+            # No ellipse that could rule a cell out.
+            span[_CENTER_X + lane] = span[_CENTER_Y + lane] = span[_SKEW + lane] = ZERO
+            span[_EXTREME + lane] = span[_INVERSE + lane] = span[_MARGIN + lane] = ZERO
+            span[_ACROSS + lane] = FAR
+            continue
+        center_x: Any = 0.5 * (np.float64(boxes[i, 2]) + np.float64(boxes[i, 0])) - left
+        across: Any = max(half_x * half_x * (1.0 + SHARE_MARGIN) - skew * skew, 0.0)
+        span[_CENTER_X + lane] = center_x
+        span[_CENTER_Y + lane] = 0.5 * (np.float64(boxes[i, 3]) + np.float64(boxes[i, 1])) - top
+        span[_SKEW + lane] = skew
+        span[_EXTREME + lane] = skew / half_x
+        span[_INVERSE + lane] = 1.0 / half_y
+        span[_ACROSS + lane] = math.sqrt(across)
+        span[_MARGIN + lane] = PIXEL_MARGIN + _FLOAT_MARGIN * (half_x + abs(center_x))
+    for k in range(count, (count + SPAN - 1) // SPAN * SPAN):
+        span = spans[k // SPAN]
+        for column in range(TILE_COLUMNS):
+            span[column * SPAN + k % SPAN] = ZERO
+        span[_FRONT + k % SPAN] = FAR
+        span[_CENTER_X + k % SPAN] = -FAR
+
+
+@inline
+def _touch(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
+    """Mark by 1 the ellipses of a span that reach a rectangle, see ``area_lists.strip_span``."""
+    for j in range(SPAN):
+        inverse, center_y = span[_INVERSE + j], span[_CENTER_Y + j]
+        first = max((y0 - center_y) * inverse - _FLOAT_MARGIN, -ONE)
+        last = min((y1 - center_y) * inverse + _FLOAT_MARGIN, ONE)
+        extreme, skew, across = span[_EXTREME + j], span[_SKEW + j], span[_ACROSS + j]
+        t = min(max(extreme, first), last)
+        right = skew * t + across * math.sqrt(max(ONE - t * t, ZERO))
+        t = min(max(-extreme, first), last)
+        left = skew * t - across * math.sqrt(max(ONE - t * t, ZERO))
+        center_x, margin = span[_CENTER_X + j], span[_MARGIN + j]
+        touched = (first <= last) & (center_x + right + margin >= x0)
+        touched = touched & (center_x + left - margin <= x1)
+        span[_TOUCHED + j] = ONE if touched else ZERO
+
+
+@part(fast=True)
+def fill_cell(
+    columns: int,
+    part: int,
+    shift: int,
+    count: int,
+    tile_spans: np.ndarray,
+    spans: np.ndarray,
+    fronts: np.ndarray,
+    members: np.ndarray,
+) -> int:
+    """Lay out those Gaussians of a tile that reach one of its cells; return their number.
+
+    Parameters
+    ----------
+    columns : int
+        Columns of ``spans``.
+    part : int
+        Number of the cell within its tile.
+    count : int
+        Gaussians of the tile.
+    tile_spans : (t, 22 * 32) float32
+        From :func:`fill_tile`.
+    spans : (s, columns * 32) float32
+        The last span is filled up with Gaussians of no opacity.
+    fronts : (s + 1,) float32
+        Receives the z-depth before which no Gaussian of this span or a later one has a density
+        worth counting.
+    members : (g,) int64
+        Receives the place of each Gaussian in the tile's list.
+    """
+    cell_px = TILE >> shift
+    margin = np.float32(PIXEL_MARGIN)
+    x0 = np.float32((part & ((1 << shift) - 1)) * cell_px)
+    y0 = np.float32((part >> shift) * cell_px)
+    x1, y1 = x0 + np.float32(cell_px), y0 + np.float32(cell_px)
+    total: Any = 0
+    for at in range((count + SPAN - 1) // SPAN):
+        source = tile_spans[at]
+        if shift > 0:
+            _touch(source, x0, y0 - margin, x1, y1 + margin)
+        else:
+            for lane in range(SPAN):
+                source[_TOUCHED + lane] = ONE if at * SPAN + lane < count else ZERO
+        for run in range(0, SPAN, RUN):
+            hits = positive_run(RUN, source, _TOUCHED + run)
+            while hits != np.uint64(0):
+                j = run + np.int64(lowest_bit(hits))
+                hits &= hits - np.uint64(1)
+                target = spans[total // SPAN]
+                lane = total % SPAN
+                for column in range(GEOMETRY):
+                    target[column * SPAN + lane] = source[column * SPAN + j]
+                front, to = source[_FRONT + j], total // SPAN
+                fronts[to] = front if lane == 0 else min(fronts[to], front)
+                members[total] = at * SPAN + j
+                total += 1
+    last = (total + SPAN - 1) // SPAN
+    for k in range(total, last * SPAN):
+        for column in range(columns):
+            spans[last - 1, column * SPAN + k % SPAN] = ZERO
+    fronts[last] = FAR
+    for at in range(last - 1, -1, -1):
+        fronts[at] = min(fronts[at], fronts[at + 1])
+    return total
+
+
+@part(fast=False)
+def longest_list(
+    first_tile: int, end_tile: int, start: np.ndarray, shift: int, cell_start: np.ndarray
+) -> int:
+    """Return the length of the longest list of those tiles that hold positions."""
+    longest = 0
+    for tile in range(first_tile, end_tile):
+        if cell_start[tile << (2 * shift)] < cell_start[(tile + 1) << (2 * shift)]:
+            longest = max(longest, start[tile + 1] - start[tile])
+    return longest

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Transmittance along a ray past its contributors, and where it falls to 0.5.
+
+The contributors are three arrays, moved together: opacities before the cap of 0.99, z-depths of
+the peaks, sharpnesses 1 / sigma^2 along the ray. The crossing is solved by Newton steps on
+``log T`` inside a bracket (docs/method.md, section 2.4).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ... import tolerances
+from ...kernels.compiled import inline
+from ..simd.raster_math import ALPHA_MAX, HALF, ONE, TWO, WIDE_END, ZERO, exp_wide
+
+# Converged: a step so small beside the thinnest Gaussian's sigma along the ray that log T is its
+# Taylor series, to second order, to float32's precision ...
+_STEP_SIGMAS = np.float32(5e-4)
+# ... or a transmittance equal to 0.5 within its own rounding ...
+_LEVEL_MARGIN = np.float32(1.2e-7)
+# ... or a bracket of one rounding of the depth. A step below that rounding alone proves nothing:
+# a layer may be steep there and yet end before the level is reached.
+_BRACKET_SHARE = np.float32(1.25e-7)
+_LEAST_SHARE = np.float32(1.25e-7)
+"""Steps are at least this share of the depth, so that they can close the bracket."""
+_POLISH_SIGMAS = np.float32(3e-3)
+"""A last step is taken up to this length. A longer one would leave the place at which the slope is
+known, by which gradients at the stored depth are divided; where T is all but flat, its rounding
+would lead far astray."""
+_LEVEL_FAR, _FLAT = np.float32(0.05), np.float32(0.02)
+"""A layer thinner than a rounding of the depth: T jumps over 0.5 from where it is flat. Its
+gradient is lost; rather let it be too small than a thousand times too large."""
+_LEAST_SLOPE = np.float32(1e-12)
+"""Keeps a step finite; it leaves the bracket then."""
+# Halley's correction of a Newton step stays within these factors.
+_LEAST_BEND, _MOST_BEND = HALF, TWO
+_NEWTON_STEPS = 8
+"""From here on every second step is a bisection, which bounds the number of steps."""
+_MAX_STEPS = 80
+SLOPE_FLOOR = np.float32(tolerances.SLOPE_FLOOR)
+"""Floor of -d(log T)/dt in shares of the 1/sigma along the ray of the Gaussian at which the
+blending crosses 0.5 (docs/method.md, section 2.5)."""
+_THIRD, _FIFTH = np.float32(1.0 / 3.0), np.float32(0.2)
+# exp(-x / 2) is below 3e-7 beyond this x = sharpness d^2.
+NEGLIGIBLE = np.float32(30.0)
+TINY = np.float32(1e-30)
+
+
+@inline
+def evaluate_ray(capped: Any, count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
+    """Return T and -d(log T)/dt at depth t; ``capped``: what is capped at 0.99 has no slope."""
+    product, slope = ONE, ZERO
+    for c in range(count):
+        ahead = max(peaks[c] - t, ZERO)
+        pull = sharpnesses[c] * ahead
+        raw = alphas[c] * exp_wide(HALF * pull * ahead)
+        density = min(raw, ALPHA_MAX)
+        keep = ONE - density
+        product *= keep
+        steep = density * pull / keep
+        if capped:
+            steep = steep if raw < ALPHA_MAX else ZERO
+        slope += steep
+    return product, slope
+
+
+@inline
+def _log_twice(value: Any) -> Any:
+    """Return log(2 value), exactly near 0.5 and with the right sign and order elsewhere."""
+    y = (TWO * value - ONE) / (TWO * value + ONE)
+    square = y * y
+    return TWO * y * (ONE + square * (_THIRD + square * _FIFTH))
+
+
+@inline
+def _bend(count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
+    """Return T, the slope -d(log T)/dt and its growth with t, at depth t."""
+    product, slope, growth = ONE, ZERO, ZERO
+    for c in range(count):
+        ahead = max(peaks[c] - t, ZERO)
+        fall = HALF * sharpnesses[c] * ahead * ahead
+        density = min(alphas[c] * exp_wide(fall), ALPHA_MAX)
+        # 0 where nothing changes with t; far behind, the square below could overflow.
+        sharpness = sharpnesses[c] if ahead > ZERO and fall <= WIDE_END else ZERO
+        pull = sharpness * ahead
+        keep = ONE - density
+        product *= keep
+        odds = density / keep
+        slope += odds * pull
+        growth += odds * (pull * pull / keep - sharpness)
+    return product, slope, growth
+
+
+@inline
+def solve_ray(
+    count: Any, alphas: Any, peaks: Any, sharpnesses: Any, high: Any, guess: Any, sharpest: Any,
+    alone: Any,
+) -> Any:  # fmt: skip
+    """Return where T crosses 0.5 between 0 and ``high``, and -d(log T)/dt there, floored."""
+    t, low, found_slope = guess, ZERO, ZERO
+    for number in range(_MAX_STEPS):
+        product, slope, growth = _bend(count, t, alphas, peaks, sharpnesses)
+        excess = _log_twice(max(product, TINY))
+        if excess > ZERO:
+            low = t
+        else:
+            high = t
+        turns = ONE / max(slope, _LEAST_SLOPE)
+        newton = excess * turns
+        bend = min(max(ONE + HALF * newton * growth * turns, _LEAST_BEND), _MOST_BEND)
+        step = newton / bend
+        size = abs(step)
+        sigmas = size * sharpest
+        found_slope = slope
+        closed = abs(excess) <= _LEVEL_MARGIN or high - low <= _BRACKET_SHARE * high
+        if closed or sigmas < _STEP_SIGMAS:
+            # Rounding may put a step this small on the bracket's end.
+            if sigmas < _POLISH_SIGMAS:
+                moved = min(max(t + step, low), high)
+                found_slope = slope + growth * (moved - t)
+                t = moved
+            found_slope = max(found_slope, SLOPE_FLOOR * alone)
+            if abs(excess) > _LEVEL_FAR and slope < _FLAT * alone:
+                found_slope = TWO * alone
+            break
+        least = _LEAST_SHARE * t
+        moved = t + (step if size > least else (least if excess > ZERO else -least))
+        newton_next = moved > low and moved < high
+        newton_next = newton_next and (number < _NEWTON_STEPS or number % 2 == 0)
+        t = moved if newton_next else HALF * (low + high)
+    return t, max(found_slope, SLOPE_FLOOR * alone)

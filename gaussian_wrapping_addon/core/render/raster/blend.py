@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Blending the tiles of a view, forward and backward: the raster kernels over threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ...dataset.camera import Camera
+from ...kernels.huge_pages import empty_array
+from ...kernels.parallel import even_bounds, run_chunks
+from ..isosurface.isosurface_steps import LIST_VALUES
+from ..projection.projection import RawArrays, ScreenGaussians
+from ..simd.raster_math import ROW_VALUES, TILE, aligned_zeros
+from ..tiling.tiles import TileLists
+from ..types.options import RenderOptions
+from .raster_backward import BACKWARD_SCRATCH, backward_kernel, sum_pairs
+from .raster_forward import FORWARD_SCRATCH, forward_kernel
+from .visits import VISITS_ROOM
+
+_MOST_BLOCKS = 32
+"""Blocks of a tile where they have eight pixels."""
+
+
+def _take(pool: list[np.ndarray], count: int, make: Callable[[int], np.ndarray]) -> np.ndarray:
+    """Return an array of at least ``count`` values from a pool, or a new one with some to spare."""
+    try:
+        kept = pool.pop()
+    except IndexError:
+        return make(count * 5 // 4)
+    return kept if len(kept) >= count else make(count * 5 // 4)
+
+
+@dataclass
+class RenderBuffers:
+    """Large scratch arrays kept from call to call.
+
+    Taken and given back with the atomic ``list.pop`` and ``list.append``, so renderings in several
+    threads never share one.
+    """
+
+    scratch: list[np.ndarray] = field(default_factory=list)
+    lists: list[np.ndarray] = field(default_factory=list)
+    visits: list[np.ndarray] = field(default_factory=list)
+    pairs: list[np.ndarray] = field(default_factory=list)
+    renderers: list[Any] = field(default_factory=list)
+    """Idle :class:`~..view_renderer.ViewRenderer` with their memory."""
+
+    def reserve(self, threads: int, longest: int, *, depth: bool) -> None:
+        """Have memory for every thread, so that it is not a matter of timing who allocates it.
+
+        ``longest`` is the number of pairs of the fullest tile; only the depth needs lists.
+        """
+        spare = [
+            (self.scratch, self.take_scratch()),
+            (self.lists, self.take_lists(longest if depth else 0)),
+            (self.visits, self.take_visits(longest)),
+        ]
+        for pool, array in spare:
+            pool.append(array)
+            while len(pool) < threads:
+                pool.append(array.copy() if pool is self.visits else aligned_zeros(len(array)))
+
+    def take_scratch(self) -> np.ndarray:
+        """Return the state of one thread's tile, with any content."""
+        return _take(self.scratch, max(FORWARD_SCRATCH, BACKWARD_SCRATCH), aligned_zeros)
+
+    def take_lists(self, longest: int) -> np.ndarray:
+        """Return room for the list of a block of a tile of ``longest`` pairs, with any content."""
+        return _take(self.lists, longest * LIST_VALUES * TILE, aligned_zeros)
+
+    def take_visits(self, longest: int) -> np.ndarray:
+        """Return room for the pairs that reach each block of such a tile, with any content."""
+        count = _MOST_BLOCKS * (longest + VISITS_ROOM)
+        return _take(self.visits, count, lambda size: np.zeros(size, np.int32))
+
+    def take_pairs(self, count: int) -> np.ndarray:
+        """Return at least ``count`` rows of pair gradients with any content."""
+        try:
+            kept = self.pairs.pop()
+        except IndexError:
+            kept = np.zeros((0, ROW_VALUES), np.float32)
+        if len(kept) >= count:
+            return kept
+        return empty_array(count * 5 // 4 * ROW_VALUES, np.float32).reshape(-1, ROW_VALUES)
+
+
+@dataclass(frozen=True)
+class ScreenView:
+    """One view, or a part of its tiles, between projection and gradient."""
+
+    gaussians: RawArrays
+    camera: Camera
+    options: RenderOptions
+    screen: ScreenGaussians
+    lists: TileLists
+    lanes: int
+    masks: np.ndarray  # (pairs,) uint32: blocks of the tile that the ellipse reaches
+    bounds: np.ndarray  # tiles of about equal cost
+    threads: int
+
+    def arguments(self) -> tuple[np.ndarray | int, ...]:
+        """Return what the raster kernels read of a view, in their order."""
+        lists, camera = self.lists, self.camera
+        return (
+            self.screen.params, lists.start, lists.gaussian_ids, lists.pair_slots, self.masks,
+            lists.tiles_x, camera.width, camera.height,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Images:
+    """What the forward kernel writes, image layout, float32."""
+
+    color: np.ndarray  # (h, w, 3)
+    normal: np.ndarray  # (h, w, 3)
+    geometric: np.ndarray  # (h, w, 3)
+    alpha: np.ndarray  # (h, w)
+    depth: np.ndarray  # (h, w)
+    slope: np.ndarray  # (h, w) floored -d(log T)/dt at the depth; (0, 0) without depth
+    strongest: np.ndarray  # (h, w) int32; (0, 0) without statistics
+
+    @classmethod
+    def allocate(
+        cls,
+        camera: Camera,
+        options: RenderOptions,
+        take: Callable[[str, tuple[int, ...], Any], np.ndarray] | None = None,
+    ) -> Images:
+        """Return images of the camera's size, all 0.
+
+        With ``take(name, shape, dtype)`` they lie in the memory it returns, with any content where
+        :func:`blend` writes every pixel.
+        """
+        if take is None:
+
+            def take(name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+                return np.zeros(shape, dtype)
+
+        one = (camera.height, camera.width)
+        three = (*one, 3)
+        no_image = (0, 0)
+        images = cls(
+            color=take("color", three, np.float32),
+            normal=take("normal", three, np.float32),
+            geometric=take("geometric", three, np.float32),
+            alpha=take("alpha", one, np.float32),
+            depth=take("depth", one, np.float32),
+            slope=take("slope", one if options.depth else no_image, np.float32),
+            strongest=take("strongest", one if options.statistics else no_image, np.int32),
+        )
+        if not options.depth:
+            images.depth.fill(0.0)
+        return images
+
+    def arguments(self) -> tuple[np.ndarray, ...]:
+        """Return the images that the gradient reads too, in the raster kernels' order."""
+        return self.color, self.normal, self.geometric, self.alpha, self.depth, self.slope
+
+
+def blend(
+    view: ScreenView,
+    images: Images,
+    buffers: RenderBuffers,
+    pair_weights: np.ndarray | None = None,
+) -> np.ndarray:
+    """Blend the tiles of a view into ``images`` and solve their isosurface depth.
+
+    Parameters
+    ----------
+    pair_weights : (pairs, 2) float32, optional
+        Where the weights are written; by default a new array.
+
+    Returns
+    -------
+    (pairs, 2) float32
+        Sum and maximum of the blending weight of each pair, by slot; (0, 2) without statistics.
+    """
+    options, lists = view.options, view.lists
+    depth, weights = options.depth, options.statistics
+    if pair_weights is None:
+        pair_weights = np.zeros((len(lists.gaussian_ids) if weights else 0, 2), np.float32)
+    forward = forward_kernel(view.lanes, depth, weights)
+    background = np.asarray(options.background, np.float32)
+    limit = np.float32(options.depth_valid_transmittance)
+    longest = int(np.diff(lists.start).max(initial=0))
+    buffers.reserve(view.threads, longest, depth=depth)
+
+    def run(first: int, end: int) -> None:
+        scratch = buffers.take_scratch()
+        entries = buffers.take_lists(longest if depth else 0)
+        visits = buffers.take_visits(longest)
+        forward(
+            first,
+            end,
+            *view.arguments(),
+            background,
+            limit,
+            scratch,
+            entries,
+            visits,
+            *images.arguments(),
+            pair_weights,
+            images.strongest,
+        )
+        buffers.scratch.append(scratch)
+        buffers.lists.append(entries)
+        buffers.visits.append(visits)
+
+    run_chunks(run, view.bounds, view.threads)
+    return pair_weights
+
+
+def pair_gradients(
+    view: ScreenView,
+    images: Images,
+    grads: list[np.ndarray],
+    buffers: RenderBuffers,
+    pairs: np.ndarray,
+    *,
+    depth: bool,
+    absolute: bool,
+) -> None:
+    """Write the gradients of all pairs of a view's tiles at their slots of ``pairs (p, 24)``.
+
+    ``depth`` tells that the gradient of the depth is not all 0, ``absolute`` that the sums of
+    absolute values are wanted.
+    """
+    backward = backward_kernel(view.lanes, view.options.depth and depth, absolute)
+
+    def run(first: int, end: int) -> None:
+        scratch = buffers.take_scratch()
+        backward(
+            first,
+            end,
+            *view.arguments(),
+            *images.arguments(),
+            *grads,
+            scratch,
+            pairs,
+        )
+        buffers.scratch.append(scratch)
+
+    run_chunks(run, view.bounds, view.threads)
+
+
+def blend_backward(
+    view: ScreenView,
+    images: Images,
+    grads: list[np.ndarray],
+    buffers: RenderBuffers,
+    *,
+    absolute: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the gradient on params (n, 24), and its length on (u, v) plain and absolute (n,)."""
+    lists, count = view.lists, len(view.screen)
+    pairs = buffers.take_pairs(len(lists.gaussian_ids))
+    depth = bool(grads[4].any())
+    pair_gradients(view, images, grads, buffers, pairs, depth=depth, absolute=absolute)
+    grad_params = np.zeros((count, ROW_VALUES), np.float32)
+    grad_px = np.zeros(count, np.float32)
+    grad_abs_px = np.zeros(count, np.float32)
+
+    def combine(first: int, end: int) -> None:
+        sum_pairs(first, end, pairs, lists.pair_offsets, grad_params, grad_px, grad_abs_px)
+
+    run_chunks(combine, even_bounds(count, view.threads), view.threads)
+    buffers.pairs.append(pairs)
+    return grad_params, grad_px, grad_abs_px

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compiled sums of what the pairs of one band hold, added to the rows of the seen Gaussians."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...kernels.compiled import kernel
+from ..simd.raster_math import FLOAT32_MAX, ROW_VALUES, ZERO
+from .raster_backward import ABS_U, ABS_V
+
+
+@kernel(fast=False)
+def add_pair_gradients(
+    begin: int,
+    end: int,
+    ids: np.ndarray,
+    pairs: np.ndarray,
+    pair_offsets: np.ndarray,
+    fresh: bool,
+    grad_params: np.ndarray,
+) -> None:
+    """Add the pair gradients of the Gaussians ``ids[begin .. end]`` to ``grad_params (n, 24)``.
+
+    With ``fresh`` the rows start at 0, whatever they hold. The last two columns receive sums of
+    absolute values. Slots are added one after the other, so the order is that of the tiles.
+    """
+    total = np.zeros(ROW_VALUES, np.float32)
+    for k in range(begin, end):
+        i = ids[k]
+        if fresh:
+            total[:] = ZERO
+        else:
+            for column in range(ROW_VALUES):
+                total[column] = grad_params[i, column]
+        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
+            for column in range(ROW_VALUES):
+                total[column] += pairs[slot, column]
+        for column in range(ROW_VALUES):
+            grad_params[i, column] = total[column]
+
+
+@kernel(fast=False)
+def take_screen_gradients(
+    begin: int,
+    end: int,
+    ids: np.ndarray,
+    grad_params: np.ndarray,
+    grad_px: np.ndarray,
+    grad_abs_px: np.ndarray,
+) -> None:
+    """Write the lengths of the gradient on (u, v) and of its sum of absolute values.
+
+    The columns that held the absolute values become 0: params have none there. So does a row that
+    float32 could not hold.
+    """
+    for k in range(begin, end):
+        i = ids[k]
+        row = grad_params[i]
+        size = np.float64(0.0)
+        for column in range(ROW_VALUES):
+            size += abs(np.float64(row[column]))
+        if not size <= FLOAT32_MAX:
+            row[:] = ZERO
+        # In float64: squares of float32 overflow beyond 1e19.
+        u, v = np.float64(row[0]), np.float64(row[1])
+        grad_px[i] = math.sqrt(u * u + v * v)
+        u, v = np.float64(row[ABS_U]), np.float64(row[ABS_V])
+        grad_abs_px[i] = math.sqrt(u * u + v * v)
+        row[ABS_U] = row[ABS_V] = ZERO
+
+
+@kernel(fast=False)
+def add_pair_weights(
+    begin: int,
+    end: int,
+    ids: np.ndarray,
+    pair_weights: np.ndarray,
+    pair_offsets: np.ndarray,
+    weight_sum: np.ndarray,
+    weight_max: np.ndarray,
+) -> None:
+    """Combine the blending weights of the pairs of the Gaussians ``ids[begin .. end]``."""
+    for k in range(begin, end):
+        i = ids[k]
+        total, largest = weight_sum[i], weight_max[i]
+        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
+            total += pair_weights[slot, 0]
+            largest = max(largest, pair_weights[slot, 1])
+        weight_sum[i], weight_max[i] = total, largest
+
+
+@kernel(fast=False)
+def mark_seen(
+    begin: int,
+    end: int,
+    ids: np.ndarray,
+    boxes: np.ndarray,
+    visible: np.ndarray,
+    radii_px: np.ndarray,
+) -> None:
+    """Mark the Gaussians ``ids[begin .. end]``; write half of the longer side of their boxes."""
+    for k in range(begin, end):
+        i = ids[k]
+        visible[i] = True
+        width, height = boxes[i, 2] - boxes[i, 0], boxes[i, 3] - boxes[i, 1]
+        radii_px[i] = np.float32(0.5) * max(width, height)

@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Rows of a tile between its planes, ordered by blocks, and the images, ordered by pixels.
+
+A row of a tile is 16 pixels: in a plane four runs of four values, one a block; in an image of three
+channels 48 values, interleaved. Both are moved as vectors and reordered in registers. Rows that the
+image's edge cuts take the same path with masked loads and stores, so that their values are the
+same; masks are kept from whole rows because some processors are slow at them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils, errors, types
+from numba.extending import intrinsic
+
+from ...kernels.compiled import inline
+from ..simd.raster_math import (
+    BLOCK_COLUMNS,
+    BLOCK_WIDTH,
+    DEPTH,
+    F0,
+    SLOPE,
+    STRIDE,
+    TILE,
+    TRANSMITTANCE,
+)
+from ..simd.simd import Block, Vector
+from . import backward_block as gradient
+
+_CHANNELS = 3
+_WORD = ir.IntType(32)
+
+
+class _Rows:
+    """Moves rows of one tile; ``live`` is the number of columns in the image, None for all."""
+
+    def __init__(
+        self, lanes: int, context: Any, builder: Any, place: Any, at: Any, live: Any | None
+    ) -> None:
+        self.lanes, self.builder = lanes, builder
+        self.block, self.quad = Block(TILE, context, builder), Block(BLOCK_WIDTH, context, builder)
+        self.place, self.at = place, at
+        self._live = None if live is None else builder.trunc(live, _WORD)
+
+    def plane(self, m: Any, which: int) -> Vector:
+        """Return the row of one plane."""
+        a, b, c, d = (self.quad.load(m, place).value for place in self._places(which))
+        left, right = self._shuffle(a, b, range(8)), self._shuffle(c, d, range(8))
+        return Vector(self.block, self._shuffle(left, right, range(TILE)))
+
+    def set_plane(self, value: Vector, m: Any, which: int) -> None:
+        """Write the row of one plane."""
+        for column, place in enumerate(self._places(which)):
+            order = range(column * BLOCK_WIDTH, (column + 1) * BLOCK_WIDTH)
+            part = self._shuffle(value.value, value.value, order)
+            self.quad.store(Vector(self.quad, part), m, place)
+
+    def _places(self, which: int) -> list[Any]:
+        return [
+            self.block.offset(self.place, which * STRIDE + column * self.lanes)
+            for column in range(BLOCK_COLUMNS)
+        ]
+
+    def store_one(self, value: Vector, image: Any) -> None:
+        """Write the row of an image of one channel."""
+        self._store(value, image, self.at, 0, 1)
+
+    def load_one(self, image: Any) -> Vector:
+        """Return the row of an image of one channel, 0 outside of it."""
+        return self._load(image, self.at, 0, 1)
+
+    def store_three(self, channels: Sequence[Vector], image: Any) -> None:
+        """Write the row of an image of three channels."""
+        a, b, c = (channel.value for channel in channels)
+        first = self._first_value()
+        for part in range(_CHANNELS):
+            pixels = [divmod(part * TILE + k, _CHANNELS) for k in range(TILE)]
+            two = [pixel + TILE * (channel == 1) for pixel, channel in pixels]
+            three = [pixels[k][0] + TILE if pixels[k][1] == 2 else k for k in range(TILE)]
+            value = self._shuffle(self._shuffle(a, b, two), c, three)
+            self._store(Vector(self.block, value), image, first, part, _CHANNELS)
+
+    def load_three(self, image: Any) -> list[Vector]:
+        """Return the channels of the row of an image, 0 outside of it."""
+        first = self._first_value()
+        a, b, c = (self._load(image, first, part, _CHANNELS).value for part in range(_CHANNELS))
+        channels = []
+        for channel in range(_CHANNELS):
+            places = [divmod(k * _CHANNELS + channel, TILE) for k in range(TILE)]
+            two = [at + TILE * (part == 1) for part, at in places]
+            three = [places[k][1] + TILE if places[k][0] == 2 else k for k in range(TILE)]
+            value = self._shuffle(self._shuffle(a, b, two), c, three)
+            channels.append(Vector(self.block, value))
+        return channels
+
+    def inside(self, value: Vector) -> Vector:
+        """Return ``value`` in the image, 0 outside."""
+        if self._live is None:
+            return value
+        zeros = self.block.vector(0.0).value
+        return Vector(self.block, self.builder.select(self._mask(0, 1), value.value, zeros))
+
+    def _first_value(self) -> Any:
+        return self.builder.mul(self.at, self.block.index(_CHANNELS), flags=("nuw", "nsw"))
+
+    def _shuffle(self, a: Any, b: Any, order: Sequence[int]) -> Any:
+        places = [ir.Constant(_WORD, k) for k in order]
+        return self.builder.shuffle_vector(
+            a, b, ir.Constant(ir.VectorType(_WORD, len(places)), places)
+        )
+
+    def _mask(self, part: int, channels: int) -> Any:
+        """Return which of 16 values of a row lie in the image."""
+        words = ir.VectorType(_WORD, TILE)
+        values = self.builder.mul(self._live, ir.Constant(_WORD, channels))
+        one = self.builder.insert_element(
+            ir.Constant(words, ir.Undefined), values, ir.Constant(_WORD, 0)
+        )
+        end = self.builder.shuffle_vector(one, one, ir.Constant(words, None))
+        own = ir.Constant(words, [ir.Constant(_WORD, part * TILE + k) for k in range(TILE)])
+        return self.builder.icmp_signed("<", own, end)
+
+    def _masked(self, operation: str, result: Any, values: Sequence[Any]) -> Any:
+        kind = ir.FunctionType(result, [value.type for value in values])
+        name = f"llvm.masked.{operation}.v{TILE}f32.p0"
+        function = cgutils.get_or_insert_function(self.builder.module, kind, name)
+        return self.builder.call(function, values)
+
+    def _pointer(self, image: Any, first: Any, part: int) -> Any:
+        place = self.builder.gep(image, [self.block.offset(first, part * TILE)])
+        return self.builder.bitcast(place, self.block.kind.as_pointer())
+
+    def _store(self, value: Vector, image: Any, first: Any, part: int, channels: int) -> None:
+        pointer = self._pointer(image, first, part)
+        if self._live is None:
+            self.builder.store(value.value, pointer, align=4)
+            return
+        align = ir.Constant(_WORD, 4)
+        mask = self._mask(part, channels)
+        self._masked("store", ir.VoidType(), [value.value, pointer, align, mask])
+
+    def _load(self, image: Any, first: Any, part: int, channels: int) -> Vector:
+        pointer = self._pointer(image, first, part)
+        if self._live is None:
+            return Vector(self.block, self.builder.load(pointer, align=4))
+        align, zeros = ir.Constant(_WORD, 4), self.block.vector(0.0).value
+        mask = self._mask(part, channels)
+        values = [pointer, align, mask, zeros]
+        return Vector(self.block, self._masked("load", self.block.kind, values))
+
+
+def _require_contiguous(*arrays: Any) -> None:
+    for array in arrays:
+        if not isinstance(array, types.Array) or array.layout != "C":
+            raise errors.TypingError(f"Rows of tiles are moved in C-contiguous arrays, not {array}")
+
+
+def _images(block: Block, kinds: Any, values: Any) -> list[Any]:
+    """Return the pointers to the arrays of a tuple."""
+    arrays = cgutils.unpack_tuple(block.builder, values)
+    return [block.data(kind, array) for kind, array in zip(kinds, arrays, strict=True)]
+
+
+def _multiply_add(a: Vector, b: Vector, c: Vector) -> Vector:
+    """Return ``a b + c``, fused where the processor can; never reordered."""
+    return Vector(a.block, a.block.call("llvm.fmuladd", [a.value, b.value, c.value], flags=()))
+
+
+def _write_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
+    @intrinsic
+    def write(typingctx, m, place, live, background, images, at):  # type: ignore[no-untyped-def]
+        _require_contiguous(m, background, *images)
+
+        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            rows = _Rows(lanes, context, builder, args[1], args[5], None if whole else args[2])
+            block = rows.block
+            state, behind = block.data(sig.args[0], args[0]), block.data(sig.args[3], args[3])
+            *three, alpha, depth_image, slope = _images(block, sig.args[4], args[4])
+            through = rows.plane(state, TRANSMITTANCE)
+            for number, image in enumerate(three):
+                first = F0 + number * _CHANNELS
+                planes = [rows.plane(state, first + channel) for channel in range(_CHANNELS)]
+                if number == 0:
+                    colors = [block.scalar(behind, block.index(k)) for k in range(_CHANNELS)]
+                    planes = [
+                        plane + through * block.splat(color)
+                        for plane, color in zip(planes, colors, strict=True)
+                    ]
+                rows.store_three(planes, image)
+            rows.store_one(1.0 - through, alpha)
+            if depth:
+                rows.store_one(rows.plane(state, DEPTH), depth_image)
+                rows.store_one(rows.plane(state, SLOPE), slope)
+            return context.get_dummy_value()
+
+        index = types.intp
+        return types.void(m, index, index, background, images, index), generate
+
+    return write
+
+
+def _read_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
+    @intrinsic
+    def read(typingctx, m, place, live, images, grads, at):  # type: ignore[no-untyped-def]
+        _require_contiguous(m, *images, *grads)
+
+        def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            rows = _Rows(lanes, context, builder, args[1], args[5], None if whole else args[2])
+            block = rows.block
+            state = block.data(sig.args[0], args[0])
+            *three, alpha, depth_image, slope_image = _images(block, sig.args[3], args[3])
+            *g_three, g_alpha, g_depth = _images(block, sig.args[4], args[4])
+            # The colour holds the background, so its part of the final T is included.
+            grad = rows.load_one(g_alpha)
+            remaining = _multiply_add(grad, rows.load_one(alpha), -grad)
+            values = [rows.load_three(image) for image in three]
+            grads_of = [rows.load_three(image) for image in g_three]
+            for channel in range(_CHANNELS):
+                for number, pair in enumerate(zip(values, grads_of, strict=True)):
+                    which = gradient.G0 + number * _CHANNELS + channel
+                    value, grad = (channels[channel] for channels in pair)
+                    rows.set_plane(grad, state, which)
+                    remaining = _multiply_add(grad, value, remaining)
+            rows.set_plane(remaining, state, gradient.REMAINING)
+            rows.set_plane(rows.inside(block.vector(1.0)), state, gradient.TRANSMITTANCE)
+            if depth:
+                found, grad = rows.load_one(depth_image), rows.load_one(g_depth)
+                pulls = (found > 0.0) & ((grad < 0.0) | (grad > 0.0))
+                slope = rows.load_one(slope_image)
+                # Divided exactly: fast arithmetic would allow vectors an approximation, and numba
+                # makes every operation without a flag of its own fast.
+                pull = Vector(block, builder.fdiv(grad.value, slope.value, flags=("nsz",)))
+                rows.set_plane(pulls.choose(found, 0.0), state, gradient.DEPTH)
+                rows.set_plane(pulls.choose(pull, 0.0), state, gradient.PULL)
+            return context.get_dummy_value()
+
+        index = types.intp
+        return types.void(m, index, index, images, grads, index), generate
+
+    return read
+
+
+_write_whole_16, _write_cut_16 = (_write_intrinsic(16, False, whole) for whole in (True, False))
+_write_whole_8, _write_cut_8 = (_write_intrinsic(8, False, whole) for whole in (True, False))
+_depth_whole_16, _depth_cut_16 = (_write_intrinsic(16, True, whole) for whole in (True, False))
+_depth_whole_8, _depth_cut_8 = (_write_intrinsic(8, True, whole) for whole in (True, False))
+_read_whole_16, _read_cut_16 = (_read_intrinsic(16, False, whole) for whole in (True, False))
+_read_whole_8, _read_cut_8 = (_read_intrinsic(8, False, whole) for whole in (True, False))
+_pull_whole_16, _pull_cut_16 = (_read_intrinsic(16, True, whole) for whole in (True, False))
+_pull_whole_8, _pull_cut_8 = (_read_intrinsic(8, True, whole) for whole in (True, False))
+
+
+@inline
+def write_row(
+    lanes: Any, depth: Any, m: Any, place: Any, live: Any, background: Any, images: Any, at: Any
+) -> None:
+    """Write one row of a tile's forward planes to the images.
+
+    Parameters
+    ----------
+    lanes : int
+        8 or 16.
+    depth : bool
+        Also depth and slope.
+    m : (n,) float32
+        The tile's scratch.
+    place : int
+        Where the row begins in each plane.
+    live : int
+        Columns of the tile in the image.
+    background : (3,) float32
+    images : tuple
+        Colour, normal, geometric normal, alpha, depth, slope; C-contiguous.
+    at : int
+        Index of the row's first pixel in an image.
+    """
+    if lanes == 16:
+        if depth:
+            if live == TILE:
+                _depth_whole_16(m, place, live, background, images, at)
+            else:
+                _depth_cut_16(m, place, live, background, images, at)
+        else:
+            if live == TILE:
+                _write_whole_16(m, place, live, background, images, at)
+            else:
+                _write_cut_16(m, place, live, background, images, at)
+    else:
+        if depth:
+            if live == TILE:
+                _depth_whole_8(m, place, live, background, images, at)
+            else:
+                _depth_cut_8(m, place, live, background, images, at)
+        else:
+            if live == TILE:
+                _write_whole_8(m, place, live, background, images, at)
+            else:
+                _write_cut_8(m, place, live, background, images, at)
+
+
+@inline
+def read_row(
+    lanes: Any, depth: Any, m: Any, place: Any, live: Any, images: Any, grads: Any, at: Any
+) -> None:
+    """Read one row of images and loss gradients into a tile's planes of the backward pass.
+
+    Pixels outside the image become opaque ones without gradient; ``live`` may be 0. Other
+    parameters as in :func:`write_row`; ``grads`` are those on the images but the slope.
+    """
+    if lanes == 16:
+        if depth:
+            if live == TILE:
+                _pull_whole_16(m, place, live, images, grads, at)
+            else:
+                _pull_cut_16(m, place, live, images, grads, at)
+        else:
+            if live == TILE:
+                _read_whole_16(m, place, live, images, grads, at)
+            else:
+                _read_cut_16(m, place, live, images, grads, at)
+    else:
+        if depth:
+            if live == TILE:
+                _pull_whole_8(m, place, live, images, grads, at)
+            else:
+                _pull_cut_8(m, place, live, images, grads, at)
+        else:
+            if live == TILE:
+                _read_whole_8(m, place, live, images, grads, at)
+            else:
+                _read_cut_8(m, place, live, images, grads, at)

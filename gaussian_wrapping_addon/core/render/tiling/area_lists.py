@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lists of the Gaussians that reach anywhere into a tile, and of the positions inside each cell.
+
+The lists of :mod:`.tiles` hold what reaches a pixel *centre* of a tile; a Gaussian that passes
+between centres is rightly missing there. Positions between the centres need these lists.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ... import tolerances
+from ...errors import ResourceError
+from ...kernels.compiled import kernel, part
+from ...kernels.parallel import even_bounds, run_chunks
+from ..projection.projection import ScreenGaussians
+from .depth_order import radix_order
+
+TILE = tolerances.TILE_PX
+_MAX_PAIRS = 2**31 - 1
+# Rounding of the float32 boxes and skews: pixels, share of a half side.
+PIXEL_MARGIN = 0.02
+SHARE_MARGIN = 1e-6
+_MAX_SHIFT = 2
+_POSITIONS_PER_CELL = 14
+"""Cells shrink while they still hold this many positions: each costs one walk of its tile's list,
+and shortens the list that its positions walk."""
+
+
+@dataclass(frozen=True)
+class AreaLists:
+    """For each tile, the Gaussians whose ellipse ``alpha >= 1/255`` reaches its area.
+
+    Nearest first, ties by index. Tiles are numbered row by row. *Slots* number the pairs (tile,
+    Gaussian) so that those of one Gaussian are contiguous.
+    """
+
+    start: np.ndarray  # (tiles + 1,) int64: the pairs of tile t are start[t] .. start[t + 1]
+    gaussian_ids: np.ndarray  # (pairs,) int32
+    pair_slots: np.ndarray  # (pairs,) int32
+    pair_offsets: np.ndarray  # (n + 1,) int64: the slots of Gaussian i
+    tiles_x: int
+    tiles_y: int
+
+
+@dataclass(frozen=True)
+class SortedPositions:
+    """Positions inside the image, by cell; cells divide each tile ``2^shift`` times per axis."""
+
+    places: np.ndarray  # (k, 2) float32, pixels, sorted
+    order: np.ndarray  # (k,) int32: index of each among the positions that were given
+    start: np.ndarray  # (cells + 1,) int64; cells are numbered tile by tile
+    shift: int
+    given: int
+    """Number of positions that were given."""
+
+
+def list_areas(screen: ScreenGaussians, width: int, height: int, threads: int) -> AreaLists:
+    """List the visible Gaussians by the tiles whose area they reach.
+
+    Parameters
+    ----------
+    screen : ScreenGaussians
+        Boxes in pixels of an image of ``width`` x ``height``.
+    threads : int
+        The result does not depend on it.
+
+    Raises
+    ------
+    ResourceError
+        If the lists would hold more than 2^31 - 1 pairs.
+    """
+    count = len(screen)
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    order = radix_order(screen.depths, screen.visible)
+    pair_offsets = np.zeros(count + 1, np.int64)
+    # Runs of the order are counted apart, so that each knows where it writes in every tile.
+    bounds = even_bounds(len(order), threads, 1)
+    heads = np.zeros((max(len(bounds) - 1, 1), tiles_x * tiles_y), np.int64)
+    run_of = {int(begin): run for run, begin in enumerate(bounds[:-1])}
+
+    def walk(begin: int, end: int, ids: np.ndarray, slots: np.ndarray) -> None:
+        walk_areas(
+            begin, end, order, screen.boxes, screen.skews, tiles_x, tiles_y,
+            heads[run_of[begin]], pair_offsets, ids, slots,
+        )  # fmt: skip
+
+    nothing = np.zeros(0, np.int32)
+    run_chunks(lambda begin, end: walk(begin, end, nothing, nothing), bounds, threads)
+    np.cumsum(pair_offsets, out=pair_offsets)
+    pairs = int(pair_offsets[-1])
+    if pairs > _MAX_PAIRS:
+        raise ResourceError(
+            f"{pairs} pairs of Gaussian and tile do not fit.", "Query a smaller image."
+        )
+    start = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    np.cumsum(heads.sum(0), out=start[1:])
+    heads[1:] = start[:-1] + np.cumsum(heads[:-1], axis=0)
+    heads[0] = start[:-1]
+    gaussian_ids, pair_slots = np.zeros(pairs, np.int32), np.zeros(pairs, np.int32)
+    if pairs > 0:
+        run_chunks(lambda begin, end: walk(begin, end, gaussian_ids, pair_slots), bounds, threads)
+    return AreaLists(start, gaussian_ids, pair_slots, pair_offsets, tiles_x, tiles_y)
+
+
+def sort_positions(positions: np.ndarray, width: int, height: int) -> SortedPositions:
+    """Sort positions by cell, in each cell as given; leave out what is not on the image.
+
+    Parameters
+    ----------
+    positions : (m, 2) array
+        Pixels. The image is ``0 <= x <= width``, ``0 <= y <= height``; NaN lies outside.
+    """
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    shift = 0
+    while (
+        shift < _MAX_SHIFT
+        and (tiles_x * tiles_y) << (2 * shift + 2) <= len(positions) // _POSITIONS_PER_CELL
+    ):
+        shift += 1
+    places = np.ascontiguousarray(positions, np.float32)
+    cells = np.empty(len(places), np.int32)
+    start = np.zeros((tiles_x * tiles_y << (2 * shift)) + 1, np.int64)
+    find_cells(places, width, height, tiles_x, tiles_y, shift, cells, start)
+    np.cumsum(start, out=start)
+    order = np.empty(start[-1], np.int32)
+    place_in_cells(cells, start[:-1].copy(), order)
+    return SortedPositions(places[order], order, start, shift, len(places))
+
+
+@part(fast=False)
+def strip_span(x0: float, y0: float, x1: float, y1: float, skew: float, top: float, bottom: float):  # type: ignore[no-untyped-def]  # numba infers the pair of floats
+    """Return the extent in x of an ellipse's part between two heights; (1, 0) where it has none.
+
+    The ellipse is given by its box and the x offset ``skew`` of its lowest point. Its part is
+    convex: the extent ends at the ellipse's own extreme point where the strip holds it, else on
+    the edge of the strip nearer to it.
+    """
+    half_x, half_y = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
+    if math.isinf(skew) or not (half_x > 0.0 and half_y > 0.0):
+        return x0, x1
+    center_x, center_y = 0.5 * (x1 + x0), 0.5 * (y1 + y0)
+    first = max((top - PIXEL_MARGIN - center_y) / half_y, -1.0)
+    last = min((bottom + PIXEL_MARGIN - center_y) / half_y, 1.0)
+    if first > last:
+        return 1.0, 0.0
+    # At height t (in half heights) the ellipse spans skew t +- across sqrt(1 - t^2).
+    across = math.sqrt(max(half_x * half_x * (1.0 + SHARE_MARGIN) - skew * skew, 0.0))
+    extreme = skew / half_x  # height of the rightmost point; the leftmost is opposite
+    t = min(max(extreme, first), last)
+    right = skew * t + across * math.sqrt(max(1.0 - t * t, 0.0))
+    t = min(max(-extreme, first), last)
+    left = skew * t - across * math.sqrt(max(1.0 - t * t, 0.0))
+    margin = PIXEL_MARGIN + SHARE_MARGIN * half_x
+    return max(center_x + left - margin, x0), min(center_x + right + margin, x1)
+
+
+@kernel(fast=False)
+def walk_areas(
+    begin: int,
+    end: int,
+    order: np.ndarray,
+    boxes: np.ndarray,
+    skews: np.ndarray,
+    tiles_x: int,
+    tiles_y: int,
+    heads: np.ndarray,
+    pair_offsets: np.ndarray,
+    gaussian_ids: np.ndarray,
+    pair_slots: np.ndarray,
+) -> None:
+    """Count or, where ``gaussian_ids`` has room, write the pairs of ``order[begin .. end]``.
+
+    Counting adds to ``heads (tiles,)`` and writes the number of pairs of Gaussian i to
+    ``pair_offsets[i + 1]``; writing advances ``heads``.
+    """
+    write = len(gaussian_ids) > 0
+    for k in range(begin, end):
+        i = order[k]
+        x0, y0 = float(boxes[i, 0]), float(boxes[i, 1])
+        x1, y1 = float(boxes[i, 2]), float(boxes[i, 3])
+        skew = float(skews[i])
+        slot = pair_offsets[i]
+        first_row = int(min(max(y0 / TILE, 0.0), tiles_y - 1.0))
+        last_row = int(min(max(y1 / TILE, 0.0), tiles_y - 1.0))
+        pairs = 0
+        for row in range(first_row, last_row + 1):
+            left, right = x0, x1
+            if first_row < last_row:
+                left, right = strip_span(
+                    x0, y0, x1, y1, skew, float(row * TILE), float(row * TILE + TILE)
+                )
+            if left > right:
+                continue
+            # Both ends are clamped before the conversion, which they could overflow.
+            first = int(min(max(left / TILE, 0.0), tiles_x - 1.0))
+            last = int(min(max(right / TILE, 0.0), tiles_x - 1.0))
+            for column in range(first, last + 1):
+                tile = row * tiles_x + column
+                if write:
+                    place = heads[tile]
+                    gaussian_ids[place] = i
+                    pair_slots[place] = slot + pairs
+                heads[tile] += 1
+                pairs += 1
+        if not write:
+            pair_offsets[i + 1] = pairs
+
+
+@kernel(fast=False)
+def find_cells(
+    places: np.ndarray,
+    width: int,
+    height: int,
+    tiles_x: int,
+    tiles_y: int,
+    shift: int,
+    cells: np.ndarray,
+    start: np.ndarray,
+) -> None:
+    """Write the cell of each position, or -1, and count those of cell c in ``start[c + 1]``."""
+    mask = (1 << shift) - 1
+    cell_px = np.float32(TILE >> shift)
+    for p in range(len(places)):
+        x, y = places[p, 0], places[p, 1]
+        cells[p] = -1
+        # Written so that a NaN fails the test.
+        if not (x >= 0.0 and y >= 0.0 and x <= width and y <= height):
+            continue
+        cx = min(int(x / cell_px), (tiles_x << shift) - 1)
+        cy = min(int(y / cell_px), (tiles_y << shift) - 1)
+        tile = (cy >> shift) * tiles_x + (cx >> shift)
+        cell = (tile << (2 * shift)) + ((cy & mask) << shift) + (cx & mask)
+        cells[p] = cell
+        start[cell + 1] += 1
+
+
+@kernel(fast=False)
+def place_in_cells(cells: np.ndarray, heads: np.ndarray, order: np.ndarray) -> None:
+    """Write the indices of the positions of each cell, from its ``heads`` on."""
+    for p in range(len(cells)):
+        if cells[p] >= 0:
+            order[heads[cells[p]]] = p
+            heads[cells[p]] += 1

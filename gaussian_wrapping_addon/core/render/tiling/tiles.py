@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lists of the Gaussians that touch each tile of 16 x 16 pixels, in blending order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ... import tolerances
+from ...errors import ResourceError, UsageError
+from ...kernels.array_store import ArrayStore
+from ...kernels.parallel import balanced_bounds, default_threads, even_bounds, run_chunks
+from ..projection.projection import ScreenGaussians
+from .depth_order import order_by_keys
+from .tile_kernels import (
+    ID,
+    RECORD_VALUES,
+    count_band,
+    place_slots,
+    range_pixels,
+    rank_records,
+    scatter_tiles,
+    span_tiles,
+)
+
+_MAX_PAIRS = 2**31 - 1
+_MAX_TILES_ACROSS = 2**16 - 1
+_CHUNKS_PER_THREAD = 2
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """For each tile, the Gaussians whose ellipse ``alpha >= 1/255`` reaches it, nearest first.
+
+    Tiles are numbered row by row. A *pair* is one (tile, Gaussian); *slots* number the pairs so
+    that those of one Gaussian are contiguous, which is where per-pair gradients are written. The
+    lists may be those of a band of tiles; all others are empty then.
+    """
+
+    start: np.ndarray
+    """(tiles + 1,) int64: the pairs of tile t are ``start[t] .. start[t + 1]``."""
+    gaussian_ids: np.ndarray
+    """(pairs,) int32, by increasing distance within a tile, ties by index."""
+    pair_slots: np.ndarray
+    """(pairs,) int32: slot of each pair."""
+    pair_offsets: np.ndarray
+    """(n + 1,) int64: the slots of Gaussian i are ``pair_offsets[i] .. pair_offsets[i + 1]``."""
+    pixel_ranges: np.ndarray
+    """(n, 4) int32: first and last row, first and last column of pixels whose centre lies in the
+    box, inside the image; empty (first > last) where not visible."""
+    tiles_x: int
+    tiles_y: int
+
+
+class TileBinning:
+    """Which tiles each Gaussian of a view reaches, from which the lists of any band are made.
+
+    Attributes
+    ----------
+    ids : (v,) int32
+        The Gaussians that reach a tile, increasing.
+    tile_pairs : (tiles,) int64
+        Number of Gaussians that reach each tile.
+    pixel_ranges, tiles_x, tiles_y
+        As in :class:`TileLists`.
+    """
+
+    def __init__(
+        self, screen: ScreenGaussians, width: int, height: int, threads: int, store: ArrayStore
+    ) -> None:
+        """Find tiles and order; the arrays live in ``store`` until its next binning.
+
+        Raises
+        ------
+        UsageError
+            If a side of the image has 2^16 tiles or more.
+        ResourceError
+            If the Gaussians reach more than 2^31 - 1 rows of tiles.
+        """
+        tile = tolerances.TILE_PX
+        self.tiles_x, self.tiles_y = -(-width // tile), -(-height // tile)
+        if max(self.tiles_x, self.tiles_y) > _MAX_TILES_ACROSS:
+            raise UsageError(
+                f"An image of {width} x {height} pixels is too large.", "Render a smaller image."
+            )
+        self.threads, self._store = threads, store
+        count = len(screen)
+        self._count = count
+        self._gaussians = _bounds(count, threads)  # runs of Gaussians, one a chunk
+        chunks = len(self._gaussians) - 1
+        self.pixel_ranges = store.take("pixel ranges", (count, 4), np.int32)
+        found = np.zeros((chunks + 1, 2), np.int64)  # visible, rows of tiles they reach
+
+        def ranges(first: int, end: int) -> None:
+            for chunk in range(first, end):
+                begin, stop = self._gaussians[chunk], self._gaussians[chunk + 1]
+                found[chunk + 1] = range_pixels(
+                    begin, stop, screen.boxes, screen.visible, width, height, self.pixel_ranges
+                )
+
+        run_chunks(ranges, np.arange(chunks + 1), threads)
+        starts = np.cumsum(found, axis=0)
+        if starts[-1, 1] > _MAX_PAIRS:
+            raise ResourceError(
+                f"The Gaussians reach {starts[-1, 1]} rows of tiles.", "Render a smaller image."
+            )
+        self._spans = store.take("spans", (int(starts[-1, 1]), 2), np.uint16)
+        self._records = store.take("records", (int(starts[-1, 0]), RECORD_VALUES), np.int32)
+        keys = store.take("keys", int(starts[-1, 0]), np.uint32)
+        changes = store.take("changes", (chunks, self.tiles_y, self.tiles_x + 1), np.int32)
+        results = np.zeros((chunks, 4), np.int64)  # end record, pairs, lowest and highest key
+
+        def spans(first: int, end: int) -> None:
+            for chunk in range(first, end):
+                results[chunk] = span_tiles(
+                    self._gaussians[chunk],
+                    self._gaussians[chunk + 1],
+                    starts[chunk, 0],
+                    starts[chunk, 1],
+                    screen.boxes,
+                    screen.skews,
+                    screen.visible,
+                    screen.depths,
+                    self.pixel_ranges,
+                    self._spans,
+                    self._records,
+                    keys,
+                    changes[chunk],
+                )
+
+        run_chunks(spans, np.arange(chunks + 1), threads)
+        # Gaussians that turned out to reach no tile leave gaps at the ends of the runs.
+        self._runs = np.stack([starts[:-1, 0], results[:, 0]], 1)  # (chunks, 2) runs of records
+        # The records hold numbers of pairs of the whole image until slots take their place.
+        self._whole_pairs: np.ndarray | None = results[:, 1]
+        seen = int((self._runs[:, 1] - self._runs[:, 0]).sum())
+        self.ids = store.take("ids", seen, np.int32)
+        at = 0
+        for begin, end in self._runs.tolist():
+            self.ids[at : at + end - begin] = self._records[begin:end, ID]
+            at += end - begin
+        per_tile = changes.sum(0, dtype=np.int64).cumsum(1)  # (tiles_y, tiles_x + 1)
+        self.tile_pairs = np.ascontiguousarray(per_tile[:, :-1]).reshape(-1)
+        extent = (0, 0)
+        if seen:
+            extent = int(results[:, 2].min()), int(results[:, 3].max())
+        self._order = order_by_keys(keys, self._runs, extent, threads, store)
+
+    def bands(self, most_pairs: int) -> list[tuple[int, int]]:
+        """Cut the tiles into runs of at most ``most_pairs`` pairs, or of a single tile.
+
+        Returns
+        -------
+        list of (first, end)
+            At least one band, even where nothing is visible.
+        """
+        below = np.concatenate([[0], np.cumsum(self.tile_pairs)])
+        tiles = len(self.tile_pairs)
+        bands, first = [], 0
+        while first < tiles:
+            fitting = int(np.searchsorted(below, below[first] + most_pairs, side="right")) - 1
+            end = min(max(fitting, first + 1), tiles)
+            bands.append((first, end))
+            first = end
+        return bands
+
+    def lists(self, first: int, end: int, most_pairs: int | None = None) -> TileLists:
+        """Return the lists of the tiles ``first .. end``; those made before are overwritten.
+
+        Parameters
+        ----------
+        first, end : int
+            Any run of tiles.
+        most_pairs : int, optional
+            No memory is reserved for more pairs than these, beyond what the band needs.
+
+        Raises
+        ------
+        ResourceError
+            If they would hold more than 2^31 - 1 pairs.
+        """
+        store, threads = self._store, self.threads
+        tiles = len(self.tile_pairs)
+        start = store.take("start", tiles + 1, np.int64)
+        start[: first + 1] = 0
+        np.cumsum(self.tile_pairs[first:end], out=start[first + 1 : end + 1])
+        start[end:] = pairs = int(start[end])
+        if pairs > _MAX_PAIRS:
+            raise ResourceError(
+                f"{pairs} pairs of Gaussian and tile do not fit.",
+                "Render a smaller image or with a smaller budget.",
+            )
+        pair_offsets = self._offsets(first, end)
+        heads = store.take("heads", tiles, np.int64)
+        heads[:] = start[:-1]
+        gaussian_ids = store.take("gaussian ids", pairs, np.int32, most_pairs)
+        pair_slots = store.take("pair slots", pairs, np.int32, most_pairs)
+        ranked = store.take("ranked", (len(self._order), RECORD_VALUES), np.int32)
+
+        def rank(begin: int, stop: int) -> None:
+            rank_records(begin, stop, self._order, self._records, ranked)
+
+        run_chunks(rank, _bounds(len(ranked), threads), threads)
+
+        def scatter(first_tile: int, end_tile: int) -> None:
+            scatter_tiles(
+                first_tile,
+                end_tile,
+                first,
+                end,
+                self.tiles_x,
+                ranked,
+                self._spans,
+                heads,
+                gaussian_ids,
+                pair_slots,
+            )
+
+        # Each thread walks the whole order and keeps what falls into its tiles.
+        bounds = first + balanced_bounds(self.tile_pairs[first:end], threads)
+        run_chunks(scatter, bounds, threads)
+        return TileLists(
+            start,
+            gaussian_ids,
+            pair_slots,
+            pair_offsets,
+            self.pixel_ranges,
+            self.tiles_x,
+            self.tiles_y,
+        )
+
+    def _offsets(self, first: int, end: int) -> np.ndarray:
+        """Number the slots of a band; return (n + 1,) offsets."""
+        chunks, threads = len(self._runs), self.threads
+        offsets = self._store.take("pair offsets", self._count + 1, np.int64)
+        totals = np.zeros(chunks + 1, np.int64)
+
+        def count(first_chunk: int, end_chunk: int) -> None:
+            for chunk in range(first_chunk, end_chunk):
+                begin, stop = self._runs[chunk]
+                totals[chunk + 1] = count_band(
+                    begin, stop, first, end, self.tiles_x, self._spans, self._records
+                )
+
+        if self._whole_pairs is not None and (first, end) == (0, len(self.tile_pairs)):
+            totals[1:] = self._whole_pairs
+        else:
+            run_chunks(count, np.arange(chunks + 1), threads)
+        self._whole_pairs = None
+        slots = np.cumsum(totals)
+
+        def place(first_chunk: int, end_chunk: int) -> None:
+            for chunk in range(first_chunk, end_chunk):
+                begin, stop = self._runs[chunk]
+                begin_gaussian, end_gaussian = self._gaussians[chunk : chunk + 2]
+                place_slots(
+                    begin, stop, begin_gaussian, end_gaussian, slots[chunk], self._records, offsets
+                )
+
+        run_chunks(place, np.arange(chunks + 1), threads)
+        offsets[self._count] = slots[-1]
+        return offsets
+
+
+def bin_gaussians(
+    screen: ScreenGaussians,
+    width: int,
+    height: int,
+    threads: int = 0,
+    store: ArrayStore | None = None,
+) -> TileLists:
+    """Sort the visible Gaussians by distance and scatter them into tile lists.
+
+    One radix sort of the distances and one counting sort into tiles; the order within each tile
+    is that of a stable sort, whatever the number of threads. In tiles at the corners of a box that
+    the ellipse itself does not reach, the Gaussian is left out.
+
+    Parameters
+    ----------
+    screen : ScreenGaussians
+        Projected for an image of ``width`` x ``height`` pixels.
+    threads : int
+        0 uses every core.
+    store : ArrayStore, optional
+        Where the lists live, until they are made again there; by default they are new.
+
+    Raises
+    ------
+    ResourceError
+        If the lists would hold more than 2^31 - 1 pairs.
+    """
+    store = ArrayStore() if store is None else store
+    binning = TileBinning(screen, width, height, threads or default_threads(), store)
+    return binning.lists(0, binning.tiles_x * binning.tiles_y)
+
+
+def _bounds(count: int, threads: int) -> np.ndarray:
+    """Split the Gaussians: one run for one thread, else a few a thread."""
+    return even_bounds(count, threads, _CHUNKS_PER_THREAD if threads > 1 else 1)

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a texture is worth, counted atlas by atlas."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...settings import TextureSettings
+from ..unwrap.unwrap import Unwrap
+from .bake import Baked
+from .photo_samples import SurfacePoints
+
+
+class Tally:
+    """Counts of texels and faces over the atlases of one mesh.
+
+    Parameters
+    ----------
+    faces : int
+        Of the mesh.
+    """
+
+    def __init__(self, faces: int) -> None:
+        self._with_texel = np.zeros(faces, np.bool_)
+        self._face_seen = np.zeros(faces, np.bool_)
+        self._used = self._seen = self._outlines = self._badly = self._overlaps = 0
+        self._views = self._rejected = 0
+        self._baked: Baked | None = None
+
+    def add(self, points: SurfacePoints, baked: Baked, overlaps: int) -> None:
+        """Count one atlas, of which ``overlaps`` texels are used twice."""
+        seen = baked.views > 0
+        self._with_texel[points.face] = True
+        self._face_seen[points.face[seen]] = True
+        self._used += len(points)
+        self._seen += int(seen.sum())
+        self._outlines += int((baked.sure & ~baked.clear).sum())
+        self._badly += int((seen & ~baked.sure).sum())
+        self._overlaps += overlaps
+        self._views += int(baked.views.sum(dtype=np.int64))
+        self._rejected += baked.rejected
+        self._baked = baked
+
+    def statistics(
+        self, size_px: int, settings: TextureSettings, unwrapped: Unwrap, areas: np.ndarray
+    ) -> dict[str, Any]:
+        """Return plain JSON values of all atlases together.
+
+        Parameters
+        ----------
+        size_px : int
+            Side of each.
+        settings : TextureSettings
+        unwrapped : Unwrap
+        areas : (f,) float64
+            Of the faces.
+        """
+        baked = self._baked
+        assert baked is not None  # a mesh has an atlas
+        with_texel, face_seen = self._with_texel, self._face_seen
+        used, seen = self._used, self._seen
+        judged_area = float(areas[with_texel].sum())
+        return {
+            "size_px": size_px,
+            "size_automatic": settings.size_px == 0,
+            "atlases": unwrapped.atlases,
+            "unwrap": unwrapped.method,
+            "unwrap_fallback_reason": unwrapped.reason,
+            "charts": int(unwrapped.charts.max()) + 1,
+            "gutter_px": round(unwrapped.gutter_px, 2),
+            "utilisation": used / (unwrapped.atlases * size_px**2),
+            "texels_used": used,
+            "texels_seen": seen,
+            "texels_filled": used - seen,
+            "texels_seen_at_outlines_only": self._outlines,
+            "texels_seen_badly": self._badly,
+            "texels_overlapping": self._overlaps,
+            "coverage": seen / max(used, 1),
+            "faces_seen_share": float(face_seen.sum()) / max(int(with_texel.sum()), 1),
+            # Of the faces that have a texel: whether a photo saw the others is not known.
+            "area_seen_share": float(areas[face_seen].sum()) / judged_area if judged_area else 0.0,
+            "area_without_texel_share": float(areas[~with_texel].sum() / areas.sum()),
+            "faces_without_texel": int((~with_texel).sum()),
+            "views_per_seen_texel": self._views / seen if seen else 0.0,
+            "views_rejected_share": self._rejected / max(self._views + self._rejected, 1),
+            "photos_used": baked.photos_used,
+            "exposure_spread": baked.gain_spread,
+            "exposure_corrected": baked.gains_applied,
+            "brightness_spread_within_photos": baked.field_spread,
+            "brightness_evened_within_photos": baked.fields_applied,
+        }

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Side and number of textures from what the photos resolve on the surface."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ... import limits
+from ...dataset.photo_source import PhotoSource
+from ...mesh.face_graph import FaceGraph
+from ..bake.photo_samples import MIN_COSINE
+
+SAMPLED_FACES = 2_000
+TEXELS_PER_FACE = 12
+"""Many small charts need room for their faces, however little the photos show of each: with less,
+most faces of a wheel with 28 spokes had no texel at all."""
+TEXELS_PER_DETAIL_POINT = 2
+"""A normal map of one texel for each vertex of the dense mesh would lose half of its bends."""
+FULL_GUTTER_SIDE_PX = 4096
+MIN_GUTTER_PX = 2
+MIN_SIZE_PX = 256
+MAX_AUTOMATIC_SIZE_PX = 4096
+EXPECTED_UTILISATION = 0.5
+"""Share of texels that charts cover; 0.4 to 0.65 were measured on ordinary meshes."""
+ENOUGH = 0.8
+"""A texture of this share of the photos' resolution is enough: the next size costs four times."""
+
+
+def wanted_side(
+    graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0, seed: int = 0
+) -> float:
+    """Return the side in pixels of one texture that shows about what the photos do; no limits.
+
+    The footprint of a photo's pixel on the surface is ``z / focal``; each sampled face takes its
+    best photo, and the surface their median (by area). Occlusion is not tested: a size needs no
+    more than the order. There is also room for :data:`TEXELS_PER_FACE`,
+    and for :data:`TEXELS_PER_DETAIL_POINT` of the ``detail_points`` that a normal map shows.
+    """
+    area = float(graph.areas.sum())
+    generator = np.random.default_rng(seed)
+    faces = generator.choice(len(graph.areas), SAMPLED_FACES, p=graph.areas / area)
+    centroids, normals = graph.centroids[faces], graph.normals[faces]
+    best = np.full(SAMPLED_FACES, np.inf)
+    for index in range(count):
+        camera = photos.camera(index, 1)
+        pixels, depth = camera.project(centroids)
+        inside = (pixels > 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
+        ray = centroids - camera.center
+        cosine = -(ray * normals).sum(axis=1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
+        sees = inside & (depth > 0) & (cosine > MIN_COSINE)
+        best = np.where(sees, np.minimum(best, depth / camera.fx), best)
+    best = best[np.isfinite(best)]
+    if len(best) == 0:
+        return 0.0
+    footprint = float(np.median(best))
+    wanted = ENOUGH * math.sqrt(area / EXPECTED_UTILISATION) / footprint
+    room = max(TEXELS_PER_FACE * len(graph.areas), TEXELS_PER_DETAIL_POINT * detail_points)
+    return max(wanted, math.sqrt(room / EXPECTED_UTILISATION))
+
+
+def automatic_size(
+    graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0, seed: int = 0
+) -> int:
+    """Return the side in pixels, a power of two from 256 to 4096, that :func:`wanted_side` asks."""
+    return _power_of_two(wanted_side(graph, photos, count, detail_points, seed))
+
+
+def _power_of_two(wanted: float) -> int:
+    exponent = math.ceil(math.log2(max(wanted, 1.0)))
+    largest = min(MAX_AUTOMATIC_SIZE_PX, limits.MAX_TEXTURE_SIDE_PX)
+    return int(min(max(2**exponent, MIN_SIZE_PX), largest))
+
+
+def plan_textures(wanted: float, size_px: int, max_atlases: int) -> tuple[int, int]:
+    """Return the side of each texture in pixels and how many there are.
+
+    Parameters
+    ----------
+    wanted : float
+        Side of the one texture that would do (:func:`wanted_side`).
+    size_px : int
+        What was asked for; 0 chooses a power of two from 256 to 4096.
+    max_atlases : int
+        As many textures as hold what one of side ``wanted`` would, up to this. 0 means one, but
+        where one of 8192 would not do and no smaller size was asked for:
+        :data:`~.limits.MAX_AUTOMATIC_ATLASES`.
+    """
+    side = size_px or _power_of_two(wanted)
+    most = max_atlases
+    if most == 0:
+        is_free = size_px in (0, limits.MAX_TEXTURE_SIDE_PX)
+        beyond = wanted > limits.MAX_TEXTURE_SIDE_PX
+        most = limits.MAX_AUTOMATIC_ATLASES if is_free and beyond else 1
+    # A rounding error more than full does not need another texture.
+    return side, min(max(math.ceil((wanted / side) ** 2 - 1e-6), 1), most)
+
+
+def gutter_for(size_px: int, gutter_px: int) -> int:
+    """Return the gutter of a texture: ``gutter_px`` at 4096 texels, in proportion below.
+
+    Smaller textures have fewer mip levels to keep apart, and charts hardly larger than a full
+    gutter would leave no room for texels.
+    """
+    share = min(1.0, size_px / FULL_GUTTER_SIDE_PX)
+    return max(min(MIN_GUTTER_PX, gutter_px), round(gutter_px * share))

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Levels of detail: ever fewer faces, each level with an atlas and maps of its own.
+
+Collapses across charts move the seams, so that one atlas for all levels would either forbid them
+or smear colours. Each level is therefore unwrapped anew, at half the side, and looks its colours
+up on the textured mesh by the same rays that find its normals on the dense one.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ...errors import MeshingError
+from ...mesh.simplification.decimation import decimate
+from ...mesh.surface_mesh import SurfaceMesh
+from ...mesh.tangent_frame import shading_normals
+from ...mesh.textured_mesh import AtlasMaps, TexturedMesh
+from ...progress import Progress
+from ...regions.convex_region import Region
+from ...report_warning import ReportWarning
+from ...settings import TextureSettings
+from ..atlas.atlas_raster import AtlasRaster
+from ..atlas.texel_points import texel_points
+from ..bake.fill import fill_background, grow
+from ..cost.texture_size import gutter_for
+from ..unwrap.unwrap import unwrap
+from .chart_pyramid import ChartPyramid, chart_pyramid
+from .dense_surface import BLOCK, NO_HIT, DenseSurface, cage_distance
+from .detail import bake_detail, merged_statistics
+
+_logger = logging.getLogger(__name__)
+
+FACES_DIVISOR = 4
+"""A level's faces are twice as long, so half the texture side shows as much a face."""
+FLOOR_FACES = 100
+"""No level below has fewer: a shape would not be known again."""
+MIN_SIDE_PX = 128
+
+
+class Colors(NamedTuple):
+    """Where a level looks up its colours."""
+
+    textured: TexturedMesh
+    surface: DenseSurface
+    """Of the textured mesh."""
+    pyramids: list[ChartPyramid]
+    """Of its texture, one for each atlas."""
+
+
+def levels_of_detail(
+    textured: TexturedMesh,
+    dense: SurfaceMesh | None,
+    settings: TextureSettings,
+    work_folder: Path,
+    progress: Progress,
+    *,
+    threads: int,
+    region: Region | None = None,
+) -> list[TexturedMesh]:
+    """Make the coarser levels of a textured mesh.
+
+    Parameters
+    ----------
+    textured : TexturedMesh
+        Level 0.
+    dense : SurfaceMesh or None
+        What level 0 was decimated from; otherwise level 0 is the dense mesh of the others.
+    settings : TextureSettings
+        ``lods`` levels are made, fewer where the next would have less than
+        :data:`FLOOR_FACES` faces, or where no more faces can go without tearing the mesh: why
+        becomes an entry of ``warnings`` in the statistics of ``textured``.
+    work_folder : Path
+        For temporary sub-folders.
+    region : Region, optional
+        The region that the mesh was made in: its flat boundary stays flat.
+
+    Returns
+    -------
+    list of TexturedMesh
+        Levels 1, 2, ...
+    """
+    levels: list[TexturedMesh] = []
+    if settings.lods == 0:
+        return levels
+    source = textured.mesh if dense is None else dense
+    pyramids = [
+        chart_pyramid(textured, settings.lods, threads, number)
+        for number in range(len(textured.atlases))
+    ]
+    colors = Colors(textured, DenseSurface(textured.mesh), pyramids)
+    current, size_px = textured.mesh, textured.albedo.shape[0]
+    for number in range(1, settings.lods + 1):
+        span = progress.span((number - 1) / settings.lods, number / settings.lods)
+        target = len(current.faces) // FACES_DIVISOR
+        if target < FLOOR_FACES:
+            _ended(textured, settings, number, f"it would have {target} faces")
+            break
+        try:
+            fewer = decimate(
+                current.vertices, current.faces, target, span.span(0.0, 0.2), region=region
+            )
+        except MeshingError as error:
+            _ended(textured, settings, number, error.message.rstrip("."))
+            break
+        if 2 * len(fewer.faces) > len(current.faces):
+            _ended(textured, settings, number, "fewer faces would tear the mesh")
+            break
+        current = SurfaceMesh(fewer.vertices, fewer.faces.astype(np.int32))
+        size_px = max(size_px // 2, min(size_px, MIN_SIDE_PX))
+        levels.append(
+            _level(current, colors, source, size_px, settings, work_folder, span, threads)
+        )
+    progress.update(1.0, f"{len(levels)} levels of detail")
+    return levels
+
+
+def _ended(textured: TexturedMesh, settings: TextureSettings, number: int, reason: str) -> None:
+    """Say, in the log and for the report, why there is no further level."""
+    text = f"{number - 1} of {settings.lods} levels of detail were made, no further one: {reason}."
+    _logger.warning("%s", text)
+    hint = "Ask for fewer with --lods, or for a mesh with more faces."
+    warning = ReportWarning("fewer-levels", text, hint)
+    textured.statistics.setdefault("warnings", []).append(warning.to_json())
+
+
+def _level(
+    mesh: SurfaceMesh,
+    colors: Colors,
+    source: SurfaceMesh,
+    size_px: int,
+    settings: TextureSettings,
+    work_folder: Path,
+    progress: Progress,
+    threads: int,
+) -> TexturedMesh:
+    gutter_px = gutter_for(size_px, settings.gutter_px)
+    unwrapped = unwrap(
+        mesh, size_px, gutter_px, work_folder, progress.span(0.2, 0.5),
+        threads=threads, atlases=len(colors.textured.atlases),
+    )  # fmt: skip
+    maps, details, overlaps = [], [], 0
+    for number in range(unwrapped.atlases):
+        low, high = (0.5 + 0.5 * n / unwrapped.atlases for n in (number, number + 1))
+        span = progress.span(low, high)
+        raster = unwrapped.raster(size_px, threads, number)
+        overlaps += raster.overlaps
+        albedo = transferred(mesh, raster, colors, gutter_px, span.span(0.0, 0.4))
+        detail = bake_detail(
+            mesh, unwrapped, raster, source, settings, span.span(0.4, 1.0),
+            threads=threads, atlas=number,
+        )  # fmt: skip
+        details.append(detail)
+        maps.append(AtlasMaps(albedo, detail.normal_map, detail.occlusion))
+    statistics = {
+        "faces": len(mesh.faces),
+        "size_px": size_px,
+        "atlases": unwrapped.atlases,
+        "unwrap": unwrapped.method,
+        "texels_overlapping": overlaps,
+        **merged_statistics(details),
+    }
+    return TexturedMesh.of(mesh, unwrapped.corner_uvs, unwrapped.face_atlas, maps, statistics)
+
+
+def transferred(
+    mesh: SurfaceMesh, raster: AtlasRaster, colors: Colors, gutter_px: int, progress: Progress
+) -> np.ndarray:
+    """Return the (h, w, 3) uint8 texture of a mesh, looked up on another textured one.
+
+    Parameters
+    ----------
+    mesh : SurfaceMesh
+    raster : AtlasRaster
+        Of its UVs, at the size wanted: the source is averaged to the same fineness, within its
+        charts.
+    gutter_px : int
+    """
+    size = raster.face.shape[0]
+    cage = cage_distance(mesh, DenseSurface(mesh), colors.surface)
+    level = max(0, round(math.log2(colors.textured.albedo.shape[0] / size)))
+    atlas_of_faces = colors.textured.atlas_of_faces
+    normals = shading_normals(mesh.vertices, mesh.faces)
+    image = np.zeros((size, size, 3), np.uint8)
+    texels = np.flatnonzero(raster.face.ravel() >= 0)
+    for start in range(0, len(texels), BLOCK):
+        progress.update(start / len(texels), "level of detail: colours")
+        part = texels[start : start + BLOCK]
+        at = texel_points(mesh, raster, part, normals)
+        places = colors.surface.corresponding(at.points, at.normals, cage)
+        lost = np.flatnonzero(places.how == NO_HIT)
+        if len(lost):
+            near, _ = colors.surface.nearest(at.points[lost])
+            places.face[lost], places.weights[lost] = near.face, near.weights
+        uvs = np.asarray(colors.textured.corner_uvs, np.float64)[places.face]  # (n, 3, 2)
+        uv = np.einsum("nc,ncx->nx", places.weights, uvs)
+        owner = atlas_of_faces[places.face]
+        for number, pyramid in enumerate(colors.pyramids):
+            mine = owner == number
+            found = pyramid.looked_up(uv[mine], places.face[mine], level)
+            image.reshape(-1, 3)[part[mine]] = found
+    owned = raster.face >= 0
+    ring, chart = np.where(owned, 0, -1).astype(np.int16), np.where(owned, 0, -1).astype(np.int32)
+    grow(image, ring, chart, gutter_px, inside=False)
+    fill_background(image, ring >= 0)
+    progress.update(1.0, "level of detail: colours")
+    return image

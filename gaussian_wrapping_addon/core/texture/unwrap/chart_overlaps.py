@@ -1,0 +1,282 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Faces of one chart that cover each other, found exactly, and charts split until none does."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...kernels.compiled import inline, kernel
+from ...mesh.face_graph import FaceGraph, components
+
+OVERLAP_DEPTH_SHARE = 1e-4
+"""Two faces overlap when they cannot be moved apart by this share of the median edge of all. In
+textures in use that is a hundredth of a texel; rounding of UVs stays below."""
+LEAST_CLASS_SHARE = 1.0 / 64.0
+"""Of the median width or height: all smaller faces share one class."""
+
+
+def signed_areas(flat: np.ndarray) -> np.ndarray:
+    """Return (f,) areas of (f, 3, 2) triangles, positive when counter-clockwise."""
+    one, two = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+    return np.asarray(0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
+
+
+def conflicts(corner_uvs: np.ndarray, charts: np.ndarray) -> np.ndarray:
+    """Find the pairs of faces of the same chart that overlap.
+
+    Returns
+    -------
+    (p, 2) int64
+        Each pair once.
+    """
+    uvs = np.ascontiguousarray(corner_uvs, np.float64)
+    edges = np.linalg.norm(uvs - np.roll(uvs, -1, axis=1), axis=2)
+    solid = edges[edges > 0]
+    if len(solid) == 0:
+        return np.empty((0, 2), np.int64)
+    depth = OVERLAP_DEPTH_SHARE * float(np.median(solid))
+    found, _ = overlapping_pairs(uvs, charts, depth)
+    return found
+
+
+def overlapping_pairs(uvs: np.ndarray, charts: np.ndarray, depth: float) -> tuple[np.ndarray, int]:
+    """Find pairs of one chart that lie deeper in each other than ``depth``.
+
+    Returns
+    -------
+    pairs : (p, 2) int64
+        Each once.
+    candidates : int
+        Pairs that were looked at.
+
+    Notes
+    -----
+    Boxes are sorted into classes by width and height, each within a factor of two, and those of a
+    class into rows as high as it. A box meets three rows, at most, of each class that is as high
+    as itself or higher, and in a row only boxes within twice its width: what is looked at grows
+    with the boxes that meet, however long and thin they are and whichever way they lie.
+    """
+    rows = _rows(uvs, charts)
+    found = np.empty((0, 2), np.int64)
+    candidates = np.zeros(1, np.int64)
+    count = int(_overlapping(*rows.arrays, depth, found, candidates))
+    if count:
+        found = np.empty((count, 2), np.int64)
+        _overlapping(*rows.arrays, depth, found, candidates)
+    return np.asarray(rows.order[found], np.int64), int(candidates[0])
+
+
+class _Rows(NamedTuple):
+    order: np.ndarray
+    """(f,) faces by chart, class, row and left border; all below is in this order."""
+    arrays: tuple[np.ndarray, ...]
+    """As :func:`_overlapping` takes them."""
+
+
+def _rows(uvs: np.ndarray, charts: np.ndarray) -> _Rows:
+    low, high = uvs.min(axis=1), uvs.max(axis=1)  # (f, 2)
+    size = high - low
+    # One class for all that is narrower than most by far: there is no end of classes below.
+    least = np.maximum(LEAST_CLASS_SHARE * np.median(size, axis=0), np.finfo(np.float64).tiny)
+    exponent = np.frexp(np.maximum(size, least))[1]  # (f, 2) int32; size <= 2^exponent
+    row = np.floor(np.ldexp(low[:, 1], -exponent[:, 1]))
+    order = np.lexsort((low[:, 0], row, exponent[:, 0], exponent[:, 1], charts))
+    chart = charts[order].astype(np.int64)
+    exponent, row = exponent[order], row[order]
+    new_class = _changes(chart, exponent[:, 0], exponent[:, 1])
+    new_row = new_class | _changes(row)
+    row_begin = np.append(np.flatnonzero(new_row), len(order))
+    class_begin = np.flatnonzero(new_class)
+    first_row = np.append(np.cumsum(new_row)[class_begin] - 1, len(row_begin) - 1)
+    class_chart = chart[class_begin]
+    classes_end = np.searchsorted(class_chart, chart, side="right")  # (f,)
+    own_height = np.maximum.accumulate(np.where(new_class, np.arange(len(order)), 0))
+    # Classes of a chart are sorted by height: those as high or higher follow one another.
+    height_key = np.stack([class_chart, exponent[class_begin, 1]], axis=1)
+    begins = np.flatnonzero(_changes(height_key[:, 0], height_key[:, 1]))
+    group = begins[np.searchsorted(begins, np.arange(len(class_begin)), side="right") - 1]
+    classes_begin = group[np.searchsorted(class_begin, own_height, side="right") - 1]
+    return _Rows(
+        order,
+        (
+            np.ascontiguousarray(uvs[order]), np.ascontiguousarray(low[order]),
+            np.ascontiguousarray(high[order]), classes_begin, classes_end, first_row,
+            np.exp2(exponent[class_begin].astype(np.float64)), row[row_begin[:-1]], row_begin,
+            exponent[:, 1], exponent[class_begin, 1],
+        ),
+    )  # fmt: skip
+
+
+def _changes(*columns: np.ndarray) -> np.ndarray:
+    """Tell which rows begin something new: the first, and those unlike the one before."""
+    new = np.ones(len(columns[0]), np.bool_)
+    new[1:] = np.any([column[1:] != column[:-1] for column in columns], axis=0)
+    return new
+
+
+def split_overlaps(corner_uvs: np.ndarray, charts: np.ndarray, graph: FaceGraph) -> np.ndarray:
+    """Split charts until no two faces of one overlap; UVs stay.
+
+    A new chart grows from the face in the middle of the old one over shared edges, and leaves out
+    what it would cover or what is turned over; what is left is split in the same way.
+
+    Parameters
+    ----------
+    corner_uvs : (f, 3, 2) float
+        Finite; charts may lie upon each other.
+    charts : (f,) int
+        Each connected.
+
+    Returns
+    -------
+    (f,) int32
+        New labels from 0.
+    """
+    pairs = conflicts(corner_uvs, charts)
+    areas = signed_areas(np.asarray(corner_uvs, np.float64))
+    count = int(charts.max()) + 1
+    up = np.bincount(charts, areas > 0, count)
+    down = np.bincount(charts, areas < 0, count)
+    broken = (up > 0) & (down > 0)
+    broken[charts[pairs[:, 0]]] = True
+    if not broken.any():
+        return np.asarray(charts, np.int32)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    starts = np.searchsorted(both[:, 0], np.arange(len(charts) + 1))
+    neighbours = np.where(graph.opposite >= 0, graph.opposite // 3, -1).astype(np.int64)
+    centres = np.asarray(corner_uvs, np.float64).mean(axis=1)
+    middle = (
+        np.stack([np.bincount(charts, centres[:, axis], count) for axis in range(2)], axis=1)
+        / np.maximum(np.bincount(charts, minlength=count), 1)[:, None]
+    )
+    distance = np.linalg.norm(centres - middle[charts], axis=1)
+    faces = np.flatnonzero(broken[charts])
+    faces = faces[np.lexsort((distance[faces], charts[faces]))]
+    pieces = _grow_pieces(
+        np.ascontiguousarray(charts, np.int64), faces, neighbours, np.sign(areas), starts,
+        np.ascontiguousarray(both[:, 1]), count,
+    )  # fmt: skip
+    other = np.where(graph.opposite >= 0, graph.opposite // 3, 0)
+    return components(graph, pieces[other] == pieces[:, None])
+
+
+@inline
+def _apart(a: Any, b: Any, ccw: float) -> float:
+    """Return the widest gap between two triangles over the directions of the first one's edges."""
+    widest = -np.inf
+    for k in range(3):
+        ax, ay = a[k, 0], a[k, 1]
+        dx, dy = a[(k + 1) % 3, 0] - ax, a[(k + 1) % 3, 1] - ay
+        length = np.hypot(dx, dy)
+        if length == 0.0:
+            continue
+        nearest = np.inf
+        for j in range(3):
+            out = ccw * (dy * (b[j, 0] - ax) - dx * (b[j, 1] - ay)) / length
+            nearest = min(nearest, out)
+        widest = max(widest, nearest)
+    return widest
+
+
+@inline
+def _turn(a: Any) -> float:
+    double = (a[1, 0] - a[0, 0]) * (a[2, 1] - a[0, 1]) - (a[2, 0] - a[0, 0]) * (a[1, 1] - a[0, 1])
+    return 1.0 if double > 0.0 else (-1.0 if double < 0.0 else 0.0)
+
+
+@inline
+def _first_at_least(values: Any, begin: int, end: int, wanted: float) -> int:
+    while begin < end:
+        middle = (begin + end) // 2
+        if values[middle] < wanted:
+            begin = middle + 1
+        else:
+            end = middle
+    return begin
+
+
+@kernel(fast=False)
+def _overlapping(
+    uvs: Any, low: Any, high: Any, classes_begin: Any, classes_end: Any, first_row: Any,
+    class_size: Any, row: Any, row_begin: Any, height: Any, class_height: Any,
+    depth: float, found: Any, candidates: Any,
+) -> int:  # fmt: skip
+    count = 0
+    candidates[0] = 0
+    left = low[:, 0]
+    for i in range(len(uvs)):
+        one = uvs[i]
+        turn = _turn(one)
+        if turn == 0.0:
+            continue
+        for c in range(classes_begin[i], classes_end[i]):
+            same_height = class_height[c] == height[i]
+            wide, tall = class_size[c, 0], class_size[c, 1]
+            last = np.floor(high[i, 1] / tall)
+            r = _first_at_least(row, first_row[c], first_row[c + 1], np.floor(low[i, 1] / tall) - 1)
+            while r < first_row[c + 1] and row[r] <= last:
+                begin = row_begin[r]
+                if same_height:  # each pair once
+                    begin = max(begin, i + 1)
+                j = _first_at_least(left, begin, row_begin[r + 1], low[i, 0] - wide)
+                while j < row_begin[r + 1] and left[j] <= high[i, 0] - depth:
+                    candidates[0] += 1
+                    apart = high[j, 0] < low[i, 0] + depth or high[j, 1] < low[i, 1] + depth
+                    if not apart and low[j, 1] <= high[i, 1] - depth:
+                        other = uvs[j]
+                        turn_other = _turn(other)
+                        if turn_other != 0.0 and (
+                            _apart(one, other, turn) <= -depth
+                            and _apart(other, one, turn_other) <= -depth
+                        ):
+                            if count < len(found):
+                                found[count, 0] = i
+                                found[count, 1] = j
+                            count += 1
+                    j += 1
+                r += 1
+    return count
+
+
+@kernel(fast=False)
+def _grow_pieces(
+    charts: Any, faces: Any, neighbours: Any, turn: Any, starts: Any, others: Any, label: int
+) -> np.ndarray:
+    """Give the faces listed (by chart, from the middle outwards) labels of pieces."""
+    piece = charts.copy()
+    waiting = np.zeros(len(charts), np.bool_)
+    for face in faces:
+        waiting[face] = True
+    queue = np.empty(len(charts), np.int64)
+    for seed in faces:
+        if not waiting[seed]:
+            continue
+        begin, end = 0, 1
+        queue[0] = seed
+        waiting[seed] = False
+        piece[seed] = label
+        while begin < end:
+            face = queue[begin]
+            begin += 1
+            for k in range(3):
+                other = neighbours[face, k]
+                if other < 0 or not waiting[other] or charts[other] != charts[seed]:
+                    continue
+                if turn[other] * turn[seed] < 0.0:
+                    continue
+                free = True
+                for at in range(starts[other], starts[other + 1]):
+                    if piece[others[at]] == label:
+                        free = False
+                        break
+                if not free:
+                    continue
+                waiting[other] = False
+                piece[other] = label
+                queue[end] = other
+                end += 1
+        label += 1
+    return piece

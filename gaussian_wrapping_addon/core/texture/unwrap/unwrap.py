@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""UV unwrap: charts and packing by xatlas, checked; a box projection to fall back on."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import NO_ROOM, DatasetError, ResourceError, WorkerError, cannot_be_written
+from ...mesh.face_graph import FaceGraph, face_graph, uv_charts
+from ...mesh.surface_mesh import SurfaceMesh
+from ...mesh.topology import edge_lengths
+from ...progress import Progress
+from ..atlas.atlas_raster import AtlasRaster, raster_atlas
+from .box_unwrap import box_unwrap
+from .charts import find_charts, pack_charts
+
+_logger = logging.getLogger(__name__)
+
+FLAT_FACE_AREA = 1e-6
+"""Faces of less than this share of the squared median edge are not given to xatlas."""
+MAX_IGNORED_AREA_SHARE = 1e-3
+CHECK_SIZE_PX = 2048
+MAX_REASON = 200
+"""Characters of a helper's last words that go into the report."""
+
+
+@dataclass(frozen=True)
+class Unwrap:
+    """UVs of a mesh and how they were made."""
+
+    corner_uvs: np.ndarray
+    """(f, 3, 2) float32 in [0, 1], v upwards; faces without area are collapsed to a point."""
+    charts: np.ndarray
+    """(f,) int32 labels of charts."""
+    method: str
+    """``"xatlas"`` or ``"box"``."""
+    gutter_px: float
+    """Texels kept free between charts at the size asked for."""
+    reason: str = ""
+    """Why the fallback was used."""
+    face_atlas: np.ndarray | None = None
+    """(f,) uint8 the atlas of each face, from 0; None where there is one."""
+
+    @property
+    def atlases(self) -> int:
+        """Number of atlases."""
+        return 1 if self.face_atlas is None else int(self.face_atlas.max()) + 1
+
+    def raster(self, size_px: int, threads: int, atlas: int = 0) -> AtlasRaster:
+        """Rasterise one atlas."""
+        faces = None if self.face_atlas is None else self.face_atlas == atlas
+        return raster_atlas(self.corner_uvs, size_px, threads, faces)
+
+
+def unwrap(
+    mesh: SurfaceMesh,
+    size_px: int,
+    gutter_px: int,
+    work_folder: Path,
+    progress: Progress,
+    *,
+    threads: int = 1,
+    atlases: int = 1,
+) -> Unwrap:
+    """Give every face corner a UV, without overlaps.
+
+    Parameters
+    ----------
+    mesh : SurfaceMesh
+        Checked mesh: finite, at least one face with area.
+    size_px, gutter_px : int
+        Side of the texture and texels to keep free between charts.
+    work_folder : Path
+        A folder for a temporary sub-folder, removed before returning.
+    progress : Progress
+        Span of this step.
+    atlases : int
+        Textures that the charts are spread over, at one density; fewer may be used.
+
+    Notes
+    -----
+    xatlas crashes, hangs or answers NaN on some meshes. Whatever it does, a
+    box projection takes its place, with a warning and ``method = "box"``.
+    """
+    graph = face_graph(mesh.vertices, mesh.faces)
+    try:
+        corner_uvs, face_atlas, gutter_left_px = _xatlas(
+            mesh, graph, size_px, gutter_px, work_folder, progress.span(0.0, 0.9), threads, atlases
+        )
+        method, reason = "xatlas", ""
+    except (WorkerError, ResourceError, DatasetError) as error:
+        if isinstance(error.__cause__, OSError):
+            raise  # a full disk: nothing else could be written either
+        reason = error.message[:MAX_REASON]
+        _logger.warning("xatlas could not unwrap the mesh (%s): box projection instead", reason)
+        corner_uvs, face_atlas, gutter_left_px = box_unwrap(
+            mesh, graph, size_px, gutter_px, progress.span(0.0, 0.9), atlases
+        )
+        method = "box"
+        problem = _problem(corner_uvs, face_atlas, size_px, threads)
+        if problem:
+            _logger.warning("the box projection is not perfect: %s", problem)
+    if gutter_left_px < gutter_px:
+        _logger.warning(
+            "the texture is too small for %d texels between charts: %.1f are kept",
+            gutter_px,
+            gutter_left_px,
+        )
+    progress.update(0.95, "finding charts")
+    # Atlases lie upon each other: apart, no two charts touch by chance.
+    apart = corner_uvs + 2.0 * face_atlas.astype(np.float64)[:, None, None]
+    charts = uv_charts(graph, mesh.faces, apart)
+    progress.update(1.0, f"unwrapped with {method}")
+    return Unwrap(
+        corner_uvs, charts, method, float(gutter_left_px), reason,
+        _numbered(face_atlas) if face_atlas.any() else None,
+    )  # fmt: skip
+
+
+def _numbered(face_atlas: np.ndarray) -> np.ndarray:
+    """Number the atlases that are used from 0, without gaps."""
+    return np.unique(face_atlas, return_inverse=True)[1].ravel().astype(np.uint8)
+
+
+def _xatlas(
+    mesh: SurfaceMesh,
+    graph: FaceGraph,
+    size_px: int,
+    gutter_px: int,
+    work_folder: Path,
+    progress: Progress,
+    threads: int,
+    atlases: int = 1,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    corners = mesh.vertices[mesh.faces]
+    if not np.isfinite(corners).all():
+        raise DatasetError("Vertices of the mesh are not finite.")
+    edges = edge_lengths(mesh.vertices, mesh.faces)
+    unit = float(np.median(edges[edges > 0]))
+    solid = np.flatnonzero(graph.areas > FLAT_FACE_AREA * unit**2)
+    if len(solid) == 0:
+        raise DatasetError("No face of the mesh has an area.")
+    # xatlas has absolute tolerances: median edge 1, centre 0 suits them.
+    scaled = (mesh.vertices - mesh.vertices.mean(axis=0)) / unit
+    faces = mesh.faces[solid]
+    work_folder.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix="unwrap-", dir=work_folder))
+    try:
+        charts = find_charts(
+            scaled, faces, size_px, gutter_px, folder, progress.span(0.0, 0.7), atlases
+        )
+        texture_uvs, chart_atlas, gutter_left_px = pack_charts(
+            charts, size_px, gutter_px, folder, progress.span(0.7, 0.9), atlases
+        )
+    except (OSError, ValueError, KeyError) as error:
+        if isinstance(error, OSError) and error.errno in NO_ROOM:
+            raise cannot_be_written(error.filename or folder, error) from error
+        raise WorkerError(f"xatlas left no usable result ({error}).") from None
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    progress.update(0.9, "checking the unwrap")
+    corner_uvs = np.full((len(mesh.faces), 3, 2), np.nan, np.float32)
+    corner_uvs[solid[charts.faces]] = texture_uvs
+    face_atlas = np.zeros(len(mesh.faces), np.uint8)
+    face_atlas[solid[charts.faces]] = chart_atlas
+    _collapse_ignored(corner_uvs, face_atlas, mesh.faces, graph)
+    problem = _problem(corner_uvs, face_atlas, size_px, threads)
+    if problem:
+        raise DatasetError(f"The UVs that xatlas made cannot be used: {problem}.")
+    return corner_uvs, face_atlas, gutter_left_px
+
+
+def _collapse_ignored(
+    corner_uvs: np.ndarray, face_atlas: np.ndarray, faces: np.ndarray, graph: FaceGraph
+) -> None:
+    """Give faces without UVs one point of the atlas: that of a face at the same vertex."""
+    missing = ~np.isfinite(corner_uvs).all(axis=(1, 2))
+    if not missing.any():
+        return
+    share = graph.areas[missing].sum() / graph.areas.sum()
+    if share > MAX_IGNORED_AREA_SHARE:
+        raise DatasetError(f"xatlas ignored {100 * share:.2f} % of the surface.")
+    known = np.flatnonzero(~missing)
+    corner_of_vertex = np.full(int(faces.max()) + 1, -1)
+    corner_of_vertex[faces[known].ravel()] = (3 * known[:, None] + np.arange(3)).ravel()
+    options = corner_of_vertex[faces[missing]]  # (m, 3), -1 where the vertex has none
+    chosen = np.full(len(options), -1)
+    for corner in range(3):
+        chosen = np.where(chosen >= 0, chosen, options[:, corner])
+    chosen = np.where(chosen >= 0, chosen, 3 * known[0])
+    corner_uvs[missing] = corner_uvs.reshape(-1, 2)[chosen][:, None, :]
+    face_atlas[missing] = face_atlas[chosen // 3]
+
+
+def _problem(corner_uvs: np.ndarray, face_atlas: np.ndarray, size_px: int, threads: int) -> str:
+    """Say what is wrong with the UVs; empty when nothing is."""
+    if not np.isfinite(corner_uvs).all():
+        return "some are not finite"
+    if corner_uvs.min() < 0.0 or corner_uvs.max() > 1.0:
+        return "some lie outside of 0 to 1"
+    used = overlaps = 0
+    for number in np.unique(face_atlas).tolist():
+        faces = face_atlas == number
+        raster = raster_atlas(corner_uvs, min(size_px, CHECK_SIZE_PX), threads, faces)
+        used += int(raster.inside.sum())
+        overlaps += raster.overlaps
+    if used == 0:
+        return "no texel is used"
+    if overlaps > 0:
+        return f"{overlaps} of {used} texels are used twice"
+    return ""

@@ -1,0 +1,383 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Trained exposure of each photo: a gain and an offset per colour channel.
+
+See docs/method.md, section 1.6.
+
+The method's ``exp(a) I + b`` has one gain and one offset per photo. Cameras on automatic change the
+white balance too, so here every channel has its own. The offset is not a luxury: with the sRGB
+curve ``s = 1.055 L^(1/2.4) - 0.055``, light ``L`` times ``g`` makes of ``s`` exactly
+``k s + 0.055 (k - 1)`` with ``k = g^(1/2.4)``, which a gain alone cannot follow in dark parts.
+
+The corrected image enters the whole colour loss. In the method SSIM sees the raw render; but its
+luminance and contrast terms then ask of the same Gaussians a different brightness for every photo,
+which is the contradiction that the exposure is there to remove.
+
+The Gaussians keep the mean exposure of the training photos: the means over these of all log gains
+and of all offsets (at middle grey) are held at 0, without which colours and exposures could drift
+against each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...errors import UsageError
+from ...kernels.array_store import ArrayStore
+from ...kernels.parallel import default_threads, even_bounds, run_chunks
+from .exposure_kernels import apply_rows, backward_rows
+
+SRGB_PEDESTAL = 0.055
+"""Constant of the sRGB curve: display values plus this are a power of the light."""
+
+PIVOT = 0.5
+"""Display value about which gains act: an offset then moves the mean of a usual image and a gain
+its contrast, and Adam, which scales every value alone, need not creep along the valley between
+them. Middle grey is also what the pinned means leave in place."""
+
+REFERENCE_RATE = 1e-3
+"""Learning rate of docs/method.md, section 1.4."""
+
+TRAVEL = 1.5
+"""A short run's first rate would let a value move by this much in all of its photo's turns; as the
+rate falls, it is 0.6. Light altered by a factor of 1.35 either way is a log gain of 0.13."""
+
+LARGEST_RATE = 0.02
+LAST_SHARE = 0.1
+"""The last rate is this share of the first: Adam's steps are about as large as its rate, and what
+they leave at the end is an error of colour."""
+
+MAX_LOG_GAIN = 1.5
+"""Log gains are kept within this; more is no exposure but a photo that shows nothing."""
+MAX_OFFSET = 1.0
+
+BETAS = (0.9, 0.99)
+"""Of Adam. A photo has its turn only some dozens of times in a short run; its gradient, a mean over
+all its pixels, is hardly noisy, so that a short memory of its size serves better than 0.999."""
+
+EPSILON = 1e-15
+
+_NO_ALPHA = {np.dtype(t): np.zeros((0, 0), t) for t in (np.float32, np.float64)}
+
+
+def exposure_rate(iteration: int, iterations: int, photos: int) -> float:
+    """Return the learning rate of an iteration: :data:`TRAVEL` over a photo's turns, falling.
+
+    Never below :data:`REFERENCE_RATE` nor above :data:`LARGEST_RATE` at the start; then log-linear
+    to :data:`LAST_SHARE` of that.
+    """
+    turns = max(1.0, iterations / max(1, photos))
+    first = min(LARGEST_RATE, max(REFERENCE_RATE, TRAVEL / turns))
+    return first * LAST_SHARE ** min(1.0, iteration / max(1, iterations))
+
+
+class Exposure:
+    """Gains and offsets of all photos, with what their optimiser remembers.
+
+    Parameters
+    ----------
+    count : int
+        Number of the scene's views.
+    trained : sequence of int
+        Views that are trained on; the others stay neutral and take no part in the mean.
+    log_gains : (count, 3), optional
+        Log gains of display values plus :data:`SRGB_PEDESTAL` to start from, as
+        :mod:`..selection.exposure_selection` estimates them; then a short run has only to refine
+        them. Not finite values count as 0.
+
+    Raises
+    ------
+    UsageError
+        A trained view is none of the scene's, or the gains do not fit.
+    """
+
+    def __init__(
+        self, count: int, trained: Sequence[int], log_gains: np.ndarray | None = None
+    ) -> None:
+        self.trained = np.unique(np.asarray(trained, np.int64))
+        if len(self.trained) and (self.trained[0] < 0 or self.trained[-1] >= count):
+            raise UsageError(
+                f"Exposures of {count} views cannot hold view {int(self.trained[-1])}.",
+                "Number the views of the scene from 0.",
+            )
+        self.values = np.zeros((count, 6), np.float32)
+        """Log gains of red, green, blue, then offsets at :data:`PIVOT`; display values."""
+        self.first = np.zeros((count, 6), np.float32)
+        self.second = np.zeros((count, 6), np.float32)
+        self.steps = np.zeros(count, np.int64)
+        self.gradient = np.zeros(6)
+        """Of the last backward pass, for the step that follows; no part of the state."""
+        self._store = ArrayStore()
+        if log_gains is not None:
+            start = np.asarray(log_gains, np.float64)
+            if start.shape != (count, 3):
+                raise UsageError(
+                    f"Gains to start from have the shape {start.shape}.", f"Give ({count}, 3)."
+                )
+            start = np.where(np.isfinite(start), start, 0.0)[self.trained]
+            self.values[self.trained, :3] = start
+            self.values[self.trained, 3:] = (SRGB_PEDESTAL + PIVOT) * np.expm1(start)
+        self.pin()
+
+    def corrected(
+        self, view: int, color: np.ndarray, alpha: np.ndarray | None = None, *, threads: int = 0
+    ) -> np.ndarray:
+        """Return what the photo's exposure makes of a render: ``exp(a) color + b``.
+
+        Parameters
+        ----------
+        view : int
+        color : (h, w, 3) float32 or float64
+        alpha : (h, w), the same type, optional
+            The offset is then ``b alpha``: what a colour blended over emptiness becomes. For
+            images that are composited afterwards (:mod:`.background`).
+
+        Returns
+        -------
+        (h, w, 3), of the colour's type
+            Valid until the next call.
+        """
+        color, alpha = self._arrays(color, alpha)
+        out = self._store.take(f"corrected {color.dtype}", color.shape, color.dtype)
+        gains, offsets = self.factors(view, color.dtype)
+
+        def run(begin: int, end: int) -> None:
+            apply_rows(begin, end, color, alpha, gains, offsets, out)
+
+        threads = threads or default_threads()
+        run_chunks(run, even_bounds(len(color), threads, 1), threads)
+        return out
+
+    def backward(
+        self,
+        view: int,
+        color: np.ndarray,
+        by_corrected: np.ndarray,
+        alpha: np.ndarray | None = None,
+        *,
+        threads: int = 0,
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return the gradients on colour and alpha; keep that of the exposure for :meth:`step`.
+
+        Parameters
+        ----------
+        view, color, alpha
+            As handed to :meth:`corrected`.
+        by_corrected : (h, w, 3), of the colour's type
+            Gradient of the loss on the corrected image.
+
+        Returns
+        -------
+        by_color : (h, w, 3)
+            Valid until the next call.
+        by_alpha : (h, w) or None
+            ``None`` without alpha. Both bitwise the same for any number of threads.
+        """
+        color, cover = self._arrays(color, alpha)
+        by_out = np.ascontiguousarray(by_corrected, color.dtype)
+        if by_out.shape != color.shape:
+            raise UsageError(
+                f"Image {color.shape} and gradient {by_out.shape} differ in size.",
+                "Hand in the gradient of the corrected image.",
+            )
+        by_color = self._store.take(f"by color {color.dtype}", color.shape, color.dtype)
+        by_alpha = self._store.take(f"by alpha {color.dtype}", cover.shape, color.dtype)
+        gains, offsets = self.factors(view, color.dtype)
+        sums = np.zeros((len(color), 6))
+
+        def run(begin: int, end: int) -> None:
+            backward_rows(
+                begin, end, color, cover, by_out, gains, offsets, by_color, by_alpha, sums
+            )
+
+        threads = threads or default_threads()
+        run_chunks(run, even_bounds(len(color), threads, 1), threads)
+        self.gradient[:] = sums.sum(axis=0)
+        # d/da of exp(a) (color - PIVOT alpha)
+        self.gradient[:3] = gains * (self.gradient[:3] - PIVOT * self.gradient[3:])
+        return by_color, None if alpha is None else by_alpha
+
+    def step(self, view: int, rate: float) -> None:
+        """Move a photo's exposure by Adam along the last backward pass, then pin the mean.
+
+        A gradient that is not finite moves nothing.
+        """
+        if not np.isfinite(self.gradient).all():
+            return
+        self.steps[view] += 1
+        taken = int(self.steps[view])
+        gradient = self.gradient.astype(np.float32)
+        self.first[view] += np.float32(1.0 - BETAS[0]) * (gradient - self.first[view])
+        self.second[view] += np.float32(1.0 - BETAS[1]) * (gradient**2 - self.second[view])
+        mean = self.first[view].astype(np.float64) / (1.0 - BETAS[0] ** taken)
+        size = np.sqrt(self.second[view].astype(np.float64) / (1.0 - BETAS[1] ** taken))
+        self.values[view] -= (rate * mean / (size + EPSILON)).astype(np.float32)
+        self.pin()
+
+    def pin(self) -> None:
+        """Bring the means over the trained photos to 0 (to rounding), and values into bounds."""
+        if len(self.trained) == 0:
+            return
+        kept = self.values[self.trained].astype(np.float64)
+        limit = np.repeat([MAX_LOG_GAIN, MAX_OFFSET], 3)
+        kept = np.clip(kept - kept.mean(axis=0), -limit, limit)
+        self.values[self.trained] = kept - kept.mean(axis=0)
+
+    def factors(self, view: int, dtype: np.dtype | type = np.float64) -> tuple[np.ndarray, ...]:
+        """Return ``exp(a)`` (3,) and the offset at black ``b`` (3,) of a photo."""
+        value = self.values[view].astype(np.float64)
+        gains = np.exp(value[:3])
+        return gains.astype(dtype), (value[3:] + PIVOT * (1.0 - gains)).astype(dtype)
+
+    def spread(self) -> float:
+        """Return the standard deviation of the trained photos' log gains over all channels."""
+        return float(np.sqrt(np.mean(self.values[self.trained, :3].astype(np.float64) ** 2)))
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of all that the next iteration depends on, by name."""
+        names = ("values", "first", "second", "steps", "trained")
+        return {name: getattr(self, name).copy() for name in names}
+
+    @classmethod
+    def restore(cls, arrays: dict[str, np.ndarray]) -> Exposure:
+        """Build from :meth:`to_arrays`, bit for bit; the arrays are copied.
+
+        Raises
+        ------
+        KeyError, ValueError
+            Something is missing or does not fit together.
+        """
+        count = len(arrays["values"])
+        trained = arrays["trained"]
+        if trained.ndim != 1 or (
+            len(trained) and not (0 <= trained.min() <= trained.max() < count)
+        ):
+            raise ValueError("the trained views of the exposures are none of the scene's")
+        made = cls(count, trained.tolist())
+        for name in ("values", "first", "second", "steps"):
+            like, array = getattr(made, name), arrays[name]
+            if array.shape != like.shape or array.dtype != like.dtype:
+                raise ValueError(f"{name} of the exposures: {array.dtype} {array.shape}")
+            setattr(made, name, array.copy())
+        return made
+
+    @staticmethod
+    def _arrays(color: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        color = np.ascontiguousarray(color)
+        if color.ndim != 3 or color.shape[2] != 3 or color.dtype not in _NO_ALPHA:
+            raise UsageError(
+                f"An image is {color.dtype} {color.shape}.", "Give (height, width, 3) floats."
+            )
+        if alpha is None:
+            return color, _NO_ALPHA[color.dtype]
+        cover = np.ascontiguousarray(alpha, color.dtype)
+        if cover.shape != color.shape[:2]:
+            raise UsageError(
+                f"Image {color.shape} and alpha {cover.shape} differ in size.",
+                "Hand in the alpha of the same render.",
+            )
+        return color, cover
+
+
+FIT_ROUNDS = 8
+FIT_PRIOR_SQ = 0.02**2
+"""Weight, as a variance of display values, of the wish that a fitted gain be 1: a photo of one
+colour says nothing of gain against offset."""
+FIT_SCALE = 0.05
+"""Errors beyond this many display values count with falling weight."""
+FIT_DARKEST, FIT_BRIGHTEST = 2.5 / 255, 252.5 / 255
+"""Values of the photo beyond are clipped and say nothing of its exposure."""
+MIN_FIT_PIXELS = 64
+
+
+def fit_exposure(
+    render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return gain and offset per channel that bring a render closest to a photo.
+
+    Least squares in closed form, repeated with weights ``1 / max(|error|, 0.05)`` (Huber); the gain
+    is drawn to 1 as weakly as :data:`FIT_PRIOR_SQ` says. For photos whose exposure was not trained.
+    A figure measured on the very pixels that the fit saw flatters; report that of
+    :func:`corrected_for_measuring`.
+
+    Parameters
+    ----------
+    render : (h, w, 3) floats
+    photo : (h, w, 3) uint8, or floats in [0, 1]
+    mask : (h, w) bool, optional
+        Pixels to look at.
+
+    Returns
+    -------
+    gain, offset : (3,) float64
+        ``photo ~ gain render + offset``; 1 and 0 for a channel with fewer than
+        :data:`MIN_FIT_PIXELS` usable pixels.
+
+    Raises
+    ------
+    UsageError
+        If the shapes differ.
+    """
+    x, y = np.asarray(render, np.float64), np.asarray(photo)
+    y = y / 255.0 if y.dtype == np.uint8 else y.astype(np.float64)
+    if x.shape != y.shape or (mask is not None and np.shape(mask) != x.shape[:2]):
+        raise UsageError(
+            f"Render {x.shape}, photo {y.shape} and mask differ in size.",
+            "Compare images of one camera.",
+        )
+    gain, offset = np.ones(3), np.zeros(3)
+    for channel in range(3):
+        value = y[..., channel]
+        usable = (value >= FIT_DARKEST) & (value <= FIT_BRIGHTEST) & np.isfinite(x[..., channel])
+        if mask is not None:
+            usable &= np.asarray(mask, np.bool_)
+        if np.count_nonzero(usable) >= MIN_FIT_PIXELS:
+            gain[channel], offset[channel] = _fit(x[..., channel][usable], value[usable])
+    return gain, offset
+
+
+def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    weight = np.ones(len(x))
+    gain = offset = 0.0
+    for _ in range(FIT_ROUNDS):
+        total = weight.sum()
+        mean_x, mean_y = float(weight @ x / total), float(weight @ y / total)
+        variance = float(weight @ (x - mean_x) ** 2 / total)
+        covariance = float(weight @ ((x - mean_x) * (y - mean_y)) / total)
+        gain = (covariance + FIT_PRIOR_SQ) / (variance + FIT_PRIOR_SQ)
+        gain = min(max(gain, math.exp(-MAX_LOG_GAIN)), math.exp(MAX_LOG_GAIN))
+        offset = mean_y - gain * mean_x
+        weight = 1.0 / np.maximum(np.abs(gain * x + offset - y), FIT_SCALE)
+    return gain, offset
+
+
+def corrected_for_measuring(
+    render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the render in the photo's exposure, no pixel corrected by a fit that saw it.
+
+    The exposure of a held-out photo was never trained. Each half of the image (left, right) is
+    corrected by the fit on the other, so that figures of the whole image measure how well the scene
+    is known and not how well six numbers fit. They must be named as such: "PSNR after an exposure
+    fitted crosswise on the image's halves".
+
+    Parameters
+    ----------
+    render, photo, mask
+        As for :func:`fit_exposure`. A half whose other half has too few pixels stays as rendered.
+
+    Returns
+    -------
+    (h, w, 3) float32
+        In [0, 1].
+    """
+    middle = np.shape(render)[1] // 2
+    halves = (slice(None, middle), slice(middle, None))
+    result = np.array(render, np.float64)
+    for half, other in (halves, halves[::-1]):
+        part = None if mask is None else mask[:, other]
+        gain, offset = fit_exposure(render[:, other], photo[:, other], part)
+        result[:, half] = gain * result[:, half] + offset
+    return np.clip(result, 0.0, 1.0).astype(np.float32)

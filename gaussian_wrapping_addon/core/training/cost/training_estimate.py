@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a training will take: time, memory and disk, from photos, settings and the machine.
+
+The time of an iteration is a constant, plus a part per rendered pixel, plus a part per Gaussian;
+the pyramid's levels and the growth of the number of Gaussians are summed over the whole plan. The
+constants were fitted (least squares of the relative error) to 35 finished trainings on 2 threads of
+one machine (AMD EPYC): 8 scenes of 14 to 50 photos, 96 to 480 px, caps from 5000 to 120 000
+Gaussians, 22 to 424 s. The estimate lay between 0.52 and 1.24 times what they took; scenes with
+much background take longest per pixel. The range that is told covers all of them. On a machine
+with 14 waiting processes (3 trainings of 200 to 300 iterations, speed told by its fastest pass) the
+estimate lay between 0.45 and 0.69 times what they took, one of them above the range.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...errors import ResourceError
+from ...gaussians.initialisation import FEW_POINTS
+from ...machine import available_memory_bytes
+from ...report_warning import ReportWarning
+from ...settings import TrainingSettings
+from ..schedule import Schedule
+
+if TYPE_CHECKING:
+    from ...dataset.scene import Scene
+
+ITERATION_S = 2.06e-3
+"""Of each iteration, whatever its size."""
+
+PIXEL_S = 0.75e-6
+"""Of each pixel of an iteration with isosurface depth: rendering, losses and their gradients. With
+it, and the figures below, 3000 iterations on 40 photos of 640 x 480 px come to 284 s; they took
+335 s on two cores with a little other work (benchmarks/scenes wheel, preset standard)."""
+
+WITHOUT_DEPTH = 0.45
+"""Share of :data:`PIXEL_S` before the depth is asked for (docs/benchmarks/kernels.md: depth adds
+105 to 141 % to rendering forward, and the normal losses go with it)."""
+
+GAUSSIAN_S = 0.254e-6
+"""Of each Gaussian in each iteration: projection, and the step of those that were seen."""
+
+MULTI_VIEW_SHARE = 0.4
+"""What a multi-view iteration adds, as a share of a plain one (57 ms against 144 ms of one thread,
+40 000 Gaussians, 4000 places)."""
+
+LOW, HIGH = 0.75, 1.95
+"""The range told is the model's figure times these: it holds every measured training."""
+
+MESH_AND_TEXTURE_SHARE = (0.2, 0.9)
+"""What meshing and texture took, as a share of the training before them: from 17 to 94 % in the
+jobs of docs/figures.md and of benchmarks/scenes, with one region of about 50 thousand faces. Long
+trainings have the small shares."""
+
+ROUND_GROWTH = 1.8
+"""Growth of the number of Gaussians in one round of densification, until the budget (measured: 1.55
+to 1.87 in the first round)."""
+
+LITTLE_GROWTH = 0.4
+"""Share of the room to grow that is used, at the least, where the photos decide on growth."""
+
+BASE_BYTES = 520 * 2**20
+"""Python with torch, scipy and the compiled kernels. With it, a training of 8000 Gaussians at 96 px
+was estimated at 533 MiB and took 531 MiB. Whole jobs of 40 small photos took 0.7 to 1.4 GB: mesh
+and texture need more than a small training does."""
+
+GAUSSIAN_COPIES = 8
+"""Parameters, two moments, two states to fall back to, a checkpoint on its way to disk."""
+
+PIXEL_BYTES = 250
+"""Images, their gradients, contributor lists, losses."""
+
+RENDER_GAUSSIAN_BYTES = 600
+"""Screen rows, pairs and their gradients."""
+
+PHOTO_CACHE_BYTES = 1 << 30
+MEMORY_SHARE_LEFT = 0.9
+"""More than this share of the free memory makes the system swap or kill."""
+
+CHECKPOINTS = 3
+"""Two stay, and the third is written before the oldest goes."""
+
+RESULT_BYTES_PER_GAUSSIAN = 500
+"""Trained Gaussians and the PLY of the result."""
+
+OTHER_DISK_BYTES = 60 * 2**20
+"""Pictures, report, mesh and texture of one region."""
+
+DISK_RESERVE_BYTES = 100 * 2**20
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What the estimate must know of an input."""
+
+    photos: int
+    pixels: float
+    """Mean number of pixels of a photo as it lies on disk."""
+    long_side_px: int
+    """Of the largest photo."""
+    points: int
+    """Sparse points; 0 where they are not known yet."""
+    masked: bool = False
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What the estimate must know of a machine; 0 bytes where the system does not tell."""
+
+    threads: int
+    speed: float = 1.0
+    """Times the reference machine (:func:`~.machine_speed.machine_speed`)."""
+    memory_bytes: int = 0
+    """That could be taken now."""
+    disk_free_bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a training will take."""
+
+    seconds_low: float
+    seconds_high: float
+    memory_bytes: int
+    """Largest resident size of the worker."""
+    disk_bytes: int
+    gaussians: int
+    """Most Gaussians that it will hold."""
+
+    def span(self) -> str:
+        """Return the time as people say it."""
+        low, high = self.seconds_low, self.seconds_high
+        if high < 90:
+            return f"{max(1, round(low))} to {max(1, round(high))} s"
+        if high < 5400:
+            return f"{max(1, round(low / 60))} to {round(high / 60)} min"
+        return f"{low / 3600:.1f} to {high / 3600:.1f} h"
+
+    def sentence(self) -> str:
+        """Return all of it in one line."""
+        return (
+            f"{self.span()}, {self.memory_bytes / 2**30:.1f} GB of memory, "
+            f"{self.disk_bytes / 2**30:.2f} GB of disk, up to {self.gaussians} Gaussians"
+        )
+
+
+def scene_facts(scene: Scene) -> SceneFacts:
+    """Return the facts of a loaded scene."""
+    sizes = [(v.camera.width, v.camera.height) for v in scene.views]
+    return SceneFacts(
+        len(sizes),
+        sum(w * h for w, h in sizes) / max(1, len(sizes)),
+        max((max(size) for size in sizes), default=0),
+        len(scene.points),
+        any(view.mask_path is not None for view in scene.views),
+    )
+
+
+def this_machine(folder: Path, threads: int, speed: float = 1.0) -> Machine:
+    """Return what is free now, on the disk that holds ``folder`` (or will hold it)."""
+    existing = folder
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    try:
+        free_bytes = shutil.disk_usage(existing).free
+    except OSError:
+        free_bytes = 0
+    return Machine(threads, speed, available_memory_bytes(), free_bytes)
+
+
+def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float) -> np.ndarray:
+    """Return (iterations + extra,) expected numbers of Gaussians.
+
+    Parameters
+    ----------
+    growth : float
+        Share of the room between start and limit that is filled.
+    """
+    schedule = _schedule(facts, settings)
+    limit = schedule.growth_limit()
+    start = min(limit, max(facts.points, FEW_POINTS))
+    top = limit if settings.growth == "on" else start + growth * (limit - start)
+    if settings.growth == "off":
+        top = start
+    total = settings.iterations + settings.extra_iterations
+    counts = np.empty(total)
+    count = float(start)
+    for iteration in range(total):
+        counts[iteration] = count
+        done = iteration + 1
+        if done >= settings.iterations:
+            continue
+        if schedule.densifies(done):
+            count = max(count, min(top, schedule.budget(done), count * ROUND_GROWTH))
+        if settings.wrapping != "off" and schedule.wraps(done):
+            count = min(settings.max_gaussians, count * (1.0 + settings.wrap_share))
+    return counts
+
+
+def _schedule(facts: SceneFacts, settings: TrainingSettings) -> Schedule:
+    return Schedule(settings, max(1, min(facts.long_side_px, settings.max_image_px)))
+
+
+def _trained_pixels(facts: SceneFacts, settings: TrainingSettings) -> float:
+    """Return the pixels of a photo at the finest training size."""
+    factor = min(1.0, settings.max_image_px / max(1, facts.long_side_px))
+    return facts.pixels * factor * factor
+
+
+def _seconds(
+    facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray, first: int = 0
+) -> float:
+    """Return the model's time on the reference machine, from iteration ``first`` on."""
+    schedule, pixels = _schedule(facts, settings), _trained_pixels(facts, settings)
+    last = settings.iterations - 1
+    total_s = 0.0
+    for iteration, count in enumerate(counts.tolist()):
+        if iteration < first:
+            continue
+        planned = min(iteration, last)
+        size = _window(pixels / schedule.divisor(planned) ** 2, settings.pixels_per_iteration)
+        depth = schedule.uses_depth(planned)
+        spent_s = size * PIXEL_S * (1.0 if depth else WITHOUT_DEPTH) + count * GAUSSIAN_S
+        compares = settings.multi_view != "off" and facts.photos > 1
+        if compares and schedule.compares_views(planned):
+            spent_s *= 1.0 + MULTI_VIEW_SHARE
+        total_s += ITERATION_S + spent_s
+    return total_s
+
+
+def _window(pixels: float, most: int) -> float:
+    """Return about how many pixels of an image an iteration looks at (:mod:`..windows`)."""
+    across = math.ceil(math.sqrt(pixels / most))
+    return pixels / across**2 if across > 1 else pixels
+
+
+def estimate(
+    scene_facts: SceneFacts, settings: TrainingSettings, machine: Machine, *, first: int = 0
+) -> Estimate:
+    """Return what a training will take.
+
+    Where the photos decide (``"auto"``), the range reaches from "not needed" to "needed".
+
+    Parameters
+    ----------
+    scene_facts : SceneFacts
+    settings : TrainingSettings
+    machine : Machine
+    first : int
+        Iterations that a checkpoint has done already.
+
+    Returns
+    -------
+    Estimate
+        Seconds of the training alone: solving cameras from photos, meshing and texture come on top
+        (:data:`MESH_AND_TEXTURE_SHARE`).
+    """
+    decided = settings.multi_view == "auto"
+    cheap = dataclasses.replace(settings, multi_view="off") if decided else settings
+    least = gaussian_counts(scene_facts, settings, LITTLE_GROWTH)
+    most = gaussian_counts(scene_facts, settings, 1.0)
+    low_s = LOW * _seconds(scene_facts, cheap, least, first) / machine.speed
+    high_s = HIGH * _seconds(scene_facts, settings, most, first) / machine.speed
+    count = math.ceil(float(most.max()))
+    coefficients = 3 * (settings.sh_degree + 1) ** 2
+    trained = 3 + 3 + 4 + 1 + coefficients + 4  # values of a Gaussian that are trained
+    state_bytes = 4 * (3 * trained + 5)  # with both moments, filter, steps, statistics
+    pixels = _trained_pixels(scene_facts, settings)
+    channels = 4 if scene_facts.masked else 3
+    photos_bytes = scene_facts.photos * pixels * channels * (1 + 1 / 4 + 1 / 16)
+    memory = (
+        BASE_BYTES
+        + count * (4 * trained * GAUSSIAN_COPIES + RENDER_GAUSSIAN_BYTES)
+        + pixels * PIXEL_BYTES
+        + min(photos_bytes, PHOTO_CACHE_BYTES)
+    )
+    disk = CHECKPOINTS * count * state_bytes + count * RESULT_BYTES_PER_GAUSSIAN
+    return Estimate(low_s, high_s, round(memory), round(disk) + OTHER_DISK_BYTES, count)
+
+
+def judge(expected: Estimate, machine: Machine) -> list[ReportWarning]:
+    """Refuse where the disk is clearly too full; return warnings about memory.
+
+    Raises
+    ------
+    ResourceError
+        The disk has less free than the training will write.
+    """
+    if machine.disk_free_bytes and expected.disk_bytes > machine.disk_free_bytes:
+        missing = expected.disk_bytes + DISK_RESERVE_BYTES - machine.disk_free_bytes
+        raise ResourceError(
+            f"The training will write {expected.disk_bytes / 2**30:.2f} GB, and only "
+            f"{machine.disk_free_bytes / 2**30:.2f} GB are free where the job lies.",
+            f"Free {missing / 2**30:.2f} GB there, choose another --out, or fewer "
+            "--max-gaussians; then resume.",
+        )
+    if machine.memory_bytes and expected.memory_bytes > MEMORY_SHARE_LEFT * machine.memory_bytes:
+        text = (
+            f"The training may need {expected.memory_bytes / 2**30:.1f} GB of memory, and "
+            f"{machine.memory_bytes / 2**30:.1f} GB are free: close other programs, or give fewer "
+            "--max-gaussians or a smaller --max-image-px."
+        )
+        return [ReportWarning("memory-short", text)]
+    return []

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Adding Gaussians where the images ask for them, and removing those that show nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ... import tolerances
+from ...render.types.images import RenderStatistics
+from ..optimizer.adam import Adam
+
+GRADIENT_THRESHOLD = 2e-4
+"""Average loss gradient per half image from which a Gaussian is doubled.
+
+See docs/method.md, section 4.1.
+"""
+
+LOWEST_SCORE = 0.3
+"""Where the budget has room for more than qualify, those with at least this share of the threshold
+are taken, best first: the budget decides how many, the gradients decide which (Taming 3DGS)."""
+
+CLONE_SIZE = 0.01 * tolerances.SCENE_RADIUS
+"""Gaussians whose largest raw standard deviation is at most this are cloned, others split."""
+
+SPLIT_FACTOR = 1.6
+MIN_OPACITY = 0.02
+"""Gaussians with a smaller raw opacity are removed. Between 0.05 and 0.005 of the two published
+codes (docs/method.md, section 4.1): short runs hardly recover what 0.05 removes."""
+
+RESET_OPACITY = 0.01
+
+
+@dataclass
+class DensityStatistics:
+    """Running sums over the views since the last densification, all (n,)."""
+
+    gradient: np.ndarray
+    """float32: sum of screen gradients, per half image."""
+    gradient_abs: np.ndarray
+    """float32: the same of the absolute gradients (AbsGS)."""
+    views: np.ndarray
+    """int32: views that saw the Gaussian."""
+
+    @classmethod
+    def zeros(cls, count: int) -> DensityStatistics:
+        """Return empty statistics."""
+        return cls(
+            np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.int32)
+        )
+
+    def add(self, statistics: RenderStatistics, width: int, height: int, part: float = 1.0) -> None:
+        """Add one view after its backward pass.
+
+        Parameters
+        ----------
+        width, height : int
+            Of its image, pixels.
+        part : float
+            Share of the image that was rendered: a loss that is a mean over fewer pixels has
+            larger gradients.
+        """
+        half_image = 0.5 * max(width, height) * part
+        # 0 for the unseen: all are added, which is faster than picking the seen.
+        weight = np.multiply(statistics.visible, half_image, dtype=np.float32)
+        self.gradient += weight * statistics.grad_px
+        self.gradient_abs += weight * statistics.grad_abs_px
+        self.views += statistics.visible
+
+
+@dataclass(frozen=True)
+class DensityChange:
+    """What one round of density control did."""
+
+    cloned: int
+    split: int
+    pruned: int
+
+
+def densify_and_prune(
+    adam: Adam,
+    statistics: DensityStatistics,
+    limit: int,
+    random: np.random.Generator,
+    weights: np.ndarray | None = None,
+) -> DensityChange:
+    """Clone small and split large Gaussians with high gradients; remove transparent ones.
+
+    A Gaussian qualifies by its average gradient, or by its average absolute gradient above the
+    quantile that selects the same share (docs/method.md, section 4.1). Where more qualify than
+    ``limit`` has room for, those with the highest gradients are taken.
+
+    Parameters
+    ----------
+    adam : Adam
+        Rebuilt; new Gaussians start with zero moments.
+    statistics : DensityStatistics
+        Of the current Gaussians.
+    limit : int
+        The number of Gaussians never grows beyond this.
+    random : numpy.random.Generator
+        Positions of the new Gaussians are drawn from the old ones.
+    weights : (n,), optional
+        What counts in the ranking where room is short: gradients are multiplied by it there.
+    """
+    log_scales = adam.array("log_scales")
+    opacity = 1.0 / (1.0 + np.exp(-adam.array("opacity_logits").astype(np.float64)))
+    keep = opacity >= MIN_OPACITY
+    if not keep.any():
+        keep[np.argmax(opacity)] = True
+    chosen = _qualified(statistics, keep, limit - int(keep.sum()), weights)
+    small = log_scales.max(axis=1) <= np.log(CLONE_SIZE)
+    cloned = np.nonzero(chosen & small)[0]
+    split = np.nonzero(chosen & ~small)[0]
+    stay = keep.copy()
+    stay[split] = False
+    old = np.nonzero(stay)[0]
+    parents = np.concatenate([old, cloned, split, split])
+    fresh = np.arange(len(parents)) >= len(old)
+    born = parents[fresh]
+    means = adam.array("means")[parents].copy()
+    means[fresh] += _offsets(adam, born, random)
+    new_scales = log_scales[parents].copy()
+    new_scales[len(old) + len(cloned) :] -= np.float32(np.log(SPLIT_FACTOR))
+    adam.rebuild(parents, fresh, {"means": means, "log_scales": new_scales})
+    return DensityChange(len(cloned), len(split), int((~keep).sum()))
+
+
+def _qualified(
+    statistics: DensityStatistics, keep: np.ndarray, room: int, weights: np.ndarray | None
+) -> np.ndarray:
+    """(n,) bool: Gaussians to double, at most ``room`` of them."""
+    views = np.maximum(statistics.views, 1)
+    average = statistics.gradient / views
+    average_abs = statistics.gradient_abs / views
+    above = average >= GRADIENT_THRESHOLD
+    share = float(above.mean())
+    score = average / GRADIENT_THRESHOLD
+    if share > 0.0:
+        level = float(np.quantile(average_abs, 1.0 - share))
+        if level > 0.0:
+            score = np.maximum(score, average_abs / level)
+    chosen = (score >= LOWEST_SCORE) & keep & (statistics.views > 0)
+    if chosen.sum() > room:
+        weighted = score if weights is None else score * weights
+        ranked = np.argsort(-np.where(chosen, weighted, -np.inf), kind="stable")
+        chosen[:] = False
+        chosen[ranked[: max(0, room)]] = True
+    return chosen
+
+
+def _offsets(adam: Adam, rows: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """(m, 3) draws from the Gaussians of ``rows``, relative to their means."""
+    gaussians = adam.gaussians().detached()
+    rotations = gaussians.rotations().numpy()[rows]  # (m, 3, 3)
+    local = np.exp(adam.array("log_scales")[rows]) * random.normal(size=(len(rows), 3))
+    return np.einsum("nij,nj->ni", rotations, local).astype(np.float32)
+
+
+def reset_opacity(adam: Adam) -> None:
+    """Cap all effective opacities at 0.01 and forget their moments.
+
+    See docs/method.md, section 4.1.
+    """
+    gaussians = adam.gaussians().detached()
+    log_factor = (gaussians.log_scales - gaussians.scales().log()).sum(1).numpy()  # (n,) <= 0
+    log_cap = np.minimum(np.log(RESET_OPACITY) - log_factor, np.log1p(-1e-6))
+    cap = log_cap - np.log(-np.expm1(log_cap))  # logit of the raw opacity
+    logits = adam.array("opacity_logits")
+    np.minimum(logits, cap, out=logits)
+    adam.reset_moments("opacity_logits")

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Orientation without training: the shortest axis, its sign by the cameras' vote."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+
+from ...dataset.camera import Camera
+from ...gaussians.model import OrientedGaussians
+from ...render.render import render
+from ...render.types.options import RenderOptions
+
+FIRST_SIGN = 0.5
+"""Size of the sign parameter after the cameras' vote (docs/method.md, section 1.3)."""
+
+
+def voted_orientation(
+    gaussians: OrientedGaussians, cameras: Iterable[Camera], *, threads: int = 0
+) -> np.ndarray:
+    """Return the orientation parameters of Gaussians that have learned none.
+
+    The direction is the shortest axis. Each camera votes with the Gaussian's blending weight for
+    the side that it sees; the sign parameter is +-0.5, or 0 where no camera sees the Gaussian
+    (docs/method.md, section 1.3).
+
+    Parameters
+    ----------
+    gaussians : OrientedGaussians
+        float32; in the frame of the cameras.
+
+    Returns
+    -------
+    (n, 4) float32
+        Direction and sign parameter.
+    """
+    gaussians = gaussians.detached()
+    shortest = torch.argmin(gaussians.log_scales, dim=1)  # (n,)
+    axes = gaussians.rotations()  # (n, 3, 3)
+    direction = axes[torch.arange(len(gaussians)), :, shortest].numpy()  # (n, 3)
+    means = gaussians.means.numpy()
+    votes = np.zeros(len(gaussians))
+    options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
+    for camera in cameras:
+        with torch.no_grad():
+            statistics = render(gaussians, camera, options).statistics
+        assert statistics is not None
+        toward = camera.center - means  # (n, 3)
+        votes += statistics.weight_sum * np.sign((toward * direction).sum(1))
+    sign = FIRST_SIGN * np.sign(votes)  # (n,)
+    return np.concatenate([direction, sign[:, None]], axis=1).astype(np.float32)
+
+
+def orient(
+    gaussians: OrientedGaussians, cameras: Iterable[Camera], *, threads: int = 0
+) -> OrientedGaussians:
+    """Return the Gaussians with :func:`voted_orientation`: a splat that can be meshed."""
+    orientation = voted_orientation(gaussians, cameras, threads=threads)
+    return gaussians.replaced(orientation=torch.from_numpy(orientation))

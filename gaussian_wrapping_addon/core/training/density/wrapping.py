@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Orientation: its first guess, and clones of opposite orientation where normals disagree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ... import tolerances
+from ...dataset.camera import Camera
+from ...gaussians.model import OrientedGaussians
+from ...render.render import render
+from ...render.types.options import RenderOptions
+from ..losses.losses import normals_from_depth
+from ..optimizer.adam import Adam
+from .orientation import voted_orientation
+
+SHIFT = 0.1
+"""Original and clone move apart by this many standard deviations along the normal, each."""
+
+MIN_VIEWS = 2
+"""The error of a Gaussian is averaged over at least this many views, so that one bad view of a
+rarely seen Gaussian does not win (docs/method.md, section 4.2)."""
+
+_SATURATED = 20.0
+"""tanh of this is 1 in float32: normals of unit length."""
+
+
+@dataclass(frozen=True)
+class WrapView:
+    """A training view as the rounds look at it."""
+
+    camera: Camera
+    mask: np.ndarray | None
+    """(h, w) bool."""
+
+
+def start_orientation(adam: Adam, views: Iterable[WrapView], *, threads: int = 0) -> None:
+    """Set the direction to the shortest axis and let the views vote for the sign.
+
+    Each view votes with the Gaussian's blending weight for the side that it sees; the sign
+    parameter becomes +-0.5, or stays 0 where no view sees the Gaussian (docs/method.md,
+    section 1.3).
+    """
+    cameras = (view.camera for view in views)
+    adam.array("orientation")[:] = voted_orientation(adam.gaussians(), cameras, threads=threads)
+    adam.reset_moments("orientation")
+
+
+def normal_errors(
+    gaussians: OrientedGaussians, views: Iterable[WrapView], *, threads: int = 0
+) -> np.ndarray:
+    """Return (n,) mean normal error of each Gaussian over the views (docs/method.md, section 4.2).
+
+    ``1 - N . n_depth`` with normals of unit length; each pixel counts for the Gaussian with the
+    largest blending weight there.
+    """
+    count = len(gaussians)
+    unit = gaussians.orientation.detach().clone()
+    unit[:, 3] = _SATURATED * torch.sign(unit[:, 3])
+    oriented = gaussians.detached().replaced(orientation=unit)
+    options = RenderOptions(depth=True, sh_degree=0, threads=threads, statistics=True)
+    total, seen = np.zeros(count), np.zeros(count)
+    for view in views:
+        with torch.no_grad():
+            image = render(oriented, view.camera, options)
+        assert image.statistics is not None
+        assert image.statistics.strongest is not None
+        normals, valid = normals_from_depth(image.depth.numpy(), view.camera, threads=threads)
+        if view.mask is not None:
+            valid &= view.mask
+        strongest = image.statistics.strongest
+        valid &= strongest >= 0
+        error = 1.0 - (image.normal.numpy() * normals).sum(2)[valid]
+        owner = strongest[valid]
+        pixels = np.bincount(owner, minlength=count)
+        sums = np.bincount(owner, weights=error, minlength=count)
+        total += sums / np.maximum(pixels, 1)
+        seen += pixels > 0
+    return total / np.maximum(seen, MIN_VIEWS)
+
+
+def wrap(adam: Adam, errors: np.ndarray, share: float, limit: int) -> int:
+    """Clone the Gaussians of largest error with the opposite orientation.
+
+    See docs/method.md, section 4.2.
+
+    Both are shrunk along the normal to half the volume and moved apart by 0.1 standard deviations
+    along it, the clone to the back. Gaussians without orientation are left alone.
+
+    Parameters
+    ----------
+    adam : Adam
+        Rebuilt; clones have zero moments.
+    errors : (n,) float64
+        Of :func:`normal_errors`.
+    share : float
+        At most this share of the Gaussians is cloned.
+    limit : int
+        The number of Gaussians never grows beyond this.
+
+    Returns
+    -------
+    int
+        How many were cloned.
+    """
+    gaussians = adam.gaussians().detached()
+    count = len(gaussians)
+    room = min(math.floor(share * count), limit - count)
+    normals = gaussians.normals().numpy().astype(np.float64)
+    length = np.linalg.norm(normals, axis=1)
+    usable = (errors > 0.0) & (length >= tolerances.ORIENTED_MIN_NORM)
+    room = min(room, int(usable.sum()))
+    if room <= 0:
+        return 0
+    ranked = np.argsort(-np.where(usable, errors, -1.0), kind="stable")
+    chosen = np.sort(ranked[:room])
+    unit = normals[chosen] / length[chosen, None]  # (m, 3)
+    axes = gaussians.rotations().numpy()[chosen].astype(np.float64)  # columns are axes
+    along_sq = np.einsum("nij,ni->nj", axes, unit) ** 2  # (m, 3), sums to 1
+    log_scales = adam.array("log_scales").copy()
+    log_scales[chosen] += (math.log(0.5) * along_sq).astype(np.float32)
+    filter_sq = gaussians.filter_3d.numpy()[chosen, None].astype(np.float64) ** 2
+    effective_sq = np.exp(2.0 * log_scales[chosen].astype(np.float64)) + filter_sq
+    sigma = np.sqrt((along_sq * effective_sq).sum(1))
+    shift = (SHIFT * sigma[:, None] * unit).astype(np.float32)
+    parents = np.concatenate([np.arange(count), chosen])
+    fresh = np.arange(len(parents)) >= count
+    means = adam.array("means")[parents].copy()
+    means[chosen] += shift
+    means[count:] -= shift
+    orientation = adam.array("orientation")[parents].copy()
+    orientation[count:, 3] *= -1.0
+    adam.rebuild(
+        parents,
+        fresh,
+        {"means": means, "log_scales": log_scales[parents], "orientation": orientation},
+    )
+    return room

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Gaussians in another frame: shapes, orientations and harmonics move along with the means."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...dataset.loading.splat_cameras import even_directions
+from ...dataset.readers.source_model import quaternion_from_rotation
+from ...dataset.similarity import Similarity
+from ...gaussians.model import OrientedGaussians
+from ...render.reference.reference_projection import harmonics_basis
+
+_DIRECTIONS = 64
+"""Directions in which rotated harmonics must agree; 16 would do, more are better conditioned."""
+
+
+def move_gaussians(
+    gaussians: OrientedGaussians, target_from_source: Similarity
+) -> OrientedGaussians:
+    """Return what looks from a moved camera as the Gaussians do from the camera before.
+
+    Parameters
+    ----------
+    gaussians : OrientedGaussians
+        Source frame; lengths (``filter_3d`` too) in its units.
+    target_from_source : Similarity
+
+    Returns
+    -------
+    OrientedGaussians
+        float64, target frame.
+    """
+    wide = {name: t.detach().cpu().double() for name, t in gaussians.tensors()}
+    move = target_from_source
+    rotation = torch.from_numpy(np.array(move.rotation, np.float64))
+    means = torch.from_numpy(move.points(wide["means"].numpy()))
+    direction = wide["orientation"][:, :3] @ rotation.T
+    return OrientedGaussians(
+        means=means,
+        log_scales=wide["log_scales"] + math.log(move.scale),
+        quats=_turned(wide["quats"], quaternion_from_rotation(move.rotation)),
+        opacity_logits=wide["opacity_logits"],
+        sh=rotate_harmonics(wide["sh"], rotation),
+        orientation=torch.cat([direction, wide["orientation"][:, 3:]], dim=1),
+        filter_3d=wide["filter_3d"] * move.scale,
+    )
+
+
+def _turned(quats: Tensor, turn: np.ndarray) -> Tensor:
+    """Return the (n, 4) products ``turn * quats`` of quaternions w x y z."""
+    a, b, c, d = turn.tolist()
+    left = quats.new_tensor([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
+    return quats @ left.T
+
+
+def rotate_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
+    """Rotate functions on the sphere, given by real spherical harmonics.
+
+    The coefficients are those that agree with the function before in :data:`_DIRECTIONS`
+    directions, by least squares for each degree; the degrees do not mix, so the fit is exact.
+
+    Parameters
+    ----------
+    sh : (n, (degree + 1)^2, 3)
+        Of degree 0 to 3.
+    rotation : (3, 3)
+        Of the frame: the result at ``rotation @ d`` is the input at ``d``.
+
+    Returns
+    -------
+    Tensor
+        Of the shape and type of ``sh``.
+    """
+    degree = math.isqrt(sh.shape[1]) - 1
+    if torch.equal(rotation, torch.eye(3, dtype=rotation.dtype)):
+        return sh
+    before = _directions()  # (m, 3)
+    after = before @ rotation.double().T
+    basis, turned = harmonics_basis(before, degree), harmonics_basis(after, degree)  # (m, k)
+    out = sh.double().clone()
+    for level in range(1, degree + 1):
+        band = slice(level * level, (level + 1) ** 2)
+        matrix = torch.linalg.lstsq(turned[:, band], basis[:, band]).solution  # (2l+1, 2l+1)
+        out[:, band] = torch.einsum("ij,njc->nic", matrix, sh[:, band].double())
+    return out.to(sh.dtype)
+
+
+@functools.cache
+def _directions() -> Tensor:
+    """(m, 3) unit vectors spread evenly: a spherical Fibonacci lattice."""
+    return torch.from_numpy(even_directions(_DIRECTIONS))
+
+
+def with_degree(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:
+    """Return the Gaussians with harmonics of a degree: cut, or filled up with zeros."""
+    wanted = (degree + 1) ** 2
+    sh = gaussians.sh[:, :wanted]
+    missing = sh.new_zeros((len(sh), wanted - sh.shape[1], 3))
+    return gaussians.replaced(sh=torch.cat([sh, missing], dim=1))

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Start of a training from an existing splat: into the scene, capped, checked, oriented."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...dataset.camera import Camera
+from ...dataset.photo_source import PhotoSource
+from ...dataset.scene import Scene
+from ...errors import DatasetError
+from ...gaussians.foreign_splat import read_foreign_splat
+from ...gaussians.mip_filter import mip_filter
+from ...gaussians.model import OrientedGaussians
+from ...progress import Progress
+from ...render.render import render
+from ...render.types.options import RenderOptions
+from ...report_warning import ReportWarning
+from ...settings import TrainingSettings
+from ..density.orientation import orient
+from .splat_motion import move_gaussians, with_degree
+
+_logger = logging.getLogger(__name__)
+
+ITERATIONS_SHARE = 0.3
+"""Of the preset's iterations: colour and places are there, shapes and orientations are to learn."""
+
+FILTER_MULTIPLE = 2.0
+"""No axis is shorter than this many standard deviations of the 3D filter: of a thinner one the
+filter would take the opacity (a disc a tenth of the filter thick keeps a tenth of it)."""
+
+HIGHEST_OPACITY = 0.995
+LOWEST_OPACITY = 1e-4
+"""Opacities are clamped to this range: beyond, the sigmoid's gradient is too small to train."""
+
+MATCH_VIEWS = 8
+"""Photos that the splat is compared with."""
+
+MATCH_DB = 12.0
+"""Below this PSNR the splat shows something else than the photos."""
+
+CLEAR_DB = 20.0
+"""From here on a splat matches even where a photo of one colour would do as well."""
+
+WEIGHT_VIEWS = 24
+"""Views that are asked which Gaussians count, where there are too many."""
+
+_SMALL_DIVISOR = 4
+
+
+@dataclass(frozen=True)
+class SplatStart:
+    """What training starts from."""
+
+    gaussians: OrientedGaussians
+    """float32, scene frame; ``filter_3d`` is that of the training cameras at full size."""
+    warnings: tuple[ReportWarning, ...] = ()
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+def wrapping_settings(settings: TrainingSettings) -> TrainingSettings:
+    """Return the plan of a short training from a splat.
+
+    Nothing is added or pruned by density control; depth and normals are learned from the start;
+    the wrapping rounds lie between 30 and 70 % of the iterations.
+    """
+    return dataclasses.replace(
+        settings,
+        iterations=max(1, round(ITERATIONS_SHARE * settings.iterations)),
+        growth="off",
+        full_size="on",
+        prune_share=0.0,
+        depth_from=0.0,
+        densify_from=0.0,
+        densify_until=0.0,
+        orient_from=0.0,
+        wrap_from=0.3,
+        wrap_until=0.7,
+    )
+
+
+def start_from_splat(
+    path: Path,
+    scene: Scene,
+    photos: PhotoSource,
+    view_indices: Sequence[int],
+    settings: TrainingSettings,
+    progress: Progress,
+    *,
+    threads: int = 0,
+) -> SplatStart:
+    """Read a splat in the world frame of the photos' cameras and make it a training's start.
+
+    Parameters
+    ----------
+    path : Path
+        3D Gaussian splatting PLY of any program.
+    scene : Scene
+        Of the photos.
+    photos : PhotoStore
+    view_indices : sequence of int
+        Training views.
+    settings : TrainingSettings
+        ``max_gaussians`` and ``sh_degree`` are kept to.
+    progress : Progress
+        Asked for cancelling at every view.
+
+    Returns
+    -------
+    SplatStart
+
+    Raises
+    ------
+    ParseError
+        The file is not a splat.
+    DatasetError
+        The splat does not show what the photos show.
+    """
+    splat = read_foreign_splat(path)
+    progress.check()
+    # Degrees do not mix in a rotation: those that are cut need not be rotated.
+    wanted = with_degree(baked(splat.gaussians), settings.sh_degree)
+    moved = move_gaussians(wanted, scene.world_from_scene.inverse())
+    cameras = [photos.camera(i, 1) for i in view_indices]
+    gaussians = fit_filter(moved, cameras, threads=threads)
+    warnings, facts = list(splat.warnings), dict(splat.facts)
+    if len(gaussians) > settings.max_gaussians:
+        text = (
+            f"The splat has {len(gaussians)} Gaussians; the {settings.max_gaussians} that the "
+            "photos show most of are kept."
+        )
+        warnings.append(ReportWarning("gaussians-over-cap", text))
+        chosen = _spread(view_indices, WEIGHT_VIEWS)
+        small = [photos.camera(i, _divisor(photos, i)) for i in chosen]
+        weights = _shown(gaussians, small, progress, threads=threads)
+        # A stable order makes the choice among equals a function of the file alone.
+        kept = np.sort(np.argsort(-weights, kind="stable")[: settings.max_gaussians])
+        gaussians = gaussians.select(torch.from_numpy(kept))
+    facts["splat_kept"] = len(gaussians)
+    matched, unlike = _match(gaussians, photos, view_indices, progress, threads=threads)
+    facts["splat_psnr"] = round(matched, 2)
+    if unlike:
+        raise DatasetError(
+            f"The splat {path.name} does not show what the photos show (PSNR {matched:.1f} dB): "
+            "its frame probably differs from that of the photos' cameras.",
+            "Give the photos with the camera poses that the splat was trained with, or wrap the "
+            "splat alone, without photos.",
+        )
+    if not splat.oriented:
+        chosen = _spread(view_indices, WEIGHT_VIEWS)
+        small = [photos.camera(i, _divisor(photos, i)) for i in chosen]
+        gaussians = orient(gaussians, small, threads=threads)
+    return SplatStart(gaussians, tuple(warnings), facts)
+
+
+def baked(gaussians: OrientedGaussians) -> OrientedGaussians:
+    """Return the same Gaussians with a filter of 0: it is in scales and opacities (float64)."""
+    wide = OrientedGaussians(**{n: t.detach().double() for n, t in gaussians.tensors()})
+    if not wide.filter_3d.any():
+        return wide
+    return wide.replaced(
+        log_scales=torch.log(wide.scales()),
+        opacity_logits=_logit(torch.exp(wide.log_opacities())),
+        filter_3d=torch.zeros_like(wide.filter_3d),
+    )
+
+
+def fit_filter(
+    gaussians: OrientedGaussians, cameras: Sequence[Camera], *, threads: int = 0
+) -> OrientedGaussians:
+    """Return Gaussians that look with the cameras' 3D filter as the given ones do without.
+
+    Where that cannot be (an axis shorter than :data:`FILTER_MULTIPLE` filters, a thin and opaque
+    Gaussian), the axis is made that long and the opacity as high as it can be.
+
+    Parameters
+    ----------
+    gaussians : OrientedGaussians
+        Scene frame, with a filter of 0.
+    cameras : sequence of Camera
+        Training cameras at full size.
+
+    Returns
+    -------
+    OrientedGaussians
+        float32, with the filter of the cameras.
+    """
+    wide = {name: t.detach().double() for name, t in gaussians.tensors()}
+    width = torch.from_numpy(mip_filter(wide["means"].numpy(), cameras, threads=threads))  # (n,)
+    least = (FILTER_MULTIPLE * width)[:, None]
+    wanted = torch.maximum(torch.exp(wide["log_scales"]), least)  # (n, 3) effective
+    raw = torch.sqrt(wanted**2 - width[:, None] ** 2)
+    kept = (raw / wanted).prod(dim=1)  # (n,) what the filter leaves of the opacity
+    wide["log_scales"] = torch.log(raw)
+    wide["opacity_logits"] = _logit(torch.sigmoid(wide["opacity_logits"]) / kept)
+    wide["filter_3d"] = width
+    # Files hold quaternions of any length; the rotation's learning rate is for length 1.
+    wide["quats"] = torch.nn.functional.normalize(wide["quats"], dim=1)
+    return OrientedGaussians(**{name: t.float() for name, t in wide.items()})
+
+
+def _logit(opacity: torch.Tensor) -> torch.Tensor:
+    clamped = opacity.clamp(LOWEST_OPACITY, HIGHEST_OPACITY)
+    return torch.log(clamped) - torch.log1p(-clamped)
+
+
+def _spread(indices: Sequence[int], count: int) -> list[int]:
+    """Return at most ``count`` of the indices, evenly spread."""
+    positions = np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int)
+    return [indices[i] for i in positions.tolist()]
+
+
+def _divisor(photos: PhotoSource, index: int) -> int:
+    """Return the divisor of a small image that still has a few tiles."""
+    camera = photos.camera(index, 1)
+    return _SMALL_DIVISOR if min(camera.width, camera.height) >= 32 * _SMALL_DIVISOR else 1
+
+
+def _shown(
+    gaussians: OrientedGaussians, cameras: Sequence[Camera], progress: Progress, *, threads: int
+) -> np.ndarray:
+    """(n,) share of all views' pixels that each Gaussian gives."""
+    options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
+    total = np.zeros(len(gaussians))
+    for camera in cameras:
+        progress.check()
+        with torch.no_grad():
+            statistics = render(gaussians, camera, options).statistics
+        assert statistics is not None
+        total += statistics.weight_sum / (camera.width * camera.height)
+    return total
+
+
+def _match(
+    gaussians: OrientedGaussians,
+    photos: PhotoSource,
+    view_indices: Sequence[int],
+    progress: Progress,
+    *,
+    threads: int,
+) -> tuple[float, bool]:
+    """Return the median PSNR against some photos, dB, and whether the splat shows another thing.
+
+    It does where it is below :data:`MATCH_DB`, or, short of :data:`CLEAR_DB`, no better than each
+    photo's mean colour: before a black background any small thing is close to any photo.
+    """
+    options = RenderOptions(depth=False, threads=threads)
+    errors, spreads = [], []
+    for index in _spread(view_indices, MATCH_VIEWS):
+        progress.check()
+        divisor = _divisor(photos, index)
+        with torch.no_grad():
+            image = render(gaussians, photos.camera(index, divisor), options).color.numpy()
+        photo = photos.photo(index, divisor) / 255.0
+        mask = photos.mask(index, divisor)
+        counted = np.ones(photo.shape[:2], np.bool_) if mask is None else mask
+        if not counted.any():
+            continue
+        pixels = photo[counted]  # (m, 3)
+        errors.append(float(((np.clip(image[counted], 0.0, 1.0) - pixels) ** 2).mean()))
+        spreads.append(float(pixels.var(axis=0).mean()))
+    if not errors:
+        raise DatasetError("The masks leave nothing of any photo.", "Check the masks.")
+    psnr = -10.0 * math.log10(max(float(np.median(errors)), 1e-10))
+    explains_nothing = float(np.median(np.array(errors) - np.array(spreads))) >= 0.0
+    return psnr, psnr < MATCH_DB or (psnr < CLEAR_DB and explains_nothing)

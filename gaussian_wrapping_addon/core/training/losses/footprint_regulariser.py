@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A price on overlap: Gaussians shrink where the photos do not ask for their size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...render.types.gradients import VisibleGradients
+
+
+def add_overlap_price(
+    gradients: VisibleGradients,
+    log_scales: np.ndarray,
+    boxes: np.ndarray,
+    size_px: tuple[int, int],
+    price: float,
+) -> float:
+    """Add the gradient of ``price`` times the mean number of Gaussians over a pixel.
+
+    Blending costs time for every Gaussian whose footprint holds a pixel, seen or hidden. Photos
+    alone do not mind: half transparent layers that overlap a hundredfold show the same as a few
+    small opaque ones, but take longer and have no surface. The footprint is the box on the screen;
+    its area grows with the square of the scale, and each axis takes its share of the square sum.
+
+    Parameters
+    ----------
+    gradients : VisibleGradients
+        ``log_scales`` is added to.
+    log_scales : (n, 3) float32
+        Raw, of all Gaussians.
+    boxes : (n, 4) float32
+        Footprints on the screen: x0, y0, x1, y1 in pixels.
+    size_px : (int, int)
+        Width and height of the image; what lies outside costs nothing.
+    price : float
+        Of one Gaussian over every pixel, in the unit of the loss.
+
+    Returns
+    -------
+    float
+        Mean number of Gaussians over a pixel.
+    """
+    ids = gradients.ids
+    width, height = size_px
+    box = np.clip(boxes[ids], 0.0, np.array([width, height, width, height], np.float32))  # (v, 4)
+    area = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])  # (v,)
+    area /= np.float32(width * height)
+    squares = np.exp(2.0 * log_scales[ids])  # (v, 3)
+    squares *= (2.0 * price * area / squares.sum(1))[:, None]
+    gradients.log_scales[...] += squares
+    return float(area.sum())

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compiled rows of the losses: normals of a depth map, and how others agree with them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ...kernels.compiled import inline, kernel, part
+
+MIN_NORMAL_SQ = 1e-30
+"""Cross products whose squared length (scene units^4) is below this give no normal."""
+
+BLOCK_PX = 256
+"""Columns whose planes lie in the fastest cache together."""
+
+_PLANE = BLOCK_PX + 16
+# Planes of a block. Constant offsets in one array let LLVM see that they do not overlap.
+_HERE, _UP, _DOWN, _ALPHA, _KEEP = 0, _PLANE, 2 * _PLANE, 3 * _PLANE, 4 * _PLANE
+_GEOMETRIC, _LEARNED = 5 * _PLANE, 8 * _PLANE  # three planes each
+_BY_GEOMETRIC, _BY_LEARNED = 11 * _PLANE, 14 * _PLANE
+_BY_ALPHA, _BY_UP, _BY_DOWN, _BY_LEFT, _BY_RIGHT = (k * _PLANE for k in range(17, 22))
+_PLANES = 22
+
+
+@inline
+def _edges(x: Any, y: Any, fx: Any, fy: Any, up: Any, down: Any, left: Any, right: Any) -> Any:
+    """Differences of back-projected neighbours: down the column of pixels, along the row.
+
+    ``x``, ``y``: the pixel's ray; ``fx``, ``fy``: 1 / focal length in pixels.
+    """
+    high, wide = down - up, right - left
+    return (
+        x * high, y * high + (down + up) * fy, high,
+        x * wide + (right + left) * fx, y * wide, wide,
+    )  # fmt: skip
+
+
+@inline
+def _cross(a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: Any) -> Any:
+    return a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+
+
+@kernel(fast=False)
+def normal_rows(begin, end, depth, camera, max_jump, normals, valid):  # type: ignore[no-untyped-def]
+    """Camera-frame normals of the surface z = depth, rows [begin, end).
+
+    See docs/method.md, section 2.8.
+
+    Parameters
+    ----------
+    depth : (h, w) float
+        z-depth; <= 0 where there is none.
+    camera : (4,) float64
+        fx, fy, cx, cy.
+    max_jump : float
+        Where opposite neighbours differ by more than this share of the depth, there is no normal;
+        0 switches the test off.
+    normals : (h, w, 3), valid : (h, w) bool
+        Written.
+    """
+    height, width = depth.shape
+    fx, fy, cx, cy = 1.0 / camera[0], 1.0 / camera[1], camera[2], camera[3]
+    for i in range(begin, end):
+        for j in range(width):
+            valid[i, j] = False
+            normals[i, j, 0] = normals[i, j, 1] = normals[i, j, 2] = 0.0
+            if i == 0 or j == 0 or i == height - 1 or j == width - 1:
+                continue
+            here, up, down = depth[i, j], depth[i - 1, j], depth[i + 1, j]
+            left, right = depth[i, j - 1], depth[i, j + 1]
+            if not (here > 0 and up > 0 and down > 0 and left > 0 and right > 0):
+                continue
+            if max_jump > 0 and (
+                abs(down - up) > max_jump * here or abs(right - left) > max_jump * here
+            ):
+                continue
+            x, y = (j + 0.5 - cx) * fx, (i + 0.5 - cy) * fy
+            a0, a1, a2, b0, b1, b2 = _edges(x, y, fx, fy, up, down, left, right)
+            c0, c1, c2 = _cross(a0, a1, a2, b0, b1, b2)
+            length_sq = c0 * c0 + c1 * c1 + c2 * c2
+            if not length_sq > MIN_NORMAL_SQ:
+                continue
+            inverse = 1.0 / math.sqrt(length_sq)
+            normals[i, j, 0] = c0 * inverse
+            normals[i, j, 1] = c1 * inverse
+            normals[i, j, 2] = c2 * inverse
+            valid[i, j] = True
+
+
+@part(fast=True)
+def _load_planes(row, first, count, depth, alpha, mask, geometric, learned, planes):  # type: ignore[no-untyped-def]
+    """Copy ``count`` pixels of a row and its neighbours to planes; masked and border pixels have
+    no keep."""
+    width = depth.shape[1]
+    one, zero = planes.dtype.type(1.0), planes.dtype.type(0.0)
+    here, up, down = depth[row], depth[row - 1, first:], depth[row + 1, first:]
+    cover = alpha[row, first:]
+    normals, others = geometric[row, 3 * first :], learned[row, 3 * first :]
+    planes[_HERE] = here[first - 1] if first > 0 else zero
+    planes[_HERE + 1 + count] = here[first + count] if first + count < width else zero
+    middle = here[first:]
+    for j in range(count):
+        planes[_HERE + 1 + j] = middle[j]
+    for j in range(count):
+        planes[_UP + j] = up[j]
+        planes[_DOWN + j] = down[j]
+    for j in range(count):
+        planes[_ALPHA + j] = cover[j]
+        planes[_KEEP + j] = one
+    for j in range(count):
+        planes[_GEOMETRIC + j] = normals[3 * j]
+        planes[_GEOMETRIC + _PLANE + j] = normals[3 * j + 1]
+        planes[_GEOMETRIC + 2 * _PLANE + j] = normals[3 * j + 2]
+    for j in range(count):
+        planes[_LEARNED + j] = others[3 * j]
+        planes[_LEARNED + _PLANE + j] = others[3 * j + 1]
+        planes[_LEARNED + 2 * _PLANE + j] = others[3 * j + 2]
+    if mask.shape[0] > 0:
+        for j in range(count):
+            planes[_KEEP + j] = one if mask[row, first + j] else zero
+    if first == 0:
+        planes[_KEEP] = zero
+    if first + count == width:
+        planes[_KEEP + count - 1] = zero
+
+
+@part(fast=True)
+def _agree(  # type: ignore[no-untyped-def]
+    first, count, y, camera, rotation, max_jump, weight_geometric, weight_learned, planes
+):
+    """Losses and gradients of ``count`` pixels; returns the sums of ``1 - cos`` and the number of
+    pixels with a normal."""
+    kind = planes.dtype.type
+    zero, half, one = kind(0.0), kind(0.5), kind(1.0)
+    fx, fy, cx = kind(1.0 / camera[0]), kind(1.0 / camera[1]), kind(camera[2])
+    row_y, jump = kind(y), kind(max_jump if max_jump > 0.0 else 1e30)
+    w_geometric, w_learned = kind(weight_geometric), kind(weight_learned)
+    r00, r01, r02 = kind(rotation[0, 0]), kind(rotation[0, 1]), kind(rotation[0, 2])
+    r10, r11, r12 = kind(rotation[1, 0]), kind(rotation[1, 1]), kind(rotation[1, 2])
+    r20, r21, r22 = kind(rotation[2, 0]), kind(rotation[2, 1]), kind(rotation[2, 2])
+    least = kind(MIN_NORMAL_SQ)
+    total_geometric, total_learned, found = zero, zero, zero
+    for j in range(count):
+        left, here, right = planes[_HERE + j], planes[_HERE + 1 + j], planes[_HERE + 2 + j]
+        up, down, alpha = planes[_UP + j], planes[_DOWN + j], planes[_ALPHA + j]
+        x = (kind(first + j) + half - cx) * fx
+        a0, a1, a2, b0, b1, b2 = _edges(x, row_y, fx, fy, up, down, left, right)
+        c0, c1, c2 = _cross(a0, a1, a2, b0, b1, b2)
+        length_sq = c0 * c0 + c1 * c1 + c2 * c2
+        nearest = min(
+            min(min(up, down), min(left, right)), min(min(here, alpha), planes[_KEEP + j])
+        )
+        spread = max(abs(a2), abs(b2))
+        valid = (nearest > zero) & (spread <= jump * here) & (length_sq > least)
+        inverse = one / np.sqrt(length_sq if valid else one)
+        cover = one / (alpha if valid else one)
+        used = one if valid else zero
+        n0, n1, n2 = c0 * inverse, c1 * inverse, c2 * inverse
+        # The depth's normal in the scene frame.
+        s0 = r00 * n0 + r10 * n1 + r20 * n2
+        s1 = r01 * n0 + r11 * n1 + r21 * n2
+        s2 = r02 * n0 + r12 * n1 + r22 * n2
+        g0, g1 = planes[_GEOMETRIC + j], planes[_GEOMETRIC + _PLANE + j]
+        g2 = planes[_GEOMETRIC + 2 * _PLANE + j]
+        l0, l1 = planes[_LEARNED + j], planes[_LEARNED + _PLANE + j]
+        l2 = planes[_LEARNED + 2 * _PLANE + j]
+        cos_geometric = (g0 * s0 + g1 * s1 + g2 * s2) * cover
+        cos_learned = l0 * s0 + l1 * s1 + l2 * s2
+        found += used
+        total_geometric += used * (one - cos_geometric)
+        total_learned += used * (one - cos_learned)
+        share, learned = used * w_geometric * cover, used * w_learned
+        planes[_BY_ALPHA + j] = share * cos_geometric
+        planes[_BY_GEOMETRIC + j] = -share * s0
+        planes[_BY_GEOMETRIC + _PLANE + j] = -share * s1
+        planes[_BY_GEOMETRIC + 2 * _PLANE + j] = -share * s2
+        planes[_BY_LEARNED + j] = -learned * s0
+        planes[_BY_LEARNED + _PLANE + j] = -learned * s1
+        planes[_BY_LEARNED + 2 * _PLANE + j] = -learned * s2
+        # Gradient with respect to the normal, back in the camera frame.
+        t0, t1, t2 = share * g0 + learned * l0, share * g1 + learned * l1, share * g2 + learned * l2
+        u0 = -(r00 * t0 + r01 * t1 + r02 * t2)
+        u1 = -(r10 * t0 + r11 * t1 + r12 * t2)
+        u2 = -(r20 * t0 + r21 * t1 + r22 * t2)
+        along = n0 * u0 + n1 * u1 + n2 * u2
+        d0, d1, d2 = u0 - n0 * along, u1 - n1 * along, u2 - n2 * along
+        d0, d1, d2 = d0 * inverse, d1 * inverse, d2 * inverse
+        # d(a x b) . d = da . (b x d) + db . (d x a)
+        p0, p1, p2 = _cross(b0, b1, b2, d0, d1, d2)
+        q0, q1, q2 = _cross(d0, d1, d2, a0, a1, a2)
+        ray_p, ray_q = x * p0 + row_y * p1 + p2, x * q0 + row_y * q1 + q2
+        planes[_BY_UP + j] = p1 * fy - ray_p
+        planes[_BY_DOWN + j] = p1 * fy + ray_p
+        planes[_BY_LEFT + j] = q0 * fx - ray_q
+        planes[_BY_RIGHT + j] = q0 * fx + ray_q
+    return total_geometric, total_learned, found
+
+
+@part(fast=True)
+def _store_planes(first, count, planes, by_geometric, by_learned, by_alpha):  # type: ignore[no-untyped-def]
+    """Write the gradients on the normals and alpha of ``count`` pixels to a row of the images."""
+    normals, others, cover = by_geometric[3 * first :], by_learned[3 * first :], by_alpha[first:]
+    for j in range(count):
+        normals[3 * j] = planes[_BY_GEOMETRIC + j]
+        normals[3 * j + 1] = planes[_BY_GEOMETRIC + _PLANE + j]
+        normals[3 * j + 2] = planes[_BY_GEOMETRIC + 2 * _PLANE + j]
+    for j in range(count):
+        others[3 * j] = planes[_BY_LEARNED + j]
+        others[3 * j + 1] = planes[_BY_LEARNED + _PLANE + j]
+        others[3 * j + 2] = planes[_BY_LEARNED + 2 * _PLANE + j]
+    for j in range(count):
+        cover[j] = planes[_BY_ALPHA + j]
+
+
+@part(fast=True)
+def _spread_planes(first, count, planes, by_up, by_down, by_here):  # type: ignore[no-untyped-def]
+    """Write what ``count`` pixels say about the depth above and below; add what they say about the
+    depth beside them, a place further right because ``by_here`` begins a pixel early."""
+    up, down, here = by_up[first:], by_down[first:], by_here[first:]
+    for j in range(count):
+        up[j] = planes[_BY_UP + j]
+        down[j] = planes[_BY_DOWN + j]
+    for j in range(count):
+        here[j] += planes[_BY_LEFT + j]
+    for j in range(count):
+        here[j + 2] += planes[_BY_RIGHT + j]
+
+
+@part(fast=True)
+def _sum_rows(count, above, below, here, out):  # type: ignore[no-untyped-def]
+    for j in range(count):
+        out[j] = above[j] + below[j] + here[1 + j]
+
+
+@kernel(fast=True)
+def agreement_rows(  # type: ignore[no-untyped-def]
+    begin, end, depth, camera, rotation, mask, geometric, learned, alpha, max_jump,
+    weight_geometric, weight_learned, sums, by_depth, by_geometric, by_learned, by_alpha,
+):  # fmt: skip
+    """Disagreement of blended normals with the depth's normals, rows [begin, end), and gradients.
+
+    A strip also looks at the row above and the row below it, whose normals depend on its depth, so
+    that nothing depends on where strips begin.
+
+    Parameters
+    ----------
+    depth, camera, max_jump
+        As for :func:`normal_rows`.
+    rotation : (3, 3) float64
+        Camera from scene.
+    mask : (h, w) bool, or (0, 0) for none
+    geometric, learned : (h, 3 w)
+        Blended normals, scene frame; the geometric ones are divided by ``alpha`` here.
+    alpha : (h, w)
+    weight_geometric, weight_learned : float
+        What one pixel contributes to the loss per unit of ``1 - cos``.
+    sums : (h, 3) float64
+        Written: sums of ``1 - cos`` over the row, geometric and learned, and pixels with a normal.
+    by_depth, by_alpha : (h, w), by_geometric, by_learned : (h, 3 w)
+        Written: gradients.
+    """
+    height, width = depth.shape
+    kind = depth.dtype.type
+    planes = np.zeros(_PLANES * _PLANE, kind)
+    # Of the last three rows: what they say about the depth above, below and in them.
+    by_up, by_down = np.zeros((3, width), kind), np.zeros((3, width), kind)
+    by_here = np.zeros((3, width + 2), kind)
+    for i in range(begin - 1, end + 1):
+        slot = (i + 3) % 3
+        by_up[slot] = kind(0.0)
+        by_down[slot] = kind(0.0)
+        by_here[slot] = kind(0.0)
+        inside = 0 < i < height - 1
+        total_geometric, total_learned, found = 0.0, 0.0, 0.0
+        y = (i + 0.5 - camera[3]) / camera[1]
+        for first in range(0, width if inside else 0, BLOCK_PX):
+            count = min(BLOCK_PX, width - first)
+            _load_planes(i, first, count, depth, alpha, mask, geometric, learned, planes)
+            g, o, n = _agree(
+                first,
+                count,
+                y,
+                camera,
+                rotation,
+                max_jump,
+                weight_geometric,
+                weight_learned,
+                planes,
+            )
+            total_geometric += g
+            total_learned += o
+            found += n
+            if begin <= i < end:
+                _store_planes(first, count, planes, by_geometric[i], by_learned[i], by_alpha[i])
+            _spread_planes(first, count, planes, by_up[slot], by_down[slot], by_here[slot])
+        if begin <= i < end:
+            sums[i, 0] = total_geometric
+            sums[i, 1] = total_learned
+            sums[i, 2] = found
+            if not inside:
+                by_geometric[i] = kind(0.0)
+                by_learned[i] = kind(0.0)
+                by_alpha[i] = kind(0.0)
+        if i > begin:
+            middle, above = (slot + 2) % 3, (slot + 1) % 3
+            _sum_rows(width, by_up[slot], by_down[above], by_here[middle], by_depth[i - 1])

@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compiled loops of the multi-view terms: there and back between two views, patches compared.
+
+Everything is float64 but the images, the depths and the places that are looked up. Derivatives are
+written out by hand. With ``r_p`` the ray of the reference pixel, ``r_o`` that of a sample of its
+patch, depth z and any multiple n of the plane's normal, the homography of docs/method.md,
+section 3.4, takes ``r_o`` to ``R r_o + s t`` with ``s = (n . r_o) / (z n . r_p)``; only s depends
+on z and n.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ...kernels.compiled import inline, kernel
+
+CAMERA_VALUES = 6
+"""fx, fy, cx, cy, width, height."""
+
+HALF_PATCH = 3
+"""A patch has ``2 * 3 + 1`` samples per side ..."""
+PATCH_STEP_PX = 0.5
+"""... half a pixel of the reference apart, where that is not flat."""
+PATCH_SIZES = 3
+"""Where it is flat, patches of twice and four times the size are tried: plain walls and glaze show
+their shading and stains only from farther apart."""
+SAMPLES = (2 * HALF_PATCH + 1) ** 2
+
+MAX_NOISE_PX = 1.0
+"""Points that come back farther from their pixel than this are hidden or wrong in one view."""
+MIN_NOISE_PX = 1e-9
+"""Below, the direction in which a point missed its pixel is rounding: no gradient."""
+
+MIN_SPREAD = SAMPLES * 0.012**2
+"""Smallest sum of squared deviations in a patch, of grey in [0, 1]: contrast of three grey levels.
+The usual 5e-6 (docs/method.md, section 3.4) is far below the noise of photos: such patches agree by
+chance, pull the surface about at random, and a surface that is pulled about recedes."""
+SPREAD_PRODUCT = 1e-8
+"""Added to the product of two such sums: patches of weak contrast correlate less."""
+MAX_ERROR = 0.9
+"""Patches that agree less than this show different things."""
+MIN_NORMAL = 0.3
+"""Shortest mean normal that stands for a plane (docs/method.md, section 3.4)."""
+MIN_FACING = 0.1
+"""Least cosine between normal and ray (84 degrees): a plane seen more edge-on has no patch."""
+MAX_RISE = 4.0
+"""Where the surface leaves the plane by more than so many half sides of the patch within it, there
+is no plane, as for a spoke before a wall: thin parts would be pulled towards what lies behind. With
+1, thin parts gain a little more, but rooms lose most of what the terms give them: early surfaces
+are rough."""
+
+# States of a compared pixel.
+SKIPPED, KEPT, BROKEN = 0, 1, 2
+
+
+@inline
+def _on_image(x: Any, y: Any, camera: Any) -> Any:
+    return x >= 0.0 and y >= 0.0 and x <= camera[4] and y <= camera[5]
+
+
+@inline
+def _masked(mask: Any, x: Any, y: Any) -> Any:
+    """Whether the pixel that holds a place on the image is left out."""
+    return (
+        mask.shape[0] > 0
+        and not mask[min(int(y), mask.shape[0] - 1), min(int(x), mask.shape[1] - 1)]
+    )
+
+
+@kernel(fast=False, fused=True)
+def lift_range(
+    begin: int,
+    end: int,
+    pixels: np.ndarray,
+    depth: np.ndarray,
+    camera: np.ndarray,
+    other: np.ndarray,
+    pose: np.ndarray,
+    near_z: float,
+    other_mask: np.ndarray,
+    places: np.ndarray,
+    moves: np.ndarray,
+) -> None:
+    """Where pixels land in the other view, and how that moves with their depth.
+
+    Parameters
+    ----------
+    pixels : (m,) int32
+        ``row * width + column``.
+    depth : (h, w) float32
+    camera, other : (6,) float64
+    pose : (3, 4) float64
+        Other camera from reference camera.
+    places : (m, 2) float32
+        Written: pixels of the other view; NaN behind ``near_z``, off the image, in its mask.
+    moves : (m, 2) float64
+        Written: derivative with respect to the depth.
+    """
+    width = depth.shape[1]
+    for k in range(begin, end):
+        row, column = pixels[k] // width, pixels[k] % width
+        z = float(depth[row, column])
+        x = (column + 0.5 - camera[2]) / camera[0]
+        y = (row + 0.5 - camera[3]) / camera[1]
+        a0 = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]
+        a1 = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]
+        a2 = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
+        h2 = a2 * z + pose[2, 3]
+        places[k, 0] = places[k, 1] = np.float32(math.nan)
+        moves[k, 0] = moves[k, 1] = 0.0
+        if not h2 > near_z:
+            continue
+        u, v = (a0 * z + pose[0, 3]) / h2, (a1 * z + pose[1, 3]) / h2
+        at_x, at_y = other[0] * u + other[2], other[1] * v + other[3]
+        if not _on_image(at_x, at_y, other) or _masked(other_mask, at_x, at_y):
+            continue
+        places[k, 0], places[k, 1] = np.float32(at_x), np.float32(at_y)
+        moves[k, 0] = other[0] * (a0 - u * a2) / h2
+        moves[k, 1] = other[1] * (a1 - v * a2) / h2
+
+
+@kernel(fast=False, fused=True)
+def return_range(
+    begin: int,
+    end: int,
+    pixels: np.ndarray,
+    width: int,
+    places: np.ndarray,
+    found: np.ndarray,
+    camera: np.ndarray,
+    other: np.ndarray,
+    pose: np.ndarray,
+    near_z: float,
+    noise: np.ndarray,
+    by_found: np.ndarray,
+    by_places: np.ndarray,
+) -> None:
+    """How far from their pixel points come back, with derivatives.
+
+    Parameters
+    ----------
+    places : (m, 2) float32
+        In the other view.
+    found : (m,) float32
+        Depth of the other view there; 0 where there is none.
+    noise : (m,) float64
+        Written: pixels; inf where there is no way back or it is not below :data:`MAX_NOISE_PX`.
+    by_found : (m,), by_places : (m, 2) float64
+        Written: derivative of the noise; 0 where it is inf or nearly 0.
+    """
+    for k in range(begin, end):
+        noise[k] = math.inf
+        by_found[k] = by_places[k, 0] = by_places[k, 1] = 0.0
+        z = float(found[k])
+        if not z > near_z:
+            continue
+        x = (float(places[k, 0]) - other[2]) / other[0]
+        y = (float(places[k, 1]) - other[3]) / other[1]
+        c0, c1, c2 = x * z - pose[0, 3], y * z - pose[1, 3], z - pose[2, 3]
+        b0 = pose[0, 0] * c0 + pose[1, 0] * c1 + pose[2, 0] * c2
+        b1 = pose[0, 1] * c0 + pose[1, 1] * c1 + pose[2, 1] * c2
+        b2 = pose[0, 2] * c0 + pose[1, 2] * c1 + pose[2, 2] * c2
+        if not b2 > near_z:
+            continue
+        row, column = pixels[k] // width, pixels[k] % width
+        at_x = camera[0] * b0 / b2 + camera[2]
+        at_y = camera[1] * b1 / b2 + camera[3]
+        off_x, off_y = at_x - (column + 0.5), at_y - (row + 0.5)
+        length = math.sqrt(off_x * off_x + off_y * off_y)
+        if not (length < MAX_NOISE_PX and _on_image(at_x, at_y, camera)):
+            continue
+        noise[k] = length
+        if length < MIN_NOISE_PX:
+            continue
+        g0, g1 = camera[0] * off_x / (length * b2), camera[1] * off_y / (length * b2)
+        g2 = -(g0 * b0 + g1 * b1) / b2
+        # In the other camera's frame.
+        e0 = pose[0, 0] * g0 + pose[0, 1] * g1 + pose[0, 2] * g2
+        e1 = pose[1, 0] * g0 + pose[1, 1] * g1 + pose[1, 2] * g2
+        e2 = pose[2, 0] * g0 + pose[2, 1] * g1 + pose[2, 2] * g2
+        by_found[k] = e0 * x + e1 * y + e2
+        by_places[k, 0], by_places[k, 1] = e0 * z / other[0], e1 * z / other[1]
+
+
+@inline
+def _corner(grey: Any, x: Any, y: Any) -> Any:
+    """Upper left pixel of the four around a place, and the shares of the right and lower ones."""
+    at_x, at_y = x - 0.5, y - 0.5
+    column = min(max(int(at_x), 0), grey.shape[1] - 2)
+    row = min(max(int(at_y), 0), grey.shape[0] - 2)
+    return row, column, at_x - column, at_y - row
+
+
+@inline
+def _between(grey: Any, x: Any, y: Any) -> Any:
+    """Whether a place lies between pixel centres: NaN does not."""
+    return x >= 0.5 and y >= 0.5 and x <= grey.shape[1] - 0.5 and y <= grey.shape[0] - 0.5
+
+
+@inline
+def _all_count(mask: Any, row: Any, column: Any) -> Any:
+    """Whether the mask keeps a pixel and those to its right and below."""
+    return mask.shape[0] == 0 or (
+        mask[row, column]
+        and mask[row, column + 1]
+        and mask[row + 1, column]
+        and mask[row + 1, column + 1]
+    )
+
+
+@kernel(fast=False, fused=True)
+def compare_range(  # type: ignore[no-untyped-def]
+    begin, end, pixels, noise, depth, normals, alpha, rotation, camera, other, pose, near_z,
+    grey, other_grey, mask, other_mask, squared, sizes, max_rise, states, errors, by_depth,
+    by_normals,
+):  # fmt: skip
+    """Compare the patches around pixels with what their planes show of the other photo.
+
+    Parameters
+    ----------
+    pixels : (m,) int32, noise : (m,) float64
+        Pixels whose noise is inf are skipped.
+    depth, alpha : (h, w) float32, normals : (h, w, 3) float32
+        Of the reference view; blended normals, scene frame.
+    rotation : (3, 3) float64
+        Reference camera from scene.
+    grey, other_grey : (h, w) float32, mask, other_mask : bool or (0, 0) for none
+    squared : bool
+        Correlation -1 is as good as 1.
+    sizes : int
+        Sizes of patch that are tried, each twice as large as the one before, until one is not flat.
+    max_rise : float
+        See :data:`MAX_RISE`.
+    states : (m,) uint8
+        Written: :data:`KEPT` where the patch counts, :data:`BROKEN` where numbers were not finite.
+    errors : (m,) float64
+        Written: ``1 - correlation``; 0 where not kept, as are the derivatives.
+    by_depth : (m,), by_normals : (m, 3) float64
+        Written: derivatives with respect to the depth and the normal (scene frame, any length).
+    """
+    width = depth.shape[1]
+    ours, theirs = np.empty(SAMPLES), np.empty(SAMPLES)
+    slopes, ratios = np.empty(SAMPLES), np.empty(SAMPLES)
+    for k in range(begin, end):
+        states[k] = SKIPPED
+        errors[k] = by_depth[k] = by_normals[k, 0] = by_normals[k, 1] = by_normals[k, 2] = 0.0
+        if not noise[k] < math.inf:
+            continue
+        row, column = pixels[k] // width, pixels[k] % width
+        s0, s1, s2 = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
+        z, cover = float(depth[row, column]), float(alpha[row, column])
+        length = math.sqrt(float(s0) * s0 + float(s1) * s1 + float(s2) * s2)
+        if not (length >= MIN_NORMAL * cover and length > 0.0):
+            continue
+        n0 = (rotation[0, 0] * s0 + rotation[0, 1] * s1 + rotation[0, 2] * s2) / length
+        n1 = (rotation[1, 0] * s0 + rotation[1, 1] * s1 + rotation[1, 2] * s2) / length
+        n2 = (rotation[2, 0] * s0 + rotation[2, 1] * s1 + rotation[2, 2] * s2) / length
+        px, py = (column + 0.5 - camera[2]) / camera[0], (row + 0.5 - camera[3]) / camera[1]
+        facing = n0 * px + n1 * py + n2  # n . r_p
+        if not abs(facing) >= MIN_FACING * math.sqrt(px * px + py * py + 1.0):
+            continue
+        step_px, flat = 0.5 * PATCH_STEP_PX, True
+        rise = max_rise * HALF_PATCH / camera[0]
+        our_spread, their_spread, common = 0.0, 0.0, 0.0
+        for _ in range(sizes):
+            step_px *= 2.0
+            whole, sample = True, 0
+            our_sum, their_sum = 0.0, 0.0
+            for i in range(-HALF_PATCH, HALF_PATCH + 1):
+                for j in range(-HALF_PATCH, HALF_PATCH + 1):
+                    at_x, at_y = column + 0.5 + step_px * j, row + 0.5 + step_px * i
+                    if not _between(grey, at_x, at_y):
+                        whole = False
+                        break
+                    top, left, right, low = _corner(grey, at_x, at_y)
+                    if not _all_count(mask, top, left):
+                        whole = False
+                        break
+                    high = grey[top, left] + right * (grey[top, left + 1] - grey[top, left])
+                    below = grey[top + 1, left] + right * (
+                        grey[top + 1, left + 1] - grey[top + 1, left]
+                    )
+                    ours[sample] = high + low * (below - high)
+                    x, y = (at_x - camera[2]) / camera[0], (at_y - camera[3]) / camera[1]
+                    ratio = (n0 * x + n1 * y + n2) / (facing * z)
+                    h0 = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] + ratio * pose[0, 3]
+                    h1 = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] + ratio * pose[1, 3]
+                    h2 = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] + ratio * pose[2, 3]
+                    # The point of the plane has depth 1 / ratio in the reference.
+                    if not (ratio > 0.0 and h2 > near_z * ratio):
+                        whole = False
+                        break
+                    if i % HALF_PATCH == 0 and j % HALF_PATCH == 0 and (i != 0 or j != 0):
+                        there = float(depth[int(at_y), int(at_x)])
+                        if not abs(there * ratio - 1.0) < rise * step_px:
+                            whole = False
+                            break
+                    u, v = h0 / h2, h1 / h2
+                    to_x, to_y = other[0] * u + other[2], other[1] * v + other[3]
+                    if not _between(other_grey, to_x, to_y):
+                        whole = False
+                        break
+                    top, left, right, low = _corner(other_grey, to_x, to_y)
+                    if not _all_count(other_mask, top, left):
+                        whole = False
+                        break
+                    g00, g01 = float(other_grey[top, left]), float(other_grey[top, left + 1])
+                    g10, g11 = (
+                        float(other_grey[top + 1, left]),
+                        float(other_grey[top + 1, left + 1]),
+                    )
+                    high, below = g00 + right * (g01 - g00), g10 + right * (g11 - g10)
+                    theirs[sample] = high + low * (below - high)
+                    across = (g01 - g00) + low * ((g11 - g10) - (g01 - g00))
+                    # How the sample changes with the ratio.
+                    slopes[sample] = (
+                        across * other[0] * (pose[0, 3] - u * pose[2, 3])
+                        + (below - high) * other[1] * (pose[1, 3] - v * pose[2, 3])
+                    ) / h2
+                    ratios[sample] = ratio
+                    our_sum += ours[sample]
+                    their_sum += theirs[sample]
+                    sample += 1
+                if not whole:
+                    break
+            if not whole:
+                break
+            our_mean, their_mean = our_sum / SAMPLES, their_sum / SAMPLES
+            our_spread = their_spread = common = 0.0
+            for sample in range(SAMPLES):
+                a, b = ours[sample] - our_mean, theirs[sample] - their_mean
+                our_spread += a * a
+                their_spread += b * b
+                common += a * b
+            flat = not (our_spread > MIN_SPREAD and their_spread > MIN_SPREAD)
+            if not flat:
+                break
+        if flat:
+            continue
+        product = our_spread * their_spread + SPREAD_PRODUCT
+        root = math.sqrt(product)
+        correlation = common / root
+        agreement = correlation * correlation if squared else correlation
+        error = min(max(1.0 - agreement, 0.0), 2.0)
+        if not math.isfinite(error):
+            states[k] = BROKEN
+            continue
+        if not error < MAX_ERROR:
+            continue
+        chain = -2.0 * correlation if squared else -1.0
+        pull = common * our_spread / product
+        of_depth, d0, d1, d2 = 0.0, 0.0, 0.0, 0.0
+        sample = 0
+        for i in range(-HALF_PATCH, HALF_PATCH + 1):
+            for j in range(-HALF_PATCH, HALF_PATCH + 1):
+                a, b = ours[sample] - our_mean, theirs[sample] - their_mean
+                by_ratio = chain * (a - pull * b) / root * slopes[sample]
+                share = ratios[sample] * z
+                of_depth -= by_ratio * ratios[sample]
+                x = px + step_px * j / camera[0]
+                y = py + step_px * i / camera[1]
+                d0 += by_ratio * (x - share * px)
+                d1 += by_ratio * (y - share * py)
+                d2 += by_ratio * (1.0 - share)
+                sample += 1
+        inverse = 1.0 / (facing * z * length)
+        of_depth, d0, d1, d2 = of_depth / z, d0 * inverse, d1 * inverse, d2 * inverse
+        if not math.isfinite(of_depth + d0 + d1 + d2):
+            states[k] = BROKEN
+            continue
+        states[k] = KEPT
+        errors[k] = error
+        by_depth[k] = of_depth
+        for c in range(3):
+            by_normals[k, c] = rotation[0, c] * d0 + rotation[1, c] * d1 + rotation[2, c] * d2

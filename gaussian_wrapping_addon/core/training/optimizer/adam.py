@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Adam over the Gaussians' tensors, in place, stepping only Gaussians that the view saw."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from ...gaussians.model import OrientedGaussians
+from ...kernels.parallel import default_threads, even_bounds, run_chunks
+from ...render.types.gradients import VisibleGradients
+from .adam_kernels import BETA1, BETA2, COLUMNS, LANES, SH_COLUMN, adam_rows
+
+TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
+"""Tensors that receive gradients; ``filter_3d`` is recomputed instead.
+
+See docs/method.md, section 1.5.
+"""
+
+_TABLE_STEPS = 20_000
+"""Both bias corrections are 1 within float32 from here on."""
+
+_STAYS = np.float32(-1.0)
+
+
+@functools.lru_cache(maxsize=1)
+def _corrections() -> np.ndarray:
+    steps = np.arange(1, _TABLE_STEPS, dtype=np.float64)
+    table = np.ones((_TABLE_STEPS, 2))
+    table[1:, 0] = 1.0 / (1.0 - BETA1**steps)
+    table[1:, 1] = 1.0 / np.sqrt(1.0 - BETA2**steps)
+    return table.astype(np.float32)
+
+
+class Adam:
+    """Trained tensors with their moments; rows are Gaussians and can be rebuilt.
+
+    Each Gaussian counts its own steps, so that one created late, or rarely seen, starts with the
+    right bias correction instead of jumping.
+
+    Parameters
+    ----------
+    gaussians : OrientedGaussians
+        float32, on the CPU. The tensors are copied.
+    """
+
+    def __init__(self, gaussians: OrientedGaussians) -> None:
+        self.values: dict[str, torch.Tensor] = {
+            name: tensor.detach().clone().contiguous() for name, tensor in gaussians.tensors()
+        }
+        harmonics = -(-3 * self.values["sh"].shape[1] // LANES) * LANES
+        self._moments = np.zeros((len(gaussians), 2, SH_COLUMN + harmonics), np.float32)
+        self.steps = np.zeros(len(gaussians), np.int32)
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def gaussians(self) -> OrientedGaussians:
+        """Return the current Gaussians; the tensors are the trained ones themselves."""
+        return OrientedGaussians(**self.values)
+
+    def array(self, name: str) -> np.ndarray:
+        """Return the memory of one tensor; writing changes the Gaussians."""
+        return self.values[name].numpy()
+
+    def moments(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the memory of the first and second moment of one tensor, of its shape."""
+        shape = tuple(self.values[name].shape)
+        begin = COLUMNS.get(name, SH_COLUMN)
+        both = self._moments[:, :, begin : begin + math.prod(shape[1:])]
+        return both[:, 0].reshape(shape), both[:, 1].reshape(shape)
+
+    def step_rows(
+        self,
+        gradients: VisibleGradients,
+        rates: Mapping[str, np.ndarray],
+        *,
+        sh_degree: int | None = None,
+        threads: int = 0,
+    ) -> None:
+        """Update the Gaussians that a view has seen, in place.
+
+        A Gaussian counts as seen when any of its gradients is not 0. Those that are listed but
+        hidden behind others keep their values, moments and steps, like those that are not listed.
+
+        Parameters
+        ----------
+        gradients : VisibleGradients
+            No Gaussian is listed twice.
+        rates : mapping of name to (c,) float32
+            Learning rate of each column of the flattened tensor, >= 0; a tensor that is absent
+            stays.
+        sh_degree : int, optional
+            Highest degree of the harmonics that has ever had a gradient: spares the columns
+            beyond, whose moments are 0, the step of 0.
+        """
+        threads = threads or default_threads()
+        coefficients = self.values["sh"].shape[1]
+        used = coefficients if sh_degree is None else min(coefficients, (sh_degree + 1) ** 2)
+        packed = np.full(self._moments.shape[2], _STAYS)
+        for name, begin in (*COLUMNS.items(), ("sh", SH_COLUMN)):
+            if name in rates:
+                packed[begin : begin + len(rates[name])] = rates[name]
+        rows, listed = len(self), len(gradients.ids)
+        flat = [getattr(gradients, name).reshape(-1) for name in COLUMNS]
+        flat += [gradients.sh.reshape(listed, 3 * coefficients)]
+        flat += [self.array(name).reshape(-1) for name in COLUMNS]
+        flat += [self.array("sh").reshape(rows, 3 * coefficients)]
+        table = _corrections()
+
+        def run(begin: int, end: int) -> None:
+            adam_rows(
+                begin, end, gradients.ids, *flat, self._moments, self.steps, table, packed,
+                3 * used,
+            )  # fmt: skip
+
+        run_chunks(run, even_bounds(listed, threads, 2), threads)
+
+    def rebuild(
+        self, parents: np.ndarray, fresh: np.ndarray, changes: Mapping[str, np.ndarray]
+    ) -> None:
+        """Replace all Gaussians by rows picked from the current ones.
+
+        Parameters
+        ----------
+        parents : (m,) int64
+            Row of the current Gaussians that each new one starts from.
+        fresh : (m,) bool
+            New Gaussians whose moments and steps start at zero; the others keep their parent's.
+        changes : mapping of name to array
+            Tensors to replace after picking, (m, ...).
+        """
+        rows = torch.from_numpy(np.ascontiguousarray(parents, np.int64))
+        for name in list(self.values):
+            if name in changes:
+                array = np.ascontiguousarray(changes[name], np.float32)
+                self.values[name] = torch.from_numpy(array.copy())
+            else:
+                self.values[name] = self.values[name][rows].contiguous()
+        self._moments = self._moments[parents]
+        self._moments[fresh] = 0.0
+        self.steps = self.steps[parents]
+        self.steps[fresh] = 0
+
+    def reset_moments(self, name: str) -> None:
+        """Forget the moments of one tensor (after its values were set by hand)."""
+        for moment in self.moments(name):
+            moment[...] = 0.0
+
+    def is_finite(self) -> bool:
+        """Tell whether every parameter is a finite number."""
+        return all(math.isfinite(float(tensor.sum())) for tensor in self.values.values())

@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compiled Adam steps of single Gaussians, all of their tensors at once, on explicit vectors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from ...kernels.compiled import kernel, part
+
+BETA1, BETA2 = 0.9, 0.999
+EPSILON = 1e-15
+
+LANES = 16
+"""Columns stepped at once. LLVM splits them into as many registers as the processor needs."""
+
+COLUMNS = {"quats": 0, "orientation": 4, "means": 8, "opacity_logits": 11, "log_scales": 12}
+"""First column of each small tensor in moments and rates; column 15 stays empty."""
+
+SH_COLUMN = LANES
+"""First column of the harmonics."""
+
+AHEAD = 8
+"""Gaussians between asking for memory and using it: those that a view sees lie in no order that
+the processor could guess."""
+
+_WORD = ir.IntType(32)
+
+
+class _Emitter:
+    """Emits Adam on runs of 16 columns; every operation is rounded to float32, as numpy does."""
+
+    def __init__(self, context: Any, builder: Any, sig: Any, args: Any) -> None:
+        self.context, self.builder, self.sig, self.args = context, builder, sig, args
+        self.vector = ir.VectorType(ir.FloatType(), LANES)
+
+    def pointer(self, argument: int, at: Any, lanes: int) -> Any:
+        """Return the address of ``lanes`` values of an array, from place ``at`` on."""
+        make = self.context.make_array(self.sig.args[argument])
+        data = make(self.context, self.builder, self.args[argument]).data
+        kind = ir.VectorType(ir.FloatType(), lanes)
+        return self.builder.bitcast(self.builder.gep(data, [at]), kind.as_pointer())
+
+    def state(self, moments: int, rates: int, rate_at: Any) -> tuple[Any, Any, Any]:
+        """Return the addresses of both moments, whose places follow their array, and rates."""
+        return (
+            self.pointer(moments, self.args[moments + 1], LANES),
+            self.pointer(moments, self.args[moments + 2], LANES),
+            self.pointer(rates, rate_at, LANES),
+        )
+
+    def splat(self, value: Any) -> Any:
+        kind = ir.VectorType(value.type, LANES)
+        nothing = ir.Constant(kind, ir.Undefined)
+        single = self.builder.insert_element(nothing, value, ir.Constant(_WORD, 0))
+        lanes = ir.Constant(ir.VectorType(_WORD, LANES), [0] * LANES)
+        return self.builder.shuffle_vector(single, nothing, lanes)
+
+    def constant(self, value: float) -> Any:
+        return ir.Constant(self.vector, [float(np.float32(value))] * LANES)
+
+    def function(self, name: str, result: Any, arguments: list[Any]) -> Any:
+        kind = ir.FunctionType(result, arguments)
+        return cgutils.get_or_insert_function(self.builder.module, kind, name)
+
+    def shuffled(self, a: Any, b: Any, lanes: list[int]) -> Any:
+        chosen = ir.Constant(ir.VectorType(_WORD, len(lanes)), lanes)
+        return self.builder.shuffle_vector(a, b, chosen)
+
+    def advance(self, x: Any, g: Any, places: tuple[Any, Any, Any], up: Any, down: Any) -> Any:
+        """Update the moments and return the new values; columns of negative rate stay.
+
+        ``places``: addresses of first moment, second moment and rate.
+        """
+        b = self.builder
+        m, v, rate = (b.load(place, align=4) for place in places)
+        one = np.float32(1.0)
+        keep1, take1 = self.constant(BETA1), self.constant(float(one - np.float32(BETA1)))
+        keep2, take2 = self.constant(BETA2), self.constant(float(one - np.float32(BETA2)))
+        new_m = b.fadd(b.fmul(keep1, m), b.fmul(take1, g))
+        new_v = b.fadd(b.fmul(keep2, v), b.fmul(b.fmul(take2, g), g))
+        root = self.function(f"llvm.sqrt.v{LANES}f32", self.vector, [self.vector])
+        size = b.fadd(b.fmul(b.call(root, [new_v]), self.splat(down)), self.constant(EPSILON))
+        step = b.fdiv(b.fmul(b.fmul(rate, self.splat(up)), new_m), size)
+        moves = b.fcmp_ordered(">=", rate, ir.Constant(self.vector, None))
+        b.store(b.select(moves, new_m, m), places[0], align=4)
+        b.store(b.select(moves, new_v, v), places[1], align=4)
+        return b.select(moves, b.fsub(x, step), x)
+
+
+_SMALL_VALUES = (4, 4, 3, 1, 3)
+"""Columns of the small tensors, in the order of :data:`COLUMNS`."""
+
+
+@intrinsic
+def _step_small(  # type: ignore[no-untyped-def]
+    typingctx, quats, orientation, means, opacity_logits, log_scales, row,
+    grad_quats, grad_orientation, grad_means, grad_opacity_logits, grad_log_scales, grad_row,
+    moments, first_at, second_at, rates, up, down,
+):  # fmt: skip
+    """Step the small tensors of one row; all arrays are flat."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        emit = _Emitter(context, builder, sig, args)
+
+        def places(first: int, row: Any) -> list[Any]:
+            found = []
+            for k, values in enumerate(_SMALL_VALUES):
+                at = builder.mul(row, ir.Constant(row.type, values))
+                found.append(emit.pointer(first + k, at, values))
+            return found
+
+        def joined(pointers: list[Any]) -> Any:
+            a, o, m, p, s = (builder.load(pointer, align=4) for pointer in pointers)
+            turns = emit.shuffled(a, o, list(range(8)))
+            mean_opacity = emit.shuffled(m, emit.shuffled(p, p, [0, 0, 0]), [0, 1, 2, 3])
+            scales = emit.shuffled(s, ir.Constant(s.type, None), [0, 1, 2, 3])
+            rest = emit.shuffled(mean_opacity, scales, list(range(8)))
+            return emit.shuffled(turns, rest, list(range(LANES)))
+
+        targets, first_rate = places(0, args[5]), ir.Constant(args[5].type, 0)
+        moved = emit.advance(
+            joined(targets), joined(places(6, args[11])), emit.state(12, 15, first_rate),
+            args[16], args[17],
+        )  # fmt: skip
+        at = 0
+        for target, values in zip(targets, _SMALL_VALUES, strict=True):
+            part = emit.shuffled(moved, moved, list(range(at, at + values)))
+            builder.store(part, target, align=4)
+            at += values
+        return context.get_dummy_value()
+
+    array, index = quats, types.intp
+    signature = types.void(
+        array, array, array, array, array, index, array, array, array, array, array, index,
+        array, index, index, array, types.float32, types.float32,
+    )  # fmt: skip
+    return signature, generate
+
+
+@intrinsic
+def _step_run(  # type: ignore[no-untyped-def]
+    typingctx, values, at, gradients, gradient_at, count, moments, first_at, second_at,
+    rates, rate_at, up, down,
+):  # fmt: skip
+    """Step ``count`` columns, at most 16, of flat arrays; moments and rates always have 16."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        emit = _Emitter(context, builder, sig, args)
+        words = builder.trunc(args[4], _WORD)
+        lanes = ir.Constant(ir.VectorType(_WORD, LANES), list(range(LANES)))
+        inside = builder.icmp_signed("<", lanes, emit.splat(words))
+        pointer = emit.vector.as_pointer()
+        load = emit.function(
+            f"llvm.masked.load.v{LANES}f32.p0", emit.vector,
+            [pointer, _WORD, inside.type, emit.vector],
+        )  # fmt: skip
+        store = emit.function(
+            f"llvm.masked.store.v{LANES}f32.p0", ir.VoidType(),
+            [emit.vector, pointer, _WORD, inside.type],
+        )  # fmt: skip
+        align, zeros = ir.Constant(_WORD, 4), ir.Constant(emit.vector, None)
+        x_at, g_at = emit.pointer(0, args[1], LANES), emit.pointer(2, args[3], LANES)
+        x = builder.call(load, [x_at, align, inside, zeros])
+        g = builder.call(load, [g_at, align, inside, zeros])
+        moved = emit.advance(x, g, emit.state(5, 8, args[9]), args[10], args[11])
+        builder.call(store, [moved, x_at, align, inside])
+        return context.get_dummy_value()
+
+    index = types.intp
+    signature = types.void(
+        values, index, gradients, index, index, moments, index, index, rates, index,
+        types.float32, types.float32,
+    )  # fmt: skip
+    return signature, generate
+
+
+@intrinsic
+def _prefetch(typingctx, values, at):  # type: ignore[no-untyped-def]
+    """Ask for the cache line of ``values[at]`` of a flat array to be brought, to be written."""
+
+    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        emit = _Emitter(context, builder, sig, args)
+        byte = ir.IntType(8).as_pointer()
+        fetch = emit.function("llvm.prefetch.p0", ir.VoidType(), [byte, _WORD, _WORD, _WORD])
+        hints = [ir.Constant(_WORD, value) for value in (1, 3, 1)]  # to write, keep, data
+        builder.call(fetch, [builder.bitcast(emit.pointer(0, args[1], 1), byte), *hints])
+        return context.get_dummy_value()
+
+    return types.void(values, types.intp), generate
+
+
+@part(fast=False)
+def _has_value(values, first, count):  # type: ignore[no-untyped-def]
+    for j in range(first, first + count):  # noqa: SIM110 - numba compiles no generators to loops
+        if values[j] != 0.0:
+            return True
+    return False
+
+
+@kernel(fast=False)
+def adam_rows(  # type: ignore[no-untyped-def]
+    begin, end, ids,
+    grad_quats, grad_orientation, grad_means, grad_opacity_logits, grad_log_scales, grad_sh,
+    quats, orientation, means, opacity_logits, log_scales, sh,
+    moments, steps, corrections, rates, sh_columns,
+):  # fmt: skip
+    """One step of the Gaussians ``ids[begin .. end]``; those whose gradient is 0 stay.
+
+    Parameters
+    ----------
+    ids : (v,) int32
+        Gaussians of the gradients' rows, none of them twice.
+    grad_quats ... grad_log_scales
+        (4 v,), (4 v,), (3 v,), (v,), (3 v,) float32; ``grad_sh`` (v, k).
+    quats ... log_scales, sh
+        The same with n rows.
+    moments : (n, 2, c) float32
+        First and second moment, in the columns of :data:`COLUMNS` and :data:`SH_COLUMN`.
+    steps : (n,) int32
+        Steps of each Gaussian so far.
+    corrections : (s, 2) float32
+        ``1 / (1 - beta1^t)`` and ``1 / sqrt(1 - beta2^t)``.
+    rates : (c,) float32
+        Learning rate of each column; negative for columns that stay.
+    sh_columns : int
+        So many columns of the harmonics are stepped.
+    """
+    last = corrections.shape[0] - 1
+    sh_values, sh_gradients, columns = sh.reshape(-1), grad_sh.reshape(-1), sh.shape[1]
+    both, width = moments.reshape(-1), moments.shape[2]
+    for k in range(begin, end):
+        ahead = np.int64(ids[min(k + AHEAD, end - 1)])
+        for j in range(0, 2 * width, LANES):
+            _prefetch(both, 2 * width * ahead + j)  # type: ignore[call-arg]
+        for j in range(0, sh_columns + LANES - 1, LANES):
+            _prefetch(sh_values, columns * ahead + j)  # type: ignore[call-arg]
+        _prefetch(quats, 4 * ahead)  # type: ignore[call-arg]
+        _prefetch(orientation, 4 * ahead)
+        _prefetch(means, 3 * ahead)
+        _prefetch(log_scales, 3 * ahead)
+        # The opacity's gradient alone tells for all but Gaussians capped at every pixel.
+        if not (
+            grad_opacity_logits[k] != 0.0
+            or _has_value(grad_quats, 4 * k, 4)
+            or _has_value(grad_orientation, 4 * k, 4)
+            or _has_value(grad_means, 3 * k, 3)
+            or _has_value(grad_log_scales, 3 * k, 3)
+            or _has_value(sh_gradients, columns * k, columns)
+        ):
+            continue
+        i = np.int64(ids[k])
+        steps[i] += 1
+        step = min(steps[i], last)
+        up, down = corrections[step, 0], corrections[step, 1]
+        m, v = 2 * i * width, (2 * i + 1) * width
+        _step_small(
+            quats, orientation, means, opacity_logits, log_scales, i,
+            grad_quats, grad_orientation, grad_means, grad_opacity_logits, grad_log_scales, k,
+            both, m, v, rates, up, down,
+        )  # fmt: skip
+        for j in range(0, sh_columns, LANES):
+            _step_run(
+                sh_values, i * columns + j, sh_gradients, k * columns + j,
+                min(LANES, sh_columns - j), both, m + SH_COLUMN + j, v + SH_COLUMN + j,
+                rates, SH_COLUMN + j, up, down,
+            )  # fmt: skip

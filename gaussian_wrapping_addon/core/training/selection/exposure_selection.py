@@ -1,0 +1,371 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Evidence, before any training, of whether photos differ in exposure.
+
+See docs/method.md, section 4.4.
+
+Every sparse point's colour is read in every photo that may see it. Which photos do is not known, so
+that points behind others are left out by a coarse depth buffer, and what this misses (occlusion,
+highlights, wrong matches) by weights that fall with the square of the disagreement.
+
+An exposure changes all parts of a scene alike; shading that depends on the view changes one. A thin
+thing that is lit from one side, seen from both, looks like an exposure when all points are taken
+together. So the points are split by place, gains are found for each part alone, and what counts is
+on what most parts agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...dataset.photo_source import PhotoSource
+from ...dataset.scene import Scene
+from ..appearance.background import pixels_of
+from ..appearance.photo_exposure import FIT_BRIGHTEST, FIT_DARKEST, SRGB_PEDESTAL
+
+NEEDED_SPREAD = 0.025
+"""Robust spread of the log gains above which exposures are modelled. At a middle grey such photos
+disagree by 1.2 % of white, an error that alone limits the PSNR to 38 dB. Of the scenes it was
+chosen on, rendered at one exposure, a matte body shows 0.002 and a thin fence lit from one side
+0.011; photos altered by factors of light up to 1.35 either way show 0.060."""
+
+ERRORS_AWAY = 4.0
+"""The spread must also be this many standard errors of a photo's gain."""
+
+OUTLIER_SPREADS = 3.0
+OUTLIER_SHARE = 0.1
+"""Also where at least this share of the photos (two at the least) differ from the median by more
+than :data:`OUTLIER_SPREADS` times :data:`NEEDED_SPREAD`: a median deviation does not see them."""
+
+MIN_POINTS = 24
+"""Points, by weight, for a photo's gain to be known."""
+MIN_PHOTOS = 3
+MIN_KNOWN_SHARE = 0.5
+"""Of the photos whose gain must be known for a decision."""
+
+PARTS = 8
+"""Parts that the points are split into, a power of two; fewer where points are few."""
+MIN_PART_POINTS = 80
+MIN_POINTS_IN_PART = 12
+"""As :data:`MIN_POINTS`, for the gain that one part alone gives a photo."""
+MIN_PART_SHARE = 0.2
+"""Of the photos in which a part must be known for it to have a say."""
+
+LOOK_SIDE_PX = 128
+"""Photos are looked at as small as their long side stays at least this: averaged pixels carry less
+noise, and forgive errors of the poses."""
+
+MAX_POINTS = 4000
+MAX_SAMPLES = 2_000_000
+"""Of all points in all photos; bounds the memory (about 60 bytes each)."""
+
+BUFFER_CELLS = 24
+"""Cells of the depth buffer along the long side of a photo."""
+BEHIND_SHARE = 0.06
+"""A point this share of the depth behind the nearest around it is taken for hidden."""
+
+ROUNDS = 24
+FIRST_SCALE, LAST_SCALE = 0.3, 0.06
+"""Disagreement in log colour beyond which a sample loses its weight, first and last round: at first
+it must let gains in, at last only noise."""
+PRIOR_POINTS = 5.0
+"""As much weight as this many points holds a gain at one."""
+
+
+@dataclass(frozen=True)
+class ExposureNeed:
+    """Whether gains and offsets per photo are to be trained, and why."""
+
+    needed: bool
+    known: bool
+    """False where there is too little to see it by; then it is not modelled."""
+    spread: float
+    """Robust standard deviation, over the photos, of the log gain on which most parts of the scene
+    agree; largest of the three channels."""
+    spread_together: float
+    """The same of the gains from all points together, which shading on one side raises too."""
+    error: float
+    """Median standard error of a log gain."""
+    outliers: int
+    """Photos whose gain is far from the median."""
+    photos: int
+    """Photos whose gain is known."""
+    points: int
+    """Points that two photos or more see."""
+    log_gains: np.ndarray
+    """(views of the scene, 3) float64, median 0: what training may start from; 0 where unknown.
+    Of display values plus :data:`..appearance.photo_exposure.SRGB_PEDESTAL`."""
+    evidence: str
+    """One sentence for the report."""
+
+    def figures(self) -> dict[str, Any]:
+        """Return the numbers as plain JSON values."""
+        names = (
+            "needed", "known", "spread", "spread_together", "error", "outliers", "photos", "points"
+        )  # fmt: skip
+        return {name: getattr(self, name) for name in names}
+
+
+@dataclass(frozen=True)
+class LogGains:
+    """Gains of photos as :func:`solve_log_gains` finds them."""
+
+    values: np.ndarray
+    """(photos, 3), median 0 over the photos with enough points."""
+    errors: np.ndarray
+    """(photos, 3) standard errors; inf where there is no point."""
+    points: np.ndarray
+    """(photos, 3) points by weight."""
+
+
+def exposure_need(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> ExposureNeed:
+    """Decide from the colours of the sparse points whether exposures are to be modelled.
+
+    Parameters
+    ----------
+    scene : Scene
+    photos : PhotoStore
+        Looked at in a small size.
+    views : sequence of int
+        Views that are trained on.
+
+    Returns
+    -------
+    ExposureNeed
+        ``known=False`` and ``needed=False`` where the points are too few: the brightness of whole
+        photos says nothing, since they show different things.
+    """
+    views = list(views)
+    count = len(scene.views)
+    finite = np.isfinite(scene.points).all(axis=1) if len(scene.points) else np.zeros(0, bool)
+    kept = np.nonzero(finite)[0]
+    most = max(MIN_POINTS, min(MAX_POINTS, MAX_SAMPLES // max(1, len(views))))
+    if len(kept) > most:
+        kept = kept[np.linspace(0, len(kept) - 1, most).round().astype(np.int64)]
+    points = np.asarray(scene.points, np.float64).reshape(-1, 3)[kept]
+    if len(views) < MIN_PHOTOS or len(points) < MIN_POINTS:
+        few = f"{len(views)} photos and {len(points)} sparse points"
+        return _unknown(count, f"Not known: {few} are too few to compare.")
+    colors, valid = sample_points(points, photos, views)
+    reference = np.asarray(scene.point_colors).reshape(-1, 3)[kept] / 255.0
+    found = solve_log_gains(colors, valid, reference)
+    parts = [solve_log_gains(colors[p], valid[p], reference[p]) for p in split_by_place(points)]
+    shared = int(np.count_nonzero(valid.any(axis=2).sum(axis=1) >= 2))
+    return judge(found, parts, views, count, shared)
+
+
+def split_by_place(points: np.ndarray) -> list[np.ndarray]:
+    """Return the indices of up to :data:`PARTS` parts: halves by number along the widest axis."""
+    parts = [np.arange(len(points))]
+    while len(parts) < PARTS and len(points) >= 2 * len(parts) * MIN_PART_POINTS:
+        halves = []
+        for part in parts:
+            # Without the outermost tenths: far points must not choose the axis.
+            low, high = np.quantile(points[part], (0.1, 0.9), axis=0)
+            order = part[np.argsort(points[part, np.argmax(high - low)], kind="stable")]
+            halves += [order[: len(order) // 2], order[len(order) // 2 :]]
+        parts = halves
+    return parts
+
+
+def sample_points(
+    points: np.ndarray, photos: PhotoSource, views: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points' colours in the photos that may see them.
+
+    Returns
+    -------
+    colors : (n, views, 3) float32
+        Display values in [0, 1].
+    valid : (n, views, 3) bool
+        The photo holds the point, the mask too, no other point stands before it, and the value is
+        not clipped.
+    """
+    colors = np.zeros((len(points), len(views), 3), np.float32)
+    valid = np.zeros(colors.shape, bool)
+    for place, view in enumerate(views):
+        base = photos.camera(view, 1)
+        side = max(base.width, base.height)
+        divisor = next((d for d in (4, 2) if side >= d * LOOK_SIDE_PX), 1)
+        camera, photo = photos.camera(view, divisor), photos.photo(view, divisor)
+        mask = photos.mask(view, divisor)
+        rows, columns, depth, seen = pixels_of(points, camera)
+        shown = _in_front(rows, columns, depth, max(camera.width, camera.height))
+        if mask is not None:
+            shown &= mask[rows, columns]
+        rows, columns, seen = rows[shown], columns[shown], seen[shown]
+        value = photo[rows, columns].astype(np.float32) / np.float32(255.0)  # (m, 3)
+        colors[seen, place] = value
+        valid[seen, place] = (value >= FIT_DARKEST) & (value <= FIT_BRIGHTEST)
+    return colors, valid
+
+
+def _in_front(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, side_px: int) -> np.ndarray:
+    """Tell which points no other one in the same or a neighbouring cell stands well before."""
+    cell = max(1.0, side_px / BUFFER_CELLS)
+    y, x = (rows / cell).astype(np.int64) + 1, (columns / cell).astype(np.int64) + 1
+    nearest = np.full((BUFFER_CELLS + 3, BUFFER_CELLS + 3), np.inf)
+    np.minimum.at(nearest, (y, x), depth)
+    around = nearest.copy()
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            inner = nearest[1 + dy : nearest.shape[0] - 1 + dy, 1 + dx : nearest.shape[1] - 1 + dx]
+            around[1:-1, 1:-1] = np.minimum(around[1:-1, 1:-1], inner)
+    return depth <= (1.0 + BEHIND_SHARE) * around[y, x]
+
+
+def solve_log_gains(
+    colors: np.ndarray, valid: np.ndarray, reference: np.ndarray | None = None
+) -> LogGains:
+    """Find the photos' gains that bring the colours of the same points together.
+
+    ``log(c[i, p] + 0.055) = level[i] + gain[p]`` by alternating weighted means. Weights are those
+    of Geman and McClure, one for the three channels of a sample (what covers a point changes them
+    all), with a scale that shrinks from :data:`FIRST_SCALE` to :data:`LAST_SCALE`.
+
+    Parameters
+    ----------
+    colors : (n, photos, 3)
+        Display values in [0, 1].
+    valid : (n, photos, 3) bool
+    reference : (n, 3), optional
+        The points' own colours, of photos that do see them. By default the medians of ``colors``.
+    """
+    logs = np.log(np.asarray(colors, np.float64) + SRGB_PEDESTAL).astype(np.float32)
+    valid = valid & (valid.any(axis=2).sum(axis=1) >= 2)[:, None, None]
+    present = valid.astype(np.float32)
+    channels = np.maximum(present.sum(axis=2), 1.0)  # (n, photos)
+    if reference is None:
+        level = _median_of(logs, valid)
+    else:
+        level = np.log(np.asarray(reference, np.float64) + SRGB_PEDESTAL).astype(np.float32)
+    residual = (logs - level[:, None]) * present
+    gain = np.stack([_median_of(residual[..., c].T, valid[..., c].T) for c in range(3)], axis=1)
+    weight = present
+    for scale in np.geomspace(FIRST_SCALE, LAST_SCALE, ROUNDS):
+        residual = (logs - level[:, None] - gain) * present
+        square = (residual * residual).sum(axis=2) / channels  # (n, photos)
+        weight = present * ((1.0 + square / np.float32(scale**2)) ** -2)[..., None]
+        total = weight.sum(axis=0)  # (photos, 3)
+        gain = (weight * (logs - level[:, None])).sum(axis=0) / (total + PRIOR_POINTS)
+        gain -= _middle(gain, total)
+        per_point = weight.sum(axis=1)  # (n, 3)
+        fresh = (weight * (logs - gain)).sum(axis=1) / np.maximum(per_point, 1e-9)
+        level = np.where(per_point > 1e-3, fresh, level)
+    residual = (logs - level[:, None] - gain) * present
+    total = weight.sum(axis=0).astype(np.float64)
+    noise = np.sqrt(((weight * residual) ** 2).sum(axis=0, dtype=np.float64))
+    # No better than a noise of one 8-bit step: synthetic points may agree to the last bit.
+    floor = np.sqrt(np.maximum(total, 1.0)) / 255.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = np.where(total > 0, np.maximum(noise, floor) / total, np.inf)
+    return LogGains(gain.astype(np.float64), errors, total)
+
+
+def judge(
+    found: LogGains, parts: Sequence[LogGains], views: Sequence[int], count: int, points: int
+) -> ExposureNeed:
+    """Decide from gains and their standard errors.
+
+    Parameters
+    ----------
+    found : LogGains
+        Of the photos ``views``, from all points.
+    parts : sequence of LogGains
+        The same, each from the points of one part of the scene.
+    views : sequence of int
+    count : int
+        Views of the scene.
+    points : int
+        For the report.
+    """
+    known = (found.points >= MIN_POINTS).all(axis=1)
+    number = int(np.count_nonzero(known))
+    if number < max(MIN_PHOTOS, MIN_KNOWN_SHARE * len(views)):
+        return _unknown(
+            count,
+            f"Not known: only {number} of {len(views)} photos share enough sparse "
+            "points to be compared.",
+            photos=number,
+            points=points,
+        )
+    values = found.values[known] - np.median(found.values[known], axis=0)  # (known, 3)
+    agreed = _agreed(parts, values, known)
+    errors = found.errors[known]
+    spread, error = _spread(agreed), float(np.median(errors))
+    limit = np.maximum(OUTLIER_SPREADS * NEEDED_SPREAD, ERRORS_AWAY * errors)
+    far = (np.abs(agreed) > limit) & (np.abs(values) > limit)
+    outliers = int(np.count_nonzero(far.any(axis=1)))
+    differs = spread > max(NEEDED_SPREAD, ERRORS_AWAY * error)
+    several = outliers >= max(2.0, OUTLIER_SHARE * number)
+    needed = bool(differs or several)
+    log_gains = np.zeros((count, 3))
+    log_gains[np.asarray(views)[known]] = values
+    evidence = (
+        f"Gains of {number} photos, from "
+        f"{points} sparse points, spread by {100 * spread:.1f} % where the scene's parts agree "
+        f"(limit {100 * NEEDED_SPREAD:.1f} %; one photo's error {100 * error:.1f} %; all points "
+        f"together {100 * _spread(values):.1f} %), and {outliers} photos differ by more than "
+        f"{100 * OUTLIER_SPREADS * NEEDED_SPREAD:.1f} %."
+    )
+    return ExposureNeed(
+        needed, True, spread, _spread(values), error, outliers, number, points, log_gains, evidence
+    )
+
+
+def _agreed(parts: Sequence[LogGains], values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """(known, 3) medians over the parts of each photo's gain, median 0 over the photos.
+
+    A part sees only some of the photos, and its gains are those against their median: at the level
+    of all points' gains it would take over what it is asked to check.
+    """
+    rows = []
+    for part in parts:
+        sure = (part.points[known] >= MIN_POINTS_IN_PART).all(axis=1)
+        if np.count_nonzero(sure) < max(MIN_PHOTOS, MIN_PART_SHARE * len(known)):
+            continue
+        gain = part.values[known]
+        level = np.median(gain[sure], axis=0)
+        rows.append(np.where(sure[:, None], gain - level, np.nan))
+    if not rows:
+        return values
+    stacked = np.stack(rows)  # (parts, known, 3)
+    said = np.isfinite(stacked[..., 0]).any(axis=0)
+    agreed = values.copy()
+    agreed[said] = np.nanmedian(stacked[:, said], axis=0)
+    return agreed - np.median(agreed, axis=0)
+
+
+def _spread(values: np.ndarray) -> float:
+    return float((1.4826 * np.median(np.abs(values), axis=0)).max())
+
+
+def _unknown(count: int, evidence: str, *, photos: int = 0, points: int = 0) -> ExposureNeed:
+    zeros = np.zeros((count, 3))
+    return ExposureNeed(False, False, 0.0, 0.0, 0.0, 0, photos, points, zeros, evidence)
+
+
+def _median_of(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Return the median over the second axis of the valid values; 0 where there is none."""
+    hidden = np.sort(np.where(valid, values, np.inf), axis=1)
+    number = valid.sum(axis=1)
+    lower, upper = np.maximum(number - 1, 0) // 2, number // 2
+    last = values.shape[1] - 1
+    low, high = (
+        np.take_along_axis(hidden, np.minimum(at, last)[:, None], axis=1)[:, 0]
+        for at in (lower, upper)
+    )
+    with np.errstate(invalid="ignore"):
+        middle = 0.5 * (low + high)
+    return np.where(number > 0, middle, 0.0).astype(values.dtype)
+
+
+def _middle(gain: np.ndarray, total: np.ndarray) -> np.ndarray:
+    """(3,) median of the gains of the photos with points."""
+    known = (total >= MIN_POINTS).all(axis=1)
+    if not known.any():
+        return np.zeros(3, gain.dtype)
+    return np.median(gain[known], axis=0).astype(gain.dtype)

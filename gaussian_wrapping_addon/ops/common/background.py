@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Background work in Blender: threads do it, one timer delivers what comes of it.
+
+A :class:`Lane` is a thread that runs one :class:`Task` after the other. Tasks touch nothing of
+Blender. Their results and errors are delivered on the main thread by :func:`poll`, the only timer
+of background work, which also calls the functions that were given to :func:`watch`. The timer
+waits for nothing and starts no thread: threads are started when work is submitted, or ahead of
+time by :meth:`Lane.start`.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import weakref
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ...core.errors import Cancelled
+
+_logger = logging.getLogger(__name__)
+
+POLL_S = 0.3
+"""Between two ticks of the timer."""
+
+Answer = TypeVar("Answer")
+
+
+class Task(Generic[Answer]):
+    """One call of a :class:`Lane` and its outcome.
+
+    Parameters
+    ----------
+    call : callable
+        Runs in the lane's thread.
+    then : callable, optional
+        Receives the result on the main thread. Without it, the one who submitted the task asks for
+        :meth:`finished` and :meth:`answer`.
+    failed : callable, optional
+        Receives the exception instead where ``call`` raised one; without it, it is logged.
+    end : callable, optional
+        Called by :meth:`cancel`, to end what the call waits for; it must not wait itself.
+    """
+
+    def __init__(
+        self,
+        call: Callable[[], Answer],
+        then: Callable[[Answer], None] | None = None,
+        failed: Callable[[Exception], None] | None = None,
+        end: Callable[[], None] | None = None,
+    ) -> None:
+        self._call = call
+        self._then = then
+        self._failed = failed
+        self._end = end
+        self._answers: list[Answer] = []
+        self._failure: Exception | None = None
+        self._ended = threading.Event()
+        self._settled = then is None
+
+    def run(self) -> None:
+        """Make the call; the lane's thread does."""
+        try:
+            if self._then is not None and self._settled:
+                raise Cancelled()
+            self._answers.append(self._call())
+        except Exception as failure:  # delivered, or raised where somebody waits for it
+            self._failure = failure
+        self._ended.set()
+
+    def finished(self, wait_s: float = 0.0) -> bool:
+        """Tell whether :meth:`answer` has one, or gets one within a time."""
+        return self._ended.wait(wait_s)
+
+    def answer(self) -> Answer:
+        """Return what the call returned, or raise what it raised; waits for it."""
+        self._ended.wait()
+        if self._failure is not None:
+            raise self._failure
+        return self._answers[0]
+
+    @property
+    def pending(self) -> bool:
+        """Whether something is still to be delivered."""
+        return not self._settled
+
+    def cancel(self) -> None:
+        """Deliver nothing; end what the call waits for."""
+        if self.pending:
+            self._settled = True
+            if self._end is not None:
+                self._end()
+
+    def deliver(self) -> None:
+        """Hand on the result or the error of a finished call; the timer does, once."""
+        if self._then is None or self._settled:
+            return
+        self._settled = True
+        failure = self._failure
+        try:
+            if failure is None:
+                self._then(self._answers[0])
+            elif self._failed is not None:
+                self._failed(failure)
+            else:
+                _logger.error("a background task failed", exc_info=failure)
+        except Exception:  # a timer that raises would be dropped without a word
+            _logger.exception("delivering the result of a background task")
+
+
+class Lane:
+    """A thread that runs one task after the other.
+
+    Starting a thread means waiting for it, which takes long where a worker keeps all processors
+    busy: :meth:`start` does it ahead of time.
+
+    Parameters
+    ----------
+    of_file : bool
+        Tasks are about the open file: they are cancelled before another one is loaded.
+    """
+
+    def __init__(self, *, of_file: bool = False) -> None:
+        self.of_file = of_file
+        self._calls: queue.SimpleQueue[Task[Any] | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._tasks: list[Task[Any]] = []
+        _lanes.add(self)
+
+    def start(self) -> None:
+        """Start the thread where it does not run yet."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._work, args=(self._calls,), daemon=True)
+            self._thread.start()
+
+    def submit(
+        self,
+        call: Callable[[], Answer],
+        then: Callable[[Answer], None] | None = None,
+        *,
+        failed: Callable[[Exception], None] | None = None,
+        end: Callable[[], None] | None = None,
+    ) -> Task[Answer]:
+        """Run a call in the thread; see :class:`Task`."""
+        self.start()
+        task = Task(call, then, failed, end)
+        self._calls.put(task)
+        if task.pending:
+            self._tasks.append(task)
+            start_timer()
+        return task
+
+    @property
+    def busy(self) -> bool:
+        """Whether a result is still to be delivered."""
+        return any(task.pending for task in self._tasks)
+
+    def deliver(self) -> None:
+        """Deliver the tasks that have finished, in their order; the timer does."""
+        for task in self._tasks.copy():
+            if task.finished():
+                task.deliver()
+        self._tasks = [task for task in self._tasks if task.pending]
+
+    def cancel(self) -> None:
+        """Cancel what is to be delivered; tasks without a receiver are still run.
+
+        A thread that is at work ends by itself, and the next task gets a new one.
+        """
+        tasks, self._tasks = self._tasks, []
+        for task in tasks:
+            task.cancel()
+        if not all(task.finished() for task in tasks):
+            self._let_go()
+
+    def stop(self) -> None:
+        """Cancel, and let the thread end after what it has to do; nobody waits for it."""
+        self.cancel()
+        self._let_go()
+
+    def _let_go(self) -> None:
+        if self._thread is not None:
+            self._calls.put(None)
+            self._calls, self._thread = queue.SimpleQueue(), None
+
+    @staticmethod
+    def _work(calls: queue.SimpleQueue[Task[Any] | None]) -> None:
+        while (task := calls.get()) is not None:
+            task.run()
+
+
+_lanes: weakref.WeakSet[Lane] = weakref.WeakSet()
+_watched: list[Callable[[], bool]] = []
+
+
+def watch(function: Callable[[], bool]) -> None:
+    """Have a function called at every tick, on the main thread, as long as it returns true."""
+    if function not in _watched:
+        _watched.append(function)
+    start_timer()
+
+
+def start_timer() -> None:
+    """Let Blender call :func:`poll`."""
+    if not bpy.app.timers.is_registered(poll):
+        bpy.app.timers.register(poll, first_interval=POLL_S, persistent=True)
+
+
+def poll() -> float | None:
+    """Timer: deliver what has finished, call what is watched; return seconds to the next tick."""
+    for function in _watched.copy():
+        _watched.remove(function)
+        if _goes_on(function) and function not in _watched:
+            _watched.append(function)
+    for lane in list(_lanes):
+        lane.deliver()
+    return POLL_S if _watched or any(lane.busy for lane in _lanes) else None
+
+
+def _goes_on(function: Callable[[], bool]) -> bool:
+    try:
+        return function()
+    except Exception:  # a timer that raises would be dropped without a word
+        _logger.exception("background timer")
+        return False
+
+
+@persistent  # type: ignore[untyped-decorator]
+def before_load(*_arguments: object) -> None:
+    """``load_pre``: nobody waits any more for what is about the open file."""
+    for lane in list(_lanes):
+        if lane.of_file:
+            lane.cancel()
+
+
+def stop() -> None:
+    """Take the timer out and cancel everything; threads end after what they are at."""
+    if bpy.app.timers.is_registered(poll):
+        bpy.app.timers.unregister(poll)
+    _watched.clear()
+    lanes = list(_lanes)
+    for lane in lanes:  # first: the end of a task may need another lane
+        lane.cancel()
+    for lane in lanes:
+        lane.stop()

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The base of our operators: typed errors become one report with its next step."""
+
+from __future__ import annotations
+
+import logging
+
+import bpy
+
+from ...core.errors import WrapError
+from . import tags
+
+_logger = logging.getLogger(__name__)
+
+
+class ReportsErrors:
+    """Mixin: ``execute`` calls ``work`` and reports what it raises."""
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        """Do what the operator is for."""
+        raise NotImplementedError
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Run :meth:`work`; Blender calls this."""
+        try:
+            return self.work(context)
+        except WrapError as error:
+            _logger.info("%s: %s", type(self).__name__, error)
+            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+        except OSError as error:
+            _logger.exception("%s", type(self).__name__)
+            self.report({"ERROR"}, f"{error.strerror}: {error.filename}")  # type: ignore[attr-defined]
+        return {"CANCELLED"}
+
+
+class NeedsObjectMode(ReportsErrors):
+    """Mixin: the operator works in Object Mode only."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run; Blender calls this."""
+        if context.mode != "OBJECT":
+            cls.poll_message_set("Change to Object Mode first")  # type: ignore[attr-defined]
+            return False
+        return True
+
+
+class NeedsResult:
+    """Mixin: the operator is about the scene's current result."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run; Blender calls this."""
+        if tags.current_frame(context.scene, context.view_layer.objects.active) is None:
+            cls.poll_message_set("The scene holds no result; wrap it, or import one")  # type: ignore[attr-defined]
+            return False
+        return True

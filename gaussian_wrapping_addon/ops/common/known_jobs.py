@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which job folders this person has worked in, so that a .blend from elsewhere opens none.
+
+A .blend file names its job folder. It may come from the internet, so that the folder is read
+without a question only where it lies beside the file or was used on this machine before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from pathlib import Path
+
+import bpy
+
+from ...core.errors import WrapError
+from ...core.files import read_json, write_json
+from .addon import addon_package
+
+_logger = logging.getLogger(__name__)
+
+MAX_KNOWN = 200
+_FILE = "known_jobs.json"
+_session: list[str] = []
+
+
+def remember(folder: Path) -> None:
+    """Note a folder that the user has chosen."""
+    text = str(folder.resolve())
+    if text in _session:
+        return
+    _session.append(text)
+    path = _list_path()
+    if path is not None:
+        known = [t for t in _stored() if t != text]
+        try:
+            write_json(path, [*known, text][-MAX_KNOWN:])
+        except OSError:
+            _logger.exception("cannot write %s", path)
+
+
+def is_trusted(folder: Path) -> bool:
+    """Tell whether a folder named by the open file may be read without asking."""
+    if is_remote(folder):
+        return False
+    absolute = folder.resolve()
+    if str(absolute) in _session or str(absolute) in _stored():
+        return True
+    if not bpy.data.filepath:
+        return False
+    beside = Path(bpy.data.filepath).resolve().parent
+    return beside != Path(beside.anchor) and absolute.is_relative_to(beside)
+
+
+def is_remote(folder: Path) -> bool:
+    r"""Tell whether a path is ``\\server\share``: Windows would send it the user's name."""
+    return str(folder).replace("\\", "/").startswith("//")
+
+
+def _list_path() -> Path | None:
+    package = addon_package()
+    with contextlib.suppress(ValueError, OSError):  # ValueError: not installed as an extension
+        return Path(bpy.utils.extension_path_user(package, create=True)) / _FILE
+    return None
+
+
+def _stored() -> list[str]:
+    path = _list_path()
+    if path is None or not path.is_file():
+        return []
+    try:
+        values = read_json(path)
+    except (OSError, WrapError):
+        return []
+    return [v for v in values if isinstance(v, str)] if isinstance(values, list) else []

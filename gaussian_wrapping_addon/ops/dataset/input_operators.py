@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators that choose the photos and check them."""
+
+from pathlib import Path
+from typing import Final
+
+import bpy
+from bpy.props import BoolProperty, StringProperty
+
+from ...core.errors import UsageError, WrapError
+from ..common.error_reporting import ReportsErrors
+from ..jobs import watched_jobs
+from ..jobs.job_guards import no_job_runs
+from ..training import training_estimate
+from ..worker import preferred_worker
+from . import photo_check
+
+_INPUT_FILES: Final = (".ply", ".json")
+"""Files that are an input themselves; another file stands for its folder."""
+
+
+class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
+    bl_idname = "gwrap.choose_input"
+    bl_label = "Choose Photos"
+    bl_description = (
+        "Choose the folder of the photos, of a COLMAP project or with a transforms.json, or the "
+        "PLY of a splat; it is checked at once"
+    )
+    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's convention
+
+    filepath: StringProperty(name="Input", subtype="FILE_PATH", options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    filter_folder: BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_image: BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_glob: StringProperty(  # type: ignore[valid-type]
+        default="*.ply;*.json;*.jpg;*.jpeg;*.png;*.tif;*.tiff;*.webp;*.heic", options={"HIDDEN"}
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return no_job_runs(cls, context)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        source = context.scene.gwrap.source
+        if source:
+            self.filepath = source.rstrip("/\\") + ("" if Path(source).suffix else "/")
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        column = self.layout.column(align=True)
+        column.label(text="Open the folder with the photos,")
+        column.label(text="then press Choose Photos.")
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        if not self.filepath:
+            raise UsageError("No folder was chosen.", "Open the folder of the photos.")
+        path = Path(bpy.path.abspath(self.filepath))
+        if path.suffix.lower() not in _INPUT_FILES and not path.is_dir():
+            path = path.parent  # a photo was clicked, or a name that does not exist
+        if not path.exists():
+            raise UsageError(f"{path} does not exist.", "Choose another folder.")
+        properties = context.scene.gwrap
+        if properties.source and Path(bpy.path.abspath(properties.source)) != path:
+            if properties.output == properties.job_folder:
+                properties.output = ""  # it was made for the photos before
+            watched_jobs.detach(context.scene)
+        properties.source = str(path)
+        training_estimate.forget()
+        photo_check.start(context.scene, preferred_worker.worker_choice(context))
+        return {"FINISHED"}
+
+
+class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
+    bl_idname = "gwrap.check_photos"
+    bl_label = "Check Photos"
+    bl_description = "Look through the photos and camera poses and list what stands in the way"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not context.scene.gwrap.source:
+            cls.poll_message_set("Choose the folder of the photos first")
+            return False
+        if photo_check.is_busy():
+            cls.poll_message_set("The check is under way; it takes seconds")
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """Look in a thread: the button must not make Blender wait for a slow disk."""
+        try:
+            photo_check.start(context.scene)
+        except WrapError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        properties = context.scene.gwrap
+        photo_check.check_now(context.scene)
+        errors = sum(row.severity == "error" for row in properties.findings)
+        warnings = sum(row.severity == "warning" for row in properties.findings)
+        kind = "WARNING" if errors or warnings else "INFO"
+        self.report({kind}, f"Photos checked: {errors} errors, {warnings} warnings")
+        return {"FINISHED"}
+
+
+CLASSES: Final = (GWRAP_OT_choose_input, GWRAP_OT_check_photos)

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the job buttons do, as plain functions: from properties to a running worker."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+
+from ...core.errors import DatasetError, UsageError
+from ...core.jobs.client import JobClient, worker_python
+from ...core.jobs.store.continue_training import job_with_more
+from ...core.jobs.store.job_file import make_job
+from ...core.jobs.store.job_folder import JobFolder
+from ...core.jobs.store.rollback import finished_job
+from ...core.jobs.store.stage_folder import read_done
+from ...core.names import AUTOMATIC_REGIONS, region_name, region_names
+from ...core.regions.region_file import read_region_file
+from ...core.settings import with_values
+from ..common import tags
+from ..regions.region_objects import export_region
+from ..regions.region_resolution import own_lengths, world_per_blender
+from ..worker.preferred_worker import WorkerChoice
+from . import job_timer, watched_jobs
+from .panel_settings import job_settings, meshing_choices, texture_choices
+from .scene_folders import job_folder_of, output_of, source_of
+
+
+def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
+    """Start the whole road for a scene's photos; return the job folder.
+
+    Raises
+    ------
+    WrapError
+        The source, the output or a setting cannot be used.
+    """
+    properties = scene.gwrap
+    source = source_of(scene)
+    folder = output_of(scene, source)
+    job = make_job("wrap", source, job_settings(scene, choice.threads))
+    _refuse_running(folder)
+    client = JobClient.start(
+        folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
+    )
+    properties.output = str(folder)
+    properties.job_command = "WRAP"
+    job_timer.watch(scene, folder, client)
+    return folder
+
+
+def start_mesh(
+    scene: bpy.types.Scene, regions: list[bpy.types.Object], choice: WorkerChoice
+) -> Path:
+    """Mesh regions of a finished training, each at its resolution; return the job folder.
+
+    Parameters
+    ----------
+    regions : list of Object
+        Region objects under the frame of one result.
+
+    Raises
+    ------
+    WrapError
+        A region cannot be used, or the job folder holds no finished training.
+    """
+    frame = common_frame(regions)
+    folder = job_folder_of(frame)
+    _require_training(folder)
+    _refuse_running(folder)
+    earlier = finished_job(JobFolder(folder))
+    _refuse_linked(regions)
+    properties = scene.gwrap
+    own = own_lengths(scene, regions, frame)
+    requests = []
+    for region in regions:
+        path = folder / "regions" / f"{region.session_uid}.json"
+        path.parent.mkdir(exist_ok=True)
+        export_region(region, path, _result_name(region, frame))
+        requests.append(str(path))
+    settings = with_values(
+        earlier.settings,
+        {
+            "threads": choice.threads,
+            "regions": tuple(requests),
+            **meshing_choices(scene, world_per_blender(frame)),
+            **texture_choices(scene),
+        },
+    )
+    lengths = {
+        request: length for request, length in zip(requests, own, strict=True) if length is not None
+    }
+    job = make_job("mesh", Path(earlier.source), settings, lengths)
+    names = region_names(job.settings.regions, job.region_bodies)
+    client = JobClient.start(
+        folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
+    )
+    for region, name in zip(regions, names, strict=True):
+        region[tags.REGION] = name  # so that the import finds this box and makes no second one
+    properties.job_command = "MESH"
+    job_timer.watch(scene, folder, client)
+    return folder
+
+
+def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerChoice) -> Path:
+    """Train a finished job further, then mesh and texture it again; return the job folder.
+
+    Parameters
+    ----------
+    frame : Object
+        The frame of the job's result.
+
+    Raises
+    ------
+    WrapError
+        The job folder holds no finished training, or too many iterations are asked for.
+    """
+    folder = job_folder_of(frame)
+    _refuse_running(folder)
+    earlier = finished_job(JobFolder(folder))
+    job = job_with_more(JobFolder(folder), earlier, scene.gwrap.training.more_iterations)
+    job = replace(job, settings=replace(job.settings, threads=choice.threads))
+    client = JobClient.start(
+        folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
+    )
+    scene.gwrap.job_command = "WRAP"
+    job_timer.watch(scene, folder, client)
+    return folder
+
+
+def resume(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
+    """Continue a scene's job; finished stages are re-used. Return the job folder."""
+    if not scene.gwrap.job_folder:
+        raise UsageError("This scene has no job.", "Wrap the scene first.")
+    folder = Path(bpy.path.abspath(scene.gwrap.job_folder))
+    _refuse_running(folder)
+    client = JobClient.resume(
+        folder, python=worker_python(choice.python), keep_running=choice.keep_running
+    )
+    job_timer.watch(scene, folder, client)
+    return folder
+
+
+def _require_training(folder: Path) -> None:
+    if not any(read_done(path) for path in (folder / "stages").glob("train-*")):
+        raise UsageError(
+            f"{folder} holds no finished training.", "Wrap the scene again, or find its folder."
+        )
+
+
+def _refuse_linked(regions: list[bpy.types.Object]) -> None:
+    for region in regions:
+        if not region.is_editable:
+            raise UsageError(
+                f"Region {region.name} is linked from a library.",
+                "Make it local (Object > Relations > Make Local).",
+            )
+
+
+def _result_name(region: bpy.types.Object, frame: bpy.types.Object) -> str:
+    """Return the name under which a region's mesh replaces the one made of it before.
+
+    A region that was renamed keeps it. Its copies, which carry the same mark, do not have it: of
+    several, it belongs to the one that is still called so, or else to none. Nor has the automatic
+    region, once a person asks for what its box encloses.
+    """
+    name = region.get(tags.REGION, "")
+    if not isinstance(name, str) or name in ("", *AUTOMATIC_REGIONS):
+        return ""
+    things = [t for t in bpy.data.objects if tags.kind_of(t) == "region"]
+    same = [t for t in things if t.get(tags.REGION) == name and tags.frame_of(t) == frame]
+    if len(same) == 1 or region_name(region.name, {"blender_object_name": region.name}) == name:
+        return _stored_name(frame, name)
+    return ""
+
+
+def _stored_name(frame: bpy.types.Object, folder: str) -> str:
+    """Return the name of the region whose result lies in a folder: the folder's is a simpler one.
+
+    Under another name it would be another region, whose result may not be replaced.
+    """
+    try:
+        stored = read_region_file(tags.result_folder(frame) / folder / "region.json").name
+    except DatasetError:
+        return folder
+    return stored if region_name(stored, {"blender_object_name": stored}) == folder else folder
+
+
+def _refuse_running(folder: Path) -> None:
+    if watched_jobs.is_running(str(folder)):
+        raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
+
+
+def common_frame(regions: list[bpy.types.Object]) -> bpy.types.Object:
+    """Return the frame that regions have in common.
+
+    Raises
+    ------
+    UsageError
+        There is none, or there are several.
+    """
+    if not regions:
+        raise UsageError("No region is selected.", "Select a region box.")
+    frames = {tags.frame_of(region) for region in regions}
+    frame = next(iter(frames))
+    if len(frames) > 1:
+        raise UsageError("The regions belong to different results.", "Select those of one result.")
+    if frame is None:
+        raise UsageError(
+            f"{regions[0].name} belongs to no result.", "Add a region after wrapping the scene."
+        )
+    return frame

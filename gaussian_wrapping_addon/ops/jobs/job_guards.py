@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Conditions and questions that operators on jobs share."""
+
+from pathlib import Path
+
+import bpy
+
+from ..common import known_jobs, tags
+from ..common.error_reporting import ReportsErrors
+from ..worker import worker_setup
+from . import watched_jobs
+
+
+def no_job_runs(cls: type, context: bpy.types.Context) -> bool:
+    """Tell whether no job runs in the scene; the tooltip says why a button is grey."""
+    if watched_jobs.is_running(context.scene.gwrap.job_folder):
+        cls.poll_message_set("A job is running; cancel it or wait for it")  # type: ignore[attr-defined]
+        return False
+    return True
+
+
+def has_worker(cls: type) -> bool:
+    """Tell whether a job has a Python to run in; the tooltip says what to do where it has none."""
+    problem = worker_setup.worker_problem()
+    if problem:
+        cls.poll_message_set(problem)  # type: ignore[attr-defined]
+    return not problem
+
+
+def selected_regions(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """Return the selected region objects, the active one first; else a result's only one."""
+    active = context.view_layer.objects.active
+    things = [t for t in context.selected_objects if tags.kind_of(t) == "region"]
+    frame = None if things else tags.current_frame(context.scene, active)
+    if frame is not None:
+        own = [t for t in frame.children if tags.kind_of(t) == "region"]
+        things = own if len(own) == 1 else []
+    return sorted(things, key=lambda t: (t != active, t.name))
+
+
+def chosen_regions(context: bpy.types.Context, *, checked: bool) -> list[bpy.types.Object]:
+    """Return the checked regions of the scene by name, or the selected ones."""
+    if not checked:
+        return selected_regions(context)
+    things = tags.objects_of_kind(context.scene, "region")
+    return sorted((t for t in things if t.gwrap.checked), key=lambda t: t.name)
+
+
+class AsksAboutFolder(ReportsErrors):
+    """Asks before it works in a folder that only the file names (it may come from elsewhere)."""
+
+    def folder(self, context: bpy.types.Context) -> Path | None:
+        """Return the folder that the operator would use."""
+        raise NotImplementedError
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask where the folder is not known on this machine."""
+        folder = self.folder(context)
+        if folder is None or known_jobs.is_trusted(folder):
+            return self.execute(context)
+        return context.window_manager.invoke_confirm(  # type: ignore[no-any-return]
+            self,
+            event,
+            title="Use This Job Folder?",
+            message=f"The file names a job folder that is new on this machine: {folder}",
+            confirm_text="Use Folder",
+        )

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Look at the watched jobs from Blender's timer, and import what they have made."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+
+from ...core import limits
+from ...core.errors import UsageError, WrapError
+from ...core.jobs.client import JobClient
+from ...core.jobs.store.job_folder import JobStatus
+from ..common import background, known_jobs, tags
+from ..common.background import Lane, Task
+from ..common.redrawing import redraw
+from ..results.result_files import ResultFiles, read_result
+from ..results.scene_objects import import_result
+from . import live_preview, watched_jobs
+from .watched_jobs import WatchedJob, jobs
+
+_logger = logging.getLogger(__name__)
+
+LOOK_WAIT_S = 0.0
+"""For the disk to tell of a job; what it has told is seen at the next look."""
+
+IMPORT_STAGE = "import"
+"""Shown as a stage of the job while its result is read."""
+
+_looks, _readings = Lane(), Lane()
+
+
+def watch(scene: bpy.types.Scene, folder: Path, client: JobClient, *, imports: bool = True) -> None:
+    """Show a job in a scene and follow it to its end."""
+    known_jobs.remember(folder)
+    watched_jobs.show(scene, folder, WatchedJob(client, client.poll(), scene.session_uid, imports))
+    start_timer()
+
+
+def cancel(folder: str) -> None:
+    """Ask a job to stop; it is ended by force when it does not.
+
+    A finished job whose result is being read stays finished, and its result is offered.
+
+    Raises
+    ------
+    UsageError
+        No job is watched in this folder.
+    """
+    job = jobs.get(watched_jobs.key_of(folder))
+    if job is None:
+        raise UsageError("No job is running.", "Start one first.")
+    if job.reading is not None:
+        job.imports, job.reading, job.waits_for_mode = False, None, False
+        job.status = job.client.poll()
+        return
+    job.client.cancel()
+    if job.cancel_asked_s is None:
+        job.cancel_asked_s = time.monotonic()
+        job.ending = Lane()
+        job.ending.start()  # now: the timer starts no thread
+
+
+def forget_all() -> None:
+    """Stop watching; workers go on, and are found again by ``attach_open_file``."""
+    watched_jobs.forget_all()
+    _looks.stop()
+    _readings.stop()
+
+
+def start_timer() -> None:
+    """Look at the jobs from now on, as long as one is at work."""
+    _looks.start()
+    _readings.start()
+    live_preview.start()
+    background.watch(tick)
+
+
+def tick() -> bool:
+    """Look at all jobs once, by the add-on's timer."""
+    return poll_jobs()
+
+
+def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
+    """Look at all jobs once and import what is done; tell whether another look is needed."""
+    busy = changed = False
+    for folder, job in list(jobs.items()):
+        if not (job.status.active or job.waits_for_mode):
+            continue
+        before = (job.status, job.waits_for_mode)
+        now_s = clock()
+        try:
+            _poll(folder, job, now_s)
+        except Exception as error:  # a timer that raises would be dropped without a word
+            _logger.exception("looking at the job in %s", folder)
+            job.status = replace(
+                job.status,
+                state="FAILED",
+                error=f"The job folder cannot be read: {error}",
+                hint="See the system console, then choose Find Job.",
+            )
+        if not job.status.active:
+            job.let_go()
+            live_preview.forget(folder)
+        elif job.status.stage == "train":
+            changed = live_preview.refresh(folder, now_s) or changed
+        busy = busy or job.status.active or job.waits_for_mode
+        changed = changed or before != (job.status, job.waits_for_mode)
+    if changed:
+        redraw()
+    return busy
+
+
+def _poll(folder: str, job: WatchedJob, now_s: float) -> None:
+    asked_s = job.cancel_asked_s if job.status.active else None
+    if asked_s is not None and now_s - asked_s > limits.CANCEL_GRACE_S:
+        _logger.warning("job in %s does not stop; ending it", folder)
+        job.cancel_asked_s = now_s
+        if job.ending is not None:
+            job.ending.submit(job.client.kill)
+    if job.look is None:
+        client = job.client
+        job.look = _looks.submit(lambda: _looked(client))
+    if not job.look.finished(LOOK_WAIT_S):
+        return
+    look, job.look = job.look, None
+    job.status = look.answer()
+    job.waits_for_mode = False
+    if job.status.active:
+        return
+    if job.status.state == "LOST" and job.cancel_asked_s is not None:
+        hint = "Resume continues from the last checkpoint."
+        job.status = replace(job.status, state="CANCELLED", error="", hint=hint)
+    if job.status.state == "DONE" and job.imports:
+        _bring_in(folder, job)
+
+
+def _looked(client: JobClient) -> JobStatus:
+    """Look at a job's folder; runs in a thread."""
+    status = client.poll()
+    # It may have written its last word between our look at the file and at the process.
+    return client.poll() if status.state == "LOST" else status
+
+
+def _bring_in(folder: str, job: WatchedJob) -> None:
+    """Read a finished job's result in the background, then import it in one piece."""
+    scene = tags.scene_of_uid(job.scene_uid)
+    if scene is None:
+        job.reading = None  # another file is open: opening the old one again imports it
+        return
+    if job.reading is None:
+        job.reading = _reading(Path(job.status.result))
+    if not job.reading.finished():
+        job.status = replace(
+            job.status, state="RUNNING", stage=IMPORT_STAGE, message="reading the result"
+        )
+        return
+    job.waits_for_mode = bpy.context.mode != "OBJECT"
+    if not job.waits_for_mode:
+        reading, job.imports, job.reading = job.reading, False, None
+        _import(folder, job, scene, reading.answer)
+
+
+def _reading(folder: Path) -> Task[ResultFiles]:
+    return _readings.submit(lambda: read_result(folder))
+
+
+def _import(
+    folder: str, job: WatchedJob, scene: bpy.types.Scene, files: Callable[[], ResultFiles]
+) -> None:
+    try:
+        import_result(Path(job.status.result), scene, files())
+        _push_undo("Import Wrap Result")
+    except WrapError as error:
+        job.status = replace(job.status, state="FAILED", error=error.message, hint=error.hint)
+    except Exception as error:
+        _logger.exception("importing the result of %s", folder)
+        job.status = replace(
+            job.status,
+            state="FAILED",
+            error=f"The result could not be imported: {error}",
+            hint="See the system console, then try Import Result.",
+        )
+
+
+def _push_undo(message: str) -> None:
+    windows = bpy.context.window_manager.windows
+    if bpy.app.background or not windows:
+        return  # no undo without a window
+    with bpy.context.temp_override(window=bpy.context.window or windows[0]):
+        bpy.ops.ed.undo_push(message=message)

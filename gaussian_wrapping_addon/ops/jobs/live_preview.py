@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The picture of a running training, loaded by the job timer, drawn from memory.
+
+Panels draw often and must neither read the disk nor make anything: they ask :func:`icons_of`. The
+pictures lie in a preview collection, not in ``bpy.data``, so that no file is saved with them and
+undo does not know them. Files are looked for and read in a thread, as bare pixels: to decode its
+first picture, Blender needs longer than its window may wait.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy.utils.previews
+import numpy as np
+
+from ..common.background import Lane, Task
+
+_logger = logging.getLogger(__name__)
+
+PICTURE = "preview-training.npy"
+EVERY_S = 3.0
+"""Between two looks at the folder."""
+MAX_BYTES = 8 * 2**20
+"""Larger files are not a preview; drawing them would be felt."""
+
+_NEVER_S = float("-inf")
+
+Stamp = tuple[str, int, int]
+"""Path, time in ns and size in bytes of a file."""
+
+
+@dataclass
+class _Shown:
+    looked_s: float = _NEVER_S
+    stamp: Stamp | None = None
+    names: tuple[str, ...] = ()
+    icons: tuple[int, ...] = ()
+    reading: Task[_Read | None] | None = None
+
+
+@dataclass(frozen=True)
+class _Read:
+    stamp: Stamp
+    parts: tuple[np.ndarray, ...]
+    """Each (h, w, 4) float32, as Blender wants them: from the bottom up."""
+
+
+_readings = Lane()
+_shown: dict[str, _Shown] = {}
+_pictures: Any = None  # ImagePreviewCollection, made when the first picture is there
+_count = 0
+
+
+def icons_of(folder: str) -> tuple[int, ...]:
+    """Return the icons of a job folder's picture, none where there is none; reads nothing.
+
+    A photo beside its rendering gives two: an icon is drawn in a square.
+    """
+    shown = _shown.get(folder)
+    return shown.icons if shown else ()
+
+
+def path_of(folder: str) -> str:
+    """Return the file that the picture of a job folder was read from, or ``""``."""
+    shown = _shown.get(folder)
+    return shown.stamp[0] if shown and shown.stamp else ""
+
+
+def newest_picture(folder: Path) -> Stamp | None:
+    """Return the file of the training that is under way, or None."""
+    found = []
+    for path in (folder / "stages").glob(f"train-*/{PICTURE}"):
+        try:
+            state = path.stat()
+            if path.is_symlink() or (path.parent / "done.json").exists():
+                continue
+        except OSError:
+            continue
+        found.append((state.st_mtime_ns, state.st_size, str(path)))
+    if not found:
+        return None
+    time_ns, size_bytes, text = max(found)
+    return text, time_ns, size_bytes
+
+
+def refresh(folder: str, now_s: float) -> bool:
+    """Look for a new picture, at most every few seconds; tell whether one is shown now.
+
+    It is read in a thread and shown by a later call. The old picture stays until then: one that
+    is being written, or is broken, changes nothing.
+    """
+    shown = _shown.setdefault(folder, _Shown())
+    if shown.reading is None:
+        if now_s - shown.looked_s >= EVERY_S:
+            shown.looked_s = now_s
+            known = shown.stamp
+            shown.reading = _readings.submit(lambda: _read(Path(folder), known))
+        return False
+    if not shown.reading.finished():
+        return False
+    reading, shown.reading = shown.reading, None
+    try:
+        read = reading.answer()
+        loaded = _load(read.parts) if read else None
+    except Exception:  # whatever the file holds: the job goes on without its picture
+        _logger.info("no picture of %s", folder, exc_info=True)
+        return False
+    if read is None or loaded is None:
+        return False
+    _drop(shown.names)
+    shown.names, shown.icons = loaded
+    shown.stamp = read.stamp
+    return True
+
+
+def forget(folder: str) -> None:
+    """Let go of the picture of a job that has ended."""
+    shown = _shown.pop(folder, None)
+    if shown is not None:
+        _drop(shown.names)
+
+
+def start() -> None:
+    """Make ready what the first picture would have to wait for."""
+    _readings.start()
+
+
+def stop() -> None:
+    """Let go of everything; Blender complains about collections left behind."""
+    global _pictures
+    _shown.clear()
+    _readings.stop()
+    if _pictures is not None:
+        bpy.utils.previews.remove(_pictures)
+        _pictures = None
+
+
+def _read(folder: Path, known: Stamp | None) -> _Read | None:
+    """Return the newest picture, cut in two where it is wide; None where there is nothing new.
+
+    Raises
+    ------
+    Exception
+        The file cannot be read, or holds no picture; NumPy raises many kinds.
+    """
+    stamp = newest_picture(folder)
+    if stamp is None or stamp == known or stamp[2] > MAX_BYTES:
+        return None
+    data = Path(stamp[0]).read_bytes()  # whole: what is replaced meanwhile is not mapped
+    pixels = np.load(io.BytesIO(data), allow_pickle=False)
+    if not isinstance(pixels, np.ndarray):
+        raise ValueError(f"{stamp[0]} holds several arrays")
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8 or not pixels.size:
+        raise ValueError(f"{stamp[0]} holds {pixels.dtype} of shape {pixels.shape}")
+    height, width, _ = pixels.shape
+    values = np.ones((height, width, 4), np.float32)
+    values[..., :3] = pixels[::-1] / np.float32(255.0)
+    if width < 2 * height:
+        return _Read(stamp, (values,))
+    return _Read(stamp, (values[:, : width // 2], values[:, -(width // 2) :]))
+
+
+def _load(parts: tuple[np.ndarray, ...]) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Make pictures of (h, w, 4) values; return names and icons."""
+    global _pictures, _count
+    if _pictures is None:
+        _pictures = bpy.utils.previews.new()
+    _count += 1  # new names each time: Blender keeps what it has drawn of an old one
+    names = tuple(f"{_count} {part}" for part in ("photo", "rendering")[: len(parts)])
+    return names, tuple(map(_new, names, parts))
+
+
+def _new(name: str, pixels: np.ndarray) -> int:
+    """Make a picture of (h, w, 4) float32 values; return its icon."""
+    picture = _pictures.new(name)
+    picture.image_size = pixels.shape[1::-1]
+    picture.image_pixels_float.foreach_set(np.ascontiguousarray(pixels).ravel())
+    return int(picture.icon_id)
+
+
+def _drop(names: tuple[str, ...]) -> None:
+    for name in names:
+        if _pictures is not None and name in _pictures:
+            del _pictures[name]

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From what the panels show to the settings of a job."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...core.errors import UsageError
+from ...core.settings import Declaration, JobSettings, declarations, preset, with_values
+from ..common import known_jobs
+
+
+def settings_of_scene() -> list[Declaration]:
+    """Return the settings that a scene has a property for."""
+    return [
+        declared
+        for declared in declarations(JobSettings)
+        if declared.panel is not None and declared.property_owner != "preferences"
+    ]
+
+
+def is_shown(declared: Declaration, properties: bpy.types.PropertyGroup) -> bool:
+    """Tell whether a setting's property is shown, given the choices of ``Scene.gwrap``."""
+    panel = declared.panel
+    if panel is None or panel.shown_if is None:
+        return panel is not None
+    name, value = panel.shown_if
+    return bool(getattr(properties, name) == value)
+
+
+def chosen_values(
+    properties: bpy.types.PropertyGroup, settings: Iterable[Declaration]
+) -> dict[str, Any]:
+    """Return the values, by path, that properties hold for settings.
+
+    A number that is left to the preset is not among them.
+
+    Parameters
+    ----------
+    properties : bpy.types.PropertyGroup
+        ``Scene.gwrap``.
+    """
+    values = {}
+    for declared in settings:
+        panel, stored = declared.panel, _stored(declared, properties)
+        if panel is None or (panel.preset_if_zero and not stored):
+            continue
+        hidden = panel.default_if_hidden and not is_shown(declared, properties)
+        values[declared.path] = declared.default if hidden else declared.from_panel(stored)
+    return values
+
+
+def _stored(declared: Declaration, properties: bpy.types.PropertyGroup) -> Any:
+    owner = properties.training if declared.property_owner == "training" else properties
+    return getattr(owner, declared.property_name)
+
+
+def job_settings(scene: bpy.types.Scene, threads: int) -> JobSettings:
+    """Return the settings that the panels of a scene ask for: the preset, then the choices.
+
+    The meshing is not among them: a job that trains meshes with the settings' defaults.
+
+    Raises
+    ------
+    UsageError
+        The splat to start from is not there.
+    """
+    settings = [declared for declared in settings_of_scene() if declared.group != "meshing"]
+    values = chosen_values(scene.gwrap, settings)
+    values["start_splat"] = _splat(values["start_splat"])
+    chosen = preset(values.pop("preset"), threads=threads)
+    return with_values(chosen, values)
+
+
+def meshing_choices(scene: bpy.types.Scene, world_per_blender: float) -> dict[str, Any]:
+    """Return the meshing settings, by path, that the panels of a scene ask for.
+
+    Parameters
+    ----------
+    world_per_blender : float
+        World units of the input per unit of length in Blender.
+    """
+    settings = [declared for declared in settings_of_scene() if declared.group == "meshing"]
+    values = chosen_values(scene.gwrap, settings)
+    if values["meshing.edge_length"]:
+        values["meshing.edge_length"] *= world_per_blender
+    return values
+
+
+def method_choices(scene: bpy.types.Scene) -> dict[str, Any]:
+    """Return the meshing settings, by name, that an estimate of a mesh depends on.
+
+    The edge length is as in Blender.
+    """
+    settings = [
+        declared
+        for declared in settings_of_scene()
+        if declared.option is not None and declared.scope == "method"
+    ]
+    values = chosen_values(scene.gwrap, settings)
+    return {path.rpartition(".")[2]: value for path, value in values.items()}
+
+
+def texture_choices(scene: bpy.types.Scene) -> dict[str, Any]:
+    """Return the texture settings, by path, that the panels of a scene ask for."""
+    settings = [declared for declared in settings_of_scene() if declared.group == "texture"]
+    return chosen_values(scene.gwrap, settings)
+
+
+def _splat(stored: str) -> str:
+    if not stored:
+        return ""
+    path = Path(bpy.path.abspath(stored))
+    # A path in the open file may come from elsewhere: no name of a server is looked up.
+    if known_jobs.is_remote(path):
+        raise UsageError(f"{path} lies on another machine.", "Copy the splat to this one.")
+    if path.suffix.lower() != ".ply":
+        raise UsageError(f"{path.name} is no PLY file.", "Choose a splat saved as PLY, or none.")
+    if not path.is_file():
+        raise UsageError(
+            f"The splat {path} does not exist.",
+            "Choose it again in Train, Advanced, or clear the field.",
+        )
+    return str(path.resolve())
+
+
+def preset_lines(name: str) -> tuple[str, ...]:
+    """Return what the preset of a scene takes where a number is 0."""
+    training = preset(name.lower()).training
+    return (
+        f"0 takes {name.capitalize()}'s: {training.iterations:,},",
+        f"{training.max_gaussians:,} and {training.max_image_px:,} px",
+    )
+
+
+def choices_key(scene: bpy.types.Scene) -> tuple[object, ...]:
+    """Return what an estimate of time and memory depends on; reads no file, for panels."""
+    properties = scene.gwrap
+    own = (properties.source, properties.preset, properties.texture_size)
+    training = [d for d in settings_of_scene() if d.property_owner == "training"]
+    return (*own, *(_stored(declared, properties) for declared in training))

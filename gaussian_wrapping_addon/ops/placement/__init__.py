@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Scene tools: scale, ground, up and origin of a result, by its parent empty alone."""

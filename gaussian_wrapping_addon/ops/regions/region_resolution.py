@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How fine a region is to be meshed: its own edge length, or what the scene's panels say."""
+
+from __future__ import annotations
+
+import math
+
+import bpy
+import numpy as np
+
+from ...core.errors import UsageError
+from ..common import tags
+from .region_objects import hull_in_blender, scene_from_blender
+
+COARSEST_SHARE = 0.5
+"""Of a region's diagonal: longer edges are a slip of the hand."""
+FINEST_SHARE = 1e-6
+"""Of the diagonal: shorter edges the worker refuses as well."""
+
+
+def has_own(scene: bpy.types.Scene, region: bpy.types.Object) -> bool:
+    """Tell whether a region's own edge length decides; meshes by pivots have none."""
+    return bool(region.gwrap.own_edge_length) and scene.gwrap.method != "PIVOTS"
+
+
+def edge_length_in_blender(scene: bpy.types.Scene, region: bpy.types.Object) -> float:
+    """Return the edge length that decides, as seen in Blender; 0 where none does."""
+    if has_own(scene, region):
+        return float(region.gwrap.edge_length)
+    return float(scene.gwrap.edge_length) if scene.gwrap.resolution == "EDGE_LENGTH" else 0.0
+
+
+def checked_edge_length(scene: bpy.types.Scene, region: bpy.types.Object) -> float:
+    """Return :func:`edge_length_in_blender` after a look at the region's size.
+
+    Raises
+    ------
+    UsageError
+        The region encloses no volume, or the length is no positive number, too long or too short.
+    """
+    edge_length = edge_length_in_blender(scene, region)
+    diagonal = float(np.linalg.norm(np.ptp(hull_in_blender(region)[0], 0)))
+    if not has_own(scene, region) and scene.gwrap.resolution != "EDGE_LENGTH":
+        return 0.0
+    if not math.isfinite(edge_length) or edge_length <= 0.0:
+        raise UsageError(
+            f"Edge length {edge_length:g} of region {region.name} is not possible.",
+            "Give a positive length.",
+        )
+    if edge_length > COARSEST_SHARE * diagonal:
+        raise UsageError(
+            f"Edge length {edge_length:g} is too coarse for region {region.name}, "
+            f"which measures {diagonal:.3g} from corner to corner.",
+            "Choose a smaller edge length.",
+        )
+    if edge_length < FINEST_SHARE * diagonal:
+        raise UsageError(
+            f"Region {region.name} is {diagonal / edge_length:.2g} edges of {edge_length:g} long: "
+            "too many.",
+            "Choose a larger edge length, or a smaller region.",
+        )
+    return edge_length
+
+
+def world_per_blender(frame: bpy.types.Object) -> float:
+    """Return how many world units of the input a length of 1 in Blender is."""
+    scale = abs(np.linalg.det(scene_from_blender(frame)[:3, :3])) ** (1.0 / 3.0)
+    return float(scale * tags.world_from_scene(frame).scale)
+
+
+def own_lengths(
+    scene: bpy.types.Scene, regions: list[bpy.types.Object], frame: bpy.types.Object
+) -> list[float | None]:
+    """Return each region's own edge length in world units, None where it has none.
+
+    Raises
+    ------
+    UsageError
+        A region or the length that it is to be meshed with cannot be used.
+    """
+    lengths = [checked_edge_length(scene, region) for region in regions]
+    scale = world_per_blender(frame)
+    return [
+        length * scale if has_own(scene, region) else None
+        for region, length in zip(regions, lengths, strict=True)
+    ]

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Results as Blender objects: reading a result folder, materials, levels, report, .blend files."""

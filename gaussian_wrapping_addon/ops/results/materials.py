@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The material of a result: the photo texture, lit or unlit, glTF-safe both ways."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import bpy
+
+from ...core.texture.files.shading import ROUGHNESS, SPECULAR_LEVEL
+from ..common import tags
+
+SHADINGS = ("LIT", "UNLIT")
+_NORMAL_IMAGE, _NORMAL = "Normal Texture", "Normal Map"
+_IMAGE, _LIT, _UNLIT, _OUTPUT = "Photo Texture", "Lit", "Unlit", "Output"
+
+
+def load_texture(path: Path, colorspace: str = "sRGB") -> bpy.types.Image:
+    """Load an image by path (not packed), or reload it where it is loaded already.
+
+    Normal maps are no colours: their ``colorspace`` is ``"Non-Color"``.
+    """
+    image = bpy.data.images.load(str(path), check_existing=True)
+    if image.packed_file is not None:  # reloading would bring the packed one back
+        image.unpack(method="REMOVE")
+        image.reload()
+        image.pack()
+    elif image.users:
+        image.reload()
+    image.colorspace_settings.name = colorspace
+    return image
+
+
+def create_material(
+    name: str, image: bpy.types.Image, normal_map: bpy.types.Image | None = None
+) -> bpy.types.Material:
+    """Make a material with both branches, linked as lit; the lit one takes the normal map.
+
+    Unlit is the pattern that the glTF exporter writes as ``KHR_materials_unlit``.
+    """
+    material = bpy.data.materials.new(name)
+    if material.node_tree is None:  # Blender 4 makes materials without nodes
+        material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    texture = nodes.new("ShaderNodeTexImage")
+    texture.name, texture.image, texture.location = _IMAGE, image, (-600, 200)
+    lit = nodes.new("ShaderNodeBsdfPrincipled")
+    lit.name, lit.location = _LIT, (-200, 400)
+    lit.inputs["Roughness"].default_value = ROUGHNESS
+    lit.inputs["Specular IOR Level"].default_value = SPECULAR_LEVEL
+    links.new(texture.outputs["Color"], lit.inputs["Base Color"])
+    emission = nodes.new("ShaderNodeEmission")
+    emission.location = (-200, -300)
+    links.new(texture.outputs["Color"], emission.inputs["Color"])
+    transparent = nodes.new("ShaderNodeBsdfTransparent")
+    transparent.location = (-200, -450)
+    path = nodes.new("ShaderNodeLightPath")
+    path.location = (-600, -200)
+    unlit = nodes.new("ShaderNodeMixShader")
+    unlit.name, unlit.location = _UNLIT, (50, -300)
+    links.new(path.outputs["Is Camera Ray"], unlit.inputs[0])
+    links.new(transparent.outputs[0], unlit.inputs[1])
+    links.new(emission.outputs[0], unlit.inputs[2])
+    output = nodes.new("ShaderNodeOutputMaterial")
+    output.name, output.location = _OUTPUT, (300, 200)
+    links.new(lit.outputs[0], output.inputs["Surface"])
+    # Workbench draws the texture of the active image node.
+    nodes.active = texture
+    set_normal_map(material, normal_map)
+    return material
+
+
+def create_materials(
+    name: str, albedo: Sequence[Path], normal_map: Sequence[Path]
+) -> list[bpy.types.Material]:
+    """Make a material for each atlas: ``name``, then ``name 2`` and on.
+
+    Parameters
+    ----------
+    albedo, normal_map : sequence of Path
+        Images, one for each atlas; normal maps may be empty.
+    """
+    normals = load_normal_maps(normal_map, len(albedo))
+    return [
+        create_material(f"{name} {number}" if number > 1 else name, load_texture(path), normal)
+        for number, (path, normal) in enumerate(zip(albedo, normals, strict=True), 1)
+    ]
+
+
+def load_normal_maps(paths: Sequence[Path], count: int) -> list[bpy.types.Image | None]:
+    """Load the normal maps of ``count`` atlases; each None where there are none."""
+    return [load_texture(path, "Non-Color") for path in paths] or [None] * count
+
+
+def set_normal_map(material: bpy.types.Material, image: bpy.types.Image | None) -> bool:
+    """Give the lit branch a normal map, or take it away; False where it is none of our materials.
+
+    The image goes through a Normal Map node, without which glTF exporters drop it.
+    """
+    tree = material.node_tree
+    if tree is None or _LIT not in tree.nodes:
+        return False
+    nodes, links = tree.nodes, tree.links
+    if image is None:
+        for name in (_NORMAL, _NORMAL_IMAGE):
+            if name in nodes:
+                nodes.remove(nodes[name])
+        return True
+    texture, normal = nodes.get(_NORMAL_IMAGE), nodes.get(_NORMAL)
+    if texture is None or normal is None:
+        set_normal_map(material, None)
+        active = nodes.active
+        texture = nodes.new("ShaderNodeTexImage")
+        texture.name, texture.location = _NORMAL_IMAGE, (-900, 500)
+        normal = nodes.new("ShaderNodeNormalMap")
+        normal.name, normal.location = _NORMAL, (-450, 500)
+        links.new(texture.outputs["Color"], normal.inputs["Color"])
+        links.new(normal.outputs["Normal"], nodes[_LIT].inputs["Normal"])
+        nodes.active = active  # Workbench draws the active image
+    texture.image = image
+    return True
+
+
+def set_shading(material: bpy.types.Material, shading: str) -> bool:
+    """Link the lit or the unlit branch; False where the material is not one of ours."""
+    tree = material.node_tree
+    if tree is None or not {_LIT, _UNLIT, _OUTPUT} <= set(tree.nodes.keys()):
+        return False
+    source = tree.nodes[_LIT if shading == "LIT" else _UNLIT]
+    tree.links.new(source.outputs[0], tree.nodes[_OUTPUT].inputs["Surface"])
+    return True
+
+
+def shading_of(material: bpy.types.Material | None) -> str | None:
+    """Return ``"LIT"`` or ``"UNLIT"``, None where the material is not one of ours."""
+    tree = material.node_tree if material is not None else None
+    if tree is None or not {_LIT, _UNLIT, _OUTPUT} <= set(tree.nodes.keys()):
+        return None
+    links = tree.nodes[_OUTPUT].inputs["Surface"].links
+    return "UNLIT" if links and links[0].from_node.name == _UNLIT else "LIT"
+
+
+def show_as_emission(material: bpy.types.Material) -> None:
+    """Turn one of our materials into a black Principled one that glows in the texture's colours.
+
+    For formats without unlit materials: what is left of ``Unlit`` there, without the texture lost.
+    """
+    tree = material.node_tree
+    lit, texture = tree.nodes[_LIT], tree.nodes[_IMAGE]
+    set_normal_map(material, None)
+    for link in list(lit.inputs["Base Color"].links):
+        tree.links.remove(link)
+    lit.inputs["Base Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+    lit.inputs["Specular IOR Level"].default_value = 0.0
+    lit.inputs["Emission Strength"].default_value = 1.0
+    tree.links.new(texture.outputs["Color"], lit.inputs["Emission Color"])
+    set_shading(material, "LIT")
+
+
+def fold_specular(material: bpy.types.Material) -> None:
+    """Say the reflectance of the lit branch by its index of refraction alone, as USD does.
+
+    Blender's reader of USD takes the level for 0.5, which leaves the reflectance
+    ((ior - 1) / (ior + 1))^2 as it is; twice the level is a factor of it.
+    """
+    inputs = material.node_tree.nodes[_LIT].inputs
+    level, index = inputs["Specular IOR Level"], inputs["IOR"]
+    root = (
+        abs(index.default_value - 1.0)
+        / (index.default_value + 1.0)
+        * math.sqrt(2.0 * min(max(level.default_value, 0.0), 0.5))
+    )
+    index.default_value, level.default_value = (1.0 + root) / (1.0 - root), 0.5
+
+
+def texture_of(material: bpy.types.Material | None) -> bpy.types.Image | None:
+    """Return the photo texture of one of our materials, else None."""
+    if shading_of(material) is None:
+        return None
+    node = material.node_tree.nodes.get(_IMAGE)
+    return None if node is None else node.image
+
+
+def images_of(frame: bpy.types.Object | None) -> list[bpy.types.Image]:
+    """Return the images in our materials on the meshes of a result, each once."""
+    found = [
+        node.image
+        for child in (frame.children_recursive if frame is not None else ())
+        if tags.kind_of(child) in ("mesh", "lod")
+        for slot in child.material_slots
+        if shading_of(slot.material) is not None
+        for node in slot.material.node_tree.nodes
+        if node.bl_idname == "ShaderNodeTexImage" and node.image is not None
+    ]
+    return list(dict.fromkeys(found))

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the panel shows of a job's report: picked once at import, then kept in the .blend file.
+
+The figures lie as JSON text on the result's parent empty, so that drawing reads no file, and a
+.blend still tells them where the result folder is gone.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from ...core.evaluation.report.report_warnings import collect_warnings
+from ...core.evaluation.report.text import (
+    NOT_MEASURED,
+    bytes_text,
+    duration,
+    items,
+    measured,
+    number,
+    part,
+    percent,
+    plural,
+)
+
+MAX_WARNINGS = 50
+MAX_TEXT = 400
+"""Characters of one warning or name that are kept."""
+MAX_ROWS = 100
+"""Stages and regions that are kept."""
+
+_DECISIONS = {
+    "harmonics": "Reflections",
+    "exposure": "Exposure",
+    "multi_view": "Compare Photos",
+    "wrapping": "Wrap Thin Parts",
+    "growth": "Add Gaussians",
+    "full_size": "Photo Size",
+}
+"""Labels of what was decided, as the panel Training has them."""
+
+_STAGES = {"cameras": "Cameras", "train": "Training", "mesh": "Mesh", "texture": "Texture"}
+
+Row = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class RegionRows:
+    """Figures of one region as label and text."""
+
+    name: str
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """What the panel shows, ready to draw."""
+
+    rows: tuple[Row, ...] = ()
+    stages: tuple[Row, ...] = ()
+    decisions: tuple[Row, ...] = ()
+    """What the scene needed, or what somebody decided instead."""
+    regions: tuple[RegionRows, ...] = ()
+    warnings: tuple[str, ...] = ()
+    known: bool = False
+    """Whether there is a report at all."""
+
+    @property
+    def training(self) -> str:
+        """What was trained, for a heading: ``"12,235 Gaussians, 23.0 dB"``, or ``""``."""
+        rows = dict(self.rows)
+        gaussians, quality = rows.get("Gaussians"), rows.get("Held-Out PSNR")
+        parts = [f"{gaussians} Gaussians"] if gaussians and gaussians != NOT_MEASURED else []
+        if quality and quality != NOT_MEASURED:
+            parts.append(quality.partition(" (")[0])
+        return ", ".join(parts)
+
+    def as_text(self) -> str:
+        """Return all of it as text, a line for each row."""
+        lines = [f"{name}: {value}" for name, value in (*self.rows, *self.stages, *self.decisions)]
+        for region in self.regions:
+            lines += ["", region.name, *(f"  {name}: {value}" for name, value in region.rows)]
+        if self.warnings:
+            lines += ["", "Warnings", *(f"  {text}" for text in self.warnings)]
+        return "\n".join(lines) + "\n"
+
+
+def figures_of_report(report: Any) -> dict[str, Any]:
+    """Pick the figures that the panel shows; what a report lacks is left out.
+
+    Parameters
+    ----------
+    report : any
+        Content of ``report.json``, of any version.
+
+    Returns
+    -------
+    dict
+        ``seconds``, ``gaussians``, ``psnr`` (held-out photos, dB), ``psnr_count``,
+        ``memory_bytes``, ``stages`` (pairs of name and seconds), ``decisions`` (name, choice and
+        setting), ``warnings`` (texts), and
+        ``regions``: for each name ``faces``, ``vertices``, ``closed``, ``coverage`` and
+        ``mesh_psnr`` (dB).
+    """
+    if not isinstance(report, dict) or not report:
+        return {}
+    training = part(report, "training")
+    held_out = items(training.get("held_out"))
+    memory = [measured(value) for value in part(report, "peak_memory_bytes").values()]
+    figures: dict[str, Any] = _measured(
+        seconds=report.get("wall_seconds"),
+        gaussians=training.get("gaussians"),
+        psnr=training.get("held_out_psnr") if held_out else None,
+        psnr_count=len(held_out),
+        memory_bytes=max((value for value in memory if value), default=None),
+    )
+    figures["stages"] = [
+        [str(stage.get("name", ""))[:MAX_TEXT], stage["seconds"]]
+        for stage in map(part, items(report.get("stages"))[:MAX_ROWS])
+        if measured(stage.get("seconds")) is not None
+    ]
+    figures["decisions"] = [
+        [str(entry.get(key, ""))[:MAX_TEXT] for key in ("name", "chosen", "setting")]
+        for entry in map(part, items(training.get("decisions"))[:MAX_ROWS])
+    ]
+    figures["warnings"] = [
+        f"{warning.stage}: {warning.text} {warning.hint}".strip()[:MAX_TEXT]
+        for warning in collect_warnings(report)[:MAX_WARNINGS]
+    ]
+    figures["regions"] = {
+        str(name)[:MAX_TEXT]: _region(region)
+        for name, region in list(part(report, "regions").items())[:MAX_ROWS]
+    }
+    return figures
+
+
+def _region(region: Any) -> dict[str, Any]:
+    statistics = part(region, "statistics")
+    figures = _measured(
+        faces=statistics.get("faces"),
+        vertices=statistics.get("vertices"),
+        coverage=part(region, "texture").get("coverage"),
+        mesh_psnr=part(region, "mesh_rendering").get("psnr"),
+    )
+    if isinstance(statistics.get("closed"), bool):
+        figures["closed"] = statistics["closed"]
+    figures["open_by_request"] = part(region, "provenance").get("boundary") == "open"
+    return figures
+
+
+def _measured(**values: Any) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if measured(value) is not None}
+
+
+@functools.lru_cache(maxsize=16)
+def report_of(text: str) -> ReportData:
+    """Return what the panel shows of the figures kept in a .blend, however they were edited.
+
+    Parameters
+    ----------
+    text : str
+        JSON text of :func:`figures_of_report`; parsed once, as panels draw often.
+    """
+    try:
+        figures = json.loads(text)
+    except (ValueError, RecursionError):
+        return ReportData()
+    return _report_data(figures) if isinstance(figures, dict) and figures else ReportData()
+
+
+def _report_data(figures: dict[str, Any]) -> ReportData:
+    psnr, count = measured(figures.get("psnr")), measured(figures.get("psnr_count"))
+    quality = number(psnr, "dB", digits=1)
+    if psnr is not None and count:
+        quality += f" ({plural(int(count), 'photo')})"
+    rows = (
+        ("Time of Last Job", duration(figures.get("seconds"))),
+        ("Peak Memory", bytes_text(figures.get("memory_bytes"))),
+        ("Gaussians", number(figures.get("gaussians"))),
+        ("Held-Out PSNR", quality),
+    )
+    stages = tuple(
+        (_stage(str(entry[0])), duration(entry[1]))
+        for entry in items(figures.get("stages"))[:MAX_ROWS]
+        if isinstance(entry, list) and len(entry) == 2
+    )
+    regions = tuple(
+        RegionRows(name, _region_rows(part(region)))
+        for name, region in list(part(figures, "regions").items())[:MAX_ROWS]
+    )
+    warnings = tuple(
+        text[:MAX_TEXT]
+        for text in items(figures.get("warnings"))[:MAX_WARNINGS]
+        if isinstance(text, str)
+    )
+    decisions = tuple(
+        _decision(*map(str, entry))
+        for entry in items(figures.get("decisions"))[:MAX_ROWS]
+        if isinstance(entry, list) and len(entry) == 3
+    )
+    return ReportData(rows, stages, decisions, regions, warnings, True)
+
+
+def _decision(name: str, chosen: str, setting: str) -> Row:
+    """Return what was decided, in the panel's words; who decided where it was not the photos."""
+    value = chosen.capitalize()[:MAX_TEXT]
+    return _DECISIONS.get(name, name), value if setting == "auto" else f"{value} (set by you)"
+
+
+def _region_rows(region: dict[str, Any]) -> tuple[Row, ...]:
+    closed = region.get("closed")
+    no = "Open by request" if region.get("open_by_request") else "No"
+    return (
+        ("Faces", number(region.get("faces"))),
+        ("Closed", ("Yes" if closed else no) if isinstance(closed, bool) else NOT_MEASURED),
+        ("Texture Seen", percent(region.get("coverage"))),
+        ("Textured Mesh PSNR", number(region.get("mesh_psnr"), "dB", digits=1)),
+    )
+
+
+def _stage(name: str) -> str:
+    kind, _, region = name.partition("-")
+    return f"{_STAGES.get(kind, kind)} {region}".strip()

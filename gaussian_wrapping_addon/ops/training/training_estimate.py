@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Ask the worker in the background what a training will need."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+
+from ...core.errors import WorkerError, WrapError
+from ...core.jobs.client import worker_python
+from ...core.jobs.store.job_file import make_job
+from ...core.processes.helper_process import child_command
+from ..common import estimate_child
+from ..common.background import Lane
+from ..common.estimate_child import Child
+from ..common.redrawing import redraw
+from ..jobs.panel_settings import choices_key, job_settings
+from ..jobs.scene_folders import source_of
+from ..worker.preferred_worker import WorkerChoice
+
+MODULE = "jobs.commands.estimate_command"
+DEADLINE_S = 300.0
+MAX_LINES = 20
+MAX_TEXT = 300
+MAX_KNOWN = 20
+"""Answers kept, so that going back to a preset shows its estimate again."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One answer, ready to draw."""
+
+    lines: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """What stands in the way, or may."""
+
+
+_questions = Lane(of_file=True)
+_known: dict[tuple[object, ...], Estimate] = {}
+
+
+def is_busy() -> bool:
+    """Tell whether an answer is awaited."""
+    return _questions.busy
+
+
+def answer_for(scene: bpy.types.Scene) -> Estimate | None:
+    """Return the estimate for what a scene's panels ask for now; None where it is not known."""
+    return _known.get(choices_key(scene))
+
+
+def answer_with(scene: bpy.types.Scene, error: WrapError) -> None:
+    """Show in place of an estimate why there is none."""
+    _keep(choices_key(scene), estimate_of_failure(error))
+
+
+def _keep(key: tuple[object, ...], answer: Estimate) -> None:
+    _known.pop(key, None)
+    _known[key] = answer
+    while len(_known) > MAX_KNOWN:
+        del _known[next(iter(_known))]
+
+
+def forget() -> None:
+    """Forget all answers: the photos may be others under the same names."""
+    stop()
+    _known.clear()
+
+
+def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
+    """Begin an estimate for a scene's photos and choices.
+
+    Raises
+    ------
+    WrapError
+        The source, a choice or the interpreter cannot be used.
+    """
+    job = make_job("wrap", source_of(scene), job_settings(scene, choice.threads))
+    command = child_command(
+        MODULE, json.dumps(job.to_json(), allow_nan=False), python=worker_python(choice.python)
+    )
+    stop()
+    key, child = choices_key(scene), Child()
+
+    def keep(answer: Estimate) -> None:
+        _keep(key, answer)
+        redraw()
+
+    _questions.submit(
+        lambda: estimate_of(*child.ask(command, DEADLINE_S)),
+        keep,
+        failed=lambda error: keep(estimate_of_failure(error)),
+        end=child.end,
+    )
+
+
+def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
+    """Turn what the child said into lines for the panel.
+
+    Parameters
+    ----------
+    said : list of dict
+        ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
+        ``{"error": text, "hint": text}``.
+    last_words : str
+        The end of what the child wrote to its terminal, in case it said nothing else.
+
+    Raises
+    ------
+    WorkerError
+        It said nothing.
+    """
+    for values in said:
+        if values.get("error"):
+            return Estimate((), (str(values["error"]), str(values.get("hint", ""))))
+    told = [values for values in said if values.get("line") or values.get("warning")][:MAX_LINES]
+    if not told:
+        raise WorkerError(
+            f"There is no estimate: {last_words or 'the worker said nothing'}.",
+            "Check the worker in the add-on's preferences.",
+        )
+    return Estimate(_texts(told, "line"), _texts(told, "warning"))
+
+
+def _texts(said: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
+    """Return the texts of one kind, as sentences."""
+    texts = (str(values[kind])[:MAX_TEXT] for values in said if values.get(kind))
+    return tuple(text[:1].upper() + text[1:] for text in texts)
+
+
+def estimate_of_failure(error: Exception) -> Estimate:
+    """Return what the panel shows where asking has failed."""
+    if isinstance(error, WrapError):
+        return Estimate((), (error.message, error.hint))
+    return Estimate((), (f"{type(error).__name__}: {error}",))
+
+
+def get_ready() -> None:
+    """Start the threads of the next estimate ahead of it, where a timer begins it."""
+    _questions.start()
+    estimate_child.get_ready()
+
+
+def stop() -> None:
+    """Forget the question and end its process."""
+    _questions.cancel()

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the add-on's preferences say about workers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import bpy
+
+from ..common.addon import addon_preferences
+
+
+@dataclass(frozen=True)
+class WorkerChoice:
+    """What the add-on's preferences say about workers. Never read from a .blend file."""
+
+    python: str = ""
+    threads: int = 0
+    keep_running: bool = False
+
+
+def worker_choice(context: bpy.types.Context) -> WorkerChoice:
+    """Read the add-on's preferences; defaults where it is not enabled as an add-on."""
+    preferences = addon_preferences(context)
+    if preferences is None:
+        return WorkerChoice()
+    python = bpy.path.abspath(preferences.worker_python) if preferences.worker_python else ""
+    return WorkerChoice(python, preferences.threads, preferences.keep_running)

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators of the preferences page that set up and remove the worker."""
+
+import textwrap
+from typing import Any, Final
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from ...core.errors import WrapError
+from ...core.setup.commands import all_commands, as_line
+from ..common.addon import addon_package, addon_preferences
+from ..common.error_reporting import ReportsErrors
+from . import worker_setup
+from .worker_setup import state
+
+_LINE_CHARACTERS: Final = 84
+_DIALOG_PX: Final = 600
+_items: dict[str, list[tuple[str, str, str]]] = {}
+"""Blender keeps no reference to the texts of an enum."""
+
+
+def wheel_folder(context: bpy.types.Context) -> str:
+    """Return the wheel folder of the preferences; empty where there are none."""
+    preferences = addon_preferences(context)
+    return str(preferences.wheel_folder) if preferences is not None else ""
+
+
+def _python_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
+    found = []
+    for python in state.pythons or ():
+        notes = [] if python.has_wheels else ["some packages may have no wheels for it"]
+        if not python.has_venv:
+            lacks = "has no venv: packages go into a folder"
+            notes.append(lacks if python.can_install else "has neither venv nor pip")
+        words = f" ({', '.join(notes)})" if notes else ""
+        found.append((python.path, f"{python.version_text}  {python.path}{words}", python.path))
+    _items["python"] = found or [("", "None found", "No Python 3.11 or newer was found")]
+    return _items["python"]
+
+
+def _torch_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
+    cuda = ("cuda", "NVIDIA GPU (CUDA)", "Several GiB more; an NVIDIA driver was found")
+    _items["torch"] = [
+        ("cpu", "Processor (Default)", "The small build; what jobs use today on every system"),
+        *([cuda] if state.has_cuda else []),
+        ("index", "As in pip's Own Index",
+         "For mirrors. On Linux pip's index has the CUDA build, elsewhere the processor's"),
+    ]  # fmt: skip
+    return _items["torch"]
+
+
+def command_lines(context: bpy.types.Context, path: str, torch: str) -> list[str]:
+    """Return the commands that a set-up with these choices runs.
+
+    Raises
+    ------
+    UsageError
+        The Python or the choice cannot be used.
+    """
+    request = worker_setup.request_for(path, torch, wheel_folder(context))
+    found = [p for p in state.pythons or () if p.path == path]
+    return [as_line(command) for p in found for command in all_commands(request, p)]
+
+
+class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
+    bl_idname = "gwrap.set_up_worker"
+    bl_label = "Set Up Worker"
+    bl_description = (
+        "Make a private environment with torch and the other packages that jobs need, in place of "
+        "the one that is there; shows the commands first and changes nothing in Blender"
+    )
+
+    python: EnumProperty(  # type: ignore[valid-type]
+        name="Python", description="Python that the environment is made from", items=_python_items
+    )
+    torch: EnumProperty(  # type: ignore[valid-type]
+        name="Torch", description="Which build of torch to install", items=_torch_items
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = ""
+        if state.is_busy:
+            reason = "A set-up is running; cancel it or wait for it"
+        elif not wheel_folder(context) and not bpy.app.online_access:
+            reason = (
+                "Blender may not go online: turn on Allow Online Access in Preferences, System, "
+                "or choose a Wheel Folder"
+            )
+        elif state.pythons is None:
+            worker_setup.look_around()
+            reason = "Looking for Pythons"
+        elif not state.pythons:
+            reason = "No Python 3.11 or newer was found: install one from python.org"
+        cls.poll_message_set(reason)
+        return not reason
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, width=_DIALOG_PX)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.prop(self, "python")
+        layout.prop(self, "torch")
+        layout.label(text="These commands will run, and nothing else:")
+        column = layout.box().column(align=True)
+        column.scale_y = 0.8
+        try:
+            lines = command_lines(context, self.python, self.torch)
+        except WrapError as error:
+            lines = [str(error)]
+        for line in lines:
+            for part in textwrap.wrap(
+                line, _LINE_CHARACTERS, subsequent_indent="      ", break_on_hyphens=False
+            ):
+                column.label(text=part, translate=False)
+        copy = layout.row().operator("gwrap.copy_setup_commands", icon="COPYDOWN")
+        copy.text = "\n".join(lines)
+        size = "About 2 GiB on the disk; several" if self.torch == "cpu" else "Up to 10 GiB; many"
+        layout.label(text=f"{size} minutes. Blender stays free meanwhile", icon="INFO")
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        python = self.python or state.pythons[0].path
+        request = worker_setup.request_for(python, self.torch or "cpu", wheel_folder(context))
+        worker_setup.start(request)
+        return {"FINISHED"}
+
+
+class GWRAP_OT_copy_setup_commands(bpy.types.Operator):
+    bl_idname = "gwrap.copy_setup_commands"
+    bl_label = "Copy Commands"
+    bl_description = "Copy the commands, to run them by hand or to ask somebody about them"
+
+    text: StringProperty(options={"SKIP_SAVE"})  # type: ignore[valid-type]
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        context.window_manager.clipboard = self.text
+        return {"FINISHED"}
+
+
+class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
+    bl_idname = "gwrap.remove_worker"
+    bl_label = "Remove"
+    bl_description = "Delete the worker's environment, which this add-on has made, and nothing else"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        reason = "" if worker_setup.environment().is_ours() else "No worker has been set up here"
+        reason = "A set-up is running; cancel it or wait for it" if state.is_busy else reason
+        cls.poll_message_set(reason)
+        return not reason
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_confirm(self, event)
+
+    def work(self, _context: bpy.types.Context) -> set[str]:
+        worker_setup.start(worker_setup.request_for("", "cpu", ""), removes=True)
+        return {"FINISHED"}
+
+
+class GWRAP_OT_cancel_setup(bpy.types.Operator):
+    bl_idname = "gwrap.cancel_setup"
+    bl_label = "Cancel"
+    bl_description = "Stop the set-up and delete what it has begun"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        return state.is_busy and state.task is not None and not state.task.is_cancelling
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        state.task.cancel()
+        return {"FINISHED"}
+
+
+class GWRAP_OT_open_preferences(bpy.types.Operator):
+    bl_idname = "gwrap.open_preferences"
+    bl_label = "Open Preferences"
+    bl_description = "Show this add-on's preferences, where the worker is set up"
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        package = addon_package()
+        try:
+            return bpy.ops.preferences.addon_show(module=package)
+        except RuntimeError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+
+CLASSES: Final = (
+    GWRAP_OT_set_up_worker,
+    GWRAP_OT_copy_setup_commands,
+    GWRAP_OT_remove_worker,
+    GWRAP_OT_cancel_setup,
+    GWRAP_OT_open_preferences,
+)

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What all panels of the tab have in common: place, readiness in the header, the large button."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import bpy
+
+from ...ops.jobs import panel_state
+
+CATEGORY: Final = "Gaussian Wrapping"
+LARGE: Final = 1.6
+"""Height of the button that is the next step."""
+
+
+@dataclass(frozen=True)
+class Readiness:
+    """What a header says at its right, also while its panel is closed."""
+
+    text: str
+    icon: str = "NONE"
+    """None stands for what is not there yet: the text is dimmed."""
+
+
+class TabPanel:
+    """Mixin: a panel of our tab; :meth:`readiness` is drawn in its header."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = CATEGORY
+
+    def readiness(self, context: bpy.types.Context) -> Readiness:
+        """Return how far the panel's part is; from memory alone."""
+        raise NotImplementedError
+
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        """Draw at the right of the header; Blender calls this."""
+        ready = self.readiness(context)
+        row = self.layout.row()  # type: ignore[attr-defined]
+        row.active = ready.icon != "NONE"
+        row.label(text=ready.text, icon=ready.icon, translate=False)
+        row.separator(factor=0.25)
+
+
+def plain(layout: Any) -> None:
+    """Names at the left, values at the right, no dots for animation."""
+    layout.use_property_split = True
+    layout.use_property_decorate = False
+
+
+def button(layout: Any, context: bpy.types.Context, operator: str, **keywords: Any) -> Any:
+    """Draw an operator, large where it is the next step; return its properties."""
+    row = layout.row()
+    if panel_state.primary_of(context) == operator:
+        row.scale_y = LARGE
+    return row.operator(operator, **keywords)
+
+
+def table(layout: Any, rows: tuple[tuple[str, str], ...]) -> None:
+    """Draw names at the left and values at the right."""
+    column = layout.column(align=True)
+    column.scale_y = 0.9
+    for name, value in rows:
+        split = column.split(factor=0.55)
+        split.label(text=name, translate=False)
+        right = split.row()
+        right.alignment = "RIGHT"
+        right.label(text=value, translate=False)

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The sub-panel "Dataset": the photos, and what a check of them has found."""
+
+from typing import Any, Final
+
+import bpy
+
+from ...ops.dataset import photo_check
+from ...ops.jobs import panel_state, watched_jobs
+from ..common.panel_base import Readiness, TabPanel, button, plain
+from ..common.text import characters_of, wrapped_label
+from ..worker.worker_setup_view import draw_worker_missing
+
+_MAX_FINDINGS: Final = 12
+_ICONS: Final = {"error": "CANCEL", "warning": "ERROR"}
+
+
+class GWRAP_PT_dataset(TabPanel, bpy.types.Panel):
+    bl_label = "Dataset"
+
+    def readiness(self, context: bpy.types.Context) -> Readiness:
+        scene = context.scene
+        if not scene.gwrap.source:
+            return Readiness("No photos")
+        if photo_check.is_busy():
+            return Readiness("Checking…", "SORTTIME")
+        if not panel_state.is_checked(scene):
+            return Readiness("Not checked")
+        if panel_state.has_errors(scene):
+            return Readiness("Cannot be used", "CANCEL")
+        warned = any(f.severity == "warning" for f in scene.gwrap.findings)
+        text = scene.gwrap.checked_text.partition(",")[0] or "Checked"
+        return Readiness(text, "ERROR" if warned else "CHECKMARK")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, properties = self.layout, context.scene.gwrap
+        plain(layout)
+        characters = characters_of(context)
+        draw_worker_missing(layout, characters)
+        if not properties.source:
+            text = "Photos of one thing from all sides, in a folder of their own."
+            wrapped_label(layout, text, characters)
+        column = layout.column()
+        column.enabled = not watched_jobs.is_running(properties.job_folder)
+        if properties.source:
+            row = column.row(align=True)
+            row.prop(properties, "source", text="")
+            if panel_state.primary_of(context) != "gwrap.choose_input":
+                row.operator("gwrap.choose_input", text="", icon="FILE_FOLDER")
+        if panel_state.primary_of(context) == "gwrap.choose_input":
+            text = "Choose Other Photos" if properties.source else "Choose Photos"
+            button(column, context, "gwrap.choose_input", text=text, icon="FILE_FOLDER")
+        if properties.source and not panel_state.is_checked(context.scene):
+            text = "Checking…" if photo_check.is_busy() else "Check Photos"
+            layout.operator("gwrap.check_photos", text=text, icon="VIEWZOOM")
+        elif properties.source:
+            self._findings(layout, context, characters)
+
+    def _findings(self, layout: Any, context: bpy.types.Context, characters: int) -> None:
+        properties = context.scene.gwrap
+        row = layout.row()
+        row.label(text=properties.checked_text or "Checked", translate=False)
+        row.operator("gwrap.check_photos", text="", icon="FILE_REFRESH", emboss=False)
+        told = [f for f in properties.findings if f.severity in _ICONS]
+        told.sort(key=lambda finding: finding.severity != "error")
+        for finding in told[:_MAX_FINDINGS]:
+            box = layout.box()
+            words = box.column()
+            words.alert = finding.severity == "error"
+            wrapped_label(words, finding.message, characters - 4, icon=_ICONS[finding.severity])
+            if finding.hint:
+                wrapped_label(box, finding.hint, characters - 4, icon="BLANK1")
+        if len(told) > _MAX_FINDINGS:
+            layout.label(text=f"and {len(told) - _MAX_FINDINGS} more", translate=False)
+
+
+class GWRAP_PT_dataset_details(TabPanel, bpy.types.Panel):
+    bl_parent_id = "GWRAP_PT_dataset"
+    bl_label = "Details"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - Blender's convention
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return panel_state.is_checked(context.scene)
+
+    def readiness(self, context: bpy.types.Context) -> Readiness:
+        count = len([f for f in context.scene.gwrap.findings if f.severity not in _ICONS])
+        return Readiness(str(count))
+
+    def draw(self, context: bpy.types.Context) -> None:
+        facts = [f for f in context.scene.gwrap.findings if f.severity not in _ICONS]
+        for fact in facts[:_MAX_FINDINGS]:
+            wrapped_label(self.layout, fact.message, characters_of(context) - 4, icon="DOT")
+
+
+CLASSES: Final = (GWRAP_PT_dataset, GWRAP_PT_dataset_details)

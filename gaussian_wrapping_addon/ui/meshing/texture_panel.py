@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The sub-panel "Texture": size, where its colours come from, further maps, coarser meshes."""
+
+from typing import Final
+
+import bpy
+
+from ...ops.jobs import watched_jobs
+from ..common.panel_base import Readiness, TabPanel, plain
+from ..common.setting_properties import draw_settings, settings_in
+from ..common.text import characters_of, wrapped_label
+
+
+class GWRAP_PT_texture(TabPanel, bpy.types.Panel):
+    bl_label = "Texture"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - Blender's convention
+
+    def readiness(self, context: bpy.types.Context) -> Readiness:
+        properties = context.scene.gwrap
+        size = f"{properties.texture_size} px" if properties.texture_size != "0" else "Automatic"
+        return Readiness(f"{size}, {properties.texture_source.lower()}", "TEXTURE")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, properties = self.layout, context.scene.gwrap
+        plain(layout)
+        column = layout.column()
+        column.enabled = not watched_jobs.is_running(properties.job_folder)
+        draw_settings(column, properties, settings_in("texture"))
+        text = "Counts for the next Wrap Scene or Mesh Region."
+        wrapped_label(layout, text, characters_of(context), icon="INFO")
+
+
+CLASSES: Final = (GWRAP_PT_texture,)

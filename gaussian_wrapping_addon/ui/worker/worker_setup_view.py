@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How the worker's set-up is drawn: in the preferences, and one line in the panel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ...core.setup.install import SetupTask
+from ...ops.worker import worker_check, worker_setup
+from ...ops.worker.worker_setup import state
+from ..common.text import characters_of, wrapped_label
+
+
+def draw_setup(layout: Any, context: Any) -> None:
+    """Draw state, progress and buttons of the worker's environment."""
+    worker_setup.look_around()
+    characters = characters_of(context)
+    environment = worker_setup.environment()
+    if environment.is_ready():
+        text, icon = f"A worker is set up in {environment.root}", "CHECKMARK"
+    elif worker_setup.worker_ready():
+        text, icon = "Jobs use a Python that was set up by hand", "INFO"
+    else:
+        text, icon = "No worker is set up yet. Jobs need one: a private Python with torch.", "ERROR"
+    wrapped_label(layout, text, characters, icon=icon)
+    if state.task is not None:
+        _draw_status(layout, characters, state.task)
+    row = layout.row()
+    row.operator("gwrap.set_up_worker", text="Set Up Worker…", icon="IMPORT")
+    row.operator("gwrap.remove_worker", icon="TRASH")
+    if not bpy.app.online_access:
+        text = (
+            "Blender may not go online. Turn on Allow Online Access in Preferences, System, "
+            "or choose a Wheel Folder, which needs none."
+        )
+        wrapped_label(layout, text, characters, icon="INTERNET_OFFLINE")
+
+
+def _draw_status(layout: Any, characters: int, task: SetupTask) -> None:
+    status = task.status
+    if status.active:
+        text = f"{status.stage.capitalize()} · {100 * status.fraction:.0f} %"
+        layout.progress(factor=status.fraction, text=text, type="BAR")
+        wrapped_label(layout, status.message, characters)
+        if not task.removes:
+            text = "Cancelling…" if task.is_cancelling else "Cancel"
+            layout.operator("gwrap.cancel_setup", text=text, icon="X")
+    elif status.state == "DONE":
+        text = f"The worker is {'removed' if task.removes else 'ready'}"
+        layout.label(text=text, icon="CHECKMARK")
+    else:
+        icon = "PAUSE" if status.state == "CANCELLED" else "ERROR"
+        wrapped_label(layout, f"{status.error} {status.hint}", characters, icon=icon)
+
+
+def draw_doctor(layout: Any, context: Any) -> None:
+    """Draw the doctor's buttons and findings."""
+    row = layout.row()
+    row.operator("gwrap.check_worker", icon="VIEWZOOM")
+    row.operator("gwrap.copy_findings", icon="COPYDOWN")
+    if worker_check.is_busy():
+        layout.label(text="Checking…", icon="TIME")
+    characters = characters_of(context)
+    column = layout.column(align=True)
+    for finding in worker_check.findings():
+        icon = "CHECKMARK" if finding.good else "ERROR"
+        wrapped_label(column, f"{finding.subject}: {finding.finding}", characters, icon=icon)
+        if not finding.good and finding.hint:
+            wrapped_label(column, finding.hint, characters, icon="BLANK1")
+
+
+def draw_worker_missing(layout: Any, characters: int) -> None:
+    """Say in a panel that jobs have nothing to run in, and lead to where that changes."""
+    if worker_setup.worker_ready():
+        return
+    box = layout.box()
+    text = "Setting up the worker…" if state.is_busy else "No worker is set up yet."
+    wrapped_label(box, text, characters - 4, icon="TIME" if state.is_busy else "ERROR")
+    box.operator("gwrap.open_preferences", text="Set Up Worker…", icon="PREFERENCES")

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Cameras made up around a splat, and what the check says of a splat as an input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core.dataset.loading.check import check_input
+from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
+from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import (
+    cameras_around,
+    even_directions,
+    scene_frame,
+    splat_extent,
+)
+from gaussian_wrapping_addon.core.errors import DatasetError
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
+from tests.core.gaussians.splat_files import permuted, splat_columns, write_ply
+from tests.core.training.splat_shells import shell_of_discs
+
+OFFSET = np.array([5e5, -4e6, 30.0])
+
+
+def test_the_far_cameras_hold_the_whole_and_look_at_its_middle() -> None:
+    points = OFFSET + 7.0 * even_directions(500)
+    extent = splat_extent(points, np.ones(500))
+    assert np.linalg.norm(extent.center - OFFSET) < 0.1
+    assert extent.radius == pytest.approx(7.0, rel=0.02)
+    assert not extent.has_surroundings
+    cameras = cameras_around(extent)
+    assert len(cameras) == len({camera.name for camera in cameras}) == 48
+    for index, camera in enumerate(cameras):
+        np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(camera.rotation) == pytest.approx(1.0)
+        pixels, depth = camera.project(points)
+        assert (depth > 0).all()
+        inside = (pixels > 0).all(1) & (pixels < camera.width).all(1)
+        assert inside.all() == (index < 28)
+        middle, _ = camera.project(extent.center[None])
+        np.testing.assert_allclose(middle[0], camera.cx, atol=1e-3)
+        assert camera.rotation[1, 2] < 0  # up in the file is up in the photo
+
+
+def test_the_scene_frame_keeps_the_axes_and_fits_the_radius() -> None:
+    cameras = cameras_around(splat_extent(OFFSET + even_directions(200), np.ones(200)))
+    frame = scene_frame(cameras)
+    assert np.array_equal(frame.rotation, np.eye(3))
+    centers = frame.points(np.stack([camera.center for camera in cameras]))
+    np.testing.assert_allclose(centers.mean(0), 0.0, atol=1e-6)
+    reach = np.linalg.norm(centers, axis=1).max()
+    assert 1.1 * reach == pytest.approx(SCENE_RADIUS, rel=1e-6)
+
+
+def test_surroundings_do_not_push_the_cameras_out() -> None:
+    far = 60.0 * even_directions(150)
+    points = np.concatenate([even_directions(500), far, 1e4 * np.ones((400, 3))])
+    opacities = np.concatenate([np.full(650, 0.9), np.full(400, 0.01)])
+    extent = splat_extent(points, opacities)
+    assert extent.has_surroundings
+    assert np.linalg.norm(extent.center) < 0.5
+    assert extent.radius < 5.0
+
+
+def test_transparent_and_collapsed_splats_are_refused() -> None:
+    with pytest.raises(DatasetError, match="transparent"):
+        splat_extent(even_directions(50), np.zeros(50))
+    with pytest.raises(DatasetError, match="one place"):
+        splat_extent(np.ones((50, 3)), np.ones(50))
+
+
+def test_the_check_tells_what_a_splat_holds_and_what_it_lacks(tmp_path: Path) -> None:
+    columns = splat_columns(shell_of_discs(40, sh_degree=3)[0])
+    path = write_ply(tmp_path / "a.ply", columns, order=permuted(columns), encoding=">")
+    findings = check_input(path)
+    assert [f.severity for f in findings] == ["fact", "fact", "warning"]
+    assert "40 Gaussians" in findings[1].message
+    assert "degree 3" in findings[1].message
+    assert "photos" in findings[2].hint
+
+
+def test_the_check_finds_a_file_that_is_cut_off(tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "a.ply", splat_columns(shell_of_discs(40, sh_degree=3)[0]))
+    path.write_bytes(path.read_bytes()[:-1])
+    finding = check_input(path)[-1]
+    assert finding.severity == "error"
+    assert "cut off" in finding.message
+    assert "again" in finding.hint
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat"])
+def test_the_check_names_formats_that_are_not_read(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"x")
+    (finding,) = check_input(path)
+    assert finding.severity == "error"
+    assert "not read" in finding.message
+
+
+def test_the_check_refuses_a_point_cloud(tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "a.ply", {axis: np.arange(9.0) for axis in "xyz"})
+    finding = check_input(path)[-1]
+    assert finding.severity == "error"
+    assert "f_dc_0" in finding.message or "opacity" in finding.message
+
+
+def test_a_splat_has_no_photos_to_load(tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "a.ply", splat_columns(shell_of_discs(40)[0]))
+    with pytest.raises(DatasetError, match="no cameras"):
+        load_scene(path, tmp_path / "work", Progress())
+
+
+def test_only_the_splat_itself_decides_its_fingerprint(tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "a.ply", splat_columns(shell_of_discs(40)[0]))
+    before = source_fingerprint(path)
+    (tmp_path / "other.ply").write_bytes(b"ply")
+    assert source_fingerprint(path) == before
+    path.write_bytes(path.read_bytes() + b"\n")
+    assert source_fingerprint(path) != before

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Solving cameras and start points: pairs, EXIF, and a small real run of the helper process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
+from gaussian_wrapping_addon.core.dataset.loading.start_points import random_points, views_of_points
+from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
+from gaussian_wrapping_addon.core.dataset.poses.match_pairs import pairs_by_order, pairs_by_pose
+from gaussian_wrapping_addon.core.dataset.readers.source_model import quaternion_from_rotation
+from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError
+from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
+from tests.core.dataset.model_writers import ring_model, write_binary
+from tests.synthetic import look_at
+
+BANANAS = Path(__file__).parents[4] / "examples" / "bananas"
+NAMES = ("DSC_0423", "DSC_0424", "DSC_0425", "DSC_0438")
+
+
+def small_bananas(folder: Path, long_side: int = 400) -> Path:
+    """Write four neighbouring photos, scaled down, with the EXIF that tells the focal length."""
+    folder.mkdir()
+    for name in NAMES:
+        with Image.open(BANANAS / f"{name}.JPG") as image:
+            exif = image.getexif()
+            exif.get_ifd(0x8769)
+            size = (long_side, round(long_side * image.height / image.width))
+            small = image.resize(size, Image.Resampling.LANCZOS)
+        small.save(folder / f"{name}.jpg", quality=95, exif=exif)
+    return folder
+
+
+def test_pairs_of_small_and_large_sets() -> None:
+    assert pairs_by_order(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    pairs = pairs_by_order(1000)
+    assert len(pairs) < 25_000
+    assert all(0 <= i < j < 1000 for i, j in pairs)
+    assert len(set(pairs)) == len(pairs)
+    assert {(i, i + 1) for i in range(999)} <= set(pairs)
+    assert (0, 999) in pairs
+
+
+def test_pairs_by_pose_join_neighbours_that_look_alike() -> None:
+    angles = np.arange(40) * 2 * np.pi / 40
+    centers = np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
+    pairs = pairs_by_pose(centers, -centers)
+    assert {(i, i + 1) for i in range(39)} | {(0, 39)} <= set(pairs)
+    assert all(min(j - i, 40 - j + i) <= 7 for i, j in pairs)
+
+
+def test_focal_length_from_exif(tmp_path: Path) -> None:
+    read = read_lens_exif(BANANAS / "DSC_0423.JPG", 1000, 665)
+    # 60 mm on 36 x 24 mm, by the diagonal; the solved focal length is 1733 px.
+    assert read.focal_px == pytest.approx(60 * np.hypot(1000, 665) / np.hypot(36, 24))
+    assert read.key[:2] == ("NIKON CORPORATION", "NIKON D3200")
+    Image.new("RGB", (40, 30)).save(tmp_path / "plain.png")
+    assert read_lens_exif(tmp_path / "plain.png", 40, 30).focal_px is None
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x920A] = 50.0  # 50 mm ...
+    exif.get_ifd(0x8769)[0xA20E] = 2000.0  # ... on a sensor of 2000 pixels a centimetre
+    exif.get_ifd(0x8769)[0xA210] = 3
+    exif.get_ifd(0x8769)[0xA002] = 400
+    Image.new("RGB", (40, 30)).save(tmp_path / "plane.jpg", exif=exif)
+    assert read_lens_exif(tmp_path / "plane.jpg", 40, 30).focal_px == pytest.approx(1000.0)
+
+
+def test_photos_alone_are_solved_with_progress(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    source = small_bananas(tmp_path / "photos")
+    events: list[ProgressEvent] = []
+    scene = load_scene(source, tmp_path / "work", Progress("cameras", events.append), seed=3)
+    assert len(scene.views) == len(NAMES)
+    assert scene.facts["photos_with_focal_length"] == len(NAMES)
+    assert scene.facts["mean_reprojection_error_px"] < 0.6
+    assert len(scene.points) > 300
+    # Full-size photos give 1733 px at a width of 1000.
+    assert scene.cameras[0].fx / scene.cameras[0].width == pytest.approx(1.733, rel=0.1)
+    seen = views_of_points(scene.cameras, scene.points)
+    assert np.mean(seen >= 2) > 0.99
+    fractions = [event.fraction for event in events]
+    assert fractions == sorted(fractions)
+    assert any("searching features" in event.message for event in events)
+    assert any("placing photo" in event.message for event in events)
+    assert not (tmp_path / "work" / "pose_solver").exists()
+    assert (tmp_path / "work" / "cameras" / "images.bin").is_file()
+
+
+def textured_plane(folder: Path, count: int = 4) -> list[Camera]:
+    """Write photos of a noisy plane z = 0 and their poses, as a COLMAP model without points."""
+    rng = np.random.default_rng(7)
+    noise = rng.uniform(size=(700, 700, 3))
+    texture = sum(ndimage.gaussian_filter(noise, (s, s, 0)) * s for s in (1, 2, 4, 8))
+    texture = (texture - texture.min()) / np.ptp(texture) * 255
+    width, height, focal_px = 240, 180, 225.0
+    model = ring_model(count)
+    model.cameras = [(1, "PINHOLE", width, height, [focal_px, focal_px, width / 2, height / 2])]
+    model.points = []
+    (folder / "images").mkdir(parents=True)
+    cameras = []
+    for i, image in enumerate(model.images):
+        center = np.array([1.2 * np.cos(0.25 * i), 1.2 * np.sin(0.25 * i), 2.5])
+        camera = look_at(center, np.zeros(3), str(image.name), width, height, focal_px)
+        rays = camera.rays().reshape(-1, 3) @ camera.rotation
+        hits = center + rays * (-center[2] / rays[:, 2:])
+        where = (hits[:, :2] / 6.0 + 0.5) * 700
+        pixels = [ndimage.map_coordinates(texture[..., c], where.T, order=1) for c in range(3)]
+        photo = np.stack(pixels, 1).reshape(height, width, 3)
+        Image.fromarray(np.rint(photo).astype(np.uint8)).save(folder / "images" / str(image.name))
+        image.quaternion = quaternion_from_rotation(camera.rotation)
+        image.translation = camera.cam_from_world[:, 3]
+        image.points2d = []
+        cameras.append(camera)
+    write_binary(model, folder / "sparse")
+    return cameras
+
+
+def test_points_are_triangulated_from_posed_photos(tmp_path: Path) -> None:
+    """A model without points: the poses stay, the points come from the photos, on the plane."""
+    pytest.importorskip("pycolmap")
+    cameras = textured_plane(tmp_path / "set")
+    scene = load_scene(tmp_path / "set", tmp_path / "work", Progress(), seed=1, threads=1)
+    for camera, moved in zip(cameras, scene.cameras, strict=True):
+        center = scene.world_from_scene.points(moved.center[None])[0]
+        np.testing.assert_allclose(center, camera.center, atol=1e-9)
+    assert scene.facts["start_points"] == "triangulated from the photos"
+    assert len(scene.points) >= 200
+    world = scene.world_from_scene.points(scene.points)
+    assert np.percentile(np.abs(world[:, 2]), 90) < 0.02  # cameras are 2.8 away
+    assert scene.point_colors.std(0).min() > 5
+    again = load_scene(tmp_path / "set", tmp_path / "work2", Progress(), seed=1, threads=1)
+    np.testing.assert_array_equal(again.points, scene.points)
+
+
+def test_posed_photos_without_texture_start_from_random_points(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    model = ring_model(6)
+    model.points = []
+    write_binary(model, tmp_path / "set" / "sparse")
+    (tmp_path / "set" / "images").mkdir()
+    for image in model.images:
+        Image.new("RGB", (64, 48), (90, 80, 70)).save(tmp_path / "set" / "images" / str(image.name))
+    scene = load_scene(tmp_path / "set", tmp_path / "work", Progress())
+    assert scene.facts["start_points"] == "random"
+    assert len(scene.points) > 1000
+    assert "random ones are used" in " ".join(w.text for w in scene.warnings)
+    assert (views_of_points(scene.cameras, scene.points) >= 2).all()
+
+
+def test_random_points_lie_where_cameras_look() -> None:
+    cameras = [
+        look_at(np.array([4 * np.cos(a), 4 * np.sin(a), 1.0]), np.zeros(3), "x", 64, 48, 60.0)
+        for a in np.linspace(0, 6, 9)
+    ]
+    points = random_points(cameras, seed=0, count=500)
+    assert points.shape == (500, 3)
+    assert (views_of_points(cameras, points) >= 2).all()
+    assert np.linalg.norm(points, axis=1).max() < SCENE_RADIUS
+    np.testing.assert_array_equal(points, random_points(cameras, seed=0, count=500))
+
+
+def _texture_free(folder: Path) -> Path:
+    folder.mkdir()
+    for i in range(4):
+        Image.new("RGB", (120, 90), (100 + i, 90, 80)).save(folder / f"{i}.png")
+    return folder
+
+
+def test_photos_without_texture_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    source = _texture_free(tmp_path / "flat")
+    with pytest.raises(DatasetError, match="could be placed") as caught:
+        load_scene(source, tmp_path / "work", Progress())
+    assert "overlap" in caught.value.hint
+
+
+def test_cancelling_ends_the_helper(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    source = small_bananas(tmp_path / "photos")
+    messages: list[str] = []
+    progress = Progress(
+        "cameras",
+        lambda event: messages.append(event.message),
+        lambda: any("searching" in message for message in messages),
+    )
+    with pytest.raises(Cancelled):
+        load_scene(source, tmp_path / "work", progress)
+    assert not any("placing" in message for message in messages)

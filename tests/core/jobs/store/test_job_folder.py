@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Job folders: ownership, locks, states of processes that are gone."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.jobs.store import job_folder
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
+    JobFolder,
+    JobStatus,
+    process_alive,
+    process_start_ticks,
+)
+
+
+def dead_pid() -> int:
+    child = subprocess.Popen([sys.executable, "-c", "pass"])
+    child.wait()
+    return child.pid
+
+
+def test_a_folder_with_other_content_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "holiday.jpg").write_bytes(b"x")
+    with pytest.raises(UsageError, match="other files"):
+        JobFolder(tmp_path).create()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["holiday.jpg"]
+
+
+def test_a_job_folder_is_accepted_again(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path / "new" / "deep")
+    folder.create()
+    (folder.root / "log.txt").write_text("x")
+    folder.create()
+    assert folder.stages.is_dir()
+
+
+def test_a_file_is_not_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("x")
+    with pytest.raises(UsageError, match="is a file"):
+        JobFolder(tmp_path / "a").create()
+
+
+def test_status_of_a_dead_worker_is_lost(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    folder.write_status(JobStatus(state="RUNNING", pid=dead_pid(), heartbeat_s=time.time()))
+    status = folder.read_status()
+    assert status.state == "LOST"
+    assert "resume" in status.hint.lower()
+
+
+def test_a_worker_that_ends_between_two_looks_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = JobFolder(tmp_path)
+    folder.write_status(JobStatus(state="RUNNING", pid=1234))
+
+    def ends_now(pid: int, started: int) -> bool:
+        folder.write_status(JobStatus(state="DONE", pid=pid, exit_code=0))
+        return False
+
+    monkeypatch.setattr(job_folder, "process_alive", ends_now)
+    assert folder.read_status().state == "DONE"
+
+
+def test_a_status_of_version_0_1_0_is_read(tmp_path: Path) -> None:
+    """It had neither ``phase`` nor ``put_back``: a finished job with an error was one put back."""
+    folder = JobFolder(tmp_path)
+    for status, put_back in (
+        (JobStatus("DONE", "export", 1.0), False),
+        (JobStatus("DONE", "export", 1.0, error="No surface."), True),
+        (JobStatus("FAILED", "mesh", 0.8, error="No surface."), False),
+    ):
+        values = {
+            name: value
+            for name, value in asdict(status).items()
+            if name not in ("phase", "put_back")
+        }
+        write_json(folder.status_path, values)
+        assert folder.read_status() == replace(status, put_back=put_back)
+        write_json(folder.status_path, {**values, "put_back": "yes"})
+        assert folder.read_status() == JobStatus(), "not of its kind"
+
+
+def test_status_of_a_living_worker_stays(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    mine = JobStatus(state="RUNNING", pid=os.getpid(), pid_started=process_start_ticks(os.getpid()))
+    folder.write_status(mine)
+    assert folder.read_status() == mine
+
+
+def test_a_reused_pid_is_not_taken_for_the_worker() -> None:
+    started = process_start_ticks(os.getpid())
+    assert process_alive(os.getpid(), started)
+    if started:
+        assert not process_alive(os.getpid(), started + 1)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"state": 3}', "\x00"])
+def test_half_a_status_reads_as_not_yet(tmp_path: Path, content: str) -> None:
+    folder = JobFolder(tmp_path)
+    folder.status_path.write_text(content)
+    assert folder.read_status().fraction == 0.0
+
+
+def test_lock_of_a_living_process_is_respected_and_a_stale_one_taken(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        started = process_start_ticks(other.pid)
+        write_json(folder.lock_path, {"pid": other.pid, "started": started})
+        with pytest.raises(UsageError, match=str(other.pid)):
+            folder.lock()
+        other.kill()
+        other.wait()
+    folder.lock()
+    folder.unlock()
+    assert not folder.lock_path.exists()
+
+
+@pytest.mark.parametrize("case", ["dead", "reused", "half", "empty", "other", "clock"])
+def test_a_stale_lock_is_taken_over(case: str, tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    here, ticks = os.getppid(), process_start_ticks(os.getppid())
+    owner = {
+        "dead": {"pid": dead_pid(), "started": 1},
+        "reused": {"pid": here, "started": ticks + 1},
+        "clock": {"pid": here, "started": ticks + 10**12},  # it began when the clock was ahead
+        "other": {"pid": "me"},
+    }.get(case)
+    text = json.dumps(owner) if owner else {"half": '{"pid": 1', "empty": ""}[case]
+    folder.lock_path.write_text(text)
+    os.utime(folder.lock_path, (2e9 * 2, 2e9 * 2))
+    assert not folder.locked()
+    folder.lock()
+    assert folder.locked()
+    assert json.loads(folder.lock_path.read_text())["pid"] == os.getpid()
+    assert [p.name for p in tmp_path.iterdir()] == ["lock.json"]
+
+
+def test_a_living_owner_keeps_its_lock_whatever_the_clock_says(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    parent = os.getppid()
+    write_json(folder.lock_path, {"pid": parent, "started": process_start_ticks(parent)})
+    for time_s in (0.0, 4e9):
+        os.utime(folder.lock_path, (time_s, time_s))
+        with pytest.raises(UsageError, match=f"Process {parent} is working"):
+            folder.lock()
+    assert [p.name for p in tmp_path.iterdir()] == ["lock.json"]
+
+
+def test_two_that_take_over_at_once_leave_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other one has its lock in place between our look at the stale one and our move."""
+    folder = JobFolder(tmp_path)
+    write_json(folder.lock_path, {"pid": dead_pid(), "started": 1})
+    parent = os.getppid()
+
+    def slow(pid: int, started: int) -> bool:
+        alive = process_alive(pid, started)
+        if not alive:
+            write_json(folder.lock_path, {"pid": parent, "started": process_start_ticks(parent)})
+        return alive
+
+    monkeypatch.setattr(job_folder, "process_alive", slow)
+    with pytest.raises(UsageError, match=f"Process {parent} is working"):
+        folder.lock()
+    assert json.loads(folder.lock_path.read_text())["pid"] == parent
+    assert [p.name for p in tmp_path.iterdir()] == ["lock.json"]

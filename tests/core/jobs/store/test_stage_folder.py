@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Stages are re-used when their inputs are the same, and redone when they are not."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core.errors import Cancelled
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
+    note_interrupted,
+    run_stage,
+    source_fingerprint,
+    stage_key,
+)
+from gaussian_wrapping_addon.core.progress import Progress
+
+
+def test_a_finished_stage_is_not_run_again(tmp_path: Path) -> None:
+    runs = []
+
+    def work(folder: Path, progress: Progress) -> dict:
+        runs.append(folder)
+        return {"figure": 3}
+
+    first = run_stage(tmp_path, "train", "abc", Progress(), work)
+    second = run_stage(tmp_path, "train", "abc", Progress(), work)
+    other = run_stage(tmp_path, "train", "abd", Progress(), work)
+    assert len(runs) == 2
+    assert (first.reused, second.reused, other.reused) == (False, True, False)
+    assert second.done["figure"] == 3
+
+
+def test_an_interrupted_stage_is_run_again_in_the_same_folder(tmp_path: Path) -> None:
+    def interrupted(folder: Path, progress: Progress) -> dict:
+        (folder / "checkpoint").write_text("half")
+        raise Cancelled
+
+    def work(folder: Path, progress: Progress) -> dict:
+        assert (folder / "checkpoint").read_text() == "half"
+        return {}
+
+    with pytest.raises(Cancelled):
+        run_stage(tmp_path, "train", "abc", Progress(), interrupted)
+    note_interrupted(tmp_path, "train", "abc", 100.0)
+    stage = run_stage(tmp_path, "train", "abc", Progress(), work)
+    assert not stage.reused
+    assert stage.done["seconds"] >= 100.0
+
+
+def test_fingerprint_follows_size_time_and_names(tmp_path: Path) -> None:
+    photo = tmp_path / "a.jpg"
+    photo.write_bytes(b"12")
+    before = source_fingerprint(tmp_path)
+    assert source_fingerprint(tmp_path) == before
+    os.utime(photo, ns=(1, 1))
+    assert source_fingerprint(tmp_path) != before
+    (tmp_path / "notes.md").write_text("not an input")
+    after = source_fingerprint(tmp_path)
+    (tmp_path / "b.jpg").write_bytes(b"1")
+    assert source_fingerprint(tmp_path) != after
+
+
+def test_key_depends_on_every_part() -> None:
+    assert stage_key("a", {"x": 1}) == stage_key("a", {"x": 1})
+    assert stage_key("a", {"x": 1}) != stage_key("a", {"x": 2})
+    assert stage_key("a", "b") != stage_key("ab")

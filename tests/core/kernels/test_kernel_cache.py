@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The same bits from fresh and from cached kernels; stale caches; life without a cache."""
+
+from __future__ import annotations
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core.kernels import kernel_cache
+
+ROOT = Path(__file__).resolve().parents[3]
+PACKAGE = ROOT / "gaussian_wrapping_addon"
+STAGES = Path(__file__).with_name("kernel_stages.py")
+NOWHERE = os.devnull + "/nowhere"
+TIMEOUT_S = 240
+
+
+def start(command: list[str], root: Path, **environment: str) -> subprocess.Popen[str]:
+    """Start a Python that finds the package in ``root`` and inherits no place for its cache."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA_", "PYTHON"))}
+    return subprocess.Popen(
+        [sys.executable, *command], env={**kept, "PYTHONPATH": str(root), **environment},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=root,
+    )  # fmt: skip
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[str, str]:
+    output, errors = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 0, output + errors
+    return output, errors
+
+
+@pytest.fixture
+def installed(tmp_path: Path) -> Path:
+    """A copy of the package with a kernel whose helper and constant lie in other files."""
+    root = tmp_path / "site"
+    target = root / PACKAGE.name
+    shutil.copytree(PACKAGE, target, ignore=shutil.ignore_patterns("__pycache__"))
+    core = target / "core"
+    (core / "some_constant.py").write_text("AMOUNT = 1.0\n")
+    (core / "some_helper.py").write_text(
+        "from .compiled import inline\nfrom .some_constant import AMOUNT\n\n\n"
+        "@inline\ndef added(x):\n    return x + AMOUNT\n"
+    )
+    (core / "some_kernel.py").write_text(
+        "from .compiled import kernel\nfrom .some_helper import added\n\n\n"
+        "@kernel(fast=True)\ndef run(x):\n    return added(x)\n"
+    )
+    return root
+
+
+RUN = (
+    "import logging; logging.basicConfig(format='%(message)s')\n"
+    "from gaussian_wrapping_addon.core.some_kernel import run\n"
+    "from gaussian_wrapping_addon.core.gaussians.mip_filter import mip_filter\n"
+    "print(run(1.0), sum(run.stats.cache_hits.values()))\n"
+)
+
+
+@pytest.mark.slow
+def test_fresh_and_cached_kernels_give_the_same_bits(tmp_path: Path) -> None:
+    def run(order: list[str], folder: str) -> subprocess.Popen[str]:
+        return start([str(STAGES), *order], ROOT, NUMBA_CACHE_DIR=str(tmp_path / folder))
+
+    order = ["one_view", "losses", "fields"]
+    both = run(order, "a"), run(["fields", "losses"], "b")
+    fresh, otherwise = (finish(process)[0].splitlines() for process in both)
+    cached = finish(run(order[::-1], "a"))[0].splitlines()
+    assert len(fresh) == len(order), "kernels left functions that others could call"
+    assert cached == fresh[::-1]
+    assert otherwise == fresh[:0:-1]
+
+
+def test_no_kernel_calls_a_kernel() -> None:
+    """It would round differently when loaded from the cache (``compiled.part``)."""
+    calls: dict[tuple[Path, str], set[str]] = {}
+    kernels: set[tuple[Path, str]] = set()
+    own: dict[Path, set[str]] = {}
+    for path in sorted((PACKAGE / "core").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            marks = [d.func if isinstance(d, ast.Call) else d for d in node.decorator_list]
+            names = {mark.id for mark in marks if isinstance(mark, ast.Name)}
+            own.setdefault(path, set()).add(node.name)
+            if "kernel" in names:
+                kernels.add((path, node.name))
+            if names & {"kernel", "part", "inline"}:
+                calls[path, node.name] = {
+                    inner.func.id
+                    for inner in ast.walk(node)
+                    if isinstance(inner, ast.Call) and isinstance(inner.func, ast.Name)
+                }
+    assert len(kernels) > 40
+    anywhere = {name for _, name in kernels}
+    wrong = [
+        f"{path.name}: {caller} calls {name}"
+        for (path, caller), names in calls.items()
+        for name in names & anywhere
+        if (path, name) in kernels or name not in own[path]
+    ]
+    assert wrong == []
+
+
+def test_a_change_in_an_imported_file_is_compiled(installed: Path) -> None:
+    def value() -> str:
+        return finish(start(["-c", RUN], installed))[0]
+
+    assert value() == "2.0 0\n"
+    assert value() == "2.0 1\n"
+    # Another length: Python tells its own .pyc files apart by whole seconds and length only.
+    (installed / PACKAGE.name / "core" / "some_constant.py").write_text("AMOUNT = 5.0  # new\n")
+    assert value() == "6.0 0\n"
+    assert value() == "6.0 1\n"
+    # Another file that the kernel does not import changes nothing.
+    (installed / PACKAGE.name / "core" / "limits.py").touch()
+    with (installed / PACKAGE.name / "core" / "settings.py").open("a") as file:
+        file.write("\n")
+    assert value() == "6.0 1\n"
+
+
+def test_imports_are_followed_however_they_are_written() -> None:
+    core = PACKAGE / "core"
+    found = kernel_cache._imported(core / "render" / "projection" / "projection_activation.py")
+    assert core / "tolerances.py" in found  # from .. import tolerances
+    assert core / "kernels" / "compiled.py" in found  # from ..compiled import inline, kernel
+    assert core / "render" / "projection" / "harmonics_kernels.py" in found
+    found = kernel_cache._imported(core / "render" / "raster" / "raster_forward.py")
+    assert (
+        core / "render" / "simd" / "raster_math.py" in found
+    )  # names in brackets, over many lines
+    found = kernel_cache._imported(core / "jobs" / "stages" / "training_stage.py")
+    assert core / "training" / "trainer.py" in found  # within a function
+    assert all(path.is_file() for path in found)
+
+
+def block_caches(package: Path) -> None:
+    """A plain file where a folder is wanted stops everybody, the administrator too."""
+    for folder in [package, *(p for p in package.rglob("*") if p.is_dir())]:
+        (folder / "__pycache__").touch()
+
+
+def test_without_any_place_kernels_work_and_one_line_says_so(installed: Path) -> None:
+    block_caches(installed / PACKAGE.name)
+    environment = {"HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE, "LOCALAPPDATA": NOWHERE}
+    for _ in range(2):
+        output, errors = finish(start(["-c", RUN], installed, **environment))
+        assert output == "2.0 0\n"
+        assert errors.count("\n") == 1
+        assert "NUMBA_CACHE_DIR" in errors
+    chosen = installed.parent / "chosen"
+    for hits in (0, 1):
+        finished = start(["-c", RUN], installed, NUMBA_CACHE_DIR=str(chosen), **environment)
+        assert finish(finished) == (f"2.0 {hits}\n", "")
+    assert list(chosen.rglob("some_kernel.run-*.nbc"))
+
+
+def test_a_read_only_package_without_a_home(installed: Path) -> None:
+    folders = [installed / PACKAGE.name]
+    folders += [p for p in folders[0].rglob("*") if p.is_dir()]
+    for folder in folders:
+        folder.chmod(0o555)
+    script = "import os; os.environ.pop('HOME', None)\n" + RUN
+    environment = {"XDG_CACHE_HOME": NOWHERE, "LOCALAPPDATA": NOWHERE}
+    try:
+        if os.access(folders[0], os.W_OK):
+            pytest.skip("to this user nothing is read-only")
+        output, errors = finish(start(["-c", script], installed, **environment))
+    finally:
+        for folder in folders:
+            folder.chmod(0o755)
+    assert output == "2.0 0\n"
+    assert errors.count("\n") == 1
+    assert "NUMBA_CACHE_DIR" in errors
+
+
+def test_a_disk_that_fills_up_later_stops_nothing(installed: Path) -> None:
+    chosen = installed.parent / "chosen"
+    lost = f"import shutil; shutil.rmtree({str(chosen)!r}); open({str(chosen)!r}, 'w').close()"
+    script = RUN.replace("print(", lost + "\nprint(")
+    output, errors = finish(start(["-c", script], installed, NUMBA_CACHE_DIR=str(chosen)))
+    assert output == "2.0 0\n"
+    assert errors.count("\n") == 1
+    assert "NUMBA_CACHE_DIR" in errors
+
+
+def test_a_damaged_file_is_compiled_anew(installed: Path) -> None:
+    chosen = installed.parent / "chosen"
+    command = ["-c", RUN]
+    assert finish(start(command, installed, NUMBA_CACHE_DIR=str(chosen))) == ("2.0 0\n", "")
+    (kept,) = chosen.rglob("some_kernel.run-*.nbc")
+    kept.write_bytes(kept.read_bytes()[:50])
+    output, errors = finish(start(command, installed, NUMBA_CACHE_DIR=str(chosen)))
+    assert output == "2.0 0\n"
+    assert errors.count("\n") == 1
+    assert finish(start(command, installed, NUMBA_CACHE_DIR=str(chosen))) == ("2.0 1\n", "")

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Helper processes: progress, typed failures, crashes, deadlines, cancelling."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, ResourceError, WorkerError
+from gaussian_wrapping_addon.core.processes import helper_entry, helper_process, peak_memory
+from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+
+HELPERS = {
+    "good": "emit(fraction=0.5, message='half'); (folder / 'out').write_text('1')",
+    "typed": "raise DatasetError('The photo is odd.', 'Remove it.')",
+    "crash": "os.kill(os.getpid(), 11)",
+    "raises": "raise RuntimeError('unexpected words')",
+    "noise": "sys.stdout.write('not json\\n[1]\\n'); (folder / 'out').write_text('1')",
+    "sleeps": "time.sleep(60)",
+    "large": "held = b'x' * (150 * 2**20)",
+    "greedy": "bytearray(4 * 2**30)",
+}
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Run one of ``HELPERS`` as a helper process in a scratch folder."""
+
+    def start(name: str, progress: Progress | None = None, **options: object) -> Path:
+        body = (
+            "import os, sys, time\nfrom pathlib import Path\n"
+            f"sys.path.insert(0, {str(Path(__file__).resolve().parents[3])!r})\n"
+            "from gaussian_wrapping_addon.core.processes import helper_entry\n"
+            "from gaussian_wrapping_addon.core.errors import DatasetError\n"
+            "from gaussian_wrapping_addon.core.processes.helper_process import emit\n"
+            "import types, importlib\n"
+            "def main(folder):\n"
+            f"    {HELPERS[name]}\n"
+            "module = types.ModuleType('m'); module.main = main\n"
+            "helper_entry.importlib = types.SimpleNamespace(import_module=lambda n: module)\n"
+            "sys.exit(helper_entry.main(sys.argv[1:]))\n"
+        )
+        script = tmp_path / "script.py"
+        script.write_text(body)
+
+        def command(module: str, *arguments: str, python: str | None = None) -> list[str]:
+            return [sys.executable, str(script), *arguments]
+
+        monkeypatch.setattr(helper_process, "child_command", command)
+        helper_process.run_helper(name, tmp_path, progress or Progress(), **options)  # type: ignore[arg-type]
+        return tmp_path
+
+    return start
+
+
+def test_progress_and_results_arrive(run) -> None:
+    events: list[ProgressEvent] = []
+    folder = run("good", Progress("x", events.append))
+    assert (folder / "out").exists()
+    assert [(e.fraction, e.message) for e in events] == [(0.5, "half")]
+
+
+def test_typed_failures_keep_message_and_hint(run) -> None:
+    with pytest.raises(DatasetError) as caught:
+        run("typed")
+    assert caught.value.message == "The photo is odd."
+    assert caught.value.hint == "Remove it."
+
+
+def test_a_crash_names_the_signal(run) -> None:
+    with pytest.raises(WorkerError, match="signal 11"):
+        run("crash")
+
+
+def test_an_exception_brings_its_last_words(run) -> None:
+    with pytest.raises(WorkerError, match="unexpected words"):
+        run("raises")
+
+
+def test_noise_on_stdout_is_ignored(run) -> None:
+    assert (run("noise") / "out").exists()
+
+
+def test_the_deadline_ends_the_helper(run) -> None:
+    begun_s = time.monotonic()
+    with pytest.raises(ResourceError, match="longer than"):
+        run("sleeps", deadline_s=0.5)
+    assert time.monotonic() - begun_s < 10
+
+
+def test_cancelling_ends_the_helper_within_two_seconds(run) -> None:
+    begun_s = time.monotonic()
+    progress = Progress(is_cancelled=lambda: time.monotonic() - begun_s > 0.3)
+    with pytest.raises(Cancelled):
+        run("sleeps", progress)
+    assert time.monotonic() - begun_s < 2.5
+
+
+def test_the_memory_limit_holds(run) -> None:
+    with pytest.raises(WorkerError, match="MemoryError"):
+        run("greedy", memory_bytes=2 * 2**30)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="others report the parent's too")
+def test_the_peak_is_the_helpers_own_and_the_largest_is_kept(
+    run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(peak_memory, "_largest_helper_bytes", 0)
+    assert peak_memory.largest_helper_bytes() == 0
+    parents_bytes = b"x" * (600 * 2**20)
+    run("good")
+    small_bytes = peak_memory.largest_helper_bytes()
+    run("large")
+    large_bytes = peak_memory.largest_helper_bytes()
+    assert small_bytes + 140 * 2**20 < large_bytes < len(parents_bytes)
+    run("good")
+    assert peak_memory.largest_helper_bytes() == large_bytes
+
+
+def test_entry_module_has_the_signature_that_worker_main_calls() -> None:
+    assert callable(helper_entry.main)

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What is told of memory is this process's own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from gaussian_wrapping_addon.core.processes.peak_memory import peak_memory_bytes
+from gaussian_wrapping_addon.core.processes.spawn import child_environment
+
+PRINT_PEAKS = (
+    "import json, sys\n"
+    "sys.path[:0] = json.loads(sys.argv[1])\n"
+    "from gaussian_wrapping_addon.core.processes.peak_memory import peak_memory_bytes\n"
+    "print(json.dumps(peak_memory_bytes()))\n"
+)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="others report the parent's too")
+def test_a_small_child_of_a_large_parent_is_small() -> None:
+    held = b"x" * (300 * 2**20)
+    done = subprocess.run(
+        [sys.executable, "-c", PRINT_PEAKS, json.dumps(sys.path)],
+        capture_output=True, check=True, env=child_environment(),
+    )  # fmt: skip
+    child = json.loads(done.stdout)
+    assert 2**20 < child["worker"] < len(held) < peak_memory_bytes()["worker"]
+    assert child["largest_helper"] == 0

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Tile lists: sorted like lexsort, complete, tight at corners, the same for any thread count."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.kernels.array_store import ArrayStore
+from gaussian_wrapping_addon.core.render.projection.projection import (
+    RawArrays,
+    ScreenGaussians,
+    project_gaussians,
+)
+from gaussian_wrapping_addon.core.render.reference.reference_projection import reference_projection
+from gaussian_wrapping_addon.core.render.tiling.depth_order import order_by_keys, radix_order
+from gaussian_wrapping_addon.core.render.tiling.tiles import TileBinning, TileLists, bin_gaussians
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.tolerances import ALPHA_MIN, TILE_PX
+from tests.core.render.scenes import look_at, random_gaussians
+
+OPTIONS = RenderOptions(threads=1)
+CAMERA = look_at((2.2, 0.5, 0.8), width=75, height=52, focal=80.0)
+
+
+def tiles_of(lists: TileLists) -> np.ndarray:
+    """(pairs,) tile number of each pair."""
+    return np.repeat(np.arange(len(lists.start) - 1), np.diff(lists.start))
+
+
+def wild(gaussians: OrientedGaussians, seed: int) -> OrientedGaussians:
+    """Spread distances over 7 decades, sizes over 10 and opacity logits over +-20."""
+    random = np.random.default_rng(seed)
+    count = len(gaussians)
+    return gaussians.replaced(
+        means=gaussians.means * torch.from_numpy(10.0 ** random.uniform(-3, 4, (count, 1))),
+        log_scales=torch.from_numpy(random.uniform(-16, 8, (count, 3))),
+        opacity_logits=torch.from_numpy(random.normal(size=count) * 10),
+        filter_3d=torch.from_numpy(10.0 ** random.uniform(-9, 1, count)),
+    )
+
+
+def make(
+    seed: int = 0, count: int = 300, *, extreme: bool = False, **scene: object
+) -> tuple[ScreenGaussians, np.ndarray]:
+    """Return screen Gaussians and their float64 alpha at every pixel centre, (n, h, w)."""
+    gaussians = random_gaussians(count, seed, **scene)  # type: ignore[arg-type]
+    if extreme:
+        gaussians = wild(gaussians, seed)
+    screen = project_gaussians(RawArrays.from_gaussians(gaussians), CAMERA, OPTIONS)
+    with torch.no_grad():
+        params = reference_projection(gaussians, CAMERA, OPTIONS).params.numpy()
+    u, v, qa, qb, qc, px, py, r, s, t, _, opacity = params[:, :12].T[:, :, None, None]
+    dx = np.arange(CAMERA.width) + 0.5 - u
+    dy = (np.arange(CAMERA.height) + 0.5)[:, None] - v
+    den = 1.0 + 2.0 * (px * dx + py * dy) + r * dx * dx + s * dx * dy + t * dy * dy
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # rows of zeros
+        alpha = opacity * np.exp(-0.5 * (qa * dx * dx + qb * dx * dy + qc * dy * dy) / den)
+    return screen, alpha
+
+
+SCENES = [
+    {"seed": 0},
+    {"seed": 1, "scale": (0.003, 0.6), "filter_size": 0.0},
+    {"seed": 2, "scale": (0.001, 0.05)},
+    {"seed": 3, "scale": (0.5, 2.0), "count": 60},
+    {"seed": 4, "extreme": True, "count": 900},
+]
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_order_is_lexsort_and_slots_are_contiguous(scene: dict[str, object]) -> None:
+    screen, _ = make(**scene)  # type: ignore[arg-type]
+    lists = bin_gaussians(screen, CAMERA.width, CAMERA.height, 1)
+    assert (lists.tiles_x, lists.tiles_y) == (5, 4)
+    assert len(lists.start) == 21
+    assert lists.start[0] == 0
+    assert lists.start[-1] == len(lists.gaussian_ids) > 0
+    ids, tiles = lists.gaussian_ids, tiles_of(lists)
+    assert screen.visible[ids].all()
+    order = np.lexsort((ids, screen.depths[ids], tiles))
+    np.testing.assert_array_equal(order, np.arange(len(ids)))
+    assert len(np.unique(tiles * len(screen) + ids)) == len(ids)
+    np.testing.assert_array_equal(np.sort(lists.pair_slots), np.arange(len(ids)))
+    np.testing.assert_array_equal(
+        np.searchsorted(lists.pair_offsets, lists.pair_slots, side="right") - 1, ids
+    )
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_every_pixel_that_sees_a_gaussian_is_covered(scene: dict[str, object]) -> None:
+    screen, alpha = make(**scene)  # type: ignore[arg-type]
+    lists = bin_gaussians(screen, CAMERA.width, CAMERA.height, 1)
+    covered = np.zeros(alpha.shape, bool)
+    y0, y1, x0, x1 = lists.pixel_ranges.T
+    for i, tile in zip(lists.gaussian_ids, tiles_of(lists), strict=True):
+        row, column = divmod(int(tile), lists.tiles_x)
+        rows = slice(max(row * TILE_PX, y0[i]), min(row * TILE_PX + TILE_PX - 1, y1[i]) + 1)
+        columns = slice(
+            max(column * TILE_PX, x0[i]), min(column * TILE_PX + TILE_PX - 1, x1[i]) + 1
+        )
+        assert rows.start < rows.stop
+        assert columns.start < columns.stop
+        covered[i, rows, columns] = True
+    needed = alpha >= ALPHA_MIN
+    assert needed.any()
+    assert not (needed & ~covered).any()
+
+
+def test_corner_tiles_are_left_out_and_almost_nothing_else_is_kept() -> None:
+    screen, alpha = make(1, 200, scale=(0.003, 0.6), filter_size=0.0)
+    lists = bin_gaussians(screen, CAMERA.width, CAMERA.height, 1)
+    y0, y1, x0, x1 = (lists.pixel_ranges // TILE_PX).T
+    in_box = ((y1 - y0 + 1) * (x1 - x0 + 1))[screen.visible].sum()
+    assert len(lists.gaussian_ids) < 0.8 * in_box
+    # What is kept but reaches no pixel centre passes between the centres: few.
+    reached = 0
+    for i, tile in zip(lists.gaussian_ids, tiles_of(lists), strict=True):
+        row, column = divmod(int(tile), lists.tiles_x)
+        part = alpha[i, row * TILE_PX :, column * TILE_PX :][:TILE_PX, :TILE_PX]
+        reached += bool((part >= ALPHA_MIN).any())
+    assert reached > 0.9 * len(lists.gaussian_ids)
+
+
+def test_any_number_of_threads_gives_the_same_lists() -> None:
+    screen, _ = make(4, 700)
+    one = bin_gaussians(screen, CAMERA.width, CAMERA.height, 1)
+    for threads in (2, 5):
+        many = bin_gaussians(screen, CAMERA.width, CAMERA.height, threads)
+        for field in dataclasses.fields(TileLists):
+            np.testing.assert_array_equal(getattr(many, field.name), getattr(one, field.name))
+
+
+@pytest.mark.parametrize("most_pairs", [1, 150, 600])
+def test_bands_hold_the_pairs_of_the_whole(most_pairs: int) -> None:
+    screen, _ = make(1, 300, scale=(0.003, 0.6), filter_size=0.0)
+    whole = bin_gaussians(screen, CAMERA.width, CAMERA.height, 1)
+    binning = TileBinning(screen, CAMERA.width, CAMERA.height, 2, ArrayStore())
+    bands = binning.bands(most_pairs)
+    assert [band[0] for band in bands] + [20] == [0] + [band[1] for band in bands]
+    np.testing.assert_array_equal(binning.ids, np.unique(whole.gaussian_ids))
+    for first, end in bands[::-1]:  # in any order
+        lists = binning.lists(first, end)
+        begin, stop = whole.start[first], whole.start[end]
+        pairs = stop - begin
+        assert pairs <= most_pairs or end == first + 1
+        np.testing.assert_array_equal(lists.gaussian_ids, whole.gaussian_ids[begin:stop])
+        np.testing.assert_array_equal(lists.start, whole.start.clip(begin, stop) - begin)
+        np.testing.assert_array_equal(
+            lists.pair_offsets,
+            np.concatenate(
+                [[0], np.cumsum(np.bincount(lists.gaussian_ids, minlength=len(screen)))]
+            ),
+        )
+        np.testing.assert_array_equal(np.sort(lists.pair_slots), np.arange(pairs))
+        np.testing.assert_array_equal(
+            np.searchsorted(lists.pair_offsets, lists.pair_slots, side="right") - 1,
+            lists.gaussian_ids,
+        )
+    if len(bands) > 1:
+        assert max(whole.start[end] - whole.start[first] for first, end in bands) < pairs_of(whole)
+
+
+def pairs_of(lists: TileLists) -> int:
+    """Return the number of pairs."""
+    return len(lists.gaussian_ids)
+
+
+def test_equal_distances_keep_the_order_of_storage() -> None:
+    gaussians = random_gaussians(1, 3).select(torch.zeros(50, dtype=torch.long))
+    screen = project_gaussians(RawArrays.from_gaussians(gaussians), CAMERA, OPTIONS)
+    lists = bin_gaussians(screen, CAMERA.width, CAMERA.height, 2)
+    for begin, end in zip(lists.start[:-1], lists.start[1:], strict=True):
+        if end > begin:
+            np.testing.assert_array_equal(lists.gaussian_ids[begin:end], np.arange(50))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("kind", ["wide", "narrow", "one", "few"])
+def test_order_by_keys_is_a_stable_argsort(kind: str, threads: int) -> None:
+    random = np.random.default_rng(0)
+    count = 40_000
+    keys = {
+        "wide": random.integers(0, 2**31, count),
+        "narrow": 2**30 + random.integers(0, 5000, count),
+        "one": np.full(count, 123_456_789),
+        "few": random.choice([1, 2**31 - 1, 2**23], count),
+    }[kind].astype(np.uint32)
+    bounds = np.array([[0, 9000], [9000, 9000], [9100, 30_000], [31_000, count]])
+    counts = np.zeros(count, bool)
+    for begin, end in bounds:
+        counts[begin:end] = True
+    rows = np.nonzero(counts)[0]
+    extent = int(keys[rows].min()), int(keys[rows].max())
+    order = order_by_keys(keys, bounds, extent, threads, ArrayStore())
+    np.testing.assert_array_equal(order, rows[np.argsort(keys[rows], kind="stable")])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7])
+def test_radix_order_is_a_stable_argsort(share: float) -> None:
+    random = np.random.default_rng(0)
+    depths = np.concatenate(
+        [random.uniform(0.2, 1e4, 3000), random.choice([0.5, 1.0, 2.0], 500), [0.0, 1e-30, 3e38]]
+    ).astype(np.float32)
+    random.shuffle(depths)
+    visible = random.uniform(size=len(depths)) < share
+    order = radix_order(depths, visible)
+    rows = np.nonzero(visible)[0]
+    assert order.dtype == np.int32
+    np.testing.assert_array_equal(order, rows[np.argsort(depths[rows], kind="stable")])
+
+
+@pytest.mark.parametrize("count", [0, 40])
+def test_nothing_visible(count: int) -> None:
+    screen = ScreenGaussians.allocate(count)
+    lists = bin_gaussians(screen, 33, 16, 2)
+    np.testing.assert_array_equal(lists.start, np.zeros(4))
+    assert len(lists.gaussian_ids) == len(lists.pair_slots) == 0
+    np.testing.assert_array_equal(lists.pair_offsets, np.zeros(count + 1))
+    assert (lists.pixel_ranges[:, 0] > lists.pixel_ranges[:, 1]).all()
+
+
+def test_one_pixel_image() -> None:
+    camera = look_at((2.2, 0.5, 0.8), width=1, height=1, focal=1.0)
+    gaussians = random_gaussians(30, 1)
+    screen = project_gaussians(RawArrays.from_gaussians(gaussians), camera, OPTIONS)
+    lists = bin_gaussians(screen, 1, 1, 1)
+    assert lists.start.tolist() == [0, int(screen.visible.sum())]
+    np.testing.assert_array_equal(
+        lists.pixel_ranges[screen.visible], np.zeros((int(screen.visible.sum()), 4))
+    )

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The estimate grows with what costs, holds measured trainings, and refuses a full disk."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core.errors import ResourceError
+from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.training.cost.training_estimate import (
+    Machine,
+    SceneFacts,
+    estimate,
+    gaussian_counts,
+    judge,
+    this_machine,
+)
+from gaussian_wrapping_addon.core.training.schedule import Schedule
+
+FACTS = SceneFacts(40, 640 * 480, 640, 3000)
+PLAIN = TrainingSettings(multi_view="off", growth="on", wrapping="on")
+MACHINE = Machine(2)
+
+STANDARD = TrainingSettings(iterations=3000, max_gaussians=80_000, max_image_px=640)
+
+# Finished trainings (benchmarks/scenes, 40 photos of 640 x 480, settings STANDARD): speed of the
+# machine as it was measured before each (the first: two quiet threads), seconds, Gaussians.
+MEASURED = ((1.0, 335, 36_600), (0.357, 688, 52_506), (0.447, 561, 38_845))
+
+
+@pytest.mark.parametrize(("speed", "seconds", "gaussians"), MEASURED)
+def test_the_range_holds_measured_trainings(speed: float, seconds: int, gaussians: int) -> None:
+    found = estimate(FACTS, STANDARD, Machine(2, speed))
+    assert found.seconds_low < seconds < found.seconds_high
+    assert gaussians <= found.gaussians <= STANDARD.max_gaussians
+
+
+def test_large_photos_cost_what_their_windows_cost() -> None:
+    large = replace(STANDARD, max_image_px=2560)
+    whole = replace(large, pixels_per_iteration=10**9)
+    facts = SceneFacts(40, 2560 * 1920, 2560, 3000)
+    assert estimate(facts, large, MACHINE).seconds_high < 2 * (
+        estimate(FACTS, STANDARD, MACHINE).seconds_high
+    )
+    assert estimate(facts, whole, MACHINE).seconds_high > 10 * (
+        estimate(facts, large, MACHINE).seconds_high
+    )
+
+
+@pytest.mark.parametrize(
+    "larger",
+    [
+        {"iterations": 2 * PLAIN.iterations},
+        {"extra_iterations": 500},
+        {"max_gaussians": 2 * PLAIN.max_gaussians},
+        {"multi_view": "on"},
+        {"multi_view": "auto"},
+        {"depth_from": 0.0},
+    ],
+)
+def test_more_of_anything_takes_longer(larger: dict) -> None:
+    before = estimate(FACTS, PLAIN, MACHINE)
+    after = estimate(FACTS, replace(PLAIN, **larger), MACHINE)
+    assert after.seconds_high > before.seconds_high
+    assert after.memory_bytes >= before.memory_bytes
+    assert after.disk_bytes >= before.disk_bytes
+
+
+def test_extra_iterations_cost_what_the_last_ones_cost() -> None:
+    one, two, three = (
+        estimate(FACTS, replace(PLAIN, extra_iterations=n), MACHINE).seconds_high
+        for n in (0, 100, 200)
+    )
+    assert three - two == pytest.approx(two - one)
+    assert (two - one) / 100 > one / PLAIN.iterations  # full size, most Gaussians
+
+
+def test_a_faster_machine_takes_less() -> None:
+    fast, slow = (estimate(FACTS, PLAIN, Machine(2, speed)) for speed in (2.0, 0.5))
+    assert slow.seconds_low == pytest.approx(4 * fast.seconds_low)
+    assert slow.memory_bytes == fast.memory_bytes
+
+
+def test_images_count_at_the_size_that_is_trained() -> None:
+    small = estimate(FACTS, PLAIN, MACHINE)
+    same = replace(FACTS, pixels=16 * FACTS.pixels, long_side_px=4 * FACTS.long_side_px)
+    assert estimate(same, PLAIN, MACHINE).seconds_high == pytest.approx(small.seconds_high)
+
+
+def test_growth_off_keeps_the_start_and_on_reaches_the_cap() -> None:
+    off = gaussian_counts(FACTS, replace(PLAIN, growth="off", wrapping="off"), 1.0)
+    assert (off == 5000).all()
+    on = gaussian_counts(FACTS, replace(PLAIN, extra_iterations=50), 1.0)
+    assert len(on) == PLAIN.iterations + 50
+    assert (np.diff(on) >= 0).all()
+    assert 0.97 * PLAIN.max_gaussians < on[-1] <= PLAIN.max_gaussians
+    few = gaussian_counts(replace(FACTS, points=10**6), PLAIN, 1.0)
+    assert few[0] == Schedule(PLAIN, 640).growth_limit()
+
+
+def test_a_full_disk_is_refused_and_little_memory_is_told() -> None:
+    found = estimate(FACTS, PLAIN, MACHINE)
+    plenty = Machine(2, 1.0, 10 * found.memory_bytes, 10 * found.disk_bytes)
+    assert judge(found, plenty) == []
+    assert judge(found, MACHINE) == []  # a system that tells nothing
+    with pytest.raises(ResourceError, match="free") as caught:
+        judge(found, replace(plenty, disk_free_bytes=found.disk_bytes - 1))
+    assert caught.value.hint
+    (warning,) = judge(found, replace(plenty, memory_bytes=found.memory_bytes))
+    assert warning.code == "memory-short"
+    assert "--max-gaussians" in warning.text
+
+
+def test_this_machine_reads_what_is_free_also_for_folders_to_come(tmp_path: Path) -> None:
+    machine = this_machine(tmp_path / "not" / "yet", 3, 1.5)
+    assert (machine.threads, machine.speed) == (3, 1.5)
+    assert machine.disk_free_bytes > 0
+    assert machine.memory_bytes >= 0
+
+
+def test_what_a_checkpoint_has_done_costs_nothing_more() -> None:
+    longer = replace(STANDARD, extra_iterations=500)
+    whole, rest = estimate(FACTS, longer, MACHINE), estimate(FACTS, longer, MACHINE, first=3000)
+    base = estimate(FACTS, STANDARD, MACHINE)
+    assert rest.seconds_low == pytest.approx(whole.seconds_low - base.seconds_low)
+    assert 0 < rest.seconds_high < 0.3 * whole.seconds_high

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Decisions are kept with their evidence, in order, and a setting overrides them."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core.errors import UsageError
+from gaussian_wrapping_addon.core.training.selection.model_selection import (
+    TWO_SIDED_ERROR,
+    WRAPPING_SHARE,
+    Decision,
+    Needs,
+    decide,
+    multi_view_need,
+    wrapping_need,
+)
+
+
+def test_json_gives_back_the_same_decisions_in_order() -> None:
+    needs = Needs()
+    for name in ("growth", "exposure", "harmonics"):
+        needs = needs.with_decision(decide(name, "auto", True, "Because of 3.", {"a": 3.0}))
+    values = json.loads(json.dumps(needs.to_json(), allow_nan=False))
+    assert Needs.from_json(values) == needs
+    assert [d.name for d in needs] == ["growth", "exposure", "harmonics"]
+
+
+def test_a_later_decision_takes_the_place_of_the_earlier() -> None:
+    needs = (
+        Needs()
+        .with_decision(decide("a", "auto", True, ""))
+        .with_decision(decide("b", "auto", True, ""))
+    )
+    changed = needs.with_decision(decide("a", "auto", False, "now"))
+    assert [(d.name, d.chosen) for d in changed] == [("a", "off"), ("b", "on")]
+    assert needs.chose("a")
+    assert not changed.chose("a")
+    assert changed.chose("a", "off")
+    assert not changed.chose("c")
+    assert changed.get("c") is None
+    assert len(changed) == 2
+
+
+@pytest.mark.parametrize("needed", [True, False])
+def test_the_setting_overrides_and_the_evidence_stays(needed: bool) -> None:
+    assert decide("a", "auto", needed, "why").chosen == ("on" if needed else "off")
+    for setting in ("on", "off"):
+        decision = decide("a", setting, needed, "why")
+        assert decision.chosen == setting
+        assert decision.overridden
+        assert decision.evidence == "why"
+    with pytest.raises(UsageError, match="maybe"):
+        decide("a", "maybe", needed, "why")
+
+
+def test_figures_that_are_not_finite_are_left_out_of_json() -> None:
+    decision = decide("a", "auto", True, "", {"a": math.nan, "b": math.inf, "c": 1.0})
+    assert decision.to_json()["figures"] == {"c": 1.0}
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        *(None, 3, {}, [3], [{"name": "a"}]),
+        [{**decide("a", "on", True, "").to_json(), "chosen": 1}],
+    ],
+)
+def test_other_json_is_refused(values: object) -> None:
+    with pytest.raises(UsageError):
+        Needs.from_json(values)
+    with pytest.raises(UsageError):
+        Decision.from_json(values)
+
+
+def test_multi_view_is_on_where_any_photo_has_a_neighbour() -> None:
+    none, some = np.zeros(0, np.int64), np.array([1, 2])
+    found = multi_view_need([some, none, none, some])
+    assert found.chosen == "on"
+    assert found.figures["share_with_neighbour"] == 0.5
+    assert found.figures["neighbours_per_photo"] == 1.0
+    assert "2 of 4 photos" in found.evidence
+    assert multi_view_need([some], "off").chosen == "off"
+    for setting in ("auto", "on", "off"):
+        assert multi_view_need([none, none], setting).chosen == "off"
+    assert multi_view_need([]).chosen == "off"
+
+
+def test_wrapping_follows_the_share_of_what_is_seen_from_behind() -> None:
+    errors = np.full(1000, 0.1)
+    weights = np.ones(1000)
+    assert wrapping_need(errors, weights).chosen == "off"
+    few, many = round(0.9 * WRAPPING_SHARE * 1000), round(1.1 * WRAPPING_SHARE * 1000)
+    for count, chosen in ((few, "off"), (many, "on")):
+        two_sided = errors.copy()
+        two_sided[:count] = 2 * TWO_SIDED_ERROR
+        found = wrapping_need(two_sided, weights)
+        assert found.chosen == chosen
+        assert found.figures["share_two_sided"] == pytest.approx(count / 1000)
+    # What hardly shows decides nothing.
+    two_sided[:many], weights[:many] = 2.0, 1e-6
+    assert wrapping_need(two_sided, weights).chosen == "off"
+    assert wrapping_need(two_sided, weights, "on").chosen == "on"
+
+
+def test_wrapping_without_anything_seen_or_with_wrong_arrays() -> None:
+    assert wrapping_need(np.array([1.0]), np.array([0.0])).chosen == "off"
+    assert wrapping_need(np.array([math.nan, 1.0]), np.array([9.0, 1.0])).chosen == "on"
+    with pytest.raises(UsageError):
+        wrapping_need(np.zeros(3), np.zeros(2))
