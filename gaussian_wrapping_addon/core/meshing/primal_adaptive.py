@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Primal adaptive meshing: a closed mesh of a region at any resolution.
+"""Primal adaptive meshing: extract a closed mesh of a region at any resolution.
 
 See docs/method.md, section 7.
 """
@@ -38,11 +38,11 @@ from .tetrahedra.delaunay import bounding_points, delaunay
 _logger = logging.getLogger(__name__)
 
 KIND_SPLIT = 3
-"""Moved slightly off the isosurface, to keep parts apart that would touch."""
+"""Moved slightly off the isosurface to separate parts that would touch."""
 
 DEGENERATE_SHARE = 1e-3
 """Faces narrower than this share of the spacing are removed: collinear points on the region's edges
-have them, of either orientation."""
+form such faces, in either orientation."""
 
 LONGEST_EDGE_SHARE = 1 / 8
 """Edges of the adaptive mesh are at most this share of the region's diagonal."""
@@ -62,40 +62,40 @@ def mesh_region(
     edge_length_scene: float = 0.0,
     sightings: Sightings | None = None,
 ) -> SurfaceMesh:
-    """Mesh the surface ``vacancy = 0.5`` inside a region; the boundary closes the solid.
+    """Mesh the surface ``vacancy = 0.5`` inside a region, closed by caps on the region's boundary.
 
-    With adaptive spacing a denser mesh is made, and of its vertices those stay that the shape needs
-    (:mod:`..mesh.simplification.vertex_selection`). What stands where no camera looks, ``vacancy``
-    says. With neither an edge length nor a number of points the mesh gets about 50 thousand faces.
+    With adaptive spacing a denser mesh is extracted and simplified to the vertices that its shape
+    needs (:mod:`..mesh.simplification.vertex_selection`). ``vacancy`` decides about space that no
+    camera sees. Without an edge length or a number of points the mesh has about 50 thousand faces.
 
     Parameters
     ----------
     vacancy : VacancyField
-        Or anything with ``vacancy(points)`` and ``is_empty(points)``.
+        Or any object with ``vacancy(points)`` and ``is_empty(points)``.
     vectors : VectorField
-        Or anything with ``evaluate(points)``.
+        Or any object with ``evaluate(points)``.
     arrays : GaussianArrays
         Scene frame.
     cameras : sequence of Camera
-        Of the field; must not be empty.
+        The field's cameras; must not be empty.
     region : Region
         Scene frame.
     settings : MeshingSettings
-        ``points``, ``spacing`` and ``min_component_share`` are read; the edge length is passed in
-        scene units. Smoothing, fewer faces and an open boundary are steps of their own, on the
-        finished mesh; ``unseen`` is the field's.
+        ``points``, ``spacing`` and ``min_component_share`` are used; the edge length is passed in
+        scene units. Smoothing, decimation and an open boundary are separate steps on the finished
+        mesh; ``unseen`` concerns the field.
     seed : int
         The same seed gives the same mesh, for any number of threads.
     edge_length_scene : float
-        Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices
-        as that one. 0 leaves it to ``settings.points``.
+        Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices.
+        0 means that ``settings.points`` applies.
     sightings : Sightings, optional
         Where the cameras see the isosurface in the region (:mod:`.depth_samples`).
 
     Returns
     -------
     SurfaceMesh
-        Closed, 2-manifold, oriented outward. ``provenance`` tells counts and ``|v - 0.5|`` of the
+        Closed, 2-manifold, oriented outward. ``provenance`` holds counts, and ``|v - 0.5|`` at the
         vertices on the isosurface.
 
     Raises
@@ -103,10 +103,10 @@ def mesh_region(
     MeshingError
         The region holds no surface.
     UsageError, ResourceError
-        The request makes no sense, or needs more points than the cap.
+        The request is invalid, or needs more points than the limit.
     """
     if len(cameras) == 0:
-        raise MeshingError("There are no cameras to look from.", "Check the scene.")
+        raise MeshingError("The scene has no cameras.", "Check the scene.")
     request = checked_request(edge_length_scene, settings.points, region)
     rng = np.random.default_rng(seed)
     surface = candidate_surface(
@@ -155,14 +155,14 @@ def _connect(
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Turn points into a closed manifold: Delaunay, labels, boundary faces, repair."""
+    """Connect points to a closed manifold: Delaunay, labels, boundary faces, repair."""
     hint = "Draw the region around something that was photographed."
     if len(cloud.points) < 4:
         raise MeshingError(f"Region {region.name!r} holds no surface.", hint)
     points = np.concatenate([cloud.points, bounding_points(cloud.points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.6, 0.65))
     neighbours = tetrahedron_neighbours(tetrahedra)
-    # Points lie in a convex body: only tetrahedra with a far corner reach beyond it.
+    # The points lie in a convex body: only tetrahedra with a bounding point reach beyond it.
     outer = (tetrahedra >= len(cloud.points)).any(1)
     labels = classify(
         points,
@@ -193,13 +193,14 @@ def made_manifold(
     settings: MeshingSettings,
     progress: Progress,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Make closed faces a manifold, without floaters and faces of no area.
+    """Repair closed faces to a manifold; remove floaters and degenerate faces.
 
     Parameters
     ----------
     points : (n, 3) float64
         The cloud's points first.
     faces : (f, 3) int64
+        Closed: every edge has as many faces in one direction as in the other.
 
     Returns
     -------
@@ -211,7 +212,7 @@ def made_manifold(
     Raises
     ------
     MeshingError
-        There is no face.
+        There are no faces.
     """
     hint = "Draw the region around something that was photographed."
     if len(faces) == 0:
@@ -248,16 +249,16 @@ def simplified(
     share: float,
     region: Region,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Keep the vertices that the shape needs, of a closed 2-manifold, and their kinds.
+    """Simplify a closed 2-manifold to the vertices that its shape needs; return their kinds too.
 
-    Edges between those that stay run where they keep closest to the given mesh.
+    Edges between the remaining vertices are flipped to stay closest to the given mesh.
 
     Parameters
     ----------
     target : int
-        So many stay at least.
+        Least number of vertices to keep.
     share : float
-        Share that stays where that is more; with 1, as for uniform spacing, all do.
+        Share of the vertices to keep where that is more; 1, for uniform spacing, keeps all.
     """
     target = max(target, round(share * len(vertices)))
     if len(vertices) <= target:
@@ -271,7 +272,7 @@ def simplified(
 def small_handles_closed(
     vertices: np.ndarray, faces: np.ndarray, kind: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, int]]:
-    """Close handles that are smaller than the edges of the mesh resolve, of a closed 2-manifold."""
+    """Close the handles of a closed 2-manifold that are too small for its edges to resolve."""
     edge_length = float(np.median(edge_lengths(vertices, faces)))
     closed = without_small_handles(vertices, faces, edge_length)
     vertices, faces, chosen = compacted(vertices, closed.faces)
@@ -280,7 +281,7 @@ def small_handles_closed(
 
 
 def vertex_counts(kind: np.ndarray) -> dict[str, int]:
-    """Return how many vertices there are of each kind, for the report."""
+    """Count the vertices of each kind, for the report."""
     return {
         "vertices_on_surface": int((kind == KIND_SURFACE).sum()),
         "vertices_on_region_boundary": int((kind == KIND_CAP).sum()),

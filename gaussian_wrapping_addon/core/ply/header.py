@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bounded reader of a PLY's header: the only one."""
+"""Parse PLY headers of bounded size; the only such parser in the package."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ _TYPES = {
 _ENCODINGS = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 LIST = "list"
-"""Type of a property whose length differs from row to row; only elements after the vertices may
-have one."""
+"""Type of a list property; only elements after the vertices may have one."""
 
 
 @dataclass(frozen=True)
@@ -41,17 +40,17 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What stands in a header."""
+    """A parsed header."""
 
     encoding: str
     """``"ascii"``, or the byte order ``"<"`` or ``">"``."""
     elements: tuple[PlyElement, ...]
     comments: tuple[str, ...]
     begin: int
-    """Byte at which the body begins."""
+    """Offset of the body in bytes."""
 
     def count(self, element: str) -> int:
-        """Return how many of an element are announced, 0 where it is not named."""
+        """Return the declared count of an element, 0 if it is not declared."""
         return next((found.count for found in self.elements if found.name == element), 0)
 
 
@@ -62,12 +61,12 @@ def read_ply_header(path: Path, hint: str) -> PlyHeader:
     ----------
     path : Path
     hint : str
-        Next step of every error.
+        Hint of every error.
 
     Raises
     ------
     ParseError
-        Not a PLY, or a header line that is none; names the line.
+        The file is no PLY, or a header line is invalid; names the line.
     """
     try:
         with path.open("rb") as stream:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshing by pivots on known shapes: closed at the region, on the surface, the right topology."""
+"""Pivot meshing of known shapes: closed at the region, on the surface, correct topology."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tiles fit exactly: the same tetrahedra as without them, and one closed mesh of the same shape."""
+"""Tiled meshing: the same tetrahedra as without tiles, and one closed mesh of the same shape."""
 
 from __future__ import annotations
 

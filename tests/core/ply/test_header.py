@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One reader of PLY headers for splats, clouds and meshes: what it takes, and what it refuses."""
+"""PLY headers of splats, clouds and meshes: accepted and refused input."""
 
 from __future__ import annotations
 

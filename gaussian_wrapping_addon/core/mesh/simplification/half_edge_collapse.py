@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Half-edge collapses: a vertex merges into a neighbour, and none moves (numba).
+"""Half-edge collapses: a vertex merges into a neighbour, and no vertex moves (numba).
 
-The heap holds vertices, each with the price of its cheapest collapse, and three columns: costs,
-vertices, stamps. What lies two edges away may change that price without a new entry, so it is
-computed again when a vertex is taken.
+The heap holds vertices with the cost of their cheapest collapse, in three columns: costs, vertices,
+stamps. Changes two edges away may alter that cost without a new entry, so it is recomputed when a
+vertex is popped.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -21,28 +21,28 @@ from .link_condition import link_allows, mark_ring
 from .quadrics import WEIGHT, area_vector, error_of_one
 
 MAX_RING = 64
-"""Neighbours of a vertex at most; a vertex with more stays."""
+"""Most neighbours of a vertex that can be removed."""
 
 HEAP_COLUMNS = 2
-"""Columns of integers of the heap: vertices and stamps."""
+"""Integer columns of the heap: vertices and stamps."""
 
 
 class ShapeBounds(NamedTuple):
-    """What a half-edge collapse may do to the faces around the vertex that goes."""
+    """Bounds on the faces around a removed vertex."""
 
     longest_squared: float
-    """No new edge is longer; square of a length."""
+    """Square of the greatest length of a new edge."""
     shape_weight: float
-    """Price of length beside that of height, both squared."""
+    """Weight of squared length relative to squared height in the cost."""
     least_roundness: float
-    """Height over the longest edge that a changed triangle must keep, unless it was narrower."""
+    """Least height over longest edge of a changed triangle, unless it was narrower before."""
     least_cosine: float
-    """Between normals of a triangle before and after."""
+    """Least cosine between the normals of a triangle before and after."""
 
 
 @part(fast=False)
 def _shapes_allow(gone, stays, mesh, bounds):
-    """Tell whether no face of ``gone`` turns, gets narrow or long when it moves to ``stays``."""
+    """Return whether all faces of ``gone`` stay within the bounds when it moves to ``stays``."""
     points, faces, head, following = mesh[0], mesh[1], mesh[2], mesh[3]
     longest_squared, _, least_roundness, least_cosine = bounds
     corner = head[gone]
@@ -85,9 +85,9 @@ def _shapes_allow(gone, stays, mesh, bounds):
 
 @part(fast=False)
 def _cheapest(vertex, mesh, counts, bounds, ring):
-    """Return the neighbour that ``vertex`` merges into at the least price, and the price.
+    """Return the neighbour that ``vertex`` merges into at the least cost, and the cost.
 
-    (-1, inf) without one. Equal prices go by number, so that the order of faces does not matter.
+    (-1, inf) if there is none. Ties are broken by index, so the order of faces does not matter.
     """
     points, faces, head, following, quadrics = mesh[0], mesh[1], mesh[2], mesh[3], mesh[4]
     shape_weight = bounds[1]
@@ -96,7 +96,7 @@ def _cheapest(vertex, mesh, counts, bounds, ring):
     around, mark = mark_ring(vertex, mesh, counts, ring)
     if around > MAX_RING:
         return best, lowest
-    # Nothing merges into a neighbour with more faces than MAX_RING, although a vertex with three
+    # No vertex merges into a neighbour with more faces than MAX_RING, although one with three
     # faces would leave it with that number.
     limit = MAX_RING - 1 if around == 3 else MAX_RING
     for i in range(around):
@@ -125,7 +125,7 @@ def _push(vertex, price, stamp, heap, counts):
 
 @kernel(fast=False)
 def push_vertices(mesh, heap, counts, bounds):
-    """Put every vertex that can go into the empty heap, which must have room for all."""
+    """Push every removable vertex onto the empty heap, which must have room for all."""
     head, stamps = mesh[2], mesh[5]
     ring = np.empty(MAX_RING, np.int64)
     for vertex in range(len(head)):
@@ -146,7 +146,7 @@ def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
     bounds : tuple
         Values of :class:`ShapeBounds`.
     budget : int
-        Entries looked at.
+        Greatest number of entries to pop.
     """
     stamps = mesh[5]
     ring, changed = np.empty(MAX_RING, np.int64), np.empty(MAX_RING + 1, np.int64)

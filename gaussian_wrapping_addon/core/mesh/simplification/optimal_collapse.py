@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Edge collapses with optimal placement, each checked before it is done (numba).
+"""Edge collapses with optimal placement, each validated before it is made (numba).
 
 The heap holds edges in six columns: costs, sequence numbers, stamps (the sum of both ends'), first
-and second ends, kinds of placement. An edge whose best place is refused is tried with its ends.
+and second ends, kinds of placement. If the optimal position is refused, the ends are tried.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -21,30 +21,31 @@ from .optimal_placement import FIRST, OPTIMAL, SECOND, on_planes_of, place_merge
 from .quadrics import area_vector
 
 POINT_WEIGHT = 1e-7
-"""Weight of the distance to the vertices beside the distance to the planes. A flat patch has a best
-point by it; more of it (1e-4) would make collapses across a thin plate cheaper than along it."""
+"""Weight of the distance to the vertices relative to the distance to the planes. It makes the
+optimum unique on flat patches; 1e-4 would make collapses across a thin plate cheaper than along it.
+"""
 
 MAX_RING = 48
-"""Faces around a merged vertex at most: fans of needles bake and subdivide badly."""
+"""Most faces around a merged vertex: fans of needles bake and subdivide badly."""
 
 HEAP_COLUMNS = 5
-"""Columns of integers of the heap."""
+"""Integer columns of the heap."""
 
 
 class Limits(NamedTuple):
-    """What a collapse may do to the faces around it."""
+    """Bounds on the faces around a collapsed edge."""
 
     turn_cos: float
-    """Cosine of the largest turn of a face in one collapse."""
+    """Cosine of the largest rotation of a face in one collapse."""
     fold_cos: float
-    """Cosine of the sharpest bend between neighbours that may come up: -1 is folded back flat."""
+    """Cosine of the sharpest new bend between neighbours: -1 is folded back flat."""
     min_shape: float
     """Least height of a new face over its longest edge, unless the face was narrower before."""
 
 
 @part(fast=False)
 def _push(u, v, first_kind, mesh, caps, heap, counts, scratch):
-    """Put an edge into the heap, where the merged vertex can go anywhere."""
+    """Push an edge onto the heap if a placement of the merged vertex exists."""
     cost, kind = np.inf, first_kind
     if first_kind == OPTIMAL:
         cost = place_merged(u, v, OPTIMAL, mesh, caps, scratch)
@@ -52,7 +53,7 @@ def _push(u, v, first_kind, mesh, caps, heap, counts, scratch):
         cost, kind = place_merged(u, v, FIRST, mesh, caps, scratch), FIRST
         other = place_merged(u, v, SECOND, mesh, caps, scratch)
         if other < cost:
-            # Ends exchanged, so that the cheaper one is always tried first.
+            # Exchange the ends, so that the cheaper one is always tried first.
             u, v, cost = v, u, other
     elif first_kind == SECOND:
         cost = place_merged(u, v, SECOND, mesh, caps, scratch)
@@ -68,7 +69,7 @@ def _push(u, v, first_kind, mesh, caps, heap, counts, scratch):
 
 @part(fast=False)
 def _opposite_face(b, c, mesh, skip_u, skip_v):
-    """Return the face on the other side of the half-edge b -> c that holds neither end, or -1."""
+    """Return the face opposite the half-edge b -> c if it contains neither end, else -1."""
     faces, head, following = mesh[1], mesh[2], mesh[3]
     corner = head[b]
     while corner >= 0:
@@ -82,10 +83,10 @@ def _opposite_face(b, c, mesh, skip_u, skip_v):
 
 @part(fast=False)
 def _shapes_allow(u, v, mesh, limits, place, ring, ring_normals):
-    """Tell whether no face turns over, folds back onto a neighbour, or becomes a needle.
+    """Return the number of remaining faces, or -1 if a face violates the limits.
 
-    ``ring`` and ``ring_normals`` are filled with the outer edges and new unit normals of the faces
-    that stay.
+    A face must not turn over, fold back onto a neighbour or become a needle. ``ring`` and
+    ``ring_normals`` are filled with the outer edges and new unit normals of the remaining faces.
     """
     points, faces, head, following = mesh[0], mesh[1], mesh[2], mesh[3]
     turn_cos, fold_cos, min_shape = limits
@@ -151,7 +152,7 @@ def _shapes_allow(u, v, mesh, limits, place, ring, ring_normals):
 
 @part(fast=False)
 def _merge(u, v, mesh, caps, counts, place):
-    """Let ``v`` become ``u``, at ``place``, on the planes of both."""
+    """Merge ``v`` into ``u`` at ``place``, on the planes of both."""
     points, planes, locked = mesh[0], caps[0], caps[1]
     merge_vertices(u, v, mesh, counts)
     if not on_planes_of(planes, v, u):
@@ -162,7 +163,7 @@ def _merge(u, v, mesh, caps, counts, place):
 
 @kernel(fast=False)
 def push_edges(mesh, caps, heap, counts, scratch):
-    """Put every edge into the empty heap, which must have room for half of all corners."""
+    """Push every edge onto the empty heap, which must have room for half of all corners."""
     faces = mesh[1]
     for f in range(len(faces)):
         if faces[f, 0] >= 0:
@@ -185,7 +186,7 @@ def collapse_edges(mesh, caps, heap, counts, limits, scratch, target, budget):
     work : (8, 3) float64
         Scratch.
     budget : int
-        Entries looked at.
+        Greatest number of entries to pop.
     """
     faces, head, following, stamps = mesh[1], mesh[2], mesh[3], mesh[5]
     unused = np.empty(0, np.int64)

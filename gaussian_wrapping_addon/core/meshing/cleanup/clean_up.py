@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a person may ask for after meshing: a smoother mesh, and one of fewer faces."""
+"""Optional post-processing of a mesh: smoothing and decimation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _logger = logging.getLogger(__name__)
 
 
 class CleanUpResult(NamedTuple):
-    """A mesh as asked for, and the one with all its faces where some were taken away."""
+    """The processed mesh, and the one before decimation if it was decimated."""
 
     mesh: SurfaceMesh
     dense: SurfaceMesh | None
@@ -36,20 +36,20 @@ def clean_up(
     vacancy: Any,
     progress: Progress,
 ) -> CleanUpResult:
-    """Smooth, then decimate, as the settings ask; without a request the mesh stays as it is.
+    """Smooth, then decimate, as the settings request; otherwise return the mesh unchanged.
 
-    Both keep a closed 2-manifold closed and manifold, with its parts and their genus. Vertices then
-    lie off the isosurface by what was asked for: ``level_error_*`` of the provenance is measured
-    anew, at all vertices that are not on the region's boundary.
+    Both keep a closed 2-manifold closed and manifold, with its parts and their genus. They move
+    vertices off the isosurface, so ``level_error_*`` of the provenance is measured again, at all
+    vertices that are not on the region's boundary.
 
     Parameters
     ----------
     region : Region
         The region that the mesh was made in, same frame.
     settings : MeshingSettings
-        ``target_faces`` and ``smooth_steps`` are read.
+        ``target_faces`` and ``smooth_steps`` are used.
     vacancy : VacancyField
-        Or anything with ``vacancy(points)``.
+        Or any object with ``vacancy(points)``.
     """
     if settings.smooth_steps == 0 and not 0 < settings.target_faces < len(mesh.faces):
         return CleanUpResult(_with_request(mesh, settings), None)
@@ -94,7 +94,7 @@ def clean_up(
 
 
 def _with_request(mesh: SurfaceMesh, settings: MeshingSettings) -> SurfaceMesh:
-    """Say so where fewer faces were asked for than there are anyway."""
+    """Add a note if the requested number of faces is not below the present one."""
     if settings.target_faces == 0:
         return mesh
     text = (

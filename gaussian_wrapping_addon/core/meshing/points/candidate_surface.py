@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A first, coarse surface of a region: two-pivot marching tetrahedra.
+"""Candidate surface: a first, coarse isosurface by two-pivot marching tetrahedra.
 
 See docs/method.md, section 6.
 """
@@ -21,35 +21,35 @@ from ..tetrahedra.marching_tetrahedra import IsEmpty, bisect, marching_tetrahedr
 from .pivots import MAX_PIVOT_GAUSSIANS, gaussians_reaching, representative_gaussians, two_pivots
 
 PROBES = 4096
-"""Points spread through the region besides the pivots: a Gaussian that is as large as the region
-may have both pivots outside it."""
+"""Sample points through the region besides the pivots: a Gaussian as large as the region may have
+both pivots outside it."""
 
 MARGIN_SHARE = 0.02
-"""Gaussians this share of the diagonal beyond the region take part, so that the surface near the
-boundary is not the hull of too few pivots."""
+"""Gaussians up to this share of the diagonal beyond the region are included, so that the surface
+near the boundary is not the hull of too few pivots."""
 
 HALO_SHARE = 0.5
-"""Pivots farther from the region than this share of its diagonal take no part: the far points alone
+"""Pivots farther from the region than this share of its diagonal are left out: the bounding points
 close the triangulation, and the field need not be known there."""
 
 NO_SURFACE_HINT = "Draw the region around something that was photographed."
 
 BRACKET_SHARE = 0.003
-"""Edges are bisected to this share of the region's diagonal; later steps find the surface."""
+"""Edges are bisected to this share of the region's diagonal; later steps refine the position."""
 
 
 @dataclass(frozen=True)
 class CandidateSurface:
-    """A triangle soup near the isosurface, inside the region and slightly beyond."""
+    """A triangle soup near the isosurface, in the region and slightly beyond it."""
 
     vertices: np.ndarray
     """(v, 3) float64."""
     faces: np.ndarray
-    """(f, 3) int64, towards the empty side."""
+    """(f, 3) int64, facing the empty side."""
     gaussians: int
     """Gaussians that reach the region."""
     pivots: int
-    """Pivots that were connected."""
+    """Points that were triangulated."""
 
 
 def candidate_surface(
@@ -66,14 +66,14 @@ def candidate_surface(
     Parameters
     ----------
     tolerance : float
-        Length of the bracket on crossing edges; 0 takes :data:`BRACKET_SHARE`.
+        Length of the bracket on crossing edges; 0 stands for :data:`BRACKET_SHARE`.
     sightings : Sightings, optional
         Of the cameras in the region: parts about as thin as a pixel are found by these alone.
 
     Raises
     ------
     MeshingError
-        No Gaussian reaches the region, or nothing in it is occupied.
+        No Gaussian reaches the region, or nothing in it is occupied by the solid.
     """
     margin = MARGIN_SHARE * region.diagonal
     is_empty = _within_halo(is_empty, region)
@@ -82,7 +82,7 @@ def candidate_surface(
     points = np.concatenate([pivots, bounding_points(pivots, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
     progress.update(0.3, f"evaluating {len(pivots)} pivots")
-    inside = np.zeros(len(points), np.bool_)  # far points are empty by definition
+    inside = np.zeros(len(points), np.bool_)  # bounding points are empty by definition
     inside[: len(pivots)] = ~is_empty(pivots)
     edges, faces = marching_tetrahedra(_near(points, tetrahedra, region, margin), inside)
     if len(faces) == 0:
@@ -99,14 +99,14 @@ def candidate_surface(
 
 @dataclass(frozen=True)
 class PivotCloud:
-    """Points whose Delaunay edges the isosurface of a region is looked for on."""
+    """Points whose Delaunay edges are searched for the isosurface of a region."""
 
     points: np.ndarray
     """(p, 3) float64, all within :func:`halo_bounds`."""
     gaussians: int
     """Gaussians that reach the region."""
     chosen: int
-    """Those of them that gave pivots."""
+    """Those of them that contributed pivots."""
 
 
 def pivot_cloud(
@@ -138,7 +138,7 @@ def pivots_and_probes(
     seed: int,
     pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray],
 ) -> PivotCloud:
-    """Collect pivots and probes alone, in and around a region; asks no field.
+    """Collect pivots and probes alone, in and around a region, without evaluating the field.
 
     Raises
     ------
@@ -162,14 +162,14 @@ def _in_halo(points: np.ndarray, region: Region) -> np.ndarray:
 
 
 def halo_bounds(region: Region) -> np.ndarray:
-    """Return the box, (2, 3) float64, that holds every point whose side matters for a region."""
+    """Return the box, (2, 3) float64, of all points whose label matters for a region."""
     low, high = region.bounds
     halo = HALO_SHARE * region.diagonal
     return np.stack([low - halo, high + halo])
 
 
 def _within_halo(is_empty: IsEmpty, region: Region) -> IsEmpty:
-    """Return ``is_empty`` for points in the halo; all others are empty, as the far points are."""
+    """Restrict ``is_empty`` to the halo; all other points are empty, as the bounding points are."""
     low, high = halo_bounds(region)
 
     def inside_only(points: np.ndarray) -> np.ndarray:
@@ -182,7 +182,7 @@ def _within_halo(is_empty: IsEmpty, region: Region) -> IsEmpty:
 
 
 def no_surface_error(region: Region) -> MeshingError:
-    """Return the error for a region without a surface."""
+    """Return the error of a region without a surface."""
     return MeshingError(f"Region {region.name!r} holds no surface.", NO_SURFACE_HINT)
 
 
@@ -199,7 +199,7 @@ def _probes(region: Region, margin: float, seed: int) -> np.ndarray:
 
 
 def _near(points: np.ndarray, tetrahedra: np.ndarray, region: Region, margin: float) -> np.ndarray:
-    """Leave out tetrahedra that lie wholly beyond one face of the region."""
+    """Drop the tetrahedra that lie wholly beyond one face of the region."""
     normals, offsets = region.half_spaces
     kept = np.ones(len(tetrahedra), np.bool_)
     for normal, offset in zip(normals, offsets, strict=True):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The cheapest cut through a mesh of tetrahedra, exact, for millions of them (push-relabel)."""
+"""Exact minimum cut on the dual graph of a tetrahedral mesh, by push-relabel (numba)."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from ...kernels.compiled import kernel
 from ...progress import Progress
 
 ARCS_PER_NODE = 6
-"""Arcs looked at between two searches for the true heights, for each node. A search looks at four.
-The cut of trained scenes took as long with 2, and a quarter longer with 20."""
+"""Arcs scanned per node between two global relabellings, each of which scans four. The cut of
+trained scenes took as long with 2, and a quarter longer with 20."""
 
 
 def minimum_cut(
     arcs: np.ndarray, capacity: np.ndarray, unary: np.ndarray, progress: Progress | None = None
 ) -> np.ndarray:
-    """Return which nodes lie inside in the cheapest labelling.
+    """Return the inside nodes of the labelling with the least cost.
 
-    A labelling costs the capacity of all links between different labels, and for each node the
-    amount of its pull where it has the other label. Of several cheapest ones the one with the
-    fewest nodes inside is returned: it is unique, whatever the order of the computation.
+    The cost is the capacity of all arcs between different labels, plus for each node the magnitude
+    of its unary term where the label disagrees with its sign. Among minimum cuts the one with the
+    fewest inside nodes is returned: it is unique, whatever the order of the computation.
 
-    Flow is pushed from nodes that are pulled outside towards those that are pulled inside, along
-    shortest ways (Goldberg and Tarjan, "A new approach to the maximum-flow problem", 1988). Nodes
-    that can still pass flow on to one that wants more are inside. Memory and, on meshes, time are
-    in proportion to the nodes.
+    Flow is pushed from nodes with source capacity (negative terms) towards those with sink capacity
+    (positive terms) along shortest paths (Goldberg and Tarjan, "A new approach to the maximum-flow
+    problem", 1988). Nodes that can still reach remaining sink capacity are inside. Memory and, on
+    meshes, time grow linearly with the nodes; millions are practical.
 
     Parameters
     ----------
-    links : (k, 4) int
+    arcs : (k, 4) int
         Neighbours, -1 for none; mutual, each at most once in a row.
     capacity : (k, 4) int
-        Of each link, >= 0; the smaller of both directions counts. Below 2**30.
-    pull : (k,) int
-        Towards the inside where positive.
+        Capacity of each arc, >= 0 and below 2**30; the smaller of both directions counts.
+    unary : (k,) int
+        Unary term of each node; positive favours inside.
     progress : Progress, optional
-        Asked several times, so that the computation can be stopped.
+        Updated at each global relabelling, so that the computation can be cancelled.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def minimum_cut(
 
 @kernel(fast=False)
 def _reverse_arc_kernel(arcs, residual, reverse):  # type: ignore[no-untyped-def]
-    """Find each link in its neighbour's row; both directions get the smaller capacity."""
+    """Find the reverse of each arc; both directions get the smaller capacity."""
     for i in range(len(arcs)):
         for k in range(4):
             j = arcs[i, k]
@@ -83,7 +83,10 @@ def _reverse_arc_kernel(arcs, residual, reverse):  # type: ignore[no-untyped-def
 
 @kernel(fast=False)
 def _relabel_kernel(arcs, residual, reverse, excess, height, queue):  # type: ignore[no-untyped-def]
-    """Links between each node and the nearest one that wants flow; the number of nodes if none."""
+    """Global relabelling: the residual distance of each node to sink capacity, or the node count.
+
+    Breadth-first search from the nodes with negative excess.
+    """
     count = len(arcs)
     end = 0
     for i in range(count):
@@ -108,7 +111,7 @@ def _relabel_kernel(arcs, residual, reverse, excess, height, queue):  # type: ig
 def _push_kernel(  # type: ignore[no-untyped-def]
     arcs, residual, reverse, excess, height, queue, queued, waiting, budget
 ):
-    """Push flow down, first in first out, and lift nodes that are stuck, up to a budget of work."""
+    """Push flow and relabel active nodes, first in first out, within a budget of arcs."""
     count = len(arcs)
     begin = 0
     while waiting > 0 and budget > 0:

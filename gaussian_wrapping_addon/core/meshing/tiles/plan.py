@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What all tiles of a region share: candidate surface, spacing, borders, fillers, caps."""
+"""Plan of a tiled mesh: the candidate surface, spacing, borders and Steiner points of all tiles."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from .steiner_points import CLEARANCE_CAP_RADII, CLEARANCE_RADII, lattice_side, 
 from .tiling import Tiling, split_evenly
 
 TILE_POINTS = 75_000
-"""Surface points of a tile, at most, where the number of tiles is automatic: memory stays small
-beside that of the field, and a machine with several cores gets enough tiles to share out."""
+"""Most surface points of a tile if the number of tiles is automatic: its memory stays small
+compared with the field's, and machines with several cores get enough tiles to distribute."""
 
 WHOLE_POINTS = 400_000
-"""Regions with no more surface points are meshed whole, where memory allows it."""
+"""Regions with at most this many surface points are meshed without tiles, memory permitting."""
 
 JITTER_SHARE = 1e-6
-"""Shift of all points, as a share of the region's diagonal, while connectivity is decided: that of
-delaunay.JITTER_SHARE with its far points. Tiles must agree on it."""
+"""Perturbation of all points, as a share of the region's diagonal, for the triangulation: that of
+delaunay.JITTER_SHARE with its bounding points. Tiles must agree on it."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """Where surface points come from; duck-typed as in :func:`.primal_adaptive.mesh_region`."""
+    """The fields that define the surface; duck-typed as in :func:`.primal_adaptive.mesh_region`."""
 
     vacancy: Any
     vectors: Any
@@ -46,27 +46,27 @@ class Field:
 
 @dataclass(frozen=True)
 class TilePlan:
-    """Decided once, before any tile is worked on."""
+    """Data shared by all tiles, fixed before any tile is meshed."""
 
     region: Region
     surface: CandidateSurface
     area: float
-    """Of the candidate surface in the region."""
+    """Area of the candidate surface in the region."""
     spacing: Spacing
-    """Local thinning radii of the whole surface, of the denser mesh with adaptive spacing."""
+    """Local thinning radii of the whole surface; with adaptive spacing, of the dense mesh."""
     tiling: Tiling
     steiner_points: np.ndarray
-    """(k, 3) float64, before any gives way."""
+    """(k, 3) float64, before those near surface points are removed. Stored as ``fillers``."""
     ball_radius: float
-    """Largest empty ball that touches the region."""
+    """Greatest radius of an empty ball that touches the region. Stored as ``ball``."""
     caps: Caps
     seed: int
     notes: tuple[ReportWarning, ...]
     edge_length: float
-    """Of the uniform mesh that the request stands for."""
+    """Edge length of the uniform mesh that meets the request."""
     target: int
     share: float
-    """Vertices that stay, as for :func:`.primal_adaptive.simplified`: 0 and 1 keep all."""
+    """Vertices to keep, as for :func:`.primal_adaptive.simplified`: 0 and 1 keep all."""
     sightings: int = 0
 
     @property
@@ -76,16 +76,17 @@ class TilePlan:
 
     @property
     def halo(self) -> float:
-        """Width of the surroundings from which a tile's tetrahedra are known exactly.
+        """Width of the neighbourhood that determines a tile's tetrahedra exactly.
 
-        A tetrahedron with a corner in the tile lies in a ball of radius ``ball_radius`` through
-        that corner; twice that much again for balls that might hold a point.
+        A tetrahedron with a corner in the tile has a circumscribed ball of at most ``ball_radius``
+        through that corner, so points in that ball are at most its diameter away, plus the
+        perturbation.
         """
         return 2.0 * self.ball_radius + 2.0 * JITTER_SHARE * self.region.diagonal
 
 
 class _CapSpacing(Spacing):
-    """Spacing that does not grow inside a cap: its points bound the empty balls there."""
+    """Spacing that does not grow inside a cap, whose points bound the empty balls there."""
 
     def at(self, where: np.ndarray, threads: int = 1) -> np.ndarray:
         return np.minimum(super().at(where, threads), self.radii.max())
@@ -104,17 +105,17 @@ def make_plan(
     adaptive: bool,
     sightings: int,
 ) -> TilePlan:
-    """Decide everything that tiles share.
+    """Compute the data that tiles share.
 
     Parameters
     ----------
     tiles : int
-        Number of tiles; 0 makes as many as :data:`TILE_POINTS` asks for.
+        Number of tiles; 0 chooses it by :data:`TILE_POINTS`.
 
     Raises
     ------
     ResourceError
-        The request needs more points than the cap.
+        The request needs more points than the limit.
     """
     rng = np.random.default_rng(seed)
     sampler = SurfaceSampler(

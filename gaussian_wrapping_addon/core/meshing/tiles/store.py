@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The files of a tiled mesh (docs/file-formats.md, Tiles); each is written whole or not at all."""
+"""Read and write the files of a tiled mesh (docs/file-formats.md, Tiles); writes are atomic."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ VERSION = 1
 
 
 def points_path(folder: Path, tile: int) -> Path:
-    """Return where the points of a tile lie."""
+    """Return the file of a tile's points."""
     return folder / f"points-{tile:04d}.npz"
 
 
 def faces_path(folder: Path, tile: int) -> Path:
-    """Return where the faces of a tile lie."""
+    """Return the file of a tile's faces."""
     return folder / f"faces-{tile:04d}.npz"
 
 
 def gathered_path(folder: Path) -> Path:
-    """Return where the points of all tiles lie."""
+    """Return the file of the gathered points."""
     return folder / "points.npz"
 
 
 def save_plan(folder: Path, plan: TilePlan, origin: dict[str, Any]) -> None:
-    """Write a plan; the list itself comes last.
+    """Write a plan; its JSON file comes last.
 
     Parameters
     ----------
     origin : dict
-        JSON values with which another process finds the Gaussians and cameras.
+        JSON values by which another process finds the Gaussians and cameras.
     """
     folder.mkdir(parents=True, exist_ok=True)
     _save(
@@ -93,7 +93,7 @@ def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
     Raises
     ------
     ParseError
-        The list is not of this version, or broken.
+        The JSON file has another version, or a file is damaged.
     """
     path = folder / LIST_NAME
     try:

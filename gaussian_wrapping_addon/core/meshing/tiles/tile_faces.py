@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Labels of the tetrahedra of one tile, and its part of the faces between inside and outside.
+"""Label the tetrahedra of one tile and extract its part of the boundary faces.
 
-Each tetrahedron inside the region belongs to the tile of its corner with the smallest number. All
-tiles know it as the same one (:mod:`.steiner_points`), and only its owner says whether it is solid.
-So the faces of all tiles together bound a set of whole tetrahedra of one triangulation: they are
-closed, whatever the labels are.
+Each tetrahedron inside the region is owned by the tile of its corner with the smallest index. All
+tiles agree on the tetrahedron (:mod:`.steiner_points`), and only its owner labels it. So the faces
+of all tiles together bound a set of tetrahedra of one triangulation: they are closed, whatever the
+labels are.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from .plan import Field, TilePlan
 from .tile_points import GatheredPoints
 
 CONTEXT_RADII = 4.0
-"""Tetrahedra of others this close are labelled as well, so that the own ones have neighbours."""
+"""Tetrahedra of other tiles within this distance are labelled as well, as neighbours of the own."""
 
 
 @dataclass(frozen=True)
 class TileFaces:
-    """What a tile adds to the mesh; corners are numbers of the points of the whole region."""
+    """Faces of one tile; corners are indices into the gathered points of the region."""
 
     faces: np.ndarray
-    """(f, 3) int64: between two tetrahedra of the tile, outward."""
+    """(f, 3) int64: between two tetrahedra of the tile, oriented outward."""
     border: np.ndarray
-    """(b, 3) int64: faces of the tile's tetrahedra towards others, outward of the tile's."""
+    """(b, 3) int64: faces between the tile's tetrahedra and others, oriented out of the tile's."""
     solid: np.ndarray
     """(b,) bool: whether the tile's tetrahedron at that face is inside."""
     figures: dict[str, Any]
@@ -42,14 +42,14 @@ class TileFaces:
 def tile_faces(
     field: Field, plan: TilePlan, gathered: GatheredPoints, tile: int, progress: Progress
 ) -> TileFaces:
-    """Connect the points in and around a tile, label its tetrahedra, return its faces."""
+    """Triangulate the points in and around a tile, label its tetrahedra, return its faces."""
     numbers = np.flatnonzero(plan.tiling.within(tile, gathered.shifted, plan.halo))
     own = plan.tiling.owner(gathered.cloud.points[numbers]) == tile
     if not (own & gathered.inner[numbers]).any():
         return _no_faces()
     seed = int(np.random.default_rng([plan.seed, tile, 2]).integers(2**31))
     numbers, tetrahedra = local_tetrahedra(plan, gathered, tile, seed, progress.span(0.0, 0.2))
-    # Beyond the tile's surroundings they may be others than those of the whole.
+    # Farther away they may differ from the triangulation of the whole region.
     near = np.zeros(len(numbers) + 8, np.bool_)
     near[: len(numbers)] = plan.tiling.within(
         tile, gathered.cloud.points[numbers], CONTEXT_RADII * plan.radius
@@ -58,10 +58,10 @@ def tile_faces(
     neighbours = tetrahedron_neighbours(tetrahedra)
     inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
     outer = ~inner[tetrahedra].all(1)
-    # Numbers of the region's points rise with the local ones.
+    # Indices of the region's points increase with the local ones.
     first = tetrahedra.min(1)
     owned = ~outer & np.append(own, np.zeros(8, np.bool_))[first]
-    # Only outer tetrahedra have far corners, and nobody asks where those are.
+    # Only outer tetrahedra have bounding points as corners, whose positions are not used.
     points = np.concatenate([gathered.cloud.points[numbers], np.zeros((8, 3))])
     labels = classify(
         points,
@@ -98,16 +98,16 @@ def tile_faces(
 def local_tetrahedra(
     plan: TilePlan, gathered: GatheredPoints, tile: int, seed: int, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Connect the points in and around a tile.
+    """Triangulate the points in and around a tile.
 
-    Tetrahedra with a corner in the tile and one in the region are those of the whole.
+    Tetrahedra with a corner in the tile and one in the region are those of the whole region.
 
     Returns
     -------
     numbers : (n,) int64
-        Of the points, increasing.
+        Indices of the points, increasing.
     tetrahedra : (m, 4) int64
-        Indices into ``numbers``; n and more are points far away.
+        Indices into ``numbers``; n and above are bounding points.
     """
     numbers = np.flatnonzero(plan.tiling.within(tile, gathered.shifted, plan.halo))
     shifted = gathered.shifted[numbers]
@@ -117,7 +117,7 @@ def local_tetrahedra(
 
 
 def circumradii(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the radii of the circumscribed balls, (m,)."""
+    """Return the circumradii, (m,)."""
     base = points[tetrahedra[:, 0]]
     edges = points[tetrahedra[:, 1:]] - base[:, None]  # (m, 3, 3)
     offsets = np.linalg.solve(2.0 * edges, (edges**2).sum(2)[:, :, None])[:, :, 0]
@@ -130,15 +130,15 @@ def _no_faces() -> TileFaces:
 
 
 def joined_faces(parts: list[TileFaces]) -> np.ndarray:
-    """Return the faces of all tiles, (f, 3) int64.
+    """Join the faces of all tiles, (f, 3) int64.
 
-    A border face that two tiles name lies between their tetrahedra; one that a single tile names
-    has the region's outside behind it.
+    A border face listed by two tiles lies between their tetrahedra; one listed by a single tile
+    lies on the region's boundary.
 
     Raises
     ------
     MeshingError
-        Two tiles have connected the points near their border differently.
+        Two tiles have triangulated the points near their border differently.
     """
     border = np.concatenate([part.border for part in parts])
     solid = np.concatenate([part.solid for part in parts])
@@ -157,6 +157,6 @@ def joined_faces(parts: list[TileFaces]) -> np.ndarray:
 
 
 def _parity(faces: np.ndarray) -> np.ndarray:
-    """(f,) bool: whether the corners run like their sorted numbers, up to a rotation."""
+    """Return the parity of the permutation that sorts the corners of each face, (f,) bool."""
     a, b, c = faces.T
     return (a < b) ^ (b < c) ^ (c < a)

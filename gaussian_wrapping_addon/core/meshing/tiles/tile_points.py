@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Surface points of one tile, and the points of all tiles brought together."""
+"""Sample the surface points of one tile, and gather the points of all tiles."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from .plan import JITTER_SHARE, Field, TilePlan
 from .steiner_points import CLEARANCE_CAP_RADII, CLEARANCE_RADII, outside_clearance
 
 KIND_STEINER = 4
-"""A filler that ended between inside and outside, where the field is undecided in depth."""
+"""A Steiner point between inside and outside, where the field is ambiguous away from a surface."""
 
 MARGIN_RADII = 4.0
-"""Candidates this many of the largest radii beyond a tile may move into it."""
+"""Candidates up to this many of the largest radii beyond a tile may be projected into it."""
 
 PIECE_RADII = 8.0
-"""Triangles of the candidate surface that reach beyond are cut until edges are this short."""
+"""Triangles of the candidate surface across the border are split until edges are this short."""
 MAX_SPLITS = 24
 
 
 def tile_points(field: Field, plan: TilePlan, tile: int, progress: Progress) -> SurfacePoints:
-    """Return the points that end up in a tile, thinned among themselves.
+    """Sample the points of a tile, thinned among themselves.
 
-    The same for any number of threads and on any machine of the same kind.
+    The result is the same for any number of threads and on any machine of the same kind.
     """
     low, high = plan.tiling.box(tile)
     margin = MARGIN_RADII * plan.radius
@@ -58,7 +58,7 @@ def tile_points(field: Field, plan: TilePlan, tile: int, progress: Progress) -> 
 
 
 def empty_points(plan: TilePlan) -> SurfacePoints:
-    """Return the points of a tile without surface."""
+    """Return the points of a tile that holds no surface."""
     none = np.zeros((0, 3))
     return SurfacePoints(
         none, none, np.zeros(0, np.uint8), np.zeros(0), plan.spacing.nominal, (), {}
@@ -68,10 +68,10 @@ def empty_points(plan: TilePlan) -> SurfacePoints:
 def pieces_in_box(
     vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray, length: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a soup of triangles that covers the part of a surface in a box, and little more.
+    """Return a triangle soup that covers the part of a surface in a box, and little more.
 
-    Triangles across the border are halved along their longest edge until it is shorter than
-    ``length``; pieces outside are left out.
+    Triangles across the border are bisected at their longest edge until it is shorter than
+    ``length``; pieces outside are dropped.
     """
     corners = vertices[faces]  # (f, 3, 3)
     for _ in range(MAX_SPLITS):
@@ -93,18 +93,18 @@ def pieces_in_box(
 
 @dataclass(frozen=True)
 class GatheredPoints:
-    """The points of the whole region: few bytes each, held by every worker."""
+    """The points of the whole region: a few bytes each, held by every worker."""
 
     cloud: SurfacePoints
-    """Surface points, caps, and fillers (normal 0, ``KIND_STEINER``)."""
+    """Surface points, cap points and Steiner points (normal 0, ``KIND_STEINER``)."""
     shifted: np.ndarray
-    """(n, 3) float64: where they are while connectivity is decided."""
+    """(n, 3) float64: perturbed positions for the triangulation."""
     inner: np.ndarray
-    """(n,) bool: not a filler beyond the region."""
+    """(n,) bool: false for Steiner points beyond the region."""
 
 
 def gather(plan: TilePlan, parts: list[SurfacePoints]) -> GatheredPoints:
-    """Thin the points of all tiles together with the caps, and let fillers give way.
+    """Thin the points of all tiles together with the caps; drop Steiner points near them.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def gather(plan: TilePlan, parts: list[SurfacePoints]) -> GatheredPoints:
     radii = np.concatenate([caps.radii, *(part.radii for part in parts)])
     kind = np.full(len(points), KIND_CAP, np.uint8)
     kind[len(caps.points) :] = np.concatenate([part.kind for part in parts])
-    # As within a tile: jumps last among surface points.
+    # As within a tile: jumps come last among surface points.
     priority = PRIORITY_SURFACE + 0.5 * (rng.random(len(points)) + (kind == KIND_JUMP))
     priority[: len(caps.points)] = caps.priority
     kept = thin(points, normals, radii, priority)

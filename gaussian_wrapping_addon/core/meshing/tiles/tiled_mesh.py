@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The steps of a tiled mesh: plan, points of each tile, all points, faces of each tile, join."""
+"""Tiled meshing: plan, sample each tile, gather the points, label each tile, join the faces."""
 
 from __future__ import annotations
 
@@ -46,19 +46,19 @@ def plan_tiles(
     edge_length_scene: float = 0.0,
     sightings: Sightings | None = None,
 ) -> TilePlan:
-    """Find the region's candidate surface and cut it into tiles.
+    """Extract the region's candidate surface and split it into tiles.
 
     Parameters
     ----------
     tiles : int
-        0 makes as many as the request needs.
+        Number of tiles; 0 chooses it by the request.
 
     Raises
     ------
     MeshingError
         The region holds no surface.
     UsageError, ResourceError
-        The request makes no sense, or needs more points than the cap.
+        The request is invalid, or needs more points than the limit.
     """
     request = checked_request(edge_length_scene, settings.points, region)
     surface = candidate_surface(
@@ -82,10 +82,10 @@ def join_tiles(
     settings: MeshingSettings,
     progress: Progress,
 ) -> SurfaceMesh:
-    """Join the faces of all tiles into one closed 2-manifold, and keep the vertices that it needs.
+    """Join the faces of all tiles into one closed 2-manifold and simplify it.
 
-    The joined surface is held whole: memory is in proportion to it, not to a tile, but the
-    tetrahedra, many times larger, are never there at once.
+    The joined surface is held in one piece: memory is proportional to it, not to a tile, but the
+    tetrahedra, which are many times larger, never exist all at once.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def join_tiles(
     Raises
     ------
     MeshingError
-        The region holds no solid, or tiles do not fit together.
+        The region holds no solid, or tiles do not agree on their border.
     """
     faces = joined_faces(parts)
     progress.update(0.1, f"joining {len(plan.tiling)} tiles")
@@ -104,7 +104,7 @@ def join_tiles(
         cloud.points, faces, cloud, plan.region, settings, progress
     )
     figures["dense_vertices"] = len(vertices)
-    progress.update(0.95, f"choosing from {len(vertices)} vertices")
+    progress.update(0.95, f"simplifying {len(vertices)} vertices")
     vertices, faces, kind = simplified(vertices, faces, kind, plan.target, plan.share, plan.region)
     vertices, faces, kind, handles = small_handles_closed(vertices, faces, kind)
     figures |= handles | vertex_counts(kind)
@@ -147,12 +147,12 @@ def mesh_in_tiles(
     edge_length_scene: float = 0.0,
     sightings: Sightings | None = None,
 ) -> SurfaceMesh:
-    """Mesh a region tile by tile in this process alone; see :func:`~.primal_adaptive.mesh_region`.
+    """Mesh a region tile by tile in this process; see :func:`~.primal_adaptive.mesh_region`.
 
-    The mesh is one closed 2-manifold. Of another number of tiles it differs as of another seed.
+    The mesh is one closed 2-manifold. It varies with the number of tiles as with the seed.
     """
     if len(cameras) == 0:
-        raise MeshingError("There are no cameras to look from.", "Check the scene.")
+        raise MeshingError("The scene has no cameras.", "Check the scene.")
     field = Field(vacancy, vectors, threads)
     plan = plan_tiles(
         field, arrays, cameras, region, settings, progress.span(0.0, 0.3), tiles=tiles, seed=seed,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cutting space into boxes that hold about the same area of the surface each."""
+"""Partition space into boxes that hold about the same area of the surface each."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 Split = tuple[int, int, float]
-"""Number of the tile that is cut, axis, coordinate: what lies at it or beyond is a new tile."""
+"""Index of the tile that is split, axis, coordinate: points at or beyond it form a new tile."""
 
 
 @dataclass(frozen=True)
 class Tiling:
-    """Half-open boxes, parallel to the axes, that fill all of space.
+    """Half-open axis-aligned boxes that partition space.
 
-    Every point has exactly one owner, points on a border included.
+    Every point has exactly one owner, also on a border.
     """
 
     splits: tuple[Split, ...]
@@ -25,14 +25,14 @@ class Tiling:
         return len(self.splits) + 1
 
     def owner(self, points: np.ndarray) -> np.ndarray:
-        """Return the number of the tile of each of (n, 3) points, (n,) int64."""
+        """Return the tile index of each of (n, 3) points, (n,) int64."""
         result = np.zeros(len(points), np.int64)
         for new, (tile, axis, coordinate) in enumerate(self.splits, 1):
             result[(result == tile) & (points[:, axis] >= coordinate)] = new
         return result
 
     def box(self, tile: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and highest corner of a tile, infinite where space is not cut."""
+        """Return the lowest and highest corner of a tile, infinite where space is not split."""
         low = np.full((len(self), 3), -np.inf)
         high = np.full((len(self), 3), np.inf)
         for new, (cut, axis, coordinate) in enumerate(self.splits, 1):
@@ -41,7 +41,7 @@ class Tiling:
         return low[tile], high[tile]
 
     def within(self, tile: int, points: np.ndarray, reach: float) -> np.ndarray:
-        """Tell which of (n, 3) points lie in a tile's box or at most reach beyond, (n,) bool."""
+        """Return which of (n, 3) points lie at most ``reach`` outside a tile's box, (n,) bool."""
         low, high = self.box(tile)
         return np.asarray(((points >= low - reach) & (points <= high + reach)).all(1))
 
@@ -63,19 +63,19 @@ def split_evenly(
     bounds: tuple[np.ndarray, np.ndarray],
     enough: Callable[[int, float], bool],
 ) -> Tiling:
-    """Cut the heaviest tile in two, again and again, until there are enough.
+    """Split the heaviest tile in two until there are enough.
 
-    A tile is cut where half of its weight lies on each side, across the longest side of the box
-    around what it holds.
+    A tile is split at the median of its weight, along the longest side of the bounding box of its
+    contents.
 
     Parameters
     ----------
     centers : (n, 3) float64
     weights : (n,) float64
     bounds : pair of (3,)
-        Of the whole; where nothing has weight, tiles are halves of it.
+        Bounds of the whole; where nothing has weight, tiles are halved.
     enough : callable
-        Given the number of tiles and the heaviest weight, tells whether to stop.
+        Maps the number of tiles and the greatest weight to whether to stop.
     """
     owner = np.zeros(len(centers), np.int64)
     tile_weights, splits = [float(weights.sum())], []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The heap gives entries in the order of their costs, whole, and equal costs by their ties."""
+"""The heap pops complete entries in order of cost, and equal costs in order of their ties."""
 
 from __future__ import annotations
 

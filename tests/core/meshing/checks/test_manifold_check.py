@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The check of closed meshes: it agrees with trimesh, and every kind of defect is found."""
+"""Manifold check: it agrees with trimesh and finds every kind of defect."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Smoothing and decimation of a real mesh of a region, as the mesh stage asks for them."""
+"""Smoothing and decimation of a region's mesh, as in the mesh stage."""
 
 from __future__ import annotations
 

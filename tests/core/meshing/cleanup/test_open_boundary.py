@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes opened at their region: what stays is oriented, manifold, open on the planes alone."""
+"""Meshes without caps: oriented, manifold and open on the region's planes alone."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Non-manifold sets of faces, degenerate faces, floaters, and the figures that tell of them."""
+"""Repair of non-manifold and degenerate faces, floaters, and the statistics that report them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Handles below the resolution go; openings, tubes and everything else stay."""
+"""Small handles are closed; openings, tubes and all else are kept."""
 
 from __future__ import annotations
 

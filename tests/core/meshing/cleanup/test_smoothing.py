@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Smoothing lowers noise, keeps volume, closedness, caps and thin parts."""
+"""Smoothing lowers noise and preserves volume, closedness, caps and thin parts."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Estimates of meshes: the ranges hold what comes out; what cannot fit is refused with advice."""
+"""Mesh estimates: ranges contain the measured values; requests that cannot fit are refused."""
 
 from __future__ import annotations
 

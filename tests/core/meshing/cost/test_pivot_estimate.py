@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Estimates of meshes by pivots: ranges hold what comes out; too little memory is refused."""
+"""Pivot mesh estimates: ranges contain the measured values; too little memory is refused."""
 
 from __future__ import annotations
 

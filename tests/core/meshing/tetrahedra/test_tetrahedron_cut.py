@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tetrahedra cut by a region: they fill it, face to face, whatever the position."""
+"""Tetrahedra clipped to a region fill it face to face, in any position."""
 
 from __future__ import annotations
 
