@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Regions of interest: read and write region files, and re-exports of the region module's API."""
+"""Read and write regions; re-exports the region class and the automatic regions."""
 
 from __future__ import annotations
 

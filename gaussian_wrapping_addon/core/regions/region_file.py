@@ -100,7 +100,7 @@ def _parse_vertices(rows: Any, path: Path, hint: str) -> np.ndarray:
         raise ParseError(
             path,
             "vertices",
-            f"holds {len(rows)} corners; {limits.MAX_REGION_VERTICES} is the most.",
+            f"holds {len(rows)} corners; the limit is {limits.MAX_REGION_VERTICES}.",
             "Use a simpler body, such as a box.",
         )
     for index, row in enumerate(rows):

@@ -28,12 +28,12 @@ def check_volume(vertices: np.ndarray, name: str) -> None:
     """
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < 4:
         raise MeshingError(
-            f"Region {name!r} needs at least four corners.", "Draw a box around the thing."
+            f"Region {name!r} needs at least four corners.", "Draw a box around the object."
         )
     if len(vertices) > limits.MAX_REGION_VERTICES:
         raise MeshingError(
-            f"Region {name!r} has {len(vertices)} corners; {limits.MAX_REGION_VERTICES} is the "
-            "most.",
+            f"Region {name!r} has {len(vertices)} corners; the limit is "
+            f"{limits.MAX_REGION_VERTICES}.",
             "Use a simpler body, such as a box.",
         )
     if not np.isfinite(vertices).all():

@@ -154,7 +154,7 @@ def test_pieces_cover_the_part_of_the_surface_in_a_box() -> None:
 
 def test_a_request_for_too_few_points_is_said() -> None:
     mesh = mesh_tiles(sphere(), cube(1.3), 2, 40, spacing="adaptive")
-    assert "surface points; 40 were asked for" in " ".join(
+    assert "surface points; 40 were requested" in " ".join(
         n["text"] for n in mesh.provenance["notes"]
     )
 

@@ -67,7 +67,7 @@ def decimate(
     faces : (f, 3) int
         Consistently oriented 2-manifold, every vertex used.
     target : int
-        At least :data:`MIN_TARGET`; a mesh with fewer faces stays as it is.
+        At least :data:`MIN_TARGET`; a mesh with fewer faces is returned unchanged.
     region : Region, optional
         The region that the mesh was made in, same frame.
 

@@ -51,7 +51,7 @@ def pop_first(heap, counts):
     """Remove the cheapest entry."""
     last = counts[HEAP_SIZE] - 1
     counts[HEAP_SIZE] = last
-    # The last entry fills the vacancy at the end of the path of smaller children.
+    # The last entry fills the hole at the end of the path of smaller children.
     slot = 0
     while True:
         child = 2 * slot + 1

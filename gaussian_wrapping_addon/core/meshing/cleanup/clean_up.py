@@ -70,7 +70,7 @@ def clean_up(
         if not result.reached:
             text = (
                 f"{len(faces)} faces are left of {len(mesh.faces)}, more than the "
-                f"{settings.target_faces} asked for: fewer would fold or tear the mesh."
+                f"{settings.target_faces} requested: fewer would fold or tear the mesh."
             )
             notes.append(ReportWarning("more-faces-left", text).to_json())
         _logger.info("Decimated %d faces to %d", len(mesh.faces), len(faces))
@@ -98,7 +98,7 @@ def _with_request(mesh: SurfaceMesh, settings: MeshingSettings) -> SurfaceMesh:
     if settings.target_faces == 0:
         return mesh
     text = (
-        f"The mesh has {len(mesh.faces)} faces, fewer than the {settings.target_faces} asked for: "
+        f"The mesh has {len(mesh.faces)} faces, fewer than the {settings.target_faces} requested: "
         "nothing was decimated."
     )
     note = ReportWarning("not-decimated", text).to_json()

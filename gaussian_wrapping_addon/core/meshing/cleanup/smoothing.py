@@ -42,7 +42,7 @@ def smooth(
     *,
     region: Region | None = None,
 ) -> np.ndarray:
-    """Return smoothed positions, (v, 3) float64; the faces stay as they are.
+    """Return smoothed positions, (v, 3) float64; the faces are unchanged.
 
     Taubin's lambda-mu filter, with neighbours weighted by inverse distance so that uneven spacing
     does not drift. The volume of each part is restored afterwards; parts where that fails keep

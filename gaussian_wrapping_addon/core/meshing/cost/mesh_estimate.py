@@ -118,7 +118,7 @@ class MeshEstimate:
         if self.by_edge and self.dense_low > limits.MAX_MESH_POINTS:
             raise ResourceError(
                 f"This mesh needs at least {two_digits(self.dense_low)} points; "
-                f"{two_digits(limits.MAX_MESH_POINTS)} is the most.",
+                f"the limit is {two_digits(limits.MAX_MESH_POINTS)}.",
                 f"{self._coarser(limits.MAX_MESH_POINTS)}, or a smaller region.",
             )
         needed = self.tiled_memory_bytes if tiled else self.memory_low_bytes

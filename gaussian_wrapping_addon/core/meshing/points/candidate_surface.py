@@ -118,7 +118,7 @@ def pivot_cloud(
     *,
     pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray] = two_pivots,
 ) -> PivotCloud:
-    """Collect pivots, probes and pairs across what the cameras see, in and around a region.
+    """Collect pivots, probes and pairs that bracket the visible surface, in and around a region.
 
     Raises
     ------

@@ -111,7 +111,7 @@ def check_expected_points(points: float, request: ResolutionRequest) -> None:
         factor = math.sqrt(points / limits.MAX_MESH_POINTS)
         raise ResourceError(
             f"This edge length needs about {points:.1e} surface points; "
-            f"{limits.MAX_MESH_POINTS:.0e} is the most.",
+            f"the limit is {limits.MAX_MESH_POINTS:.0e}.",
             f"Use edges at least {factor:.2g} times longer, or a smaller region.",
         )
 
@@ -151,7 +151,7 @@ def dense_request(request: ResolutionRequest, area: float, region: Region) -> De
     if target < MIN_VERTICES:
         asked = request.points or target  # with an edge length, the points that it implies
         text = (
-            f"An adaptive mesh has at least {MIN_VERTICES} surface points; {asked} were asked for."
+            f"An adaptive mesh has at least {MIN_VERTICES} surface points; {asked} were requested."
         )
         notes = (*notes, ReportWarning("points-raised", text))
         target = MIN_VERTICES

@@ -68,19 +68,19 @@ def delaunay(
     Raises
     ------
     MeshingError
-        Fewer than four different points, or a point that is not finite.
+        Fewer than four distinct points, or a point that is not finite.
     ResourceError, WorkerError, Cancelled
         From the fallback process.
     """
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise MeshingError(f"Points of shape {points.shape} cannot be connected.", "Give (n, 3).")
+        raise MeshingError(f"Points of shape {points.shape} are invalid.", "Give (n, 3).")
     if not np.isfinite(points).all():
         raise MeshingError("A point to be triangulated is not finite.", "Check the Gaussians.")
     unique, first = np.unique(points, axis=0, return_index=True)
     if len(unique) < 4:
         raise MeshingError(
-            f"{len(unique)} different points have no tetrahedron.", "Choose a larger region."
+            f"{len(unique)} distinct points have no tetrahedron.", "Choose a larger region."
         )
     first.sort()
     low, high = unique.min(0), unique.max(0)

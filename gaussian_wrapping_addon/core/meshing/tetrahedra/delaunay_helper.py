@@ -26,7 +26,7 @@ def main(folder: Path) -> int:
     except (QhullError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise MeshingError(
-            f"{len(points)} points could not be connected ({reason}).", "Choose another region."
+            f"{len(points)} points could not be triangulated ({reason}).", "Choose another region."
         ) from None
     np.save(folder / "tetrahedra.npy", tetrahedra)
     return 0

@@ -57,9 +57,8 @@ def cut_to_region(points: np.ndarray, tetrahedra: np.ndarray, region: Region) ->
         edges, numbers = _crossing_edges(tetrahedra[crossed], inside, len(local))
         share = distance[edges[:, 0]] / (distance[edges[:, 0]] - distance[edges[:, 1]])
         cut_points = local[edges[:, 0]] + share[:, None] * (local[edges[:, 1]] - local[edges[:, 0]])
-        cut_points -= (cut_points @ normal - offset)[
-            :, None
-        ] * normal  # long edges leave a rounding error
+        # Long edges leave a rounding error.
+        cut_points -= (cut_points @ normal - offset)[:, None] * normal
         divided = _split_crossed(tetrahedra[crossed], code[crossed], numbers + len(local))
         tetrahedra = np.concatenate([tetrahedra[code == 15], divided])
         local = np.concatenate([local, cut_points])

@@ -91,14 +91,14 @@ def test_the_dense_mesh_is_kept_where_faces_went(mesh: SurfaceMesh) -> None:
 def test_more_faces_than_there_are_is_said(mesh: SurfaceMesh) -> None:
     result = cleaned(mesh, target_faces=10**6)
     np.testing.assert_array_equal(result.faces, mesh.faces)
-    assert any("1000000 asked for" in note["text"] for note in result.provenance["notes"])
+    assert any("1000000 requested" in note["text"] for note in result.provenance["notes"])
 
 
 def test_a_target_out_of_reach_is_said(mesh: SurfaceMesh) -> None:
     result = cleaned(mesh, target_faces=4)
     assert validate_manifold(result.vertices, result.faces).good
     assert len(result.faces) > 4
-    assert any("4 asked for" in note["text"] for note in result.provenance["notes"])
+    assert any("4 requested" in note["text"] for note in result.provenance["notes"])
 
 
 def test_colours_follow_their_vertices(mesh: SurfaceMesh) -> None:

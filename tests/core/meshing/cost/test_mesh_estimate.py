@@ -155,7 +155,7 @@ def test_adaptive_spacing_counts_the_mesh_from_which_it_selects() -> None:
 
 
 def test_what_cannot_fit_is_refused_with_what_would() -> None:
-    with pytest.raises(ResourceError, match="is the most"):
+    with pytest.raises(ResourceError, match="the limit is"):
         estimate_mesh(10.0, 0.0, ResolutionRequest(0.0009, 0), adaptive=False).refuse(0, tiled=True)
     expected = estimate_mesh(10.0, 0.0, ResolutionRequest(0.002, 0), adaptive=False)
     expected.refuse(0, tiled=False)  # unknown memory refuses nothing
