@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where the cameras see the isosurface: points of their depth maps, with what lies behind them.
+"""Surface samples from the cameras' depth maps, and point pairs across the surface from them.
 
-Pivots of the Gaussians alone (docs/method.md, section 6.1) miss parts that are about as thin as a
-pixel: their Gaussians are small, half transparent and many, so that neither a centre nor an outer
-pivot need lie inside the solid that they make up together. Each camera's own isosurface finds it.
+Pivots of the Gaussians alone (docs/method.md, section 6.1) miss parts about as thin as a pixel:
+their Gaussians are small, half transparent and many, so that no centre or outer pivot need lie
+inside the solid that they form together. The isosurface of each camera finds it.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from ..render.types.options import RenderOptions
 from ..render.view_renderer import ViewRenderer
 
 MAX_DEPTH_SAMPLES = 120_000
-"""Points kept, about evenly over the surface (memory and time of the triangulation)."""
+"""Largest number of samples, about evenly over the surface (bounds the triangulation)."""
 
 MAX_SIDE_PX = 960
-"""Depth maps are rendered no larger than this on the long side."""
+"""Largest long side of the rendered depth maps."""
 
 DEPTHS_PX = (0.5, 1.0, 2.0)
-"""Steps behind the surface, in pixels at its depth, at which the inside is looked for."""
+"""Steps behind the surface, in pixels at its depth, that are tested for being inside."""
 
 STEP_OUT_PX = 0.5
-"""Step towards the camera: there that camera sees more than half, so it is empty."""
+"""Step towards the camera: transmittance exceeds 0.5 there, so the point is empty."""
 
 _POOL = 8 * MAX_DEPTH_SAMPLES
-"""Points that wait for thinning at a time."""
+"""Number of pending samples from which they are thinned."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class DepthSamples:
         return len(self.points)
 
     def kept(self, index: np.ndarray) -> DepthSamples:
-        """Return those of an index or mask."""
+        """Return the samples of an index or mask."""
         return DepthSamples(self.points[index], self.directions[index], self.footprints[index])
 
 
@@ -67,25 +67,25 @@ def sample_depth_maps(
     near_z: float = tolerances.NEAR_Z,
     threads: int = 0,
 ) -> DepthSamples:
-    """Collect the points of the cameras' depth maps that lie in a volume, thinned evenly.
+    """Sample the cameras' depth maps inside a volume, thinned evenly.
 
     Parameters
     ----------
     gaussians : OrientedGaussians
         Scene frame.
     cameras : sequence of Camera
-        In the same frame.
+        Cameras in the same frame.
     contains : callable
         Tells which points lie in the volume.
     most : int
-        Of the points of a neighbourhood one stays for each octant of viewing directions, with
-        neighbourhoods as small as this number allows, but not smaller than a pixel.
+        Largest number of samples. One is kept per cell and octant of viewing directions, with cells
+        as small as this number allows, but not smaller than a pixel.
     """
     renderer, raw = ViewRenderer(), RawArrays.from_gaussians(gaussians)
     options = RenderOptions(depth=True, sh_degree=0, near_z=near_z, threads=threads)
     found, waiting = [], 0
     for index, camera in enumerate(cameras):
-        progress.update(index / len(cameras), "looking for the surface from the cameras")
+        progress.update(index / len(cameras), "sampling depth maps")
         shrink = max(1.0, max(camera.width, camera.height) / MAX_SIDE_PX)
         camera = camera.resized(round(camera.width / shrink), round(camera.height / shrink))
         depth = renderer.render(raw, camera, options).depth  # (h, w)
@@ -114,12 +114,12 @@ def _concatenated(parts: list[DepthSamples]) -> DepthSamples:
 
 
 def thin_evenly(depth_samples: DepthSamples, most: int) -> DepthSamples:
-    """Keep one sighting, the sharpest, of each cell and octant of directions; at most ``most``."""
+    """Keep the sharpest sample of each cell and octant of directions; at most ``most`` samples."""
     if len(depth_samples) == 0:
         return depth_samples
     low, high = depth_samples.points.min(0), depth_samples.points.max(0)
     side = float(np.median(depth_samples.footprints))
-    side = max(side, float((high - low).max()) / 2**20)  # cell numbers fit
+    side = max(side, float((high - low).max()) / 2**20)  # cell indices fit into 20 bits
     octant = (depth_samples.directions > 0) @ np.array([1, 2, 4])  # (n,)
     order = np.argsort(depth_samples.footprints, kind="stable")
     while True:
@@ -128,17 +128,17 @@ def thin_evenly(depth_samples: DepthSamples, most: int) -> DepthSamples:
         _, first = np.unique(key[order], return_index=True)
         if len(first) <= most:
             return depth_samples.kept(np.sort(order[first]))
-        # A surface: the number falls with the square of the side.
+        # On a surface the number falls with the square of the side.
         side *= max(1.1, float(np.sqrt(len(first) / most)))
 
 
 def bracket_pairs(
     depth_samples: DepthSamples, is_empty: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (k, 3) outside and inside of the solid, in pairs across its surface.
+    """Return pairs of points (k, 3) outside and inside the solid, across its surface.
 
-    Samples behind which no camera agrees that there is anything are left out: what one camera
-    takes for opaque, another may see through.
+    Samples without an occupied point behind them are dropped: what is opaque for one camera may be
+    transparent for another.
 
     Parameters
     ----------

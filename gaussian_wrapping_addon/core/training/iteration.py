@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One iteration: a window of a photo is rendered, compared, and the Gaussians that it saw step."""
+"""One training iteration: render a window of a photo, compute the losses, step the Gaussians."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from .state import TrainingState
 from .windows import Window, windows
 
 AVERAGE_SHARE = 0.05
-"""Weight of the newest iteration in the figures of the progress message."""
+"""Weight of the newest iteration in the moving averages of the progress message."""
 
 _MAX_WINDOWS = 1 << 12
-"""More windows than this no photo has: numbers a window of a view for the history."""
+"""Upper bound of the windows per photo; combines view and window into one history index."""
 
 
 class NotFinite(Exception):  # noqa: N818 - asks for a restart, caught in trainer.py
-    """A loss stopped being a finite number."""
+    """A loss is not finite."""
 
 
 @dataclass(frozen=True)
 class _Sample:
-    """What an iteration looks at."""
+    """Training sample of one iteration: a window of a view."""
 
     view: int
     divisor: int
@@ -58,7 +58,7 @@ class _Sample:
 
 
 class Stepper:
-    """Does iterations. Holds nothing that the next one depends on: that is the state's.
+    """Run training iterations. All that the next one depends on is in the state.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Stepper:
     views : sequence of int
         Training views.
     neighbours : dict of int to (k,) array
-        Of each training view, the views that the multi-view terms compare it with.
+        For each training view, the views that the multi-view terms compare it with.
     threads : int
     """
 
@@ -86,12 +86,12 @@ class Stepper:
         self.multi_view = MultiViewOptions.of_settings(schedule.settings)
 
     def step(self, state: TrainingState) -> None:
-        """Do one iteration.
+        """Run one iteration.
 
         Raises
         ------
         NotFinite
-            The loss is not a number; the state must be thrown away.
+            The loss is not finite; the state must be discarded.
         """
         iteration, schedule, adam = state.iteration, self.schedule, state.adam
         sample = self._draw_sample(state)
@@ -125,7 +125,7 @@ class Stepper:
         if not math.isfinite(value):
             raise NotFinite()
         seen = image.backward(gradients)
-        # Before the other view's Gaussians join: this one knows no boxes of those it has culled.
+        # Before merging the other view's gradients: culled Gaussians have no boxes in this view.
         if self.schedule.compact and self.settings.overlap_price > 0.0:
             size_px = (sample.camera.width, sample.camera.height)
             add_footprint_regulariser(
@@ -149,7 +149,7 @@ class Stepper:
             state.exposure.step(sample.view, state.rate_factor * rate)
         state.iteration = iteration + 1
         if self._is_empty(sample):
-            return  # nothing was compared: nothing is known
+            return  # no pixel was compared, so there is no error to record
         window_id = sample.view * _MAX_WINDOWS + sample.number
         state.error_history.add(iteration, window_id, len(adam), mean_squared, sample.divisor)
         share = AVERAGE_SHARE if state.error_average > 0.0 else 1.0
@@ -179,7 +179,7 @@ class Stepper:
         )
 
     def _is_empty(self, sample: _Sample) -> bool:
-        """Tell whether the mask leaves nothing to compare."""
+        """Return whether the mask leaves no pixel to compare."""
         ignores = self.settings.mask_mode == "ignore"
         return ignores and sample.mask is not None and not sample.mask.any()
 
@@ -242,6 +242,6 @@ class Stepper:
 
 
 def trimmed(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:
-    """Return the Gaussians without the harmonics above a degree: they were never used."""
+    """Return the Gaussians without the harmonics above a degree, which were never used."""
     used = (degree + 1) ** 2
     return dataclasses.replace(gaussians, sh=gaussians.sh[:, :used].contiguous())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The training loop: photos and cameras in, oriented Gaussians out, resumable at any moment."""
+"""Training loop: from photos and cameras to oriented Gaussians, resumable at any iteration."""
 
 from __future__ import annotations
 
@@ -44,30 +44,30 @@ from .state import TrainingState
 _logger = logging.getLogger(__name__)
 
 FEW_PHOTOS = 8
-"""With fewer photos than this, only one is held out."""
+"""Below this number of photos, only one is held out."""
 
 SNAPSHOT_EVERY = 100
-"""Iterations between two looks at all numbers, and two states to fall back to."""
+"""Iterations between checks that all values are finite; each one takes a snapshot."""
 
 MEASURE_EVERY = 500
-"""Iterations between two measurements of held-out photos for the history."""
+"""Iterations between measurements of held-out photos for the history."""
 
 REPORT_EVERY = 10
 
 DETAIL_PHOTOS = 8
-"""Photos, spread evenly, that are looked at for detail."""
+"""Number of photos, evenly spread, whose detail is measured."""
 
 TOO_SMALL = "The photos are too small for LPIPS."
 
 RESTART_RATE = 0.5
-"""Learning rates are multiplied by this after a restart."""
+"""Factor on the learning rates after a restart."""
 
 
 def held_out_views(scene: Scene, every: int) -> list[int]:
-    """Return the views that are measured and never trained on.
+    """Return the held-out views, which are measured and never trained on.
 
-    Every n-th photo of the list sorted by name; the first alone where there are fewer than
-    :data:`FEW_PHOTOS`; none where ``every`` is 0 or too few would be left.
+    Every n-th photo sorted by name; only the first with fewer than :data:`FEW_PHOTOS` photos; none
+    if ``every`` is 0 or too few photos would be left.
     """
     count = len(scene.views)
     if every <= 0 or count < 3:
@@ -92,10 +92,10 @@ def train(
 ) -> TrainingResult:
     """Train oriented Gaussians on the photos of a scene.
 
-    Resumes from the newest checkpoint in ``folder``; the result is then bit for bit that of a run
-    without interruption on the same machine, unless numbers break down after it was resumed: the
-    state to go back to is then the resumed one. A checkpoint stays at the end, from which more
-    iterations can go on.
+    Resumes from the newest checkpoint in ``folder``; the result is then bit for bit that of an
+    uninterrupted run on the same machine, unless values become non-finite after resuming: the
+    snapshot to restart from is then the resumed state. The last checkpoint is kept, so that the
+    training can be continued.
 
     Parameters
     ----------
@@ -104,16 +104,16 @@ def train(
         Photos, masks and cameras of the scene's views.
     settings : TrainingSettings
     folder : Path
-        Checkpoints and preview pictures are written here.
+        Receives checkpoints and preview pictures.
     progress : Progress
-        Told every few iterations; asked for cancelling in every one.
+        Updated every few iterations; checked for cancellation in each one.
     seed, threads : int
         0 threads uses every core. The result does not depend on ``threads``.
     start_splat : Path, optional
-        PLY of Gaussians in the world frame of the photos, to start from; then the training is short
-        and adds no Gaussians (:func:`~.initialisation.splat_start.wrapping_settings`).
+        PLY of Gaussians in the world frame of the photos to start from; the training is then short
+        and does not densify (:func:`~.initialisation.splat_start.wrapping_settings`).
     inside : callable, optional
-        Tells which points (n, 3), scene frame, lie where ``settings.region_weight`` applies.
+        Tells for points (n, 3), scene frame, where ``settings.region_weight`` applies.
 
     Returns
     -------
@@ -124,12 +124,12 @@ def train(
     Cancelled
         After a checkpoint was written.
     DatasetError
-        There is no photo to train on, or masks leave nothing of all of them; the splat does not
-        show what the photos show.
+        There is no photo to train on, or masks cover all of them; or the splat does not match the
+        photos.
     ParseError
         The splat cannot be read.
     WrapError
-        The numbers stopped being finite twice.
+        Values became non-finite twice.
     """
     threads = threads or default_threads()
     before = torch.get_num_threads()
@@ -144,7 +144,7 @@ def train(
 
 
 class _Trainer:
-    """One run. What it holds beside the state follows from the inputs alone."""
+    """One training run. Its attributes follow from the inputs; all else is in the state."""
 
     def __init__(
         self,
@@ -187,14 +187,14 @@ class _Trainer:
         return mask is None or bool(mask.any())
 
     def _image_size(self, side_px: int) -> tuple[Decision, int]:
-        """Decide whether the photos hold more than half their size would."""
+        """Decide whether to train at full or half size."""
         chosen = evenly_spaced(self.views, DETAIL_PHOTOS)
         found = select_image_size(
             [photo_detail(self.photos.photo(v, 1), self.photos.mask(v, 1)) for v in chosen]
         )
         decision = found.decision(self.settings.full_size)
         if side_px < 2 * SMALLEST_SIDE_PX:
-            evidence = f"{decision.evidence} Half of it would be too small to learn from."
+            evidence = f"{decision.evidence} Half of this size is too small to train on."
             size = f"{side_px} px"
             return dataclasses.replace(decision, chosen=size, evidence=evidence), 1
         return decision, 1 if found.uses_full_size(self.settings.full_size) else 2
@@ -202,7 +202,7 @@ class _Trainer:
     # -- the run ----------------------------------------------------------------------------------
 
     def run(self, progress: Progress) -> TrainingResult:
-        """Start or resume, iterate to the end, measure."""
+        """Start or resume, iterate to the end, measure the held-out photos."""
         key = fingerprint(self.scene, self.settings, self.seed, self.start_splat)
         progress.update(0.0, "preparing the Gaussians")
         rounds = Rounds(self.stepper, self.held_out, self.inside, progress)
@@ -244,7 +244,7 @@ class _Trainer:
                     save_checkpoint(self.folder, state, key)
                     saved_s = time.monotonic()
         except Cancelled:
-            # A round was left half done, or numbers broke down: what is saved must be whole.
+            # Save a consistent state, not one of a half-finished round or with non-finite values.
             if not (consistent and state.adam.is_finite()):
                 state = TrainingState.restore(*snapshot)
             save_checkpoint(self.folder, state, key)
@@ -314,7 +314,7 @@ class _Trainer:
         )
 
     def _select_model(self, state: TrainingState) -> None:
-        """Take the decisions that need no training; write down those that a person took."""
+        """Take the decisions that need no training; record those made by settings."""
         settings = self.settings
         model_selection = ModelSelection((self.image_decision,))
         exposure = select_exposure(self.scene, self.photos, self.views)
@@ -330,8 +330,10 @@ class _Trainer:
         )
         if settings.harmonics != "auto" or settings.sh_degree == 0 or self.start_splat:
             degree = settings.sh_degree if settings.harmonics != "off" else 0
-            evidence = "Nothing was tried: " + (
-                "the splat brings its own." if self.start_splat else "the settings decide."
+            evidence = "Not tried: " + (
+                "the splat has harmonics of its own."
+                if self.start_splat
+                else "decided by the settings."
             )
             model_selection = model_selection.with_decision(
                 Decision(
@@ -339,7 +341,7 @@ class _Trainer:
                 )
             )
         if settings.wrapping == "off":
-            evidence = "Nothing was measured: the settings decide."
+            evidence = "Not measured: decided by the settings."
             model_selection = model_selection.with_decision(
                 Decision("wrapping", "off", "off", evidence, measured=False)
             )
@@ -348,14 +350,14 @@ class _Trainer:
     def _restart(
         self, state: TrainingState, snapshot: tuple[dict[str, np.ndarray], dict[str, object]]
     ) -> TrainingState:
-        """Return the last good state with lower rates and another view order, once."""
+        """Restore the last snapshot with lower rates and another view order, at most once."""
         if state.restarts > 0:
             raise WrapError(
-                f"Training broke down twice, at iteration {state.iteration}: the numbers are not "
-                "finite any more.",
+                f"Training diverged twice, the second time at iteration {state.iteration}: values "
+                "are not finite.",
                 "Check the camera poses; try fewer Gaussians or another seed.",
             )
-        _logger.warning("numbers not finite at iteration %d: going back", state.iteration)
+        _logger.warning("non-finite values at iteration %d: going back", state.iteration)
         restored = TrainingState.restore(snapshot[0], snapshot[1])
         restored.restarts = state.restarts + 1
         restored.rate_factor = state.rate_factor * RESTART_RATE
@@ -365,7 +367,7 @@ class _Trainer:
             ReportWarning(
                 "training-went-back",
                 f"Training went back from iteration {state.iteration} to {restored.iteration} "
-                "once, because numbers were not finite.",
+                "once, because values were not finite.",
                 "If the figures below are poor, train again with another seed.",
             )
         )
@@ -374,7 +376,7 @@ class _Trainer:
     # -- figures ----------------------------------------------------------------------------------
 
     def _record(self, state: TrainingState, progress: Progress) -> None:
-        """Add to the history, at fixed iterations."""
+        """Append to the history, at fixed iterations."""
         last = state.iteration == self.schedule.total
         if state.iteration % SNAPSHOT_EVERY and not last:
             return
@@ -422,10 +424,10 @@ class _Trainer:
     def _measure(
         self, gaussians: OrientedGaussians, state: TrainingState, progress: Progress
     ) -> tuple[list[HeldOutMetrics], str]:
-        """Return the figures of the held-out photos, and why they have no LPIPS.
+        """Return the metrics of the held-out photos, and the reason if they have no LPIPS.
 
-        Where exposures are modelled, that of each half of a photo is fitted on the other half: it
-        was never trained.
+        Where exposures are modelled, the exposure of each half of a photo is fitted on the other
+        half, as it was never trained.
         """
         figures = []
         lpips, reason = lpips_if_ready() if self.held_out else (None, "")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compile the kernels of a training by a tiny one, so that the job can say what it waits for."""
+"""Compile the training kernels ahead by a tiny training, so that a job can report the wait."""
 
 from __future__ import annotations
 
@@ -71,19 +71,18 @@ def tiny_scene() -> Scene:
 def compile_kernels(
     settings: TrainingSettings, folder: Path, progress: Progress, *, threads: int
 ) -> None:
-    """Run a training of seconds that calls every kernel which ``settings`` may use.
+    """Run a training of a few seconds that calls every kernel that ``settings`` may use.
 
-    What fails here is only logged: the training itself compiles what is missing, and says what is
-    wrong.
+    Failures are only logged: the training itself compiles what is missing and reports errors.
 
     Parameters
     ----------
     settings : TrainingSettings
-        Decisions left to the photos count as "on".
+        Settings of "auto" count as "on".
     folder : Path
-        Gets a folder for a moment.
+        Holds a temporary folder.
     progress : Progress
-        Asked for cancelling; told nothing.
+        Checked for cancellation; receives no updates.
 
     Raises
     ------
@@ -105,4 +104,4 @@ def compile_kernels(
         except Cancelled:
             raise
         except Exception as error:
-            _logger.warning("compiling ahead ended early: %s: %s", type(error).__name__, error)
+            _logger.warning("warm-up of the kernels failed: %s: %s", type(error).__name__, error)

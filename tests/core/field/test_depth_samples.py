@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Points where cameras see the isosurface, and pairs of points across it."""
+"""Samples of depth maps, and pairs of points across the isosurface."""
 
 from __future__ import annotations
 

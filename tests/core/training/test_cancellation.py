@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A request to cancel is noticed in every loop over views before the next view is rendered."""
+"""Cancellation is checked in every loop over views before the next view is rendered."""
 
 from __future__ import annotations
 

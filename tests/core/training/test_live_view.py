@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Previews come when they are due, show what they say, and measure the same at any time."""
+"""Live view: previews when due, their content, reproducible measurements."""
 
 from __future__ import annotations
 

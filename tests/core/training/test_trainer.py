@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whole training runs on a tiny scene: quality, resuming, cancelling, masks, broken numbers."""
+"""Training runs on a tiny scene: quality, resuming, cancellation, masks, non-finite values."""
 
 from __future__ import annotations
 

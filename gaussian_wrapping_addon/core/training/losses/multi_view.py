@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Losses between two views, with gradients on both (docs/method.md, section 3.4).
+"""Multi-view losses between two views, with gradients on both (docs/method.md, section 3.4).
 
-Some pixels of the rendered view are lifted to its isosurface and followed into another view.
-*Geometric*: the depth of the other view there, brought back, should meet the pixel again.
-*Photometric*: the plane through the point shows both photos the same patch. Nothing is rendered
-for the other view: its depth is solved at the places that are asked for.
+Sampled pixels of the rendered view are lifted to its isosurface and projected into another view.
+*Geometric*: the depth of the other view there, reprojected, should meet the pixel again.
+*Photometric*: the plane through the point should show the same patch in both photos. The other view
+is not rendered: its depth is solved at the projected positions only.
 """
 
 from __future__ import annotations
@@ -56,19 +56,19 @@ _GEOMETRY_COLUMNS = 13
 
 @dataclass(frozen=True)
 class MultiViewOptions:
-    """Weights and size of the multi-view terms."""
+    """Weights and sizes of the multi-view terms."""
 
     lambda_photometric: float = 0.6
     lambda_geometric: float = 0.02
     correlation: str = "signed"
     pixels: int = 4000
-    """Most pixels that are looked at."""
+    """Largest number of sampled pixels."""
     patch_sizes: int = PATCH_SIZES
-    """Sizes of patch that are tried where smaller ones are flat."""
+    """Number of patch sizes, the larger ones for regions where smaller patches are flat."""
     max_rise: float = MAX_RISE
-    """How far the surface may leave a patch's plane within it, in half sides of the patch."""
+    """Largest deviation of the surface from a patch's plane, in half sides of the patch."""
     weight: float = 1.0
-    """Of both terms: n where they are asked in every n-th iteration."""
+    """Factor on both terms: n if they are evaluated in every n-th iteration."""
 
     def __post_init__(self) -> None:
         if self.correlation not in CORRELATIONS:
@@ -79,7 +79,7 @@ class MultiViewOptions:
 
     @classmethod
     def of_settings(cls, settings: TrainingSettings) -> MultiViewOptions:
-        """Return the options that a training's settings ask for."""
+        """Return the options of a training's settings."""
         return cls(
             settings.lambda_photometric,
             settings.lambda_geometric,
@@ -91,20 +91,20 @@ class MultiViewOptions:
 
 @dataclass(frozen=True)
 class MultiViewMetrics:
-    """What the terms measured on the way."""
+    """Values of the terms and pixel counts."""
 
     photometric: float
     """Mean of ``w (1 - correlation)`` over the patches kept; 0 without any."""
     geometric: float
     """Mean of ``w noise`` over the valid pixels, pixels; 0 without any."""
     chosen: int
-    """Pixels looked at."""
+    """Number of sampled pixels."""
     valid: int
-    """Those that came back to within a pixel."""
+    """Pixels that reproject to within a pixel."""
     kept: int
-    """Those whose patches count."""
+    """Pixels whose patches are compared."""
     dropped: int
-    """Pixels and Gaussians left out because their numbers were not finite."""
+    """Pixels and Gaussians skipped because of non-finite values."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class MultiViewLoss:
     gradients: ImageGradients
     """On ``depth`` and ``geometric_normal`` of the rendered view; none on the others."""
     other: VisibleGradients | None
-    """On the Gaussians, by way of the other view's depth; ``None`` where that has no part."""
+    """On the Gaussians, through the other view's depth; ``None`` without such a contribution."""
     figures: MultiViewMetrics
 
 
@@ -134,32 +134,32 @@ def multi_view_losses(
     threads: int = 0,
     store: ArrayStore | None = None,
 ) -> MultiViewLoss:
-    """Compare a rendered view with another photo and with the depth seen from there.
+    """Compare a rendered view with the photo and the depth of another view.
 
     ``weight (lambda_photometric mean(w (1 - ncc)) + lambda_geometric mean(w noise))`` with
-    ``w = exp(-noise)`` held constant (docs/method.md, section 3.4). A pixel is valid where both
-    depths exist, both masks keep it and the noise is below one pixel; its patch is kept where the
-    plane is not seen edge-on, all samples are inside both images and masks, neither patch is flat,
-    and ``1 - ncc < 0.9``.
+    ``w = exp(-noise)`` treated as constant (docs/method.md, section 3.4). A pixel is valid where
+    both depths exist, both masks include it and the noise is below one pixel; its patch is kept
+    where the plane is not seen edge-on, all samples are inside both images and masks, neither patch
+    is flat, and ``1 - ncc < 0.9``.
 
     Parameters
     ----------
     image : ViewPass
-        Rendered with depth; anything with its images does.
+        Rendered with depth; any object with the same images will do.
     gaussians : RawArrays
-        What was rendered, scene frame.
+        Rendered Gaussians, scene frame.
     camera, other_camera : Camera
         Scene frame; sizes may differ.
     photo, other_photo : (h, w, 3) uint8, or floats in [0, 1]
     mask, other_mask : (h, w) bool or ``None``
-        False pixels count nowhere.
+        False pixels are ignored.
     settings : MultiViewOptions
     random : numpy Generator
         ``settings.pixels`` numbers are drawn.
     threads : int
         The result does not depend on it.
     store : ArrayStore, optional
-        Memory for the gradients on images, which are then valid until the next call with it.
+        Memory for the gradients on images, which are then valid until the next call.
 
     Returns
     -------
@@ -168,7 +168,7 @@ def multi_view_losses(
     Raises
     ------
     UsageError
-        If a photo's or mask's size is not its camera's.
+        If the size of a photo or mask differs from its camera's.
     """
     threads = threads or default_threads()
     store = ArrayStore() if store is None else store
@@ -236,7 +236,7 @@ def multi_view_losses(
 
 
 class _ViewPair:
-    """Two views and the pixels of the first, as the kernels take them."""
+    """Two views and the sampled pixels of the first, packed for the kernels."""
 
     def __init__(
         self,
@@ -256,7 +256,7 @@ class _ViewPair:
         self.bounds = even_bounds(len(pixels), threads)
 
     def lift(self, other_mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return places in the other view (m, 2) float32, and how they move with the depth."""
+        """Return positions in the other view (m, 2) float32, and their derivatives by depth."""
         count = len(self.pixels)
         positions, position_slopes = np.empty((count, 2), np.float32), np.empty((count, 2))
 
@@ -272,7 +272,7 @@ class _ViewPair:
     def reproject(
         self, positions: np.ndarray, found: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return noise (m,), its derivatives by depth (m,) and place (m, 2) in the other view."""
+        """Return noise (m,), its derivatives by the other view's depth (m,) and position (m, 2)."""
         count = len(self.pixels)
         noise, by_found, by_positions = np.empty(count), np.empty(count), np.empty((count, 2))
         width = self.image.depth.shape[1]
@@ -316,10 +316,10 @@ class _ViewPair:
 def _other_gradients(
     gaussians: RawArrays, view: QueryView, depths: QueryResult, by_found: np.ndarray
 ) -> tuple[VisibleGradients, np.ndarray, int]:
-    """Return gradients on the Gaussians (m', ...) and places (m, 2), and Gaussians dropped."""
+    """Return gradients on the Gaussians (m', ...) and positions (m, 2), and Gaussians dropped."""
     grad_params = np.zeros_like(view.screen.params)
     by_positions, _ = add_query_gradients(view, depths, by_found, grad_params)
-    # Everything is finite where the sum of the absolute values is.
+    # All values are finite if the sum of their absolute values is.
     with np.errstate(all="ignore"):
         sizes = np.abs(grad_params[:, :_GEOMETRY_COLUMNS]).sum(1)  # (n,)
     wild = ~np.isfinite(sizes)

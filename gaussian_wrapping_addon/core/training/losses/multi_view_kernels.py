@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled loops of the multi-view terms: there and back between two views, patches compared.
+"""Compiled kernels of the multi-view terms: reprojection between two views, patch comparison.
 
-Everything is float64 but the images, the depths and the places that are looked up. Derivatives are
-written out by hand. With ``r_p`` the ray of the reference pixel, ``r_o`` that of a sample of its
-patch, depth z and any multiple n of the plane's normal, the homography of docs/method.md,
-section 3.4, takes ``r_o`` to ``R r_o + s t`` with ``s = (n . r_o) / (z n . r_p)``; only s depends
-on z and n.
+All values are float64, except images, depths and positions. Derivatives are written by hand. With
+``r_p`` the ray of the reference pixel, ``r_o`` that of a sample of its patch, depth z and any
+multiple n of the plane's normal, the homography of docs/method.md, section 3.4, takes ``r_o`` to
+``R r_o + s t`` with ``s = (n . r_o) / (z n . r_p)``; only s depends on z and n.
 """
 
 from __future__ import annotations
@@ -25,32 +24,32 @@ HALF_PATCH = 3
 PATCH_STEP_PX = 0.5
 """... half a pixel of the reference apart, where that is not flat."""
 PATCH_SIZES = 3
-"""Where it is flat, patches of twice and four times the size are tried: plain walls and glaze show
-their shading and stains only from farther apart."""
+"""Flat patches are retried at twice and four times the size: plain walls and glaze show shading and
+stains at a larger scale only."""
 SAMPLES = (2 * HALF_PATCH + 1) ** 2
 
 MAX_NOISE_PX = 1.0
-"""Points that come back farther from their pixel than this are hidden or wrong in one view."""
+"""Points with a larger reprojection error are occluded or wrong in one view."""
 MIN_NOISE_PX = 1e-9
-"""Below, the direction in which a point missed its pixel is rounding: no gradient."""
+"""Below this, the direction of the reprojection error is rounding: no gradient."""
 
 MIN_SPREAD = SAMPLES * 0.012**2
 """Smallest sum of squared deviations in a patch, of grey in [0, 1]: contrast of three grey levels.
 The usual 5e-6 (docs/method.md, section 3.4) is far below the noise of photos: such patches agree by
-chance, pull the surface about at random, and a surface that is pulled about recedes."""
+chance, displace the surface at random, and a surface displaced at random recedes."""
 SPREAD_PRODUCT = 1e-8
 """Added to the product of two such sums: patches of weak contrast correlate less."""
 MAX_ERROR = 0.9
-"""Patches that agree less than this show different things."""
+"""Patches with a larger error show different things."""
 MIN_NORMAL = 0.3
-"""Shortest mean normal that stands for a plane (docs/method.md, section 3.4)."""
+"""Shortest blended normal that defines a plane (docs/method.md, section 3.4)."""
 MIN_FACING = 0.1
-"""Least cosine between normal and ray (84 degrees): a plane seen more edge-on has no patch."""
+"""Smallest cosine between normal and ray (84 degrees): more grazing planes have no patch."""
 MAX_RISE = 4.0
-"""Where the surface leaves the plane by more than so many half sides of the patch within it, there
-is no plane, as for a spoke before a wall: thin parts would be pulled towards what lies behind. With
-1, thin parts gain a little more, but rooms lose most of what the terms give them: early surfaces
-are rough."""
+"""Largest deviation of the surface from the plane within a patch, in half sides of the patch:
+beyond it there is no plane, as for a spoke before a wall, and thin parts would be pulled towards
+what lies behind. With 1, thin parts gain slightly more, but rooms lose most of the terms' benefit,
+as early surfaces are rough."""
 
 # States of a compared pixel.
 SKIPPED, KEPT, BROKEN = 0, 1, 2
@@ -63,7 +62,7 @@ def _on_image(x: Any, y: Any, camera: Any) -> Any:
 
 @inline
 def _masked(mask: Any, x: Any, y: Any) -> Any:
-    """Whether the pixel that holds a place on the image is left out."""
+    """Whether the pixel at an image position is masked."""
     return (
         mask.shape[0] > 0
         and not mask[min(int(y), mask.shape[0] - 1), min(int(x), mask.shape[1] - 1)]
@@ -84,7 +83,7 @@ def lift_range(
     positions: np.ndarray,
     position_slopes: np.ndarray,
 ) -> None:
-    """Where pixels land in the other view, and how that moves with their depth.
+    """Project pixels into the other view, with derivatives by their depth.
 
     Parameters
     ----------
@@ -95,7 +94,7 @@ def lift_range(
     pose : (3, 4) float64
         Other camera from reference camera.
     positions : (m, 2) float32
-        Written: pixels of the other view; NaN behind ``near_z``, off the image, in its mask.
+        Written: pixels of the other view; NaN behind ``near_z``, outside the image or masked.
     position_slopes : (m, 2) float64
         Written: derivative with respect to the depth.
     """
@@ -138,17 +137,17 @@ def return_range(
     by_found: np.ndarray,
     by_positions: np.ndarray,
 ) -> None:
-    """How far from their pixel points come back, with derivatives.
+    """Compute the reprojection error of pixels (the noise), with derivatives.
 
     Parameters
     ----------
     positions : (m, 2) float32
-        In the other view.
+        Positions in the other view.
     found : (m,) float32
-        Depth of the other view there; 0 where there is none.
+        Depth of the other view there; 0 where undefined.
     noise : (m,) float64
-        Written: pixels; inf where there is no way back or it is not below :data:`MAX_NOISE_PX`.
-    by_found : (m,), by_places : (m, 2) float64
+        Written: pixels; inf where undefined or not below :data:`MAX_NOISE_PX`.
+    by_found : (m,), by_positions : (m, 2) float64
         Written: derivative of the noise; 0 where it is inf or nearly 0.
     """
     for k in range(begin, end):
@@ -187,7 +186,7 @@ def return_range(
 
 @inline
 def _corner(grey: Any, x: Any, y: Any) -> Any:
-    """Upper left pixel of the four around a place, and the shares of the right and lower ones."""
+    """Upper left of the four pixels around a position, and the right and lower weights."""
     at_x, at_y = x - 0.5, y - 0.5
     column = min(max(int(at_x), 0), grey.shape[1] - 2)
     row = min(max(int(at_y), 0), grey.shape[0] - 2)
@@ -196,13 +195,13 @@ def _corner(grey: Any, x: Any, y: Any) -> Any:
 
 @inline
 def _between(grey: Any, x: Any, y: Any) -> Any:
-    """Whether a place lies between pixel centres: NaN does not."""
+    """Whether a position lies between pixel centres; false for NaN."""
     return x >= 0.5 and y >= 0.5 and x <= grey.shape[1] - 0.5 and y <= grey.shape[0] - 0.5
 
 
 @inline
 def _all_count(mask: Any, row: Any, column: Any) -> Any:
-    """Whether the mask keeps a pixel and those to its right and below."""
+    """Whether a pixel and those to its right and below are unmasked."""
     return mask.shape[0] == 0 or (
         mask[row, column]
         and mask[row, column + 1]
@@ -217,27 +216,27 @@ def compare_range(  # type: ignore[no-untyped-def]
     grey, other_grey, mask, other_mask, squared, sizes, max_rise, states, errors, by_depth,
     by_normals,
 ):  # fmt: skip
-    """Compare the patches around pixels with what their planes show of the other photo.
+    """Compare patches around pixels with the other photo, warped by their planes.
 
     Parameters
     ----------
     pixels : (m,) int32, noise : (m,) float64
         Pixels whose noise is inf are skipped.
     depth, alpha : (h, w) float32, normals : (h, w, 3) float32
-        Of the reference view; blended normals, scene frame.
+        Images of the reference view; blended normals, scene frame.
     rotation : (3, 3) float64
         Reference camera from scene.
     grey, other_grey : (h, w) float32, mask, other_mask : bool or (0, 0) for none
     squared : bool
         Correlation -1 is as good as 1.
     sizes : int
-        Sizes of patch that are tried, each twice as large as the one before, until one is not flat.
+        Number of patch sizes, each twice the one before, tried until a patch is not flat.
     max_rise : float
         See :data:`MAX_RISE`.
     states : (m,) uint8
-        Written: :data:`KEPT` where the patch counts, :data:`BROKEN` where numbers were not finite.
+        Written: :data:`KEPT` for compared patches, :data:`BROKEN` for non-finite values.
     errors : (m,) float64
-        Written: ``1 - correlation``; 0 where not kept, as are the derivatives.
+        Written: ``1 - correlation``; 0 if not kept, as are the derivatives.
     by_depth : (m,), by_normals : (m, 3) float64
         Written: derivatives with respect to the depth and the normal (scene frame, any length).
     """
@@ -315,7 +314,7 @@ def compare_range(  # type: ignore[no-untyped-def]
                     high, below = g00 + right * (g01 - g00), g10 + right * (g11 - g10)
                     theirs[sample] = high + low * (below - high)
                     across = (g01 - g00) + low * ((g11 - g10) - (g01 - g00))
-                    # How the sample changes with the ratio.
+                    # Derivative of the sample by the ratio.
                     slopes[sample] = (
                         across * other[0] * (pose[0, 3] - u * pose[2, 3])
                         + (below - high) * other[1] * (pose[1, 3] - v * pose[2, 3])

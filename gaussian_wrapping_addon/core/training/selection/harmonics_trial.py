@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Spherical harmonics fitted to a few photos in closed form, without training.
+"""Fit spherical harmonics to a few photos in closed form, without training.
 
-Colours enter an image linearly: the residuals of a photo, sent backwards, give the mean residual of
-each Gaussian in it, and a small regression over the viewing directions its coefficients
-(docs/method.md, section 4.4). What that tells of a scene is judged in :mod:`.harmonics_selection`.
+Images are linear in the colours: back-projecting the residuals of a photo gives the mean residual
+of each Gaussian in it, and a small regression over the viewing directions gives its coefficients
+(docs/method.md, section 4.4). :mod:`.harmonics_selection` evaluates the result.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from ...render.types.options import RenderOptions
 from ...render.view_renderer import ViewRenderer
 
 LOWER_DEGREE_FITS = 3
-"""Fits without the degree before the comparison. Colours that training has not settled yet lend any
-further unknown a gain: on a matte sphere with colours 0.15 off, degree 1 gains 0.11 dB without."""
+"""Fits without the degree before the comparison. With unconverged colours any further parameter
+shows a gain: on a matte sphere with colours 0.15 off, degree 1 gains 0.11 dB without these fits."""
 
 RIDGE_SHARE = 0.05
 RIDGE_PX = 2.0
-"""Ridge of the regressions, in shares of a Gaussian's weight in all views, the judging ones too,
-and in pixels. It holds what few or one-sided views cannot tell: a Gaussian close to a camera fills
-the view of that camera and is a few pixels elsewhere."""
+"""Ridge of the regressions, as a share of a Gaussian's weight in all views, including those for
+evaluation, and in pixels. It constrains coefficients that few or one-sided views do not determine:
+a Gaussian close to a camera fills the view of that camera and is a few pixels elsewhere."""
 
 LOW_PASS_SHARE = 1.0 / 8.0
-"""Residuals are averaged over squares of this share of the long side. Reflections change colours
-slowly over a surface; errors of shape and detail change with the view as well, but average out."""
+"""Residuals are box-filtered with this share of the long side. Reflections vary slowly over a
+surface; errors of shape and detail also depend on the view, but average out."""
 
 _C0 = 0.5 / math.sqrt(math.pi)
 _BLOCK = 4096
@@ -46,32 +46,32 @@ _STEP_RIDGE = 1e-6
 _ERROR_FLOOR = 1e-12
 
 Correction = tuple[np.ndarray, np.ndarray]
-"""Gain and offset, (3,) each: what the photo shows is ``gain * render + offset``."""
+"""Gain and offset, (3,) each: the photo is ``gain * render + offset``."""
 
 
 @dataclass(frozen=True)
 class TrialView:
-    """A photo at a small size, to fit to or to judge by."""
+    """A photo at a small size, for fitting or evaluation."""
 
     camera: Camera
     photo: np.ndarray
     """(h, w, 3) uint8, or floats in [0, 1]."""
     mask: np.ndarray | None = None
-    """(h, w) bool, true where the photo counts."""
+    """(h, w) bool, true for pixels that count."""
     correction: Correction | None = None
-    """The photo's exposure, where it is known."""
+    """The photo's exposure, if known."""
 
 
 @dataclass(frozen=True)
 class TrialErrors:
-    """A photo that was not fitted to, judged without a degree and with it."""
+    """Errors of a photo excluded from the fit, without and with the degree."""
 
     without: np.ndarray
-    """(n,) sums over the pixels of squared :func:`low_pass` errors, blended back to the
+    """(n,) sums over the pixels of squared :func:`low_pass` errors, back-projected to the
     Gaussians."""
     with_degree: np.ndarray
     weights: np.ndarray
-    """(n,) sums of blending weights of the pixels that count."""
+    """(n,) sums of blending weights over the unmasked pixels."""
     low_frequency: tuple[float, float]
     """Mean squared :func:`low_pass` error of the photo without the degree and with it."""
     total: float
@@ -79,10 +79,10 @@ class TrialErrors:
 
 
 class HarmonicsTrial:
-    """Coefficients of the harmonics of all Gaussians, fitted to some photos.
+    """Fit of the harmonics of all Gaussians to some photos.
 
-    Every Gaussian is fitted alone; the length of the step is then chosen by least squares of the
-    fitted views' residuals: Gaussians overlap, so single fits overshoot.
+    Every Gaussian is fitted separately; the length of the common step is then chosen by least
+    squares of the fitted views' residuals, since separate fits of overlapping Gaussians overshoot.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class HarmonicsTrial:
         Weights of the Gaussians in all views, fitted or not (:func:`summed_weights`), pixels.
     threads : int
     check : callable
-        Called before each view is rendered; what it raises ends the trial.
+        Called before each view is rendered; an exception ends the trial.
     """
 
     def __init__(
@@ -124,14 +124,14 @@ class HarmonicsTrial:
         self.targets = [_target(view, None) for view in self.fitted]
 
     def fit_lower_degrees(self) -> None:
-        """Fit the lower degrees first, so that both sides of the comparison begin there."""
+        """Fit the lower degrees, the common start of both sides of the comparison."""
         for _ in range(LOWER_DEGREE_FITS):
             (self.start,) = self.fit(self.degree - 1)
 
     def fit(self, *degrees: int) -> list[np.ndarray]:
-        """Return (n, k, 3) float32 coefficients for each degree, all up to it fitted."""
+        """Return (n, k, 3) float32 coefficients for each degree, fitted up to that degree."""
         count = len(self.raw)
-        sums = np.zeros((len(self.fitted), count, 3), np.float32)  # blended residuals, in pixels
+        sums = np.zeros((len(self.fitted), count, 3), np.float32)  # back-projected, pixels
         weights = np.zeros((len(self.fitted), count), np.float32)
         before, residuals = [], []
         options = RenderOptions(depth=False, threads=self.threads, statistics=True)
@@ -146,7 +146,7 @@ class HarmonicsTrial:
             sums[row, seen.ids] = seen.sh[:, 0] / _C0
             if view.mask is None:
                 weights[row] = image.statistics.weight_sum
-            else:  # the same sums, of the pixels that count alone
+            else:  # the same sums over unmasked pixels only
                 ones = np.repeat(counts[..., None], 3, 2).astype(np.float32)
                 seen = image.backward(ImageGradients(color=ones))
                 weights[row, seen.ids] = seen.sh[:, 0].max(1) / _C0
@@ -158,15 +158,15 @@ class HarmonicsTrial:
         return out
 
     def compare(self, view: TrialView, without: np.ndarray, with_degree: np.ndarray) -> TrialErrors:
-        """Judge two sets of coefficients by a photo that took no part in fitting them.
+        """Evaluate two sets of coefficients on a photo excluded from the fit.
 
-        Where exposures are known, a photo whose own is not is matched to the settled image.
+        Where exposures are known, a photo without one is matched to the image of the start.
         """
         matched = self.corrected and view.correction is None
         target, counts = _target(view, self._image(self.start, view.camera) if matched else None)
         differences = [self._image(sh, view.camera) - target for sh in (without, with_degree)]
         squares = [np.square(low_pass(d, counts)).mean(2) for d in differences]  # (h, w) each
-        # Zero coefficients show a grey that is not clamped, so that all three channels blend alike.
+        # Zero coefficients give unclamped grey, so that all three channels have the same gradient.
         self.check()
         grey = self._with_coefficients(np.zeros((len(self.raw), 1, 3), np.float32))
         image = self.renderer.render(
@@ -202,7 +202,7 @@ class HarmonicsTrial:
     def _step_length(
         self, step: np.ndarray, before: list[np.ndarray], residuals: list[np.ndarray]
     ) -> float:
-        """Return the length of a step that leaves the fitted views the least squared residual."""
+        """Return the step length that minimises the squared residuals of the fitted views."""
         normal, right = _ERROR_FLOOR, 0.0
         moved = self._stepped(step)
         for view, (_, counts), base, residual in zip(
@@ -239,18 +239,18 @@ def _regress(
     directions: list[Callable[[int, int, int], np.ndarray]],
     degree: int,
 ) -> np.ndarray:
-    """Return (n, k, 3) float32 ridge regressions of mean residuals on the harmonics.
+    """Return (n, k, 3) float32 ridge regressions of the mean residuals on the harmonics.
 
     Parameters
     ----------
     sums : (v, n, 3)
-        Sums of blended residuals.
+        Sums of back-projected residuals.
     weights : (v, n)
         Sums of blending weights.
     weight_sums : (n,)
-        The same over all views, those too that are not fitted to.
+        The same over all views, including those not fitted to.
     directions : list of callables
-        Of each view, the harmonics of a range of Gaussians.
+        For each view, a function that evaluates the harmonics of a range of Gaussians.
     """
     views, count = weights.shape
     size = (degree + 1) ** 2
@@ -271,7 +271,7 @@ def _regress(
 
 
 def _directions(means: np.ndarray, camera: Camera) -> Callable[[int, int, int], np.ndarray]:
-    """Return what gives the harmonics (m, k) of a range of Gaussians as the camera sees them."""
+    """Return a function for the (m, k) harmonics of a range of Gaussians seen from a camera."""
     center = camera.center
 
     def basis(begin: int, end: int, degree: int) -> np.ndarray:
@@ -284,15 +284,15 @@ def _directions(means: np.ndarray, camera: Camera) -> Callable[[int, int, int], 
 
 
 def _target(view: TrialView, image: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the photo as the Gaussians should show it, and (h, w) bool where it counts.
+    """Return the target image in the Gaussians' exposure, and (h, w) bool of the pixels that count.
 
-    A photo whose exposure is not known is matched to ``image`` where that is given.
+    A photo of unknown exposure is matched to ``image`` if given.
     """
     camera, photo = view.camera, view.photo
     if photo.shape != (camera.height, camera.width, 3):
         raise UsageError(
             f"Photo {camera.name} is {photo.shape}, its camera {camera.width} x {camera.height}.",
-            "Give both at one size.",
+            "Give both at the same size.",
         )
     target = photo.astype(np.float32) / np.float32(255 if photo.dtype == np.uint8 else 1)
     counts = np.ones(photo.shape[:2], np.bool_) if view.mask is None else view.mask
@@ -306,9 +306,9 @@ def _target(view: TrialView, image: np.ndarray | None) -> tuple[np.ndarray, np.n
 
 
 def match_exposure(image: np.ndarray, photo: np.ndarray) -> Correction:
-    """Return the gain and offset per channel that bring a render closest to a photo.
+    """Return the gain and offset per channel that match a render to a photo.
 
-    Least squares over (p, 3) colours; a channel that does not vary keeps gain 1.
+    Least squares over (p, 3) colours; a constant channel keeps gain 1.
     """
     image, photo = image.astype(np.float64), photo.astype(np.float64)
     mean, wanted = image.mean(0), photo.mean(0)
@@ -320,7 +320,7 @@ def match_exposure(image: np.ndarray, photo: np.ndarray) -> Correction:
 
 
 def low_pass(difference: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return an image's averages over squares of :data:`LOW_PASS_SHARE`, of the pixels that count.
+    """Box-filter an image over the pixels that count, with sides of :data:`LOW_PASS_SHARE`.
 
     Parameters
     ----------
@@ -330,7 +330,7 @@ def low_pass(difference: np.ndarray, counts: np.ndarray) -> np.ndarray:
     Returns
     -------
     (h, w, 3) float64
-        0 where a pixel does not count.
+        0 at pixels that do not count.
     """
     size = max(1, round(LOW_PASS_SHARE * max(counts.shape)))
     weight = uniform_filter(counts.astype(np.float64), size, mode="constant")  # (h, w)

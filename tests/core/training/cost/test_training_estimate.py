@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The estimate grows with what costs, holds measured trainings, and refuses a full disk."""
+"""Training estimate: monotonicity, range of measured trainings, check of a full disk."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Splats in other frames look the same, fit the filter, are capped, checked and oriented."""
+"""Training from a splat: transforms, 3D filter, cap, check against photos, orientation."""
 
 from __future__ import annotations
 
@@ -194,6 +194,6 @@ def test_a_splat_in_another_frame_is_refused(tmp_path: Path) -> None:
     shell, _ = shell_of_discs(400)
     scene, photos = _scene(shell)
     path = write_ply(tmp_path / "a.ply", splat_columns(shell))  # scene frame, not the world's
-    with pytest.raises(DatasetError, match="does not show") as caught:
+    with pytest.raises(DatasetError, match="does not match") as caught:
         start_from_splat(path, scene, photos, range(9), SETTINGS, Progress(), threads=1)
     assert "camera poses" in caught.value.hint

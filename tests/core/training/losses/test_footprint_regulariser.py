@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The price on overlap: its value, and that its gradient shrinks what covers much."""
+"""Footprint regulariser: its value, and its gradient on the scales."""
 
 from __future__ import annotations
 

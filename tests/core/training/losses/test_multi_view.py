@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The multi-view terms end to end against their definition in torch, and what they leave out."""
+"""Multi-view losses end to end against their definition in torch; excluded pixels."""
 
 from __future__ import annotations
 

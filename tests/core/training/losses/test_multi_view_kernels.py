@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The multi-view kernels on an exact plane: zero where they should be, slopes, what they skip."""
+"""Multi-view kernels on an exact plane: zero errors, derivatives, skipped pixels."""
 
 from __future__ import annotations
 

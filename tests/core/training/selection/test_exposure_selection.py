@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whether photos differ in exposure, decided on colours of known gains, occluded and noisy."""
+"""Selection of exposures on colours with known gains, occlusion and noise."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_decision_beside_occlusions(largest: float, needed: bool) -> None:
     assert found.known
     assert found.needed == needed
     assert (found.spread > 1.5 * NEEDED_SPREAD) if needed else (found.spread < NEEDED_SPREAD / 1.5)
-    assert "parts agree (limit 2.5 %" in found.evidence
+    assert "parts (limit 2.5 %" in found.evidence
 
 
 def test_two_altered_photos_of_sixteen_are_noticed() -> None:
@@ -118,7 +118,7 @@ def test_too_little_is_not_known() -> None:
     assert not blind.known
     assert not blind.needed
     assert not blind.log_gains.any()
-    assert blind.evidence.startswith("Not known")
+    assert blind.evidence.startswith("Unknown")
     one = decide(colors[:, :1], valid[:, :1], own, places)
     assert not one.known
     few = valid.copy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Growth goes on while it pays, stops when it does not; noise of single photos decides nothing."""
+"""Selection of growth: continues while it pays, stops otherwise, robust against noisy photos."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A degree is asked for where colours depend on the view, and not where photos differ otherwise."""
+"""Selection of the SH degree: view-dependent colours against other differences of photos."""
 
 from __future__ import annotations
 
@@ -226,8 +226,8 @@ def test_the_record_names_degree_and_figures() -> None:
     gloss = select_harmonics(untrained(glossy(1)), *split(photographed(glossy(1))), 1, threads=1)
     decision = gloss.decision()
     assert decision.chosen == "degree 1"
-    assert f"On {100 * gloss.share:.1f} % of the well-seen surface" in decision.evidence
-    assert f"judged on {VIEWS} photos" in decision.evidence
+    assert f"on {100 * gloss.share:.1f} % of the well-observed surface" in decision.evidence
+    assert f"cross-validated on {VIEWS} photos" in decision.evidence
     assert decision.figures["share"] == gloss.share
     assert decision.figures["limit_share"] == NEEDED_SHARE
     assert decision.figures["gain_db"] == gloss.gain_db

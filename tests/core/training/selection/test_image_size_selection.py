@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sharp photos keep their size, blurred and enlarged ones do not, noise is not taken for detail."""
+"""Selection of the image size: sharp, blurred, enlarged and noisy photos."""
 
 from __future__ import annotations
 
@@ -102,11 +102,11 @@ def test_half_of_the_photos_decide() -> None:
     assert "320 px" in decision.evidence
     assert decision.figures["detail"] == 0.001
     assert evidence.photos == 3
-    assert "nothing finer" not in select_image_size([fine]).decision().evidence
+    assert "hold all of their detail" not in select_image_size([fine]).decision().evidence
     with pytest.raises(ValueError, match="no photo"):
         select_image_size([])
 
 
 def test_photos_of_several_sizes_are_not_taken_for_halved_ones() -> None:
     details = [PhotoDetail(side, side, 0.03, 0.01) for side in (794, 790, 790)]
-    assert "nothing finer" not in select_image_size(details).decision().evidence
+    assert "hold all of their detail" not in select_image_size(details).decision().evidence

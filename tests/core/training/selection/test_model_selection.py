@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Decisions are kept with their evidence, in order, and a setting overrides them."""
+"""Model selection: decisions with evidence, their order, overriding settings."""
 
 from __future__ import annotations
 
