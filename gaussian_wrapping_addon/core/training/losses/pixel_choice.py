@@ -144,7 +144,7 @@ def _pick(
     """Write the pixel selected by each stratum's draw, without duplicates; return their number."""
     height, width = steepness.shape
     stratum = total / len(jitter)
-    found, asked, running = 0, 0, 0.0
+    found, drawn, running = 0, 0, 0.0
     for top in range(0, height, BLOCK_PX):
         for left in range(0, width, BLOCK_PX):
             for i in range(top, min(top + BLOCK_PX, height)):
@@ -153,8 +153,8 @@ def _pick(
                         continue
                     running += steepness[i, j] + even
                     hit = False
-                    while asked < len(jitter) and (asked + jitter[asked]) * stratum < running:
-                        asked += 1
+                    while drawn < len(jitter) and (drawn + jitter[drawn]) * stratum < running:
+                        drawn += 1
                         hit = True
                     if hit:
                         chosen[found] = i * width + j

@@ -336,9 +336,9 @@ def _consensus(parts: Sequence[LogGains], values: np.ndarray, known: np.ndarray)
     if not rows:
         return values
     stacked = np.stack(rows)  # (parts, known, 3)
-    said = np.isfinite(stacked[..., 0]).any(axis=0)
+    covered = np.isfinite(stacked[..., 0]).any(axis=0)
     consensus = values.copy()
-    consensus[said] = np.nanmedian(stacked[:, said], axis=0)
+    consensus[covered] = np.nanmedian(stacked[:, covered], axis=0)
     return consensus - np.median(consensus, axis=0)
 
 

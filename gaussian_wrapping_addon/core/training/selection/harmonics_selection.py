@@ -69,7 +69,7 @@ class HarmonicsEvidence:
     well_seen: float
     """Share of the visible surface that is well observed."""
     needed: bool
-    judged: int
+    evaluated: int
     """Photos used for evaluation; 0 if there were too few."""
     coefficients: np.ndarray | None
     """(n, (degree + 1)^2, 3) float32: all harmonics fitted to all training views, an initial value
@@ -93,16 +93,16 @@ class HarmonicsEvidence:
             "gain_db": self.gain_db,
             "well_seen": self.well_seen,
             "degree_tried": float(self.degree),
-            "photos": float(self.judged),
+            "photos": float(self.evaluated),
         }
-        if not self.judged:
+        if not self.evaluated:
             evidence = "Too few photos to tell whether colours depend on the viewing direction."
         else:
             evidence = (
                 f"View-dependent colours of degree {self.degree} visibly lower the error by "
                 f"{100 * MIN_RELATIVE_REDUCTION:.0f} % or more on {100 * self.share:.1f} % of the "
                 f"well-observed surface (threshold {100 * NEEDED_SHARE:.1f} %), cross-validated on "
-                f"{self.judged} photos."
+                f"{self.evaluated} photos."
             )
         return Decision("harmonics", setting, f"degree {degree}", evidence, figures)
 
@@ -155,14 +155,17 @@ def select_harmonics(
     if not 1 <= degree <= MAX_DEGREE:
         raise UsageError(f"Degree {degree} cannot be tried.", f"Give 1 to {MAX_DEGREE}.")
     threads, check = threads or default_threads(), check or _no_check
-    fitted, judging = _evenly_spaced(views, MAX_FIT_VIEWS), _evenly_spaced(held_out, MAX_HELD_OUT)
+    fitted, evaluation_views = (
+        _evenly_spaced(views, MAX_FIT_VIEWS),
+        _evenly_spaced(held_out, MAX_HELD_OUT),
+    )
     unknown = HarmonicsEvidence(degree, 0.0, 0.0, 0.0, False, 0, None)
     halves = _halves(fitted)
     if min(len(half) for half in halves) < MIN_FIT_VIEWS or len(gaussians) == 0:
         return unknown
-    shown = summed_weights(gaussians, [*fitted, *judging], threads, check)
+    shown = summed_weights(gaussians, [*fitted, *evaluation_views], threads, check)
     statistics = _ErrorStatistics(len(gaussians))
-    for half, other, apart in zip(halves, reversed(halves), _halves(judging), strict=True):
+    for half, other, apart in zip(halves, reversed(halves), _halves(evaluation_views), strict=True):
         trial = HarmonicsTrial(gaussians, half, degree, shown, threads, check)
         trial.fit_lower_degrees()
         without, with_degree = trial.fit(degree - 1, degree)
@@ -180,9 +183,9 @@ def select_harmonics(
         trial = HarmonicsTrial(gaussians, fitted, degree, shown, threads, check)
         trial.fit_lower_degrees()
         (coefficients,) = trial.fit(degree)
-    judged = len(fitted) + len(judging)
+    evaluated = len(fitted) + len(evaluation_views)
     return HarmonicsEvidence(
-        degree, share, statistics.gain_db(), well_seen, needed, judged, coefficients
+        degree, share, statistics.gain_db(), well_seen, needed, evaluated, coefficients
     )  # fmt: skip
 
 

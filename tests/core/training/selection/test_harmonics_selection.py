@@ -92,7 +92,7 @@ def test_a_glossy_scene_asks_for_its_degree_and_a_matte_one_does_not() -> None:
     assert not matte.needed
     assert matte.share < 0.01
     assert matte.coefficients is None
-    assert gloss.judged == matte.judged == VIEWS
+    assert gloss.evaluated == matte.evaluated == VIEWS
     assert gloss.well_seen > 0.8
 
 
@@ -114,8 +114,8 @@ def test_held_out_photos_judge_and_are_never_fitted_to() -> None:
     darker = [dataclasses.replace(v, photo=0.8 * v.photo) for v in held_out]
     honest, spoiled = (select_harmonics(start, train, h, 1, threads=1) for h in (held_out, darker))
     without = select_harmonics(start, train, [], 1, threads=1)
-    assert honest.judged == VIEWS
-    assert without.judged == len(train)
+    assert honest.evaluated == VIEWS
+    assert without.evaluated == len(train)
     assert without.needed
     assert spoiled.gain_db < honest.gain_db
     assert honest.coefficients is not None
@@ -133,7 +133,7 @@ def test_wrong_places_are_not_taken_for_gloss_and_do_not_hide_it() -> None:
         start = untrained(matte)
         bent = start.replaced(means=start.means + shift)
         evidence = select_harmonics(bent, *split(photographed(truth)), 1, threads=1)
-        assert evidence.judged == VIEWS
+        assert evidence.evaluated == VIEWS
         shares.append(evidence.share)
     assert shares[0] < 0.5 * NEEDED_SHARE
     assert shares[1] > 0.5
@@ -192,7 +192,7 @@ def test_masked_pixels_count_nowhere() -> None:
         spoiled.append(dataclasses.replace(view, photo=photo, mask=mask))
     first = select_harmonics(start, *split(clean), 1, threads=1)
     second = select_harmonics(start, *split(spoiled), 1, threads=1)
-    assert first.judged == VIEWS
+    assert first.evaluated == VIEWS
     assert first.gain_db != 0.0
     assert first == second
 
@@ -208,7 +208,9 @@ def test_the_result_does_not_depend_on_the_threads() -> None:
 
 def unknown(evidence: HarmonicsEvidence) -> bool:
     return (
-        not evidence.needed and evidence.judged == 0 and evidence.gain_db == evidence.share == 0.0
+        not evidence.needed
+        and evidence.evaluated == 0
+        and evidence.gain_db == evidence.share == 0.0
     )
 
 
