@@ -19,7 +19,7 @@ import trimesh
 
 from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.field.isosurface_residual import level_errors
+from gaussian_wrapping_addon.core.field.isosurface_residual import isosurface_residuals
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.files import finite, read_json, write_json
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
@@ -114,7 +114,7 @@ def judge(
     field = VacancyField(trained.gaussians.arrays(), trained.scene.cameras, threads=threads)
     points = mesh.vertices[inner(trained.region, mesh.vertices)]
     values: dict[str, Any] = {
-        "level": level_errors(field, points),
+        "level": isosurface_residuals(field, points),
         "distance": distances(mesh, reference, trained.region),
         "reference_vertices": len(reference.vertices),
         **solidity(mesh),

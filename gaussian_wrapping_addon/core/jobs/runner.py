@@ -216,7 +216,7 @@ def _run_meshing(
         import numpy as np
 
         from ..dataset.scene_file import load_saved_scene
-        from ..field.depth_samples import find_sightings
+        from ..field.depth_samples import sample_depth_maps
         from ..field.vector_field import VectorField
         from ..gaussians.gaussian_file import load_gaussians
         from ..mesh.mesh_file import save_mesh
@@ -241,7 +241,7 @@ def _run_meshing(
             scene, arrays, region, job.settings.training, meshing, threads=threads,
             device=str(gaussians.means.device),
         )  # fmt: skip
-        sightings = find_sightings(
+        depth_samples = sample_depth_maps(
             gaussians, scene.cameras, lambda points: region.contains(points, 0.0),
             progress.span(0.0, 0.15), threads=threads,
         )  # fmt: skip
@@ -249,14 +249,14 @@ def _run_meshing(
             mesh, expected = mesh_by_pivots_in_stage(
                 stage_folder, vacancy, arrays, scene.cameras, region, meshing,
                 progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
-                sightings=sightings,
+                depth_samples=depth_samples,
             )  # fmt: skip
         else:
             mesh, expected = mesh_in_stage(
                 stage_folder, vacancy, VectorField(arrays, threads=threads), arrays, scene.cameras,
                 region, meshing, progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
                 edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
-                sightings=sightings,
+                depth_samples=depth_samples,
                 origin=tiles_origin(cameras.folder, trained.folder, job.settings),
             )  # fmt: skip
         mesh, dense = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))

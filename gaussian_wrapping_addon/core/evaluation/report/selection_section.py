@@ -38,8 +38,8 @@ def needs_lines(training: dict[str, Any]) -> list[str]:
     ----------
     training : dict
         The report's training figures; its entry ``decisions`` holds what
-        :meth:`~.model_selection.Needs.to_json` wrote. Entries of newer versions are shown as they
-        are.
+        :meth:`~.model_selection.ModelSelection.to_json` wrote. Entries of newer versions are shown
+        as they are.
     """
     decisions = [part(entry) for entry in items(training.get("decisions"))]
     decisions = [entry for entry in decisions if entry.get("name")]

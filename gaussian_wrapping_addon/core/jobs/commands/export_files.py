@@ -302,7 +302,7 @@ def _write_splat(
 ) -> Path:
     from ...gaussians.splat_ply import read_splat_ply, write_viewer_ply
     from ...texture.files.file_checks import writing
-    from ...training.initialisation.splat_motion import move_gaussians
+    from ...training.initialisation.splat_transform import transform_gaussians
 
     found = read_splat_ply(_splat_of(request.result))
     target_from_scene = blender_from_scene if request.placed else world_from_scene
@@ -310,7 +310,7 @@ def _write_splat(
     if not request.placed:
         offset = file_offset(target_from_scene.points(found.gaussians.means.double().numpy()))
     frame = FileFrame("splat", target_from_scene, offset)
-    moved = move_gaussians(found.gaussians, frame.file_from_scene())
+    moved = transform_gaussians(found.gaussians, frame.file_from_scene())
     path = request.out / SPLAT_NAME
     with writing(path):
         write_viewer_ply(path, moved)

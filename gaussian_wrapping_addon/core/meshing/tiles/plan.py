@@ -67,7 +67,7 @@ class TilePlan:
     target: int
     share: float
     """Vertices that stay, as for :func:`.primal_adaptive.selected`: 0 and 1 keep all."""
-    sightings: int = 0
+    depth_samples: int = 0
 
     @property
     def radius(self) -> float:
@@ -102,7 +102,7 @@ def make_plan(
     seed: int,
     cameras: Sequence[Camera],
     adaptive: bool,
-    sightings: int,
+    depth_samples: int,
 ) -> TilePlan:
     """Decide everything that tiles share.
 
@@ -147,5 +147,5 @@ def make_plan(
     return TilePlan(
         region, surface, sampler.area, spacing, tiling, fillers.points, fillers.ball, caps, seed,
         (*wanted.request.notes, *notes), nominal_edge(request, sampler.area, region), wanted.target,
-        wanted.share, sightings,
+        wanted.share, depth_samples,
     )  # fmt: skip
