@@ -21,7 +21,7 @@ from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protoco
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
 from gaussian_wrapping_addon.core.field.isosurface_residual import isosurface_residuals
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
-from gaussian_wrapping_addon.core.files import finite, read_json, write_json
+from gaussian_wrapping_addon.core.files import finite_json, read_json, write_json
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
 from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
@@ -121,7 +121,7 @@ def judge(
     }
     if (scene_folder / "truth.npz").is_file():
         values["truth"] = against_truth(mesh, trained, scene_folder, threads)
-    return dict(finite(values))
+    return dict(finite_json(values))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

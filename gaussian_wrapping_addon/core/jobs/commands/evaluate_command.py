@@ -26,7 +26,7 @@ from ...errors import (
     ParseError,
     UsageError,
     WorkerError,
-    cannot_be_written,
+    unwritable_error,
 )
 from ...files import read_json, write_json
 from ...processes.helper_process import child_command, emit
@@ -142,7 +142,7 @@ def _refuse_output(out: Path) -> None:
         raise UsageError(f"{out} is a folder.", "Give a file for the figures.")
     if not (out.parent.is_dir() and os.access(out.parent, os.W_OK)):
         reason = errno.EACCES if out.parent.is_dir() else errno.ENOENT
-        raise cannot_be_written(out, OSError(reason, os.strerror(reason)))
+        raise unwritable_error(out, OSError(reason, os.strerror(reason)))
 
 
 def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
