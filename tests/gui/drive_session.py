@@ -146,7 +146,9 @@ def wrap() -> Iterator[float]:
             seen.append(status.fraction)
         if not stages or status.stage != stages[-1]:
             stages.append(status.stage)
-        pictures = driving.module("ops.jobs.live_preview").icons_of(bpy.context.scene.gwrap.job_folder)
+        pictures = driving.module("ops.jobs.live_preview").icons_of(
+            bpy.context.scene.gwrap.job_folder
+        )
         if status.stage == "train" and pictures and not photographed:
             yield 1.0
             screenshot("2-training")

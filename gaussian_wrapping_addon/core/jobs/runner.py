@@ -220,10 +220,10 @@ def _run_meshing(
         from ..field.vector_field import VectorField
         from ..gaussians.gaussian_file import load_gaussians
         from ..mesh.mesh_file import save_mesh
-        from ..meshing.checks.mesh_check import check_mesh
+        from ..meshing.checks.manifold_check import validate_manifold
         from ..meshing.checks.mesh_statistics import mesh_statistics
         from ..meshing.cleanup.clean_up import clean_up
-        from ..meshing.cleanup.open_boundary import opened
+        from ..meshing.cleanup.open_boundary import without_caps
         from ..regions.region import write_region
         from .stages.region_field import field_figures, region_field, requested_region
         from .stages.region_meshing import (
@@ -262,9 +262,9 @@ def _run_meshing(
         mesh, dense = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
         open_at = region if meshing.boundary == "open" else None
         if open_at is not None:
-            mesh = opened(mesh, open_at, meshing.min_component_share)
+            mesh = without_caps(mesh, open_at, meshing.min_component_share)
             if dense is not None:
-                dense = opened(dense, open_at, meshing.min_component_share)
+                dense = without_caps(dense, open_at, meshing.min_component_share)
         mesh.provenance.update(field_figures(vacancy))
         if not np.isfinite(mesh.vertices).all():
             raise MeshingError(
@@ -279,7 +279,7 @@ def _run_meshing(
         progress.update(0.97, "measuring the mesh")
         return {
             "statistics": mesh_statistics(mesh).to_json(),
-            "check": check_mesh(mesh.vertices, mesh.faces, open_at).to_json(),
+            "check": validate_manifold(mesh.vertices, mesh.faces, open_at).to_json(),
             "provenance": mesh.provenance,
             "edge_length_world": meshing.edge_length,
             "estimate": expected,

@@ -134,11 +134,11 @@ def expected_by_pivots(
     meshing: MeshingSettings,
     depth_samples: DepthSamples,
 ) -> PivotEstimate:
-    """Estimate the mesh of a region by pivots from the Gaussians and sightings in it."""
+    """Estimate the mesh of a region by pivots from the Gaussians and depth_samples in it."""
     from ...meshing.cost.mesh_estimate import evaluation_seconds
-    from ...meshing.cost.pivot_estimate import estimate_pivots
+    from ...meshing.cost.pivot_estimate import estimate_pivot_mesh
 
-    return estimate_pivots(
+    return estimate_pivot_mesh(
         arrays, region, meshing.pivots, len(depth_samples),
         evaluation_s=evaluation_seconds(vacancy, depth_samples.points),
     )  # fmt: skip
@@ -154,10 +154,10 @@ def expected_mesh(
 ) -> MeshEstimate:
     """Estimate the mesh of a region from where the cameras see its surface."""
     from ...meshing.cost.mesh_estimate import (
-        area_of,
+        box_counting_area,
         estimate_mesh,
         evaluation_seconds,
-        occupied_boundary,
+        occupied_boundary_area,
     )
     from ...meshing.points.resolution import checked_request
     from ...meshing.points.spacing import resolved_edges
@@ -165,8 +165,8 @@ def expected_mesh(
     adaptive = meshing.spacing == "adaptive"
     some = depth_samples.points[:: max(1, len(depth_samples) // MOST_LOOKED_UP)]
     return estimate_mesh(
-        area_of(depth_samples.points),
-        occupied_boundary(region, vacancy.is_empty),
+        box_counting_area(depth_samples.points),
+        occupied_boundary_area(region, vacancy.is_empty),
         checked_request(edge_length_scene, meshing.points, region),
         adaptive=adaptive,
         evaluation_s=evaluation_seconds(vacancy, depth_samples.points),
