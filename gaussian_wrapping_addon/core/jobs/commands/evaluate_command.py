@@ -119,7 +119,7 @@ def _show(raw: bytes) -> bool:
 def main(arguments: list[str]) -> int:
     """Evaluate ``arguments = [request as JSON]`` in this process; return the exit code."""
 
-    from ...texture.files.file_checks import writing
+    from ...texture.files.file_checks import write_errors
 
     def work() -> list[str]:
         request = json.loads(arguments[0])
@@ -128,7 +128,7 @@ def main(arguments: list[str]) -> int:
             _refuse_output(out)
         report, lines = _evaluate(request)
         if out is not None:
-            with writing(out):
+            with write_errors(out):
                 write_json(out, report)
             lines.append(f"written to {out}")
         return lines
