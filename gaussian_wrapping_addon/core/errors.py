@@ -13,7 +13,7 @@ EXIT_BAD_DATA = 3
 EXIT_RESOURCES = 4
 EXIT_CANCELLED = 5
 
-NO_ROOM = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
+DISK_FULL_ERRNOS = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
 """What systems say of a disk or a quota that is full."""
 
 
@@ -79,10 +79,10 @@ class ParseError(DatasetError):
         Where in it, such as ``"byte 120"``, ``"line 7"`` or ``"frames[3].file_path"``.
     """
 
-    def __init__(self, path: str | Path, place: str, message: str, hint: str = "") -> None:
-        super().__init__(f"{Path(path).name}, {place}: {message}", hint)
+    def __init__(self, path: str | Path, location: str, message: str, hint: str = "") -> None:
+        super().__init__(f"{Path(path).name}, {location}: {message}", hint)
         self.path = Path(path)
-        self.place = place
+        self.location = location
 
 
 class ResourceError(WrapError):
@@ -110,9 +110,9 @@ class MeshingError(WrapError):
     exit_code = EXIT_BAD_DATA
 
 
-def cannot_be_written(path: str | Path, error: OSError) -> ResourceError:
+def unwritable_error(path: str | Path, error: OSError) -> ResourceError:
     """Return the error of a place that cannot be written, whatever command meets it."""
-    if error.errno in NO_ROOM:
+    if error.errno in DISK_FULL_ERRNOS:
         return ResourceError(
             f"No room is left on the disk: {path} could not be written.", "Make room there."
         )

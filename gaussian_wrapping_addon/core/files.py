@@ -49,15 +49,15 @@ def overwrite_json(path: Path, values: Any) -> None:
         os.fsync(stream.fileno())
 
 
-def finite(values: Any) -> Any:
+def finite_json(values: Any) -> Any:
     """Return JSON values with ``None`` for every number that is not finite: JSON has none.
 
     Tuples become lists and keys text, as JSON would read them back.
     """
     if isinstance(values, dict):
-        return {str(key): finite(value) for key, value in values.items()}
+        return {str(key): finite_json(value) for key, value in values.items()}
     if isinstance(values, (list, tuple)):
-        return [finite(value) for value in values]
+        return [finite_json(value) for value in values]
     if isinstance(values, float) and not math.isfinite(values):
         return None
     return values

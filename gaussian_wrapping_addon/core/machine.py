@@ -38,7 +38,7 @@ _V1 = _GroupFiles("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inact
 _V2 = _GroupFiles("memory.max", "memory.current", "inactive_file")
 
 
-def processors() -> int:
+def processor_count() -> int:
     """Return the number of processors that this process may use, at least 1."""
     if hasattr(os, "sched_getaffinity"):
         return max(1, len(os.sched_getaffinity(0)))

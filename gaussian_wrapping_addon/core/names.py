@@ -63,8 +63,8 @@ def region_name(request: str, body: Any) -> str:
     """
     if request in AUTOMATIC_REGIONS:
         return request
-    text = _wanted_name(request, body)
-    clean = _replaced(text, r"A-Za-z0-9_-").strip("_")[:MAX_REGION_CHARACTERS]
+    text = _requested_name(request, body)
+    clean = _sanitise(text, r"A-Za-z0-9_-").strip("_")[:MAX_REGION_CHARACTERS]
     if not clean or clean.lower() in AUTOMATIC_REGIONS:
         text = json.dumps([request], separators=(",", ":"))
         return f"region_{hashlib.sha256(text.encode()).hexdigest()[:6]}"
@@ -72,7 +72,7 @@ def region_name(request: str, body: Any) -> str:
     return f"region_{clean}" if taken else clean
 
 
-def _wanted_name(request: str, body: Any) -> str:
+def _requested_name(request: str, body: Any) -> str:
     wanted = body.get("blender_object_name") if isinstance(body, dict) else None
     return wanted if isinstance(wanted, str) and wanted.strip() else Path(request).stem
 
@@ -94,7 +94,7 @@ def region_names(requests: Sequence[str], bodies: Mapping[str, Any]) -> list[str
     names = [region_name(request, bodies.get(request)) for request in requests]
     first: dict[str, str] = {}
     for request, name in zip(requests, names, strict=True):
-        wanted = _wanted_name(request, bodies.get(request))
+        wanted = _requested_name(request, bodies.get(request))
         other = first.get(name.lower())
         first[name.lower()] = wanted
         if other is not None:
@@ -111,12 +111,12 @@ def file_stem(region: str, level: int) -> str:
     No spaces, which OBJ readers do not agree on, and none of the names that Windows keeps for
     itself. What is too long is cut and ends with a number made of the whole.
     """
-    clean = _replaced(region, r"\w.-").strip("._") or "mesh"
+    clean = _sanitise(region, r"\w.-").strip("._") or "mesh"
     if is_reserved_name(clean):
         clean = f"mesh_{clean}"
     if len(clean.encode()) > MAX_STEM_BYTES:
         room = MAX_STEM_BYTES - _DIGITS - 1
-        clean = f"{clean.encode()[:room].decode(errors='ignore')}-{_number(region)}"
+        clean = f"{clean.encode()[:room].decode(errors='ignore')}-{_digest(region)}"
     return f"{clean}-lod{level}" if level else clean
 
 
@@ -131,18 +131,18 @@ def file_stems(meshes: Iterable[tuple[str, int]]) -> dict[tuple[str, int], str]:
     meshes : iterable of (region, level)
         All that the result holds, not those to be written alone.
     """
-    plain = {mesh: file_stem(*mesh) for mesh in meshes}
-    count = Counter([SPLAT_STEM, *(stem.casefold() for stem in plain.values())])
+    stems = {mesh: file_stem(*mesh) for mesh in meshes}
+    count = Counter([SPLAT_STEM, *(stem.casefold() for stem in stems.values())])
     return {
-        mesh: stem if count[stem.casefold()] == 1 else f"{stem}-{_number(f'{mesh[1]} {mesh[0]}')}"
-        for mesh, stem in plain.items()
+        mesh: stem if count[stem.casefold()] == 1 else f"{stem}-{_digest(f'{mesh[1]} {mesh[0]}')}"
+        for mesh, stem in stems.items()
     }
 
 
-def _replaced(text: str, kept: str) -> str:
+def _sanitise(text: str, kept: str) -> str:
     """Return a text with an underscore for each run of characters that are not kept."""
     return re.sub(f"[^{kept}]+", "_", text)
 
 
-def _number(name: str) -> str:
+def _digest(name: str) -> str:
     return hashlib.sha256(name.encode(errors="surrogatepass")).hexdigest()[:_DIGITS]

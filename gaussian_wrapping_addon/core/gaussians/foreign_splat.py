@@ -24,7 +24,7 @@ from ..report_warning import LEFT_OUT_HINT, ReportWarning
 from ..tolerances import QUATERNION_MIN_NORM
 from .initialisation import SH_C0
 from .model import OrientedGaussians
-from .splat_ply import MAX_LOG_SCALE, MOST_OPAQUE_LOGIT, harmonics_of
+from .splat_ply import MAX_LOG_SCALE, MAX_OPACITY_LOGIT, harmonics_of
 
 _logger = logging.getLogger(__name__)
 
@@ -89,19 +89,19 @@ def read_foreign_splat(path: Path) -> ForeignSplat:
         "orientation": columns(*features) if oriented else np.zeros((count, 4), dtype),
         "filter_3d": columns("filter_3D")[:, 0] if "filter_3D" in names else np.zeros(count, dtype),
     }
-    good = _sensible(arrays)
-    dropped = count - int(good.sum())
-    if not good.any():
+    valid = _is_valid(arrays)
+    dropped = count - int(valid.sum())
+    if not valid.any():
         raise ParseError(
             path, "body", f"none of the {count} Gaussians has sensible values.",
             "Export the splat again.",
         )  # fmt: skip
-    arrays = {name: array[good] for name, array in arrays.items()}
+    arrays = {name: array[valid] for name, array in arrays.items()}
     warnings = _warnings(header, arrays, dropped, count)
     _normalise(arrays, header.axes)
     tensors = {k: torch.from_numpy(np.ascontiguousarray(v, dtype)) for k, v in arrays.items()}
     facts = {
-        "splat_gaussians": int(good.sum()),
+        "splat_gaussians": int(valid.sum()),
         "splat_dropped": dropped,
         "splat_degree": header.degree,
         "splat_surfels": header.axes == 2,
@@ -126,14 +126,14 @@ def _harmonics(header: SplatHeader, columns: Any) -> np.ndarray:
     return harmonics_of(constant, rest)
 
 
-def _sensible(arrays: dict[str, np.ndarray]) -> np.ndarray:
+def _is_valid(arrays: dict[str, np.ndarray]) -> np.ndarray:
     """(n,) bool: finite, a rotation, a size that can be meant."""
-    good = np.ones(len(arrays["means"]), np.bool_)
+    valid = np.ones(len(arrays["means"]), np.bool_)
     for array in arrays.values():
-        good &= np.isfinite(array.reshape(len(array), -1)).all(axis=1)
-    good &= np.abs(arrays["quats"]).max(axis=1) > QUATERNION_MIN_NORM
-    good &= np.abs(arrays["log_scales"].max(axis=1)) < MAX_LOG_SCALE  # the longest axis
-    return good & (arrays["filter_3d"] >= 0)
+        valid &= np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+    valid &= np.abs(arrays["quats"]).max(axis=1) > QUATERNION_MIN_NORM
+    valid &= np.abs(arrays["log_scales"].max(axis=1)) < MAX_LOG_SCALE  # the longest axis
+    return valid & (arrays["filter_3d"] >= 0)
 
 
 def _warnings(
@@ -150,8 +150,8 @@ def _warnings(
         )
         out.append(ReportWarning("harmonics-left-out", text, LEFT_OUT_HINT))
     opacity, scales = arrays["opacity_logits"], arrays["log_scales"]
-    plain = (opacity >= 0) & (opacity <= 1) & (scales > 0).all(axis=1)
-    if plain.mean() > _ACTIVATED_SHARE and np.ptp(opacity) > 0:
+    activated = (opacity >= 0) & (opacity <= 1) & (scales > 0).all(axis=1)
+    if activated.mean() > _ACTIVATED_SHARE and np.ptp(opacity) > 0:
         text = (
             "Opacities and scales look like plain values; logits and logarithms are expected. "
             "If the mesh looks wrong, export the splat again in Inria's convention."
@@ -168,7 +168,7 @@ def _normalise(arrays: dict[str, np.ndarray], axes: int) -> None:
         log_scales = np.concatenate([log_scales, third.astype(log_scales.dtype)], axis=1)
     least = log_scales.max(axis=1, keepdims=True) + math.log(THINNEST_AXIS)
     arrays["log_scales"] = np.maximum(log_scales, least.astype(log_scales.dtype))
-    limit = MOST_OPAQUE_LOGIT
+    limit = MAX_OPACITY_LOGIT
     arrays["opacity_logits"] = np.clip(arrays["opacity_logits"], -limit, limit)
     quats = arrays["quats"]
     largest = np.abs(quats).max(axis=1, keepdims=True)  # (n, 1)

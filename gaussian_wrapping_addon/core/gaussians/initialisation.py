@@ -16,14 +16,14 @@ from ..dataset.scene import Scene
 from ..errors import DatasetError
 from .model import OrientedGaussians
 
-Photograph = Callable[[int], tuple[Camera, np.ndarray, np.ndarray | None]]
+PhotoLoader = Callable[[int], tuple[Camera, np.ndarray, np.ndarray | None]]
 """Gives camera, (h, w, 3) uint8 photo and (h, w) bool mask or ``None``, at a small size."""
 
-FIRST_OPACITY = 0.1
+INITIAL_OPACITY = 0.1
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 
-FEW_POINTS = 5000
+MIN_START_POINTS = 5000
 """With fewer sparse points, more are added until there are this many."""
 
 MAX_DISTANCE = 20.0 * tolerances.SCENE_RADIUS
@@ -40,13 +40,13 @@ _DEPTH_NEIGHBOURS = 4
 _DEPTH_JITTER = 0.05
 """Spread of the filled-up points around the depth of the nearest sparse points, share of it."""
 
-_TRIES = 8
+_DEPTH_TRIALS = 8
 
 
 def initial_gaussians(
     scene: Scene,
     view_indices: list[int],
-    photograph: Photograph,
+    load_photo: PhotoLoader,
     *,
     max_gaussians: int,
     sh_degree: int,
@@ -55,16 +55,16 @@ def initial_gaussians(
     """Return the Gaussians that training starts from (docs/method.md, section 1.3).
 
     One per sparse point: round, as large as the mean distance to its three nearest neighbours,
-    opacity 0.1, orientation zero. Where there are fewer than :data:`FEW_POINTS`, random pixels are
-    lifted to the depth of the nearest sparse points; where there are none, to a random depth,
-    keeping the positions that most cameras see.
+    opacity 0.1, orientation zero. Where there are fewer than :data:`MIN_START_POINTS`, random
+    pixels are lifted to the depth of the nearest sparse points; where there are none, to a random
+    depth, keeping the positions that most cameras see.
 
     Parameters
     ----------
     scene : Scene
     view_indices : list of int
         Views that may be looked at (not the held-out ones).
-    photograph : callable
+    load_photo : callable
         Gives camera, photo and mask of a view; only called where points are few.
     max_gaussians : int
         Never exceeded; a random choice of the points is taken.
@@ -92,16 +92,18 @@ def initial_gaussians(
     if len(points) > max_gaussians:
         chosen = np.sort(random.choice(len(points), max_gaussians, replace=False))
         points, colors = points[chosen], colors[chosen]
-    wanted = min(FEW_POINTS, max_gaussians) - len(points)
+    wanted = min(MIN_START_POINTS, max_gaussians) - len(points)
     if wanted > 0:
-        more_points, more_colors = _fill_up(points, wanted, view_indices, photograph, random)
+        more_points, more_colors = _points_along_rays(
+            points, wanted, view_indices, load_photo, random
+        )
         points = np.concatenate([points, more_points])
         colors = np.concatenate([colors, more_colors])
-    points = pull_in(points)
+    points = clamp_distances(points)
     return _gaussians_at(points, colors, _spacing(points, cameras), sh_degree)
 
 
-def pull_in(points: np.ndarray) -> np.ndarray:
+def clamp_distances(points: np.ndarray) -> np.ndarray:
     """Return points with their distance from the scene's middle capped at :data:`MAX_DISTANCE`."""
     distance = np.linalg.norm(points, axis=1, keepdims=True)
     return points * np.minimum(1.0, MAX_DISTANCE / np.maximum(distance, MAX_DISTANCE))
@@ -129,7 +131,7 @@ def _gaussians_at(
     sh[:, 0] = (colors - 0.5) / SH_C0
     quats = np.zeros((count, 4), np.float32)
     quats[:, 0] = 1.0
-    logit = math.log(FIRST_OPACITY / (1.0 - FIRST_OPACITY))
+    logit = math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))
     arrays = {
         "means": points,
         "log_scales": np.repeat(np.log(spacing)[:, None], 3, axis=1),
@@ -144,15 +146,15 @@ def _gaussians_at(
     )
 
 
-def _fill_up(
+def _points_along_rays(
     points: np.ndarray,
     wanted: int,
     view_indices: list[int],
-    photograph: Photograph,
+    load_photo: PhotoLoader,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``wanted`` more points with colours in [0, 1], taken from pixels of the photos."""
-    views = [photograph(i) for i in view_indices]
+    views = [load_photo(i) for i in view_indices]
     views = [view for view in views if view[2] is None or view[2].any()]
     if not views:
         raise DatasetError("The masks leave nothing of any photo.", "Check the masks.")
@@ -213,13 +215,13 @@ def _most_seen_depth(
         ],
         axis=1,
     )
-    for _ in range(_TRIES):
+    for _ in range(_DEPTH_TRIALS):
         # Uniform in inverse depth: as many positions near the cameras as a photo can tell apart.
         depth = 1.0 / random.uniform(1.0 / far, 1.0 / near, len(pixels))
-        places = (rays * depth[:, None]) @ camera.rotation + camera.center
+        positions = (rays * depth[:, None]) @ camera.rotation + camera.center
         seen = np.zeros(len(pixels), int)
         for other in cameras:
-            where, z = other.project(places)
+            where, z = other.project(positions)
             seen += (
                 (z > tolerances.NEAR_Z)
                 & (where >= 0).all(axis=1)

@@ -30,7 +30,7 @@ _logger = logging.getLogger(__name__)
 MAX_LOG_SCALE = 40.0
 """Scales beyond e^40 cannot be meant; such Gaussians are dropped."""
 
-MOST_OPAQUE_LOGIT = 30.0
+MAX_OPACITY_LOGIT = 30.0
 """Opacity logits of viewers' files end here and at its negative: sigmoid is 1 or 0 to 13 digits."""
 
 _FRAME_COMMENT = "world_from_scene"
@@ -70,17 +70,17 @@ def write_viewer_ply(path: Path, gaussians: OrientedGaussians) -> None:
     log_opacity = wide.log_opacities()
     # logit = log(a / (1 - a)), from log a without losing a close to 1
     logit = log_opacity - torch.log(-torch.expm1(log_opacity.clamp_max(-1e-12)))
-    logit = logit.clamp(-MOST_OPAQUE_LOGIT, MOST_OPAQUE_LOGIT)
+    logit = logit.clamp(-MAX_OPACITY_LOGIT, MAX_OPACITY_LOGIT)
     baked = wide.replaced(log_scales=torch.log(wide.scales()), opacity_logits=logit)
     arrays = {name: t.numpy() for name, t in baked.tensors()}
-    good = np.ones(len(arrays["means"]), np.bool_)
+    valid = np.ones(len(arrays["means"]), np.bool_)
     for name in ("means", "sh", "opacity_logits", "log_scales", "quats"):
         with np.errstate(over="ignore"):
-            single = arrays[name].reshape(len(good), -1).astype(np.float32)
-        good &= np.isfinite(single).all(axis=1)
-    if not good.all():
+            single = arrays[name].reshape(len(valid), -1).astype(np.float32)
+        valid &= np.isfinite(single).all(axis=1)
+    if not valid.all():
         raise MeshingError(
-            f"Gaussian {int(np.argmin(good))} of the splat to write is not finite.",
+            f"Gaussian {int(np.argmin(valid))} of the splat to write is not finite.",
             "Train the scene again.",
         )
     _write(path, standard_names(arrays["sh"].shape[1]), _standard_columns(arrays), [])
@@ -173,14 +173,14 @@ def _gaussians_of(path: Path, table: np.ndarray, comments: Sequence[str]) -> Spl
     at = {name: i for i, name in enumerate(wanted)}
     quats = values[:, at["rot_0"] : at["rot_0"] + 4]
     log_scales = values[:, at["scale_0"] : at["scale_0"] + 3]
-    good = np.isfinite(values).all(axis=1) & (quats != 0).any(axis=1)
-    good &= (log_scales < MAX_LOG_SCALE).all(axis=1) & (values[:, at["filter_3D"]] >= 0)
-    dropped = int(len(values) - good.sum())
+    valid = np.isfinite(values).all(axis=1) & (quats != 0).any(axis=1)
+    valid &= (log_scales < MAX_LOG_SCALE).all(axis=1) & (values[:, at["filter_3D"]] >= 0)
+    dropped = int(len(values) - valid.sum())
     if dropped:
         _logger.warning("%s: %d Gaussians with senseless values were dropped", path.name, dropped)
-    if not good.any():
+    if not valid.any():
         raise ParseError(path, "body", "no Gaussian has sensible values.", _HINT)
-    values, quats, log_scales = values[good], quats[good], log_scales[good]
+    values, quats, log_scales = values[valid], quats[valid], log_scales[valid]
     first = at["f_dc_0"]
     sh = harmonics_of(values[:, first : first + 3], values[:, first + 3 : first + 3 + rest])
     orientation = values[:, at["gaussian_features_0"] : at["gaussian_features_0"] + 4]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 
-PLACES_VARIABLE = "GAUSSIAN_WRAPPING_LPIPS"
+WEIGHTS_VARIABLE = "GAUSSIAN_WRAPPING_LPIPS"
 """Files, or folders that hold them, separated like PATH; looked through first."""
 BACKBONE_PATTERN = "alexnet-owt-*.pth"
 """How torchvision names the weights of AlexNet in torch's hub cache."""
@@ -168,7 +168,7 @@ def _find_files() -> tuple[Path, Path]:
     """Return the files of the backbone and of the heads."""
     import torch
 
-    given = [Path(p) for p in os.environ.get(PLACES_VARIABLE, "").split(os.pathsep) if p]
+    given = [Path(p) for p in os.environ.get(WEIGHTS_VARIABLE, "").split(os.pathsep) if p]
     cache = Path(torch.hub.get_dir()) / "checkpoints"
     package = importlib.util.find_spec("lpips")
     package_folder = Path(package.origin).parent if package and package.origin else None
@@ -183,13 +183,13 @@ def _find_files() -> tuple[Path, Path]:
     if backbone is None or heads is None:
         raise ResourceError(
             f"LPIPS is not measured: {', and '.join(missing)}.",
-            f"Put the files in a folder and name it in {PLACES_VARIABLE}; nothing is downloaded.",
+            f"Put the files in a folder and name it in {WEIGHTS_VARIABLE}; nothing is downloaded.",
         )
     return backbone, heads
 
 
-def _first_file(places: list[Path], pattern: str) -> Path | None:
-    for place in places:
+def _first_file(folders: list[Path], pattern: str) -> Path | None:
+    for place in folders:
         files = sorted(place.glob(pattern)) if place.is_dir() else [place]
         for file in files:
             if file.is_file() and file.match(pattern):

@@ -45,7 +45,7 @@ class _Runs:
         lanes = ir.Constant(ir.VectorType(_WORD, LANES), [0] * LANES)
         return self.builder.shuffle_vector(first, nothing, lanes)
 
-    def place(self, at: Any, step: Any, count: int) -> Any:
+    def tap_index(self, at: Any, step: Any, count: int) -> Any:
         return self.builder.add(at, self.builder.mul(step, ir.Constant(step.type, count)))
 
     def load(self, array_type: Any, array: Any, at: Any) -> Any:
@@ -77,8 +77,8 @@ def filter_run(typingctx, target, target_at, source, source_at, step, weights): 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         runs = _Runs(context, builder, sig.args[0].dtype)
         taps = [runs.splat(builder.extract_value(args[5], tap)) for tap in range(HALF)]
-        places = [runs.place(args[3], args[4], tap) for tap in range(TAPS)]
-        loaded = [runs.load(sig.args[2], args[2], place) for place in places]
+        indices = [runs.tap_index(args[3], args[4], tap) for tap in range(TAPS)]
+        loaded = [runs.load(sig.args[2], args[2], tap_index) for tap_index in indices]
         runs.store(runs.weighted(taps, loaded), sig.args[0], args[0], args[1])
         return context.get_dummy_value()
 
@@ -102,8 +102,8 @@ def filter_two_runs(  # type: ignore[no-untyped-def]
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         runs = _Runs(context, builder, sig.args[0].dtype)
         taps = [runs.splat(builder.extract_value(args[6], tap)) for tap in range(HALF)]
-        places = [runs.place(args[4], args[5], slot) for slot in slots]
-        loaded = [runs.load(sig.args[3], args[3], place) for place in places]
+        indices = [runs.tap_index(args[4], args[5], slot) for slot in slots]
+        loaded = [runs.load(sig.args[3], args[3], tap_index) for tap_index in indices]
         upper, lower = runs.weighted(taps, loaded[:TAPS]), runs.weighted(taps, loaded[1:])
         runs.store(upper, sig.args[0], args[0], args[1])
         runs.store(lower, sig.args[0], args[0], builder.add(args[1], args[2]))

@@ -66,7 +66,7 @@ def source_stamp(path: Path) -> str:
     return state.hexdigest()
 
 
-class _WatchesImports:
+class _ImportStamp:
     """A place for the cache whose content follows from :func:`source_stamp`."""
 
     _py_file: str
@@ -76,19 +76,19 @@ class _WatchesImports:
         return source_stamp(Path(self._py_file).resolve())
 
 
-class _ChosenFolder(_WatchesImports, caching.UserProvidedCacheLocator):
+class _ChosenFolder(_ImportStamp, caching.UserProvidedCacheLocator):
     """``NUMBA_CACHE_DIR``."""
 
 
-class _BesideSource(_WatchesImports, caching.InTreeCacheLocator):
+class _BesideSource(_ImportStamp, caching.InTreeCacheLocator):
     """``__pycache__`` beside the kernel's file."""
 
 
-class _UserFolder(_WatchesImports, caching.UserWideCacheLocator):
+class _UserFolder(_ImportStamp, caching.UserWideCacheLocator):
     """The user's cache folder."""
 
 
-class _Places(caching.CompileResultCacheImpl):
+class _CacheLocators(caching.CompileResultCacheImpl):
     """The places in order; raises ``RuntimeError`` where none can be written."""
 
     _locator_classes = [_ChosenFolder, _BesideSource, _UserFolder]  # noqa: RUF012 - as its base
@@ -97,7 +97,7 @@ class _Places(caching.CompileResultCacheImpl):
 class KernelCache(caching.FunctionCache):
     """The cache of one kernel; where it cannot be read or written any more, they work without."""
 
-    _impl_class = _Places
+    _impl_class = _CacheLocators
 
     def is_empty(self) -> bool:
         """Tell whether no machine code is kept that fits the present sources."""
@@ -123,14 +123,14 @@ class KernelCache(caching.FunctionCache):
             warn_without_cache(f"{type(error).__name__}: {error}")
 
 
-_told = threading.Event()
+_warned = threading.Event()
 
 
 def warn_without_cache(reason: str) -> None:
     """Tell once, not once a kernel, that kernels are not kept."""
-    if _told.is_set():
+    if _warned.is_set():
         return
-    _told.set()
+    _warned.set()
     _logger.warning(
         "Compiled kernels cannot be kept on disk, so each run compiles them anew, about a minute: "
         "%s. Set NUMBA_CACHE_DIR to a folder that can be written.",

@@ -14,14 +14,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from ..machine import processors
+from ..machine import processor_count
 
 CHUNKS_PER_THREAD = 16
 
 
 def default_threads() -> int:
     """Return the number of processors that this process may use."""
-    return processors()
+    return processor_count()
 
 
 @functools.lru_cache(maxsize=4)

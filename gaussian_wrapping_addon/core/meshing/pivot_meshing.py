@@ -26,11 +26,11 @@ from ..regions.convex_region import Region
 from ..report_warning import ReportWarning
 from ..settings import MeshingSettings
 from .cleanup.degenerate import remove_degenerate
-from .points.candidate_surface import no_surface, pivot_cloud
+from .points.candidate_surface import no_surface_error, pivot_cloud
 from .points.pivots import PIVOTS
 from .points.spacing import footprints
 from .tetrahedra.boundary_faces import tetrahedron_neighbours
-from .tetrahedra.delaunay import delaunay, far_points
+from .tetrahedra.delaunay import bounding_points, delaunay
 from .tetrahedra.marching_tetrahedra import bisect, marching_closed
 from .tetrahedra.tetrahedron_cut import cut_to_region
 
@@ -93,14 +93,14 @@ def mesh_by_pivots(
     cloud = pivot_cloud(
         arrays, region, vacancy.is_empty, seed, depth_samples, pivots_of=PIVOTS[settings.pivots]
     )
-    points = np.concatenate([cloud.points, far_points(cloud.points, seed)])
+    points = np.concatenate([cloud.points, bounding_points(cloud.points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
     cut = cut_to_region(points, tetrahedra, region)
     inside = _inside(vacancy, cut.points, cut.tetrahedra, progress.span(0.3, 0.5))
-    pairs, faces = marching_closed(cut.tetrahedra, tetrahedron_neighbours(cut.tetrahedra), inside)
+    edges, faces = marching_closed(cut.tetrahedra, tetrahedron_neighbours(cut.tetrahedra), inside)
     if len(faces) == 0:
-        raise no_surface(region)
-    begin, end = cut.points[pairs[:, 0]], cut.points[pairs[:, 1]]
+        raise no_surface_error(region)
+    begin, end = cut.points[edges[:, 0]], cut.points[edges[:, 1]]
     pixel = footprints((begin + end) / 2, cameras)  # (e,)
     limit = np.linalg.norm(end - begin, axis=1)
     limit = np.where(pixel > 0.0, np.minimum(limit, pixel), limit)

@@ -23,7 +23,7 @@ from .tiling.tiles import TileBinning
 from .types.gradients import ImageGradients
 from .types.images import Render, RenderStatistics
 from .types.options import RenderOptions
-from .view_renderer import ViewPass, ViewRenderer, band_view, take_screen
+from .view_renderer import ViewPass, ViewRenderer, allocate_screen, band_view
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 
@@ -100,7 +100,7 @@ class _Rasterize(torch.autograd.Function):
         images = Images.allocate(camera, options)
         view = _render_view(RawArrays.from_gaussians(gaussians), camera, options, images, buffers)
         if view.statistics is not None:
-            collected.append(_own(view.statistics))
+            collected.append(_copy_statistics(view.statistics))
         ctx.view, ctx.collected = view, collected
         ctx.camera, ctx.options = camera, options
         ctx.set_materialize_grads(False)
@@ -154,7 +154,7 @@ def _render_view(
     return view
 
 
-def _own(statistics: RenderStatistics) -> RenderStatistics:
+def _copy_statistics(statistics: RenderStatistics) -> RenderStatistics:
     """Return statistics that stay when the renderer's memory is used again."""
     copies = {
         item.name: getattr(statistics, item.name).copy()
@@ -167,7 +167,7 @@ def _own(statistics: RenderStatistics) -> RenderStatistics:
 def project_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> ScreenView:
     """Project and bin: everything of a view that comes before the pixels."""
     threads, store = options.threads or default_threads(), ArrayStore()
-    screen = project_gaussians(gaussians, camera, options, take_screen(len(gaussians), store))
+    screen = project_gaussians(gaussians, camera, options, allocate_screen(len(gaussians), store))
     binning = TileBinning(screen, camera.width, camera.height, threads, store)
     band = (0, binning.tiles_x * binning.tiles_y)
     return band_view(gaussians, camera, options, screen, binning.lists(*band), band, store)

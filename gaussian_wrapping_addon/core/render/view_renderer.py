@@ -27,8 +27,13 @@ from .projection.projection import (
     project_backward_visible,
     project_gaussians,
 )
-from .raster.blend import Images, RenderBuffers, ScreenView, blend, pair_gradients
-from .raster.pair_sums import add_pair_gradients, add_pair_weights, mark_seen, take_screen_gradients
+from .raster.blend import Images, RenderBuffers, ScreenView, blend, write_intersection_gradients
+from .raster.intersection_sums import (
+    add_intersection_gradients,
+    add_intersection_weights,
+    mark_visible,
+    write_screen_gradients,
+)
 from .simd.raster_math import ROW_VALUES, vector_lanes
 from .tiling.block_masks import mask_kernel
 from .tiling.tiles import TileBinning, TileLists
@@ -36,7 +41,7 @@ from .types.gradients import ImageGradients, VisibleGradients
 from .types.images import RenderStatistics
 from .types.options import RenderOptions
 
-PAIR_BYTES = 4 * ROW_VALUES + 32
+INTERSECTION_BYTES = 4 * ROW_VALUES + 32
 """Of one pair: its gradient, its place in the lists, which pixels it reaches, blending weights."""
 
 # What a tile costs besides its pairs, in pairs: clearing and writing its pixels.
@@ -44,7 +49,7 @@ _TILE_COST = 16
 _MAX_ZERO_IMAGES = 4
 
 
-def take_screen(count: int, store: ArrayStore) -> ScreenGaussians:
+def allocate_screen(count: int, store: ArrayStore) -> ScreenGaussians:
     """Return room for the projection of Gaussians, with any content."""
     return ScreenGaussians(
         store.take("params", (count, ROW_VALUES), np.float32),
@@ -143,8 +148,8 @@ class ViewPass:
         self.ids = binning.ids
         self.statistics: RenderStatistics | None = None
         self._threads = options.threads or default_threads()
-        self._most_pairs = max(1, options.budget_bytes // PAIR_BYTES)
-        self._bands = binning.bands(self._most_pairs)
+        self._max_intersections = max(1, options.budget_bytes // INTERSECTION_BYTES)
+        self._bands = binning.bands(self._max_intersections)
         self._listed: tuple[tuple[int, int], ScreenView] | None = None
 
     @property
@@ -155,13 +160,13 @@ class ViewPass:
     def _view(self, band: tuple[int, int]) -> ScreenView:
         """Return the view of a band; the lists of one band exist at a time."""
         if self._listed is None or self._listed[0] != band:
-            lists = self._binning.lists(*band, most_pairs=self._most_pairs)
+            lists = self._binning.lists(*band, max_intersections=self._max_intersections)
             gaussians, camera, options = self.gaussians, self._camera, self._options
             view = band_view(gaussians, camera, options, self.screen, lists, band, self._store)
             self._listed = band, view
         return self._listed[1]
 
-    def _over_seen(self) -> np.ndarray:
+    def _visible_bounds(self) -> np.ndarray:
         return even_bounds(len(self.ids), self._threads, 4 if self._threads > 1 else 1)
 
     def forward(self) -> None:
@@ -170,8 +175,10 @@ class ViewPass:
             self.statistics = self._first_statistics()
         for band in self._bands:
             view = self._view(band)
-            pairs = len(view.lists.gaussian_ids) if self._options.statistics else 0
-            weights = self._store.take("pair weights", (pairs, 2), np.float32, self._most_pairs)
+            intersections = len(view.lists.gaussian_ids) if self._options.statistics else 0
+            weights = self._store.take(
+                "intersection weights", (intersections, 2), np.float32, self._max_intersections
+            )
             blend(view, self._images, self._renderer.buffers, weights)
             if self._options.statistics:
                 self._add_weights(view.lists, weights)
@@ -191,11 +198,11 @@ class ViewPass:
         )
 
         def mark(begin: int, end: int) -> None:
-            mark_seen(
+            mark_visible(
                 begin, end, self.ids, self.screen.boxes, statistics.visible, statistics.radii_px
             )
 
-        run_chunks(mark, self._over_seen(), self._threads)
+        run_chunks(mark, self._visible_bounds(), self._threads)
         return statistics
 
     def _add_weights(self, lists: TileLists, weights: np.ndarray) -> None:
@@ -203,17 +210,17 @@ class ViewPass:
         assert statistics is not None
 
         def add(begin: int, end: int) -> None:
-            add_pair_weights(
+            add_intersection_weights(
                 begin,
                 end,
                 self.ids,
                 weights,
-                lists.pair_offsets,
+                lists.intersection_offsets,
                 statistics.weight_sum,
                 statistics.weight_max,
             )
 
-        run_chunks(add, self._over_seen(), self._threads)
+        run_chunks(add, self._visible_bounds(), self._threads)
 
     def backward(self, grads: ImageGradients) -> VisibleGradients:
         """Return the gradient with respect to the raw parameters of the seen Gaussians.
@@ -271,38 +278,45 @@ class ViewPass:
         for band in reversed(self._bands):
             view = self._view(band)
             lists = view.lists
-            pairs = store.take(
-                "pairs", (len(lists.gaussian_ids), ROW_VALUES), np.float32, self._most_pairs
+            intersections = store.take(
+                "intersections",
+                (len(lists.gaussian_ids), ROW_VALUES),
+                np.float32,
+                self._max_intersections,
             )
-            pair_gradients(
+            write_intersection_gradients(
                 view,
                 self._images,
                 incoming,
                 self._renderer.buffers,
-                pairs,
+                intersections,
                 depth=depth,
                 absolute=absolute,
             )
-            self._add_pairs(lists, pairs, grad_params, band == self._bands[-1])
+            self._add_intersections(lists, intersections, grad_params, band == self._bands[-1])
         if self.statistics is not None:
-            self._take_screen_gradients(self.statistics, grad_params)
+            self._write_screen_gradients(self.statistics, grad_params)
         return grad_params
 
-    def _add_pairs(
-        self, lists: TileLists, pairs: np.ndarray, grad_params: np.ndarray, fresh: bool
+    def _add_intersections(
+        self, lists: TileLists, intersections: np.ndarray, grad_params: np.ndarray, fresh: bool
     ) -> None:
         def add(begin: int, end: int) -> None:
-            add_pair_gradients(begin, end, self.ids, pairs, lists.pair_offsets, fresh, grad_params)
+            add_intersection_gradients(
+                begin, end, self.ids, intersections, lists.intersection_offsets, fresh, grad_params
+            )
 
-        run_chunks(add, self._over_seen(), self._threads)
+        run_chunks(add, self._visible_bounds(), self._threads)
 
-    def _take_screen_gradients(self, statistics: RenderStatistics, grad_params: np.ndarray) -> None:
+    def _write_screen_gradients(
+        self, statistics: RenderStatistics, grad_params: np.ndarray
+    ) -> None:
         def take(begin: int, end: int) -> None:
-            take_screen_gradients(
+            write_screen_gradients(
                 begin, end, self.ids, grad_params, statistics.grad_px, statistics.grad_abs_px
             )
 
-        run_chunks(take, self._over_seen(), self._threads)
+        run_chunks(take, self._visible_bounds(), self._threads)
 
     def _incoming(self, grads: ImageGradients) -> list[np.ndarray]:
         """Return the five gradients, zeros where there is none."""
@@ -370,7 +384,9 @@ class ViewRenderer:
         threads = options.threads or default_threads()
         store = self.store
         self.rendered += 1
-        screen = project_gaussians(gaussians, camera, options, take_screen(len(gaussians), store))
+        screen = project_gaussians(
+            gaussians, camera, options, allocate_screen(len(gaussians), store)
+        )
         binning = TileBinning(screen, camera.width, camera.height, threads, store)
         if images is None:
             images = Images.allocate(camera, options, store.take)

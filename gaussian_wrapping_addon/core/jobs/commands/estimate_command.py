@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ...errors import DatasetError
 from ...report_warning import ReportWarning
 from ..store.job_file import JobFile
-from .worker_call import answer
+from .worker_call import run_command
 
 if TYPE_CHECKING:
     from ...training.cost.training_estimate import SceneFacts
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def main(arguments: list[str]) -> int:
     """Estimate the job of ``arguments = [job file as JSON]``; return the exit code."""
-    return answer(lambda: _estimate(JobFile.from_json(json.loads(arguments[0]))))
+    return run_command(lambda: _estimate(JobFile.from_json(json.loads(arguments[0]))))
 
 
 def _estimate(job: JobFile) -> list[str | ReportWarning]:

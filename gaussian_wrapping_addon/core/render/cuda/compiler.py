@@ -105,7 +105,7 @@ def compile_text(
         if result != 0:
             raise DeviceError(
                 f"NVRTC {library.name} refused the kernels for compute capability "
-                f"{capability[0]}.{capability[1]}: {log or _words(nvrtc, result)}",
+                f"{capability[0]}.{capability[1]}: {log or _error_text(nvrtc, result)}",
                 "Report this message; rendering on the CPU works meanwhile.",
             )
         return CompiledText(_read(nvrtc, program, "CUBIN" if exact else "PTX"), log)
@@ -117,16 +117,16 @@ def _library_files() -> Iterable[Path]:
     folders: list[Path] = []
     for package in ("nvidia", "torch"):
         spec = importlib.util.find_spec(package)
-        for place in (spec.submodule_search_locations or ()) if spec is not None else ():
-            folders.append(Path(place) / "lib" if package == "torch" else Path(place))
+        for location in (spec.submodule_search_locations or ()) if spec is not None else ():
+            folders.append(Path(location) / "lib" if package == "torch" else Path(location))
     for variable in ("CUDA_PATH", "CUDA_HOME"):
         if os.environ.get(variable):
             folders += [Path(os.environ[variable]) / name for name in ("bin", "lib64", "lib")]
     for folder in folders:
-        for place, inside, names in os.walk(folder):
-            if len(Path(place).relative_to(folder).parts) >= _MAX_FOLDER_DEPTH:
-                inside.clear()
-            yield from (Path(place) / name for name in names if "nvrtc" in name)
+        for location, subfolders, names in os.walk(folder):
+            if len(Path(location).relative_to(folder).parts) >= _MAX_FOLDER_DEPTH:
+                subfolders.clear()
+            yield from (Path(location) / name for name in names if "nvrtc" in name)
 
 
 @functools.cache
@@ -160,10 +160,10 @@ def _read(nvrtc: ctypes.CDLL, program: ctypes.c_void_p, what: str) -> bytes:
     return buffer.raw
 
 
-def _words(nvrtc: ctypes.CDLL, result: int) -> str:
+def _error_text(nvrtc: ctypes.CDLL, result: int) -> str:
     return str((nvrtc.nvrtcGetErrorString(result) or b"unknown error").decode())
 
 
 def _check(nvrtc: ctypes.CDLL, result: int) -> None:
     if result != 0:
-        raise DeviceError(f"NVRTC failed: {_words(nvrtc, result)}.", _HINT)
+        raise DeviceError(f"NVRTC failed: {_error_text(nvrtc, result)}.", _HINT)

@@ -95,7 +95,7 @@ def render_with(
     count = len(gaussians)
     statistics = _empty_statistics(count) if options.statistics else None
     tensors = [getattr(gaussians, name) for name in _TRAINED]
-    with _enough_memory(camera):
+    with _translate_out_of_memory(camera):
         images = _Rasterize.apply(
             *tensors, kernels, gaussians, camera, options, statistics, budget_bytes
         )
@@ -104,7 +104,7 @@ def render_with(
 
 
 @contextlib.contextmanager
-def _enough_memory(camera: Camera) -> Iterator[None]:
+def _translate_out_of_memory(camera: Camera) -> Iterator[None]:
     """Turn torch's error of the GPU's memory into ours."""
     try:
         yield
@@ -168,7 +168,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        with _enough_memory(ctx.camera):
+        with _translate_out_of_memory(ctx.camera):
             return (*_backward(ctx, grads), *[None] * 6)
 
 
@@ -186,23 +186,25 @@ def _backward(ctx: Any, grads: tuple[Tensor | None, ...]) -> list[Tensor]:
     params = ctx.screen.params
     grad_params = torch.zeros_like(params)  # (n, 24)
     for band in ctx.bands:
-        pairs = params.new_empty((len(band.gaussian_ids), ROW_VALUES))
+        intersections = params.new_empty((len(band.gaussian_ids), ROW_VALUES))
         kernels.launch(
             name,
             band.tiles,
             params,
             band.start,
             band.gaussian_ids,
-            band.pair_slots,
+            band.intersection_slots,
             band.masks,
-            *_place(ctx.camera, band),
+            *_band_geometry(ctx.camera, band),
             *outputs,
             ctx.slope,
             *incoming,
-            pairs,
+            intersections,
         )
         blocks = -(-len(params) // WARPS)
-        kernels.launch("sum_pairs", blocks, len(params), pairs, band.pair_offsets, grad_params)
+        kernels.launch(
+            "sum_pairs", blocks, len(params), intersections, band.intersection_offsets, grad_params
+        )
     # A row that float32 could not hold counts as nothing.
     grad_params.masked_fill_(~grad_params.isfinite().all(1, keepdim=True), 0.0)
     if statistics is not None:
@@ -231,7 +233,7 @@ def _blend(
     images: _Images,
     sums: _WeightSums | None,
 ) -> None:
-    pair_weights = screen.params.new_zeros((len(band.gaussian_ids) if sums else 0, 2))
+    intersection_weights = screen.params.new_zeros((len(band.gaussian_ids) if sums else 0, 2))
     kernels.launch(
         "forward_tiles_weights" if sums else "forward_tiles",
         band.tiles,
@@ -240,24 +242,24 @@ def _blend(
         screen.skews,
         band.start,
         band.gaussian_ids,
-        band.pair_slots,
-        *_place(camera, band),
+        band.intersection_slots,
+        *_band_geometry(camera, band),
         *(float(value) for value in options.background),
         images.color,
         images.normal,
         images.geometric,
         images.alpha,
         band.masks,
-        pair_weights,
+        intersection_weights,
         images.strongest,
     )
     if sums:
-        sums.reached.logical_or_(band.pair_offsets.diff() > 0)
+        sums.reached.logical_or_(band.intersection_offsets.diff() > 0)
         kernels.launch_each(
             "sum_weights",
             len(screen.params),
-            pair_weights,
-            band.pair_offsets,
+            intersection_weights,
+            band.intersection_offsets,
             sums.weight_sum,
             sums.weight_max,
         )
@@ -269,7 +271,7 @@ def _blend(
             band.start,
             band.gaussian_ids,
             band.masks,
-            *_place(camera, band),
+            *_band_geometry(camera, band),
             float(options.depth_valid_transmittance),
             images.alpha,
             images.depth,
@@ -294,7 +296,7 @@ class _WeightSums:
         )
 
 
-def _place(camera: Camera, band: Band) -> tuple[int, int, int, int]:
+def _band_geometry(camera: Camera, band: Band) -> tuple[int, int, int, int]:
     """Return tiles in a row, the band's first row of tiles, and the image size in pixels."""
     tiles_x = -(-camera.width // tolerances.TILE_PX)
     return tiles_x, band.first_row, camera.width, camera.height

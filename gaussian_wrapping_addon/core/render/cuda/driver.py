@@ -113,7 +113,7 @@ def load_driver() -> ctypes.CDLL:
 def _check(cuda: ctypes.CDLL, function: str, *arguments: object) -> None:
     result = getattr(cuda, function)(*arguments)
     if result != 0:
-        words = ctypes.c_char_p()
-        cuda.cuGetErrorString(result, ctypes.byref(words))
-        text = (words.value or b"unknown error").decode(errors="replace")
+        description = ctypes.c_char_p()
+        cuda.cuGetErrorString(result, ctypes.byref(description))
+        text = (description.value or b"unknown error").decode(errors="replace")
         raise DeviceError(f"{function} of NVIDIA's driver failed: {text} ({result}).", _HINT)

@@ -24,7 +24,7 @@ KEPT_BYTES = 4 + 4 + 4 * WARPS
 """Of each pair between forward and backward: Gaussian, slot, masks of contributing pixels."""
 PASSING_BYTES = 4 * ROW_VALUES
 """Of each pair of a band at a time: its gradient row; binning needs less."""
-_MAX_PAIRS = 2**31 - 1
+_MAX_INTERSECTIONS = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Band:
     tiles: int
     start: Tensor  # (tiles + 1,) int64
     gaussian_ids: Tensor  # (pairs,) int32
-    pair_slots: Tensor  # (pairs,) int32
-    pair_offsets: Tensor  # (n + 1,) int64
+    intersection_slots: Tensor  # (pairs,) int32
+    intersection_offsets: Tensor  # (n + 1,) int64
     masks: Tensor  # (pairs, 8) int32: pixels of each warp that the Gaussian contributed to
 
 
@@ -129,30 +129,32 @@ def bin_bands(
     # Invisible rows have infinite depth and come last; ties keep the order of indices.
     order = torch.sort(screen.depths, stable=True).indices  # (n,) int64
     half = budget_bytes // 2
-    pairs_at_once = min(half // PASSING_BYTES, _MAX_PAIRS)
+    max_band_intersections = min(half // PASSING_BYTES, _MAX_INTERSECTIONS)
     kept = 0
     waiting = [(0, tiles_y)]
     while waiting:
         first_row, end_row = waiting.pop()
         counts = _count(kernels, screen, camera, first_row, end_row)
-        pairs = int(counts.sum())
-        if pairs > pairs_at_once:
+        intersections = int(counts.sum())
+        if intersections > max_band_intersections:
             if end_row - first_row == 1:
                 raise ResourceError(
-                    f"One row of tiles of view {camera.name!r} holds {pairs} pairs of Gaussian "
-                    f"and tile, {pairs_at_once} fit.",
+                    f"One row of tiles of view {camera.name!r} holds {intersections} tile "
+                    f"intersections; {max_band_intersections} fit.",
                     "Use smaller images or fewer Gaussians, or render on the CPU.",
                 )
             middle = (first_row + end_row) // 2
             waiting += [(middle, end_row), (first_row, middle)]
             continue
-        kept += pairs * KEPT_BYTES
+        kept += intersections * KEPT_BYTES
         if kept > half:
             raise ResourceError(
                 f"The tile lists of view {camera.name!r} need more than {half} bytes of the GPU.",
                 "Use smaller images or fewer Gaussians, or render on the CPU.",
             )
-        yield _list(kernels, screen, camera, order, counts, pairs, (tiles_x, first_row, end_row))
+        yield _list(
+            kernels, screen, camera, order, counts, intersections, (tiles_x, first_row, end_row)
+        )
 
 
 def _count(
@@ -182,20 +184,20 @@ def _list(
     camera: Camera,
     order: Tensor,
     counts: Tensor,
-    pairs: int,
-    place: tuple[int, int, int],
+    intersections: int,
+    tile_rows: tuple[int, int, int],
 ) -> Band:
-    tiles_x, first_row, end_row = place
+    tiles_x, first_row, end_row = tile_rows
     device = order.device
-    pair_offsets = _offsets(counts)
+    intersection_offsets = _offsets(counts)
     rank_offsets = _offsets(counts[order])
-    unsorted = torch.empty((3, pairs), dtype=torch.int32, device=device)
+    unsorted = torch.empty((3, intersections), dtype=torch.int32, device=device)
     kernels.launch_each(
         "list_pairs",
         len(order),
         order,
         rank_offsets,
-        pair_offsets,
+        intersection_offsets,
         screen.boxes,
         screen.skews,
         camera.width,
@@ -216,8 +218,8 @@ def _list(
         torch.searchsorted(by_tile.values, edges),
         unsorted[1][by_tile.indices],
         unsorted[2][by_tile.indices],
-        pair_offsets,
-        torch.zeros((pairs, WARPS), dtype=torch.int32, device=device),
+        intersection_offsets,
+        torch.zeros((intersections, WARPS), dtype=torch.int32, device=device),
     )
 
 

@@ -24,10 +24,10 @@ from .isosurface_steps import (
     approach_16,
     compact_8,
     compact_16,
+    drop_occluded_8,
+    drop_occluded_16,
     evaluate_8,
     evaluate_16,
-    lit_8,
-    lit_16,
     open_8,
     open_16,
     step_8,
@@ -37,7 +37,7 @@ from .isosurface_steps import (
 _NEWTON_STEPS = 8
 """From here on every second step is a bisection, which bounds the number of steps."""
 _MAX_STEPS = 80
-_NOBODY = np.uint64(0)
+_NO_PIXELS = np.uint64(0)
 
 
 @inline
@@ -56,24 +56,24 @@ def solve_block(lanes: Any, m: Any, b: Any, lists: Any, count: Any) -> None:
     lists : (n,) float32
         Entries of the block, ``count`` of them; none where no pixel has an isosurface. Reordered.
     """
-    is_open = _NOBODY
+    is_open = _NO_PIXELS
     if count > 0:
         is_open = open_16(m) if lanes == 16 else open_8(m)
-    if is_open != _NOBODY and m[NEAREST] <= ZERO:
+    if is_open != _NO_PIXELS and m[NEAREST] <= ZERO:
         # Some Gaussian may reach the camera: light must pass at depth 0 for a crossing to exist.
         if lanes == 16:
             evaluate_16(m, lists, count, ZERO)
-            is_open = lit_16(m)
+            is_open = drop_occluded_16(m)
         else:
             evaluate_8(m, lists, count, ZERO)
-            is_open = lit_8(m)
-    if is_open != _NOBODY:
+            is_open = drop_occluded_8(m)
+    if is_open != _NO_PIXELS:
         if lanes == 16:
             approach_16(m, lists, count)
         else:
             approach_8(m, lists, count)
     steps = 0
-    while is_open != _NOBODY and steps < _MAX_STEPS:
+    while is_open != _NO_PIXELS and steps < _MAX_STEPS:
         bisect = ONE if steps >= _NEWTON_STEPS and steps & 1 else ZERO
         narrowed = steps > 0 and steps & 1 == 0
         if lanes == 16:

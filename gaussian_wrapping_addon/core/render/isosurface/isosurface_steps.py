@@ -33,12 +33,12 @@ SOLVER_VALUES = 12 * TILE
 
 _NEWTON_FLOOR = 1e-6
 _LOG_2 = math.log(2.0)
-_LEAST_DEPTH = 1e-3
+_MIN_OPTICAL_DEPTH = 1e-3
 """Of -log T, where its logarithm is taken: far from 0.5 no slope is extrapolated."""
-_ROUGH_STEPS = 2
+_APPROXIMATE_STEPS = 2
 """Newton steps on a cheap likeness of T first: half the cost of a true one each."""
 # Halley's correction of a Newton step stays within these factors.
-_LEAST_BEND, _MOST_BEND = 0.5, 2.0
+_MIN_CORRECTION, _MAX_CORRECTION = 0.5, 2.0
 # Converged: the cube of the step, in units of the thinnest Gaussian's sigma along the ray, is below
 # this share of the depth, and the step itself small enough to extrapolate the slope ...
 _CUBE_SHARE, _STEP_SIGMAS = 2e-7, 0.003
@@ -56,7 +56,7 @@ NEGLIGIBLE = 30.0
 _TINY = 1e-30
 
 
-def entry_place(block: Block, number: Any) -> Any:
+def entry_index(block: Block, number: Any) -> Any:
     """Return where an entry of a list begins."""
     size = block.index(LIST_VALUES * block.lanes)
     return block.builder.mul(number, size, flags=("nuw", "nsw"))
@@ -89,9 +89,9 @@ def start_solver(
     ahead = (ratio.log() * -2.0 / crossing.sharpness.max(_TINY)).max(0.0).sqrt()
     low = block.splat(nearest).max(0.0)
     guess = crossing.peak - ahead
-    guess = (guess > low).choose(guess, (low + crossing.high) * 0.5)
+    guess = (guess > low).select(guess, (low + crossing.high) * 0.5)
     for value, plane in (
-        (crossed.choose(guess, 0.0), AT_DEPTH),
+        (crossed.select(guess, 0.0), AT_DEPTH),
         (1.0, SLOPES),
         (low, _LOW),
         (crossing.high, _HIGH),
@@ -99,7 +99,7 @@ def start_solver(
         (low, NEAREST),
         (1.0, _PREFIX),
         (crossing.sharpness.max(0.0).sqrt(), _AT_CROSSING),
-        (crossed.choose(1.0, 0.0), _OPEN),
+        (crossed.select(1.0, 0.0), _OPEN),
     ):
         block.store(value, state, block.index(plane))
     return crossed.bits()
@@ -123,9 +123,9 @@ class _Solver:
     def entry(self, lists: Any, number: Any) -> tuple[list[Any], list[Vector]]:
         """Return the places of an entry's columns, and the columns."""
         block = self.block
-        base = entry_place(block, number)
-        places = [block.offset(base, column * block.lanes) for column in range(LIST_VALUES)]
-        return places, [block.load(lists, place) for place in places]
+        base = entry_index(block, number)
+        offsets = [block.offset(base, column * block.lanes) for column in range(LIST_VALUES)]
+        return offsets, [block.load(lists, offset) for offset in offsets]
 
     def is_open(self) -> Mask:
         """Return which pixels are not solved."""
@@ -133,7 +133,7 @@ class _Solver:
 
     def set_open(self, is_open: Mask) -> Any:
         """Keep which pixels are not solved; return them as bits."""
-        self.write(is_open.choose(1.0, 0.0), _OPEN)
+        self.write(is_open.select(1.0, 0.0), _OPEN)
         return is_open.bits()
 
 
@@ -144,7 +144,7 @@ def _evaluate_intrinsic(lanes: int) -> Any:
             solver = _Solver(lanes, context, builder, sig, args)
             block, entries = solver.block, solver.block.data(sig.args[1], args[1])
             t = solver.read(AT_DEPTH) * block.splat(args[3])
-            product, slope, bend = (
+            product, slope, curvature = (
                 State(block, solver.read(_PREFIX)),
                 State(block, 0.0),
                 State(block, 0.0),
@@ -153,20 +153,20 @@ def _evaluate_intrinsic(lanes: int) -> Any:
             def multiply(n: Any) -> None:
                 _, (alpha, peak, sharpness) = solver.entry(entries, n)
                 ahead = (peak - t).max(0.0)
-                pull = sharpness * ahead
-                density = (alpha * exp_wide(pull * ahead, 0.5)).min(float(constants.ALPHA_MAX))
+                log_slope = sharpness * ahead
+                density = (alpha * exp_wide(log_slope * ahead, 0.5)).min(float(constants.ALPHA_MAX))
                 keep = 1.0 - density
-                rise = density * pull  # d(density) / dt
-                growth = density * (pull * pull - (ahead > 0.0).choose(sharpness, 0.0))
+                rise = density * log_slope  # d(density) / dt
+                growth = density * (log_slope * log_slope - (ahead > 0.0).select(sharpness, 0.0))
                 p, d = product.get(), slope.get()
-                bend.set(bend.get() * keep - (d * 2.0 * rise + p * growth))
+                curvature.set(curvature.get() * keep - (d * 2.0 * rise + p * growth))
                 slope.set(d * keep - p * rise)
                 product.set(p * keep)
 
             block.repeat(args[2], multiply)
             solver.write(product.get(), _PRODUCT)
             solver.write(slope.get(), _FIRST)
-            solver.write(bend.get(), _SECOND)
+            solver.write(curvature.get(), _SECOND)
             return context.get_dummy_value()
 
         index = types.intp
@@ -196,33 +196,33 @@ def _approach_intrinsic(lanes: int) -> Any:
             def multiply(n: Any) -> None:
                 _, (alpha, peak, sharpness) = solver.entry(entries, n)
                 ahead = (peak - guess.get()).max(0.0)
-                pull = sharpness * ahead
+                log_slope = sharpness * ahead
                 # (1 - x / 8)^8 in place of exp(-x).
-                fall = (1.0 - pull * ahead * (0.5 / 8.0)).max(0.0)
+                fall = (1.0 - log_slope * ahead * (0.5 / 8.0)).max(0.0)
                 fall = fall * fall
                 fall = fall * fall
                 density = (alpha * (fall * fall)).min(float(constants.ALPHA_MAX))
                 keep = 1.0 - density
-                slope.set(slope.get() * keep - product.get() * (density * pull))
+                slope.set(slope.get() * keep - product.get() * (density * log_slope))
                 product.set(product.get() * keep)
 
-            def turn(_: Any) -> None:
+            def iterate(_: Any) -> None:
                 product.set(1.0)
                 slope.set(0.0)
                 block.repeat(args[2], multiply)
                 t, light = guess.get(), product.get().max(_TINY)
                 above = light > constants.ISO_LEVEL
-                low.set(above.choose(t, low.get()))
-                high.set(above.choose(high.get(), t))
+                low.set(above.select(t, low.get()))
+                high.set(above.select(high.get(), t))
                 excess = _log_of_twice(light)
                 moved = t + excess * light / (slope.get() * -1.0).max(
                     sharpest * light * _NEWTON_FLOOR
                 )
                 inside = (moved > low.get()) & (moved < high.get())
-                guess.set(inside.choose(moved, (low.get() + high.get()) * 0.5))
+                guess.set(inside.select(moved, (low.get() + high.get()) * 0.5))
 
-            block.repeat(block.index(_ROUGH_STEPS), turn)
-            solver.write(solver.is_open().choose(guess.get(), 0.0), AT_DEPTH)
+            block.repeat(block.index(_APPROXIMATE_STEPS), iterate)
+            solver.write(solver.is_open().select(guess.get(), 0.0), AT_DEPTH)
             return context.get_dummy_value()
 
         return types.void(m, lists, types.intp), generate
@@ -246,11 +246,11 @@ def _compact_intrinsic(lanes: int) -> Any:
                 changes = (peak > low) & (alpha > 0.0) & (sharpness * behind * behind < NEGLIGIBLE)
                 matters = (changes & is_open).any()
                 target = builder.load(kept)
-                places, _ = solver.entry(entries, target)
-                for place, value in zip(places, (alpha, peak, sharpness), strict=True):
-                    block.store(value, entries, place)
+                offsets, _ = solver.entry(entries, target)
+                for offset, value in zip(offsets, (alpha, peak, sharpness), strict=True):
+                    block.store(value, entries, offset)
                 builder.store(builder.add(target, builder.zext(matters, target.type)), kept)
-                passed = (peak <= low).choose(1.0 - alpha.min(float(constants.ALPHA_MAX)), 1.0)
+                passed = (peak <= low).select(1.0 - alpha.min(float(constants.ALPHA_MAX)), 1.0)
                 factor = builder.select(matters, block.vector(1.0).value, passed.value)
                 prefix.set(prefix.get() * Vector(block, factor))
 
@@ -264,18 +264,18 @@ def _compact_intrinsic(lanes: int) -> Any:
     return compact
 
 
-def _lit_intrinsic(lanes: int) -> Any:
+def _drop_occluded_intrinsic(lanes: int) -> Any:
     @intrinsic
-    def lit(typingctx, m):  # type: ignore[no-untyped-def]
+    def drop_occluded(typingctx, m):  # type: ignore[no-untyped-def]
         def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
             solver = _Solver(lanes, context, builder, sig, args)
             is_open = solver.is_open() & (solver.read(_PRODUCT) > constants.ISO_LEVEL)
-            solver.write(is_open.choose(solver.read(AT_DEPTH), 0.0), AT_DEPTH)
+            solver.write(is_open.select(solver.read(AT_DEPTH), 0.0), AT_DEPTH)
             return solver.set_open(is_open)
 
         return types.uint64(m), generate
 
-    return lit
+    return drop_occluded
 
 
 def _open_intrinsic(lanes: int) -> Any:
@@ -304,12 +304,14 @@ def _step_intrinsic(lanes: int) -> Any:
             slope = solver.read(_FIRST) * inverse * -1.0
             growth = slope * slope - solver.read(_SECOND) * inverse
             floored = slope.max(sharpest * _NEWTON_FLOOR)
-            turns = 1.0 / floored
-            newton = excess * turns
-            move = newton / (newton * growth * turns * 0.5 + 1.0).max(_LEAST_BEND).min(_MOST_BEND)
+            inverse_slope = 1.0 / floored
+            newton = excess * inverse_slope
+            move = newton / (newton * growth * inverse_slope * 0.5 + 1.0).max(_MIN_CORRECTION).min(
+                _MAX_CORRECTION
+            )
             above = excess > 0.0
-            low = above.choose(t, low)
-            high = above.choose(high, t)
+            low = above.select(t, low)
+            high = above.select(high, t)
             moved = t + move
             size = move.abs()
             inside = (moved > low) & (moved < high) & (block.splat(args[1]) <= 0.0)
@@ -325,24 +327,24 @@ def _step_intrinsic(lanes: int) -> Any:
             # a sigma, the pixel stays where the slope is known, for its gradient must be that of
             # the depth that is stored. Rounding may put the step on the bracket's end, hence no
             # test for inside.
-            settled = small.choose(moved.max(low).min(high), t)
-            moved = done.choose(settled, inside.choose(moved, (low + high) * 0.5))
+            settled = small.select(moved.max(low).min(high), t)
+            moved = done.select(settled, inside.select(moved, (low + high) * 0.5))
             over = settled - t
-            depth = (_LOG_2 - excess).max(_LEAST_DEPTH)
+            depth = (_LOG_2 - excess).max(_MIN_OPTICAL_DEPTH)
             ratio = slope / depth
-            curl = (growth / depth - ratio * ratio) * over
-            gain = (ratio + curl * 0.5) * over
-            final = (ratio + curl) * depth * ((gain * 0.5 + 1.0) * gain + 1.0)
-            final = small.choose(final, slope)
+            ratio_change = (growth / depth - ratio * ratio) * over
+            gain = (ratio + ratio_change * 0.5) * over
+            final = (ratio + ratio_change) * depth * ((gain * 0.5 + 1.0) * gain + 1.0)
+            final = small.select(final, slope)
             # A layer thinner than a rounding of the depth: T jumps over 0.5 where it is flat.
             # Its gradient is lost; rather let it be too small than a thousand times too large.
             alone = solver.read(_AT_CROSSING)
             lost = (level > _LEVEL_FAR) & (slope < alone * _FLAT)
-            final = lost.choose(alone * 2.0, final.max(alone * tolerances.SLOPE_FLOOR))
+            final = lost.select(alone * 2.0, final.max(alone * tolerances.SLOPE_FLOOR))
             solver.write(low, _LOW)
             solver.write(high, _HIGH)
-            solver.write(is_open.choose(moved, t), AT_DEPTH)
-            solver.write(is_open.choose(final, solver.read(SLOPES)), SLOPES)
+            solver.write(is_open.select(moved, t), AT_DEPTH)
+            solver.write(is_open.select(final, solver.read(SLOPES)), SLOPES)
             return solver.set_open(is_open & ~done)
 
         return types.uint64(m, types.float32), generate
@@ -354,5 +356,5 @@ approach_8, approach_16 = _approach_intrinsic(8), _approach_intrinsic(16)
 evaluate_8, evaluate_16 = _evaluate_intrinsic(8), _evaluate_intrinsic(16)
 compact_8, compact_16 = _compact_intrinsic(8), _compact_intrinsic(16)
 open_8, open_16 = _open_intrinsic(8), _open_intrinsic(16)
-lit_8, lit_16 = _lit_intrinsic(8), _lit_intrinsic(16)
+drop_occluded_8, drop_occluded_16 = _drop_occluded_intrinsic(8), _drop_occluded_intrinsic(16)
 step_8, step_16 = _step_intrinsic(8), _step_intrinsic(16)

@@ -27,9 +27,9 @@ SCALE = 11 * BLOCK
 LOGIT = 14 * BLOCK
 FILTER = 15 * BLOCK
 # As activated:
-TURN = 16 * BLOCK
+ROTATION = 16 * BLOCK
 """Rotation, row by row."""
-KEPT = 25 * BLOCK
+RAW_SHARE = 25 * BLOCK
 """Share of each variance that is not the filter's."""
 OPACITY = 28 * BLOCK
 TRANSPARENCY = 29 * BLOCK
@@ -96,29 +96,33 @@ def activate_block(m: np.ndarray, camera: np.ndarray) -> None:
         sx, sy, sz = s * x, s * y, s * z
         wx, wy, wz = sx * w, sy * w, sz * w
         xx, xy, xz, yy, yz, zz = sx * x, sx * y, sx * z, sy * y, sy * z, sz * z
-        m[TURN + lane] = 1.0 - (yy + zz)
-        m[TURN + BLOCK + lane] = xy - wz
-        m[TURN + 2 * BLOCK + lane] = xz + wy
-        m[TURN + 3 * BLOCK + lane] = xy + wz
-        m[TURN + 4 * BLOCK + lane] = 1.0 - (xx + zz)
-        m[TURN + 5 * BLOCK + lane] = yz - wx
-        m[TURN + 6 * BLOCK + lane] = xz - wy
-        m[TURN + 7 * BLOCK + lane] = yz + wx
-        m[TURN + 8 * BLOCK + lane] = 1.0 - (xx + yy)
+        m[ROTATION + lane] = 1.0 - (yy + zz)
+        m[ROTATION + BLOCK + lane] = xy - wz
+        m[ROTATION + 2 * BLOCK + lane] = xz + wy
+        m[ROTATION + 3 * BLOCK + lane] = xy + wz
+        m[ROTATION + 4 * BLOCK + lane] = 1.0 - (xx + zz)
+        m[ROTATION + 5 * BLOCK + lane] = yz - wx
+        m[ROTATION + 6 * BLOCK + lane] = xz - wy
+        m[ROTATION + 7 * BLOCK + lane] = yz + wx
+        m[ROTATION + 8 * BLOCK + lane] = 1.0 - (xx + yy)
     # Raw variances of the three axes, one after the other.
-    for place in range(3 * BLOCK):
-        m[KEPT + place] = exp_wide(2.0 * m[SCALE + place])
+    for at in range(3 * BLOCK):
+        m[RAW_SHARE + at] = exp_wide(2.0 * m[SCALE + at])
     for lane in range(BLOCK):
         filter_sq = m[FILTER + lane] * m[FILTER + lane]
-        raw0, raw1, raw2 = m[KEPT + lane], m[KEPT + BLOCK + lane], m[KEPT + 2 * BLOCK + lane]
+        raw0, raw1, raw2 = (
+            m[RAW_SHARE + lane],
+            m[RAW_SHARE + BLOCK + lane],
+            m[RAW_SHARE + 2 * BLOCK + lane],
+        )
         variance0, variance1, variance2 = raw0 + filter_sq, raw1 + filter_sq, raw2 + filter_sq
         m[SCALE + lane] = variance0
         m[SCALE + BLOCK + lane] = variance1
         m[SCALE + 2 * BLOCK + lane] = variance2
         kept0, kept1, kept2 = raw0 / variance0, raw1 / variance1, raw2 / variance2
-        m[KEPT + lane] = kept0
-        m[KEPT + BLOCK + lane] = kept1
-        m[KEPT + 2 * BLOCK + lane] = kept2
+        m[RAW_SHARE + lane] = kept0
+        m[RAW_SHARE + BLOCK + lane] = kept1
+        m[RAW_SHARE + 2 * BLOCK + lane] = kept2
         odds = exp_wide(-m[LOGIT + lane])
         sigmoid = 1.0 / (1.0 + odds)
         m[OPACITY + lane] = math.sqrt(kept0 * kept1 * kept2) * sigmoid

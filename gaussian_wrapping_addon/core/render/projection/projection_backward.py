@@ -24,17 +24,17 @@ from .harmonics_kernels import BASIS_COUNT, direction_gradient
 from .projection_activation import (
     ACTIVATED_PLANES,
     BASIS,
-    KEPT,
     MEAN,
     OPACITY,
     ORIENTATION,
     QUAT,
+    RAW_SHARE,
     RAY,
+    ROTATION,
     SCALE,
     SLOPE,
     TANH,
     TRANSPARENCY,
-    TURN,
     activate_block,
     load_raw,
 )
@@ -101,12 +101,20 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         x, y, z = x + t0, y + t1, z + t2
         inverse_z = 1.0 / z
         u, v = x * inverse_z, y * inverse_z
-        a = in_camera(c, m[TURN + lane], m[TURN + 3 * BLOCK + lane], m[TURN + 6 * BLOCK + lane])
+        a = in_camera(
+            c, m[ROTATION + lane], m[ROTATION + 3 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
+        )
         b = in_camera(
-            c, m[TURN + BLOCK + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
+            c,
+            m[ROTATION + BLOCK + lane],
+            m[ROTATION + 4 * BLOCK + lane],
+            m[ROTATION + 7 * BLOCK + lane],
         )
         d = in_camera(
-            c, m[TURN + 2 * BLOCK + lane], m[TURN + 5 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
+            c,
+            m[ROTATION + 2 * BLOCK + lane],
+            m[ROTATION + 5 * BLOCK + lane],
+            m[ROTATION + 8 * BLOCK + lane],
         )
         var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
         w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
@@ -183,19 +191,19 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         # The rotation's columns are the axes in the scene frame.
         x, y = ga[3] + ga[1] + u * ga[0], ga[4] + ga[2] + v * ga[0]
         z = ga[5] + ga[0] - u * ga[1] - v * ga[2]
-        m[TURN + lane] = c[0] * x + c[3] * y + c[6] * z
-        m[TURN + 3 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
-        m[TURN + 6 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+        m[ROTATION + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[ROTATION + 3 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[ROTATION + 6 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
         x, y = gb[3] + gb[1] + u * gb[0], gb[4] + gb[2] + v * gb[0]
         z = gb[5] + gb[0] - u * gb[1] - v * gb[2]
-        m[TURN + BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
-        m[TURN + 4 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
-        m[TURN + 7 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+        m[ROTATION + BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[ROTATION + 4 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[ROTATION + 7 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
         x, y = gd[3] + gd[1] + u * gd[0], gd[4] + gd[2] + v * gd[0]
         z = gd[5] + gd[0] - u * gd[1] - v * gd[2]
-        m[TURN + 2 * BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
-        m[TURN + 5 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
-        m[TURN + 8 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+        m[ROTATION + 2 * BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[ROTATION + 5 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[ROTATION + 8 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
 
 
 @part(fast=False, fused=True)
@@ -209,10 +217,14 @@ def _raw_gradients(m: Any) -> None:
         inverse = 1.0 / math.sqrt(square)
         inverse = 0.0 if degenerate else inverse
         w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-        g00, g11, g22 = m[TURN + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
-        g01, g10 = m[TURN + BLOCK + lane], m[TURN + 3 * BLOCK + lane]
-        g02, g20 = m[TURN + 2 * BLOCK + lane], m[TURN + 6 * BLOCK + lane]
-        g12, g21 = m[TURN + 5 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
+        g00, g11, g22 = (
+            m[ROTATION + lane],
+            m[ROTATION + 4 * BLOCK + lane],
+            m[ROTATION + 8 * BLOCK + lane],
+        )
+        g01, g10 = m[ROTATION + BLOCK + lane], m[ROTATION + 3 * BLOCK + lane]
+        g02, g20 = m[ROTATION + 2 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
+        g12, g21 = m[ROTATION + 5 * BLOCK + lane], m[ROTATION + 7 * BLOCK + lane]
         skew_x, skew_y, skew_z = g21 - g12, g02 - g20, g10 - g01
         sum_xy, sum_xz, sum_yz = g01 + g10, g02 + g20, g12 + g21
         gw = x * skew_x + y * skew_y + z * skew_z
@@ -229,7 +241,11 @@ def _raw_gradients(m: Any) -> None:
         # d(effective log scale) = kept d(log scale); the filter also dims the opacity.
         g = m[_GRAD + 11 * BLOCK + lane] * m[OPACITY + lane]
         m[_GRAD_LOGIT + lane] = g * m[TRANSPARENCY + lane]
-        k0, k1, k2 = m[KEPT + lane], m[KEPT + BLOCK + lane], m[KEPT + 2 * BLOCK + lane]
+        k0, k1, k2 = (
+            m[RAW_SHARE + lane],
+            m[RAW_SHARE + BLOCK + lane],
+            m[RAW_SHARE + 2 * BLOCK + lane],
+        )
         m[_GRAD_SCALE + lane] = k0 * m[_GRAD_SCALE + lane] + (1.0 - k0) * g
         m[_GRAD_SCALE + BLOCK + lane] = k1 * m[_GRAD_SCALE + BLOCK + lane] + (1.0 - k1) * g
         m[_GRAD_SCALE + 2 * BLOCK + lane] = k2 * m[_GRAD_SCALE + 2 * BLOCK + lane] + (1.0 - k2) * g

@@ -30,9 +30,9 @@ from .projection_activation import (
     MEAN,
     OPACITY,
     ORIENTATION,
+    ROTATION,
     SCALE,
     TANH,
-    TURN,
     activate_block,
     load_raw,
 )
@@ -52,7 +52,7 @@ _FLOAT32_STEP = 2.0**-23
 # Boxes end here so that pixel ranges always fit an int32.
 _FARTHEST_PX = 1.0e9
 # Whatever its scales, a Gaussian with a smaller logit is fainter than 1/255; 1e-3 below the limit.
-_FAINT_LOGIT = -math.log(1.0 / _ALPHA_MIN - 1.0) - 1e-3
+_MIN_LOGIT = -math.log(1.0 / _ALPHA_MIN - 1.0) - 1e-3
 # Half axes of the ellipsoid at 1/255 in standard deviations, at most; with a margin for rounding.
 _REACH = math.sqrt(-2.0 * math.log(_ALPHA_MIN)) * (1.0 + 1e-6)
 
@@ -61,8 +61,8 @@ _PARAM = ACTIVATED_PLANES * BLOCK
 _BOX = _PARAM + PARAM_COLUMNS * BLOCK
 _DEPTH = _BOX + 4 * BLOCK
 _SKEW = _DEPTH + BLOCK
-_SEEN = _SKEW + BLOCK
-_PLANES = _SEEN // BLOCK + 1
+_VISIBLE = _SKEW + BLOCK
+_PLANES = _VISIBLE // BLOCK + 1
 
 
 @inline
@@ -108,13 +108,19 @@ def _project_shapes(m: Any, camera: Any) -> None:
         inverse_z = 1.0 / z
         u, v = x * inverse_z, y * inverse_z
         r00, r10, r20 = in_camera(
-            c, m[TURN + lane], m[TURN + 3 * BLOCK + lane], m[TURN + 6 * BLOCK + lane]
+            c, m[ROTATION + lane], m[ROTATION + 3 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
         )
         r01, r11, r21 = in_camera(
-            c, m[TURN + BLOCK + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
+            c,
+            m[ROTATION + BLOCK + lane],
+            m[ROTATION + 4 * BLOCK + lane],
+            m[ROTATION + 7 * BLOCK + lane],
         )
         r02, r12, r22 = in_camera(
-            c, m[TURN + 2 * BLOCK + lane], m[TURN + 5 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
+            c,
+            m[ROTATION + 2 * BLOCK + lane],
+            m[ROTATION + 5 * BLOCK + lane],
+            m[ROTATION + 8 * BLOCK + lane],
         )
         var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
         w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
@@ -200,7 +206,7 @@ def _project_shapes(m: Any, camera: Any) -> None:
         last_y = height - 1.0 if last_y > height - 1.0 else last_y
         seen = (first_x <= last_x) & (first_y <= last_y)
         seen = seen & (z > near_z) & (opacity > _ALPHA_MIN)
-        m[_SEEN + lane] = 1.0 if seen else 0.0
+        m[_VISIBLE + lane] = 1.0 if seen else 0.0
     for lane in range(BLOCK):
         tanh = m[TANH + lane]
         m[_PARAM + 16 * BLOCK + lane] = tanh * m[ORIENTATION + lane]
@@ -226,13 +232,13 @@ def _project_shapes(m: Any, camera: Any) -> None:
         total += abs(m[_PARAM + 20 * BLOCK + lane]) + abs(m[_PARAM + 21 * BLOCK + lane])
         skew = m[_SKEW + lane]
         total += 0.0 if skew == math.inf else abs(skew)
-        holds = (reach_x <= tolerances.FINITE_OFFSET_PX) & (reach_y <= tolerances.FINITE_OFFSET_PX)
-        holds &= (num <= tolerances.FINITE_NUM) & (den <= tolerances.FINITE_DEN)
-        holds &= a0 * sigma_z * sigma_z <= tolerances.FINITE_SPREAD
-        holds &= a0 * den * z <= tolerances.FINITE_PULL
-        holds &= (z >= tolerances.FINITE_Z_MIN) & (z <= tolerances.FINITE_Z_MAX)
-        holds &= (sigma_z <= tolerances.FINITE_SIGMA_Z) & (total < _FLOAT32_MAX)
-        m[_SEEN + lane] = m[_SEEN + lane] if holds else 0.0
+        finite = (reach_x <= tolerances.FINITE_OFFSET_PX) & (reach_y <= tolerances.FINITE_OFFSET_PX)
+        finite &= (num <= tolerances.FINITE_NUM) & (den <= tolerances.FINITE_DEN)
+        finite &= a0 * sigma_z * sigma_z <= tolerances.FINITE_SPREAD
+        finite &= a0 * den * z <= tolerances.FINITE_PULL
+        finite &= (z >= tolerances.FINITE_Z_MIN) & (z <= tolerances.FINITE_Z_MAX)
+        finite &= (sigma_z <= tolerances.FINITE_SIGMA_Z) & (total < _FLOAT32_MAX)
+        m[_VISIBLE + lane] = m[_VISIBLE + lane] if finite else 0.0
 
 
 @inline
@@ -290,7 +296,7 @@ def project_raw_range(
             depths[i] = np.inf
             m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
             z = camera[6] * m0 + camera[7] * m1 + camera[8] * m2 + camera[11]
-            if not z > camera[21] or opacity_logits[i] < _FAINT_LOGIT:
+            if not z > camera[21] or opacity_logits[i] < _MIN_LOGIT:
                 continue
             x = camera[0] * m0 + camera[1] * m1 + camera[2] * m2 + camera[9]
             y = camera[3] * m0 + camera[4] * m1 + camera[5] * m2 + camera[10]
@@ -319,7 +325,7 @@ def project_raw_range(
             activate_block(m, camera)
             _project_shapes(m, camera)
             for lane in range(min(BLOCK, count - first)):
-                if m[_SEEN + lane] == 0.0:
+                if m[_VISIBLE + lane] == 0.0:
                     continue
                 i = queue[first + lane]
                 red = green = blue = 0.5
@@ -367,7 +373,7 @@ def project_activated_range(
                 m[SCALE + axis * BLOCK + lane] = scales[i, axis] * scales[i, axis]
                 m[ORIENTATION + axis * BLOCK + lane] = normals[i, axis]
                 for column in range(3):
-                    m[TURN + (3 * axis + column) * BLOCK + lane] = rotations[i, axis, column]
+                    m[ROTATION + (3 * axis + column) * BLOCK + lane] = rotations[i, axis, column]
             m[TANH + lane] = 1.0
             m[OPACITY + lane] = math.exp(log_opacities[i])
         _project_shapes(m, camera)
@@ -375,5 +381,5 @@ def project_activated_range(
             i = first + lane
             visible[i] = False
             depths[i] = np.inf
-            if m[_SEEN + lane] != 0.0:
+            if m[_VISIBLE + lane] != 0.0:
                 _write_row(m, lane, i, params, boxes, visible, depths, skews)

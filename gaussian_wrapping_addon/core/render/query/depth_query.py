@@ -31,7 +31,7 @@ from ..projection.projection import RawArrays, RawGradients, ScreenGaussians, pr
 from ..raster.blend import ScreenView
 from ..tiling.area_lists import AreaLists, SortedPositions, list_areas, sort_positions
 from ..types.options import RenderOptions
-from .depth_query_gradient import add_pair_gradients, pull_range
+from .depth_query_gradient import add_intersection_gradients, query_gradient_range
 from .depth_query_kernels import query_kernel
 from .fine_screen import project_finely
 from .query_spans import GEOMETRY
@@ -153,16 +153,16 @@ def solve_transmittances(view: QueryView, positions: np.ndarray, depths: np.ndar
     QueryResult
         In [0, 1]; 0 off the image and where a position or depth is NaN.
     """
-    asked = np.asarray(depths, np.float64)
-    if asked.shape != (len(positions),):
+    requested = np.asarray(depths, np.float64)
+    if requested.shape != (len(positions),):
         raise UsageError(
-            f"{len(positions)} positions came with depths of shape {asked.shape}.",
+            f"{len(positions)} positions came with depths of shape {requested.shape}.",
             "Give one depth a position.",
         )
-    known = ~np.isnan(asked)
-    places = np.where(known[:, None], np.asarray(positions), np.nan)
-    sorted_positions = _sorted(view, places)
-    at = np.clip(asked[sorted_positions.order], 0.0, _DEEPEST).astype(np.float32)
+    known = ~np.isnan(requested)
+    coordinates = np.where(known[:, None], np.asarray(positions), np.nan)
+    sorted_positions = _sorted(view, coordinates)
+    at = np.clip(requested[sorted_positions.order], 0.0, _DEEPEST).astype(np.float32)
     return _query(view, sorted_positions, at, False)
 
 
@@ -198,26 +198,29 @@ def add_query_gradients(
     else:
         weights = incoming * result.found
         pull = -weights * result.slopes
-    pair_grads = np.zeros((len(lists.gaussian_ids), GEOMETRY), np.float32)
-    grad_places = np.zeros((len(positions.order), 2), np.float32)
+    intersection_grads = np.zeros((len(lists.gaussian_ids), GEOMETRY), np.float32)
+    grad_coordinates = np.zeros((len(positions.order), 2), np.float32)
 
     def run(first: int, end: int) -> None:
-        pull_range(
+        query_gradient_range(
             first, end, view.screen.params, view.screen.boxes, view.screen.skews, lists.start,
-            lists.gaussian_ids, lists.pair_slots, lists.tiles_x, positions.shift, positions.start,
-            positions.places, result.at, weights, result.stops, pair_grads, grad_places,
+            lists.gaussian_ids, lists.intersection_slots, lists.tiles_x, positions.shift,
+            positions.start, positions.coordinates, result.at, weights, result.stops,
+            intersection_grads, grad_coordinates,
         )  # fmt: skip
 
     bounds = balanced_bounds(_tile_costs(view, positions), view.threads * CHUNKS_PER_THREAD)
     run_chunks(run, bounds, view.threads)
 
     def combine(first: int, end: int) -> None:
-        add_pair_gradients(first, end, pair_grads, lists.pair_offsets, grad_params)
+        add_intersection_gradients(
+            first, end, intersection_grads, lists.intersection_offsets, grad_params
+        )
 
     run_chunks(combine, even_bounds(len(view.screen), view.threads), view.threads)
     count = len(result.values)
     grad_positions, grad_depths = np.zeros((count, 2), np.float32), np.zeros(count, np.float32)
-    grad_positions[positions.order] = grad_places
+    grad_positions[positions.order] = grad_coordinates
     grad_depths[positions.order] = pull
     return grad_positions, grad_depths
 
@@ -306,11 +309,11 @@ class _Query(torch.autograd.Function):
         options: RenderOptions,
     ) -> Tensor:
         view = query_view(RawArrays.from_gaussians(gaussians), camera, options)
-        places = positions.detach().cpu().numpy()
+        coordinates = positions.detach().cpu().numpy()
         if depths is None:
-            result = solve_depths(view, places)
+            result = solve_depths(view, coordinates)
         else:
-            result = solve_transmittances(view, places, depths.detach().cpu().numpy())
+            result = solve_transmittances(view, coordinates, depths.detach().cpu().numpy())
         ctx.view, ctx.result = view, result
         ctx.types = positions.dtype, depths.dtype if depths is not None else None
         # The backward pass reads their memory; saved, so that autograd refuses to run it after
@@ -345,12 +348,12 @@ class _Query(torch.autograd.Function):
 
 
 def _sorted(view: QueryView, positions: np.ndarray) -> SortedPositions:
-    places = np.asarray(positions)
-    if places.ndim != 2 or places.shape[1] != 2:
+    coordinates = np.asarray(positions)
+    if coordinates.ndim != 2 or coordinates.shape[1] != 2:
         raise UsageError(
-            f"Positions have the shape {places.shape}.", "Give (m, 2) pixel coordinates."
+            f"Positions have the shape {coordinates.shape}.", "Give (m, 2) pixel coordinates."
         )
-    return sort_positions(places, view.camera.width, view.camera.height)
+    return sort_positions(coordinates, view.camera.width, view.camera.height)
 
 
 def _tile_costs(view: QueryView, positions: SortedPositions) -> np.ndarray:
@@ -365,18 +368,18 @@ def _query(view: QueryView, positions: SortedPositions, at: np.ndarray, solve: b
     count = len(positions.order)
     found, slopes = np.zeros(count, np.float32), np.ones(count, np.float32)
     stops = np.zeros(count, np.int32)
-    answer = query_kernel(solve)
+    query_range = query_kernel(solve)
     limit = np.float32(view.options.depth_valid_transmittance)
 
     def run(first: int, end: int) -> None:
-        answer(
+        query_range(
             first, end, view.screen.params, view.screen.boxes, view.screen.skews, view.lists.start,
             view.lists.gaussian_ids, view.lists.tiles_x, positions.shift, positions.start,
-            positions.places, limit, at, found, slopes, stops,
+            positions.coordinates, limit, at, found, slopes, stops,
         )  # fmt: skip
 
     bounds = balanced_bounds(_tile_costs(view, positions), view.threads * CHUNKS_PER_THREAD)
     run_chunks(run, bounds, view.threads)
-    values = np.zeros(positions.given, np.float32)
+    values = np.zeros(positions.input_count, np.float32)
     values[positions.order] = found
     return QueryResult(values, positions, found if solve else at, found, slopes, stops, solve)

@@ -58,11 +58,11 @@ def project_finely(gaussians: RawArrays, camera: Camera, options: RenderOptions)
         )  # fmt: skip
 
     run_chunks(shrink, even_bounds(len(screen), threads), threads)
-    _add_far_ones(gaussians, camera, options, scale, screen)
+    _add_distant(gaussians, camera, options, scale, screen)
     return screen
 
 
-def _add_far_ones(
+def _add_distant(
     gaussians: RawArrays,
     camera: Camera,
     options: RenderOptions,

@@ -30,9 +30,9 @@ U, V, QA, QB, QC = 0, SPAN, 2 * SPAN, 3 * SPAN, 4 * SPAN
 PX, PY, R, S, T = 5 * SPAN, 6 * SPAN, 7 * SPAN, 8 * SPAN, 9 * SPAN
 Z, OPACITY, A0 = 10 * SPAN, 11 * SPAN, 12 * SPAN
 # Columns of a span of a tile: the Gaussians, where they begin in depth, and their ellipses.
-_FRONT, _CENTER_X, _CENTER_Y, _SKEW = 13 * SPAN, 14 * SPAN, 15 * SPAN, 16 * SPAN
+_NEAREST, _CENTER_X, _CENTER_Y, _SKEW = 13 * SPAN, 14 * SPAN, 15 * SPAN, 16 * SPAN
 _EXTREME, _INVERSE, _ACROSS, _MARGIN = 17 * SPAN, 18 * SPAN, 19 * SPAN, 20 * SPAN
-_TOUCHED = 21 * SPAN
+_INTERSECTS = 21 * SPAN
 TILE_COLUMNS = 22
 _FLOAT_MARGIN = np.float32(4e-6)
 """Several roundings of a float32, in shares of what is rounded."""
@@ -60,7 +60,7 @@ def fill_tile(
         lane = k % SPAN
         for column in range(GEOMETRY):
             span[column * SPAN + lane] = params[i, column]
-        span[_FRONT + lane] = params[i, 10] - FRONT_SIGMAS * params[i, 22]
+        span[_NEAREST + lane] = params[i, 10] - FRONT_SIGMAS * params[i, 22]
         half_x = 0.5 * (np.float64(boxes[i, 2]) - np.float64(boxes[i, 0]))
         half_y = 0.5 * (np.float64(boxes[i, 3]) - np.float64(boxes[i, 1]))
         skew = np.float64(skews[i])
@@ -83,12 +83,12 @@ def fill_tile(
         span = spans[k // SPAN]
         for column in range(TILE_COLUMNS):
             span[column * SPAN + k % SPAN] = ZERO
-        span[_FRONT + k % SPAN] = FAR
+        span[_NEAREST + k % SPAN] = FAR
         span[_CENTER_X + k % SPAN] = -FAR
 
 
 @inline
-def _touch(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
+def _mark_intersecting(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
     """Mark by 1 the ellipses of a span that reach a rectangle, see ``area_lists.strip_span``."""
     for j in range(SPAN):
         inverse, center_y = span[_INVERSE + j], span[_CENTER_Y + j]
@@ -100,9 +100,9 @@ def _touch(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
         t = min(max(-extreme, first), last)
         left = skew * t - across * math.sqrt(max(ONE - t * t, ZERO))
         center_x, margin = span[_CENTER_X + j], span[_MARGIN + j]
-        touched = (first <= last) & (center_x + right + margin >= x0)
-        touched = touched & (center_x + left - margin <= x1)
-        span[_TOUCHED + j] = ONE if touched else ZERO
+        intersects = (first <= last) & (center_x + right + margin >= x0)
+        intersects = intersects & (center_x + left - margin <= x1)
+        span[_INTERSECTS + j] = ONE if intersects else ZERO
 
 
 @part(fast=True)
@@ -113,7 +113,7 @@ def fill_cell(
     count: int,
     tile_spans: np.ndarray,
     spans: np.ndarray,
-    fronts: np.ndarray,
+    nearest_depths: np.ndarray,
     members: np.ndarray,
 ) -> int:
     """Lay out those Gaussians of a tile that reach one of its cells; return their number.
@@ -145,12 +145,12 @@ def fill_cell(
     for at in range((count + SPAN - 1) // SPAN):
         source = tile_spans[at]
         if shift > 0:
-            _touch(source, x0, y0 - margin, x1, y1 + margin)
+            _mark_intersecting(source, x0, y0 - margin, x1, y1 + margin)
         else:
             for lane in range(SPAN):
-                source[_TOUCHED + lane] = ONE if at * SPAN + lane < count else ZERO
+                source[_INTERSECTS + lane] = ONE if at * SPAN + lane < count else ZERO
         for run in range(0, SPAN, RUN):
-            hits = positive_run(RUN, source, _TOUCHED + run)
+            hits = positive_run(RUN, source, _INTERSECTS + run)
             while hits != np.uint64(0):
                 j = run + np.int64(lowest_bit(hits))
                 hits &= hits - np.uint64(1)
@@ -158,17 +158,17 @@ def fill_cell(
                 lane = total % SPAN
                 for column in range(GEOMETRY):
                     target[column * SPAN + lane] = source[column * SPAN + j]
-                front, to = source[_FRONT + j], total // SPAN
-                fronts[to] = front if lane == 0 else min(fronts[to], front)
+                nearest, to = source[_NEAREST + j], total // SPAN
+                nearest_depths[to] = nearest if lane == 0 else min(nearest_depths[to], nearest)
                 members[total] = at * SPAN + j
                 total += 1
     last = (total + SPAN - 1) // SPAN
     for k in range(total, last * SPAN):
         for column in range(columns):
             spans[last - 1, column * SPAN + k % SPAN] = ZERO
-    fronts[last] = FAR
+    nearest_depths[last] = FAR
     for at in range(last - 1, -1, -1):
-        fronts[at] = min(fronts[at], fronts[at + 1])
+        nearest_depths[at] = min(nearest_depths[at], nearest_depths[at + 1])
     return total
 
 

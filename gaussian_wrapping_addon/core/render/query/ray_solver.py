@@ -24,7 +24,7 @@ _LEVEL_MARGIN = np.float32(1.2e-7)
 # ... or a bracket of one rounding of the depth. A step below that rounding alone proves nothing:
 # a layer may be steep there and yet end before the level is reached.
 _BRACKET_SHARE = np.float32(1.25e-7)
-_LEAST_SHARE = np.float32(1.25e-7)
+_MIN_STEP_SHARE = np.float32(1.25e-7)
 """Steps are at least this share of the depth, so that they can close the bracket."""
 _POLISH_SIGMAS = np.float32(3e-3)
 """A last step is taken up to this length. A longer one would leave the place at which the slope is
@@ -33,10 +33,10 @@ would lead far astray."""
 _LEVEL_FAR, _FLAT = np.float32(0.05), np.float32(0.02)
 """A layer thinner than a rounding of the depth: T jumps over 0.5 from where it is flat. Its
 gradient is lost; rather let it be too small than a thousand times too large."""
-_LEAST_SLOPE = np.float32(1e-12)
+_MIN_SLOPE = np.float32(1e-12)
 """Keeps a step finite; it leaves the bracket then."""
 # Halley's correction of a Newton step stays within these factors.
-_LEAST_BEND, _MOST_BEND = HALF, TWO
+_MIN_CORRECTION, _MAX_CORRECTION = HALF, TWO
 _NEWTON_STEPS = 8
 """From here on every second step is a bisection, which bounds the number of steps."""
 _MAX_STEPS = 80
@@ -55,15 +55,15 @@ def evaluate_ray(capped: Any, count: Any, t: Any, alphas: Any, peaks: Any, sharp
     product, slope = ONE, ZERO
     for c in range(count):
         ahead = max(peaks[c] - t, ZERO)
-        pull = sharpnesses[c] * ahead
-        raw = alphas[c] * exp_wide(HALF * pull * ahead)
+        log_slope = sharpnesses[c] * ahead
+        raw = alphas[c] * exp_wide(HALF * log_slope * ahead)
         density = min(raw, ALPHA_MAX)
         keep = ONE - density
         product *= keep
-        steep = density * pull / keep
+        rate = density * log_slope / keep
         if capped:
-            steep = steep if raw < ALPHA_MAX else ZERO
-        slope += steep
+            rate = rate if raw < ALPHA_MAX else ZERO
+        slope += rate
     return product, slope
 
 
@@ -76,7 +76,7 @@ def _log_twice(value: Any) -> Any:
 
 
 @inline
-def _bend(count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
+def _log_derivatives(count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
     """Return T, the slope -d(log T)/dt and its growth with t, at depth t."""
     product, slope, growth = ONE, ZERO, ZERO
     for c in range(count):
@@ -85,12 +85,12 @@ def _bend(count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
         density = min(alphas[c] * exp_wide(fall), ALPHA_MAX)
         # 0 where nothing changes with t; far behind, the square below could overflow.
         sharpness = sharpnesses[c] if ahead > ZERO and fall <= WIDE_END else ZERO
-        pull = sharpness * ahead
+        log_slope = sharpness * ahead
         keep = ONE - density
         product *= keep
         odds = density / keep
-        slope += odds * pull
-        growth += odds * (pull * pull / keep - sharpness)
+        slope += odds * log_slope
+        growth += odds * (log_slope * log_slope / keep - sharpness)
     return product, slope, growth
 
 
@@ -102,16 +102,18 @@ def solve_ray(
     """Return where T crosses 0.5 between 0 and ``high``, and -d(log T)/dt there, floored."""
     t, low, found_slope = guess, ZERO, ZERO
     for number in range(_MAX_STEPS):
-        product, slope, growth = _bend(count, t, alphas, peaks, sharpnesses)
+        product, slope, growth = _log_derivatives(count, t, alphas, peaks, sharpnesses)
         excess = _log_twice(max(product, TINY))
         if excess > ZERO:
             low = t
         else:
             high = t
-        turns = ONE / max(slope, _LEAST_SLOPE)
-        newton = excess * turns
-        bend = min(max(ONE + HALF * newton * growth * turns, _LEAST_BEND), _MOST_BEND)
-        step = newton / bend
+        inverse_slope = ONE / max(slope, _MIN_SLOPE)
+        newton = excess * inverse_slope
+        correction = min(
+            max(ONE + HALF * newton * growth * inverse_slope, _MIN_CORRECTION), _MAX_CORRECTION
+        )
+        step = newton / correction
         size = abs(step)
         sigmas = size * sharpest
         found_slope = slope
@@ -126,7 +128,7 @@ def solve_ray(
             if abs(excess) > _LEVEL_FAR and slope < _FLAT * alone:
                 found_slope = TWO * alone
             break
-        least = _LEAST_SHARE * t
+        least = _MIN_STEP_SHARE * t
         moved = t + (step if size > least else (least if excess > ZERO else -least))
         newton_next = moved > low and moved < high
         newton_next = newton_next and (number < _NEWTON_STEPS or number % 2 == 0)

@@ -17,9 +17,9 @@ from ..projection.projection import RawArrays, ScreenGaussians
 from ..simd.raster_math import ROW_VALUES, TILE, aligned_zeros
 from ..tiling.tiles import TileLists
 from ..types.options import RenderOptions
-from .raster_backward import BACKWARD_SCRATCH, backward_kernel, sum_pairs
+from .contributors import CONTRIBUTORS_PADDING
+from .raster_backward import BACKWARD_SCRATCH, backward_kernel, sum_intersections
 from .raster_forward import FORWARD_SCRATCH, forward_kernel
-from .visits import VISITS_ROOM
 
 _MOST_BLOCKS = 32
 """Blocks of a tile where they have eight pixels."""
@@ -44,8 +44,8 @@ class RenderBuffers:
 
     scratch: list[np.ndarray] = field(default_factory=list)
     lists: list[np.ndarray] = field(default_factory=list)
-    visits: list[np.ndarray] = field(default_factory=list)
-    pairs: list[np.ndarray] = field(default_factory=list)
+    contributors: list[np.ndarray] = field(default_factory=list)
+    intersections: list[np.ndarray] = field(default_factory=list)
     renderers: list[Any] = field(default_factory=list)
     """Idle :class:`~..view_renderer.ViewRenderer` with their memory."""
 
@@ -57,12 +57,14 @@ class RenderBuffers:
         spare = [
             (self.scratch, self.take_scratch()),
             (self.lists, self.take_lists(longest if depth else 0)),
-            (self.visits, self.take_visits(longest)),
+            (self.contributors, self.take_contributors(longest)),
         ]
         for pool, array in spare:
             pool.append(array)
             while len(pool) < threads:
-                pool.append(array.copy() if pool is self.visits else aligned_zeros(len(array)))
+                pool.append(
+                    array.copy() if pool is self.contributors else aligned_zeros(len(array))
+                )
 
     def take_scratch(self) -> np.ndarray:
         """Return the state of one thread's tile, with any content."""
@@ -72,15 +74,15 @@ class RenderBuffers:
         """Return room for the list of a block of a tile of ``longest`` pairs, with any content."""
         return _take(self.lists, longest * LIST_VALUES * TILE, aligned_zeros)
 
-    def take_visits(self, longest: int) -> np.ndarray:
+    def take_contributors(self, longest: int) -> np.ndarray:
         """Return room for the pairs that reach each block of such a tile, with any content."""
-        count = _MOST_BLOCKS * (longest + VISITS_ROOM)
-        return _take(self.visits, count, lambda size: np.zeros(size, np.int32))
+        count = _MOST_BLOCKS * (longest + CONTRIBUTORS_PADDING)
+        return _take(self.contributors, count, lambda size: np.zeros(size, np.int32))
 
-    def take_pairs(self, count: int) -> np.ndarray:
+    def take_intersections(self, count: int) -> np.ndarray:
         """Return at least ``count`` rows of pair gradients with any content."""
         try:
-            kept = self.pairs.pop()
+            kept = self.intersections.pop()
         except IndexError:
             kept = np.zeros((0, ROW_VALUES), np.float32)
         if len(kept) >= count:
@@ -106,8 +108,8 @@ class ScreenView:
         """Return what the raster kernels read of a view, in their order."""
         lists, camera = self.lists, self.camera
         return (
-            self.screen.params, lists.start, lists.gaussian_ids, lists.pair_slots, self.masks,
-            lists.tiles_x, camera.width, camera.height,
+            self.screen.params, lists.start, lists.gaussian_ids, lists.intersection_slots,
+            self.masks, lists.tiles_x, camera.width, camera.height,
         )  # fmt: skip
 
 
@@ -165,13 +167,13 @@ def blend(
     view: ScreenView,
     images: Images,
     buffers: RenderBuffers,
-    pair_weights: np.ndarray | None = None,
+    intersection_weights: np.ndarray | None = None,
 ) -> np.ndarray:
     """Blend the tiles of a view into ``images`` and solve their isosurface depth.
 
     Parameters
     ----------
-    pair_weights : (pairs, 2) float32, optional
+    intersection_weights : (pairs, 2) float32, optional
         Where the weights are written; by default a new array.
 
     Returns
@@ -181,8 +183,8 @@ def blend(
     """
     options, lists = view.options, view.lists
     depth, weights = options.depth, options.statistics
-    if pair_weights is None:
-        pair_weights = np.zeros((len(lists.gaussian_ids) if weights else 0, 2), np.float32)
+    if intersection_weights is None:
+        intersection_weights = np.zeros((len(lists.gaussian_ids) if weights else 0, 2), np.float32)
     forward = forward_kernel(view.lanes, depth, weights)
     background = np.asarray(options.background, np.float32)
     limit = np.float32(options.depth_valid_transmittance)
@@ -192,7 +194,7 @@ def blend(
     def run(first: int, end: int) -> None:
         scratch = buffers.take_scratch()
         entries = buffers.take_lists(longest if depth else 0)
-        visits = buffers.take_visits(longest)
+        contributors = buffers.take_contributors(longest)
         forward(
             first,
             end,
@@ -201,25 +203,25 @@ def blend(
             limit,
             scratch,
             entries,
-            visits,
+            contributors,
             *images.arguments(),
-            pair_weights,
+            intersection_weights,
             images.strongest,
         )
         buffers.scratch.append(scratch)
         buffers.lists.append(entries)
-        buffers.visits.append(visits)
+        buffers.contributors.append(contributors)
 
     run_chunks(run, view.bounds, view.threads)
-    return pair_weights
+    return intersection_weights
 
 
-def pair_gradients(
+def write_intersection_gradients(
     view: ScreenView,
     images: Images,
     grads: list[np.ndarray],
     buffers: RenderBuffers,
-    pairs: np.ndarray,
+    intersections: np.ndarray,
     *,
     depth: bool,
     absolute: bool,
@@ -240,7 +242,7 @@ def pair_gradients(
             *images.arguments(),
             *grads,
             scratch,
-            pairs,
+            intersections,
         )
         buffers.scratch.append(scratch)
 
@@ -257,16 +259,20 @@ def blend_backward(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the gradient on params (n, 24), and its length on (u, v) plain and absolute (n,)."""
     lists, count = view.lists, len(view.screen)
-    pairs = buffers.take_pairs(len(lists.gaussian_ids))
+    intersections = buffers.take_intersections(len(lists.gaussian_ids))
     depth = bool(grads[4].any())
-    pair_gradients(view, images, grads, buffers, pairs, depth=depth, absolute=absolute)
+    write_intersection_gradients(
+        view, images, grads, buffers, intersections, depth=depth, absolute=absolute
+    )
     grad_params = np.zeros((count, ROW_VALUES), np.float32)
     grad_px = np.zeros(count, np.float32)
     grad_abs_px = np.zeros(count, np.float32)
 
     def combine(first: int, end: int) -> None:
-        sum_pairs(first, end, pairs, lists.pair_offsets, grad_params, grad_px, grad_abs_px)
+        sum_intersections(
+            first, end, intersections, lists.intersection_offsets, grad_params, grad_px, grad_abs_px
+        )
 
     run_chunks(combine, even_bounds(count, view.threads), view.threads)
-    buffers.pairs.append(pairs)
+    buffers.intersections.append(intersections)
     return grad_params, grad_px, grad_abs_px

@@ -87,11 +87,11 @@ class Vector:
 
     def max(self, other: Vector | float) -> Vector:
         """Return the larger value of each lane."""
-        return (self > other).choose(self, other)
+        return (self > other).select(self, other)
 
     def min(self, other: Vector | float) -> Vector:
         """Return the smaller value of each lane."""
-        return (self < other).choose(self, other)
+        return (self < other).select(self, other)
 
     def times(self, other: Vector) -> Vector:
         """Return the product, rounded before anything is added to it."""
@@ -154,7 +154,7 @@ class Mask:
     def __invert__(self) -> Mask:
         return Mask(self.block, self.block.builder.not_(self.value))
 
-    def choose(self, yes: Vector | float, no: Vector | float) -> Vector:
+    def select(self, yes: Vector | float, no: Vector | float) -> Vector:
         """Return ``yes`` where true, ``no`` elsewhere."""
         block = self.block
         a, b = block.vector(yes).value, block.vector(no).value
@@ -237,8 +237,8 @@ class Block:
         return base
 
     def _run(self, data: Any, at: Any) -> Any:
-        place = self.builder.gep(data, [at], inbounds=True)
-        return self.builder.bitcast(place, self.kind.as_pointer())
+        pointer = self.builder.gep(data, [at], inbounds=True)
+        return self.builder.bitcast(pointer, self.kind.as_pointer())
 
     def load(self, data: Any, at: Any) -> Vector:
         """Return the vector at ``data[at]``."""
@@ -280,7 +280,7 @@ class Block:
         while group > 1:
             half = group // 2
             first = [g + k for g in range(0, 2 * lanes, group) for k in range(half)]
-            second = [place + half for place in first]
+            second = [k + half for k in first]
             level = [
                 self._shuffle(a, b, first) + self._shuffle(a, b, second)
                 for a, b in zip(level[::2], level[1::2], strict=True)
@@ -289,17 +289,17 @@ class Block:
         return level
 
     def _shuffle(self, a: Vector, b: Vector, order: Sequence[int]) -> Vector:
-        places = ir.Constant(
+        indices = ir.Constant(
             ir.VectorType(_WORD, self.lanes), [ir.Constant(_WORD, k) for k in order]
         )
-        return Vector(self, self.builder.shuffle_vector(a.value, b.value, places))
+        return Vector(self, self.builder.shuffle_vector(a.value, b.value, indices))
 
     def walk(
-        self, place: Any, count: Any, body: Callable[[Any], Any], test: Callable[[Any], Any]
+        self, cursor: Any, count: Any, body: Callable[[Any], Any], test: Callable[[Any], Any]
     ) -> None:
-        """Run ``body`` from the index kept in ``place`` up to ``count``, while it is true.
+        """Run ``body`` from the index kept in ``cursor`` up to ``count``, while it is true.
 
-        ``place`` is moved past the last turn, so that another loop can go on from there. ``test``
+        ``cursor`` is moved past the last turn, so that another loop can go on from there. ``test``
         is asked before each turn; both return an SSA truth value.
         """
         builder = self.builder
@@ -308,17 +308,17 @@ class Block:
         )
         builder.branch(head)
         builder.position_at_end(head)
-        index = builder.load(place)
+        index = builder.load(cursor)
         builder.cbranch(builder.icmp_signed("<", index, count), probe, end)
         builder.position_at_end(probe)
         builder.cbranch(test(index), turn, end)
         builder.position_at_end(turn)
-        builder.store(builder.add(index, self.index(1)), place)
+        builder.store(builder.add(index, self.index(1)), cursor)
         builder.cbranch(body(index), head, end)
         builder.position_at_end(end)
 
     def each_bit(self, bits: Any, body: Callable[[Any], None]) -> None:
-        """Run ``body(place)`` for each set bit of an SSA 64-bit integer, lowest first."""
+        """Run ``body(bit)`` for each set bit of an SSA 64-bit integer, lowest first."""
         builder = self.builder
         left = cgutils.alloca_once_value(builder, bits)
         head = builder.append_basic_block("bits")
@@ -340,8 +340,8 @@ class Block:
         The loop ends early where ``body`` returns a mask without a set lane.
         """
         with cgutils.for_range(self.builder, count) as loop:
-            goes_on = body(loop.index)
-            if goes_on is not None:
-                nobody = self.builder.icmp_unsigned("==", goes_on.bits(), self.index(0))
-                with self.builder.if_then(nobody, likely=False):
+            active = body(loop.index)
+            if active is not None:
+                none_active = self.builder.icmp_unsigned("==", active.bits(), self.index(0))
+                with self.builder.if_then(none_active, likely=False):
                     loop.do_break()

@@ -24,7 +24,7 @@ def exp_wide(x: Vector, scale: float = 1.0) -> Vector:
     A small value in place of 0 would be magnified by the 1 / sigma^2 of thin Gaussians far behind.
     """
     value = _power(_fit(x * (scale / 32.0)), 5)
-    return (x < WIDE_END / scale).choose(value, 0.0)
+    return (x < WIDE_END / scale).select(value, 0.0)
 
 
 def _fit(y: Vector) -> Vector:
@@ -41,7 +41,7 @@ def _power(value: Vector, squarings: int) -> Vector:
 
 
 @dataclass(frozen=True)
-class Sight:
+class RayEvaluation:
     """The rays of a block against one Gaussian; names as in docs/architecture.md."""
 
     dx: Vector  # pixel - projected mean
@@ -82,7 +82,7 @@ def first_pixel(block: Block, number: Any, x: Any, y: Any) -> tuple[Any, Any]:
     return left, builder.fadd(y, builder.sitofp(down, y.type), flags=flags)
 
 
-def see(block: Block, params: Any, gaussian: Any, left: Any, top: Any) -> Sight:
+def evaluate_rays(block: Block, params: Any, gaussian: Any, left: Any, top: Any) -> RayEvaluation:
     """Evaluate a Gaussian on the rays of the block whose first pixel centre is ``(left, top)``."""
     row = Row(block, params, gaussian)
     builder, flags = block.builder, ("contract",)
@@ -100,13 +100,15 @@ def see(block: Block, params: Any, gaussian: Any, left: Any, top: Any) -> Sight:
     inverse = den.reciprocal()
     distance = (num * inverse).min(2.0 * SHORT_END)
     raw = exp_short(distance, 0.5) * row[11]
-    return Sight(dx, dy, inverse, den, distance, raw, raw.min(float(constants.ALPHA_MAX)), row)
+    return RayEvaluation(
+        dx, dy, inverse, den, distance, raw, raw.min(float(constants.ALPHA_MAX)), row
+    )
 
 
-def peak_depth(sight: Sight) -> Vector:
+def peak_depth(rays: RayEvaluation) -> Vector:
     """Return the z-depth of the Gaussian's maximum along each ray.
 
     Rounded alike wherever it is used: thin Gaussians tell a depth's last bits apart.
     """
-    row = sight.row
-    return ((sight.dx * row[5] + (sight.dy * row[6] + 1.0)) * sight.inverse).times(row[10])
+    row = rays.row
+    return ((rays.dx * row[5] + (rays.dy * row[6] + 1.0)) * rays.inverse).times(row[10])

@@ -80,9 +80,9 @@ def _prefetch_intrinsic(locality: int) -> Any:
             fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
             first = builder.mul(args[1], ir.Constant(args[1].type, ROW_VALUES))
             for offset in (0, ROW_VALUES - 1):  # 96 bytes lie on two cache lines
-                place = builder.gep(data, [builder.add(first, ir.Constant(first.type, offset))])
+                pointer = builder.gep(data, [builder.add(first, ir.Constant(first.type, offset))])
                 hints = [ir.Constant(word, value) for value in (0, locality, 1)]  # read, data
-                builder.call(fetch, [builder.bitcast(place, byte), *hints])
+                builder.call(fetch, [builder.bitcast(pointer, byte), *hints])
             return context.get_dummy_value()
 
         return types.void(rows, types.intp), generate

@@ -20,7 +20,7 @@ from ..projection.projection import ScreenGaussians
 from .depth_order import radix_order
 
 TILE = tolerances.TILE_PX
-_MAX_PAIRS = 2**31 - 1
+_MAX_INTERSECTIONS = 2**31 - 1
 # Rounding of the float32 boxes and skews: pixels, share of a half side.
 PIXEL_MARGIN = 0.02
 SHARE_MARGIN = 1e-6
@@ -40,8 +40,8 @@ class AreaLists:
 
     start: np.ndarray  # (tiles + 1,) int64: the pairs of tile t are start[t] .. start[t + 1]
     gaussian_ids: np.ndarray  # (pairs,) int32
-    pair_slots: np.ndarray  # (pairs,) int32
-    pair_offsets: np.ndarray  # (n + 1,) int64: the slots of Gaussian i
+    intersection_slots: np.ndarray  # (pairs,) int32
+    intersection_offsets: np.ndarray  # (n + 1,) int64: the slots of Gaussian i
     tiles_x: int
     tiles_y: int
 
@@ -50,11 +50,11 @@ class AreaLists:
 class SortedPositions:
     """Positions inside the image, by cell; cells divide each tile ``2^shift`` times per axis."""
 
-    places: np.ndarray  # (k, 2) float32, pixels, sorted
+    coordinates: np.ndarray  # (k, 2) float32, pixels, sorted
     order: np.ndarray  # (k,) int32: index of each among the positions that were given
     start: np.ndarray  # (cells + 1,) int64; cells are numbered tile by tile
     shift: int
-    given: int
+    input_count: int
     """Number of positions that were given."""
 
 
@@ -76,34 +76,41 @@ def list_areas(screen: ScreenGaussians, width: int, height: int, threads: int) -
     count = len(screen)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     order = radix_order(screen.depths, screen.visible)
-    pair_offsets = np.zeros(count + 1, np.int64)
+    intersection_offsets = np.zeros(count + 1, np.int64)
     # Runs of the order are counted apart, so that each knows where it writes in every tile.
     bounds = even_bounds(len(order), threads, 1)
     heads = np.zeros((max(len(bounds) - 1, 1), tiles_x * tiles_y), np.int64)
     run_of = {int(begin): run for run, begin in enumerate(bounds[:-1])}
 
     def walk(begin: int, end: int, ids: np.ndarray, slots: np.ndarray) -> None:
-        walk_areas(
+        scan_areas(
             begin, end, order, screen.boxes, screen.skews, tiles_x, tiles_y,
-            heads[run_of[begin]], pair_offsets, ids, slots,
+            heads[run_of[begin]], intersection_offsets, ids, slots,
         )  # fmt: skip
 
     nothing = np.zeros(0, np.int32)
     run_chunks(lambda begin, end: walk(begin, end, nothing, nothing), bounds, threads)
-    np.cumsum(pair_offsets, out=pair_offsets)
-    pairs = int(pair_offsets[-1])
-    if pairs > _MAX_PAIRS:
+    np.cumsum(intersection_offsets, out=intersection_offsets)
+    intersections = int(intersection_offsets[-1])
+    if intersections > _MAX_INTERSECTIONS:
         raise ResourceError(
-            f"{pairs} pairs of Gaussian and tile do not fit.", "Query a smaller image."
+            f"{intersections} pairs of Gaussian and tile do not fit.", "Query a smaller image."
         )
     start = np.zeros(tiles_x * tiles_y + 1, np.int64)
     np.cumsum(heads.sum(0), out=start[1:])
     heads[1:] = start[:-1] + np.cumsum(heads[:-1], axis=0)
     heads[0] = start[:-1]
-    gaussian_ids, pair_slots = np.zeros(pairs, np.int32), np.zeros(pairs, np.int32)
-    if pairs > 0:
-        run_chunks(lambda begin, end: walk(begin, end, gaussian_ids, pair_slots), bounds, threads)
-    return AreaLists(start, gaussian_ids, pair_slots, pair_offsets, tiles_x, tiles_y)
+    gaussian_ids, intersection_slots = (
+        np.zeros(intersections, np.int32),
+        np.zeros(intersections, np.int32),
+    )
+    if intersections > 0:
+        run_chunks(
+            lambda begin, end: walk(begin, end, gaussian_ids, intersection_slots), bounds, threads
+        )
+    return AreaLists(
+        start, gaussian_ids, intersection_slots, intersection_offsets, tiles_x, tiles_y
+    )
 
 
 def sort_positions(positions: np.ndarray, width: int, height: int) -> SortedPositions:
@@ -121,14 +128,14 @@ def sort_positions(positions: np.ndarray, width: int, height: int) -> SortedPosi
         and (tiles_x * tiles_y) << (2 * shift + 2) <= len(positions) // _POSITIONS_PER_CELL
     ):
         shift += 1
-    places = np.ascontiguousarray(positions, np.float32)
-    cells = np.empty(len(places), np.int32)
+    coordinates = np.ascontiguousarray(positions, np.float32)
+    cells = np.empty(len(coordinates), np.int32)
     start = np.zeros((tiles_x * tiles_y << (2 * shift)) + 1, np.int64)
-    find_cells(places, width, height, tiles_x, tiles_y, shift, cells, start)
+    find_cells(coordinates, width, height, tiles_x, tiles_y, shift, cells, start)
     np.cumsum(start, out=start)
     order = np.empty(start[-1], np.int32)
-    place_in_cells(cells, start[:-1].copy(), order)
-    return SortedPositions(places[order], order, start, shift, len(places))
+    sort_into_cells(cells, start[:-1].copy(), order)
+    return SortedPositions(coordinates[order], order, start, shift, len(coordinates))
 
 
 @part(fast=False)
@@ -159,7 +166,7 @@ def strip_span(x0: float, y0: float, x1: float, y1: float, skew: float, top: flo
 
 
 @kernel(fast=False)
-def walk_areas(
+def scan_areas(
     begin: int,
     end: int,
     order: np.ndarray,
@@ -168,14 +175,14 @@ def walk_areas(
     tiles_x: int,
     tiles_y: int,
     heads: np.ndarray,
-    pair_offsets: np.ndarray,
+    intersection_offsets: np.ndarray,
     gaussian_ids: np.ndarray,
-    pair_slots: np.ndarray,
+    intersection_slots: np.ndarray,
 ) -> None:
     """Count or, where ``gaussian_ids`` has room, write the pairs of ``order[begin .. end]``.
 
     Counting adds to ``heads (tiles,)`` and writes the number of pairs of Gaussian i to
-    ``pair_offsets[i + 1]``; writing advances ``heads``.
+    ``intersection_offsets[i + 1]``; writing advances ``heads``.
     """
     write = len(gaussian_ids) > 0
     for k in range(begin, end):
@@ -183,10 +190,10 @@ def walk_areas(
         x0, y0 = float(boxes[i, 0]), float(boxes[i, 1])
         x1, y1 = float(boxes[i, 2]), float(boxes[i, 3])
         skew = float(skews[i])
-        slot = pair_offsets[i]
+        slot = intersection_offsets[i]
         first_row = int(min(max(y0 / TILE, 0.0), tiles_y - 1.0))
         last_row = int(min(max(y1 / TILE, 0.0), tiles_y - 1.0))
-        pairs = 0
+        intersections = 0
         for row in range(first_row, last_row + 1):
             left, right = x0, x1
             if first_row < last_row:
@@ -201,18 +208,18 @@ def walk_areas(
             for column in range(first, last + 1):
                 tile = row * tiles_x + column
                 if write:
-                    place = heads[tile]
-                    gaussian_ids[place] = i
-                    pair_slots[place] = slot + pairs
+                    index = heads[tile]
+                    gaussian_ids[index] = i
+                    intersection_slots[index] = slot + intersections
                 heads[tile] += 1
-                pairs += 1
+                intersections += 1
         if not write:
-            pair_offsets[i + 1] = pairs
+            intersection_offsets[i + 1] = intersections
 
 
 @kernel(fast=False)
 def find_cells(
-    places: np.ndarray,
+    coordinates: np.ndarray,
     width: int,
     height: int,
     tiles_x: int,
@@ -224,8 +231,8 @@ def find_cells(
     """Write the cell of each position, or -1, and count those of cell c in ``start[c + 1]``."""
     mask = (1 << shift) - 1
     cell_px = np.float32(TILE >> shift)
-    for p in range(len(places)):
-        x, y = places[p, 0], places[p, 1]
+    for p in range(len(coordinates)):
+        x, y = coordinates[p, 0], coordinates[p, 1]
         cells[p] = -1
         # Written so that a NaN fails the test.
         if not (x >= 0.0 and y >= 0.0 and x <= width and y <= height):
@@ -239,7 +246,7 @@ def find_cells(
 
 
 @kernel(fast=False)
-def place_in_cells(cells: np.ndarray, heads: np.ndarray, order: np.ndarray) -> None:
+def sort_into_cells(cells: np.ndarray, heads: np.ndarray, order: np.ndarray) -> None:
     """Write the indices of the positions of each cell, from its ``heads`` on."""
     for p in range(len(cells)):
         if cells[p] >= 0:

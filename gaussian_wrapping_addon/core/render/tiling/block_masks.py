@@ -66,16 +66,16 @@ def _columns(block: Block, ids: Any, at: Any, boxes: Any, skews: Any) -> list[Ve
     builder, quad = block.builder, Block(_BOX, block.context, block.builder)
     rows, skew = [], ir.Constant(block.kind, ir.Undefined)
     for number in range(_GROUP):
-        place = builder.gep(ids, [block.offset(at, number)], inbounds=True)
-        gaussian = builder.sext(builder.load(place), _INDEX)
+        pointer = builder.gep(ids, [block.offset(at, number)], inbounds=True)
+        gaussian = builder.sext(builder.load(pointer), _INDEX)
         rows.append(quad.load(boxes, builder.mul(gaussian, block.index(_BOX))).value)
         number_ = ir.Constant(_WORD, number)
         skew = builder.insert_element(skew, block.scalar(skews, gaussian), number_)
 
     def shuffle(a: Any, b: Any, order: list[int]) -> Any:
-        places = [ir.Constant(_WORD, k) for k in order]
+        indices = [ir.Constant(_WORD, k) for k in order]
         kind = ir.VectorType(_WORD, len(order))
-        return builder.shuffle_vector(a, b, ir.Constant(kind, places))
+        return builder.shuffle_vector(a, b, ir.Constant(kind, indices))
 
     while len(rows) > _BOX:
         both = list(range(2 * rows[0].type.count))
@@ -89,7 +89,9 @@ def _columns(block: Block, ids: Any, at: Any, boxes: Any, skews: Any) -> list[Ve
     return [*columns, Vector(block, skew)]
 
 
-def _reached(block: Block, columns: list[Vector], left: Any, top: Any, height: int) -> _Words:
+def _reached_blocks(
+    block: Block, columns: list[Vector], left: Any, top: Any, height: int
+) -> _Words:
     """Return the masks of 16 pairs for blocks ``height`` rows high."""
     x0, y0, x1, y1, skew = columns
     tile_x, tile_y = block.splat(left), block.splat(top)
@@ -126,17 +128,17 @@ def _reached(block: Block, columns: list[Vector], left: Any, top: Any, height: i
             reach.append((skew * t, across * ((1.0 - t * t).max(0.0) + _MARGIN_CHORD).sqrt()))
         right, left_ = reach[0][0] + reach[0][1], reach[1][1] - reach[1][0]
         # Columns of blocks that begin before its right end, and that end behind its left end.
-        before = meets.choose((right + last).max(0.0).min(float(BLOCK_COLUMNS)), 0.0)
+        before = meets.select((right + last).max(0.0).min(float(BLOCK_COLUMNS)), 0.0)
         behind = (left_ + first).max(0.0).min(float(BLOCK_COLUMNS))
         full = _Words.of(block, _FULL_ROW)
         far = _Words.of(block, _FULL_ROW << (2 * BLOCK_COLUMNS))
         # Both are bits of one row, shifted by the number of columns.
         row = (full << _Words.truncated(before)) & (far >> _Words.truncated(behind))
         by = (strip - 1) * BLOCK_COLUMNS
-        places = _Words.of(block, abs(by))
-        masks = masks | (row << places if by >= 0 else row >> places)
-    every = _Words.of(block, (1 << BLOCK_COLUMNS * (TILE // height)) - 1)
-    chosen = block.builder.select(bounded.value, masks.value, every.value)
+        shift = _Words.of(block, abs(by))
+        masks = masks | (row << shift if by >= 0 else row >> shift)
+    all_blocks = _Words.of(block, (1 << BLOCK_COLUMNS * (TILE // height)) - 1)
+    chosen = block.builder.select(bounded.value, masks.value, all_blocks.value)
     return _Words(block, chosen)
 
 
@@ -151,9 +153,9 @@ def _mask_intrinsic(lanes: int) -> Any:
                 block.data(sig.args[k], args[k]) for k in (0, 2, 3, 6)
             )
             columns = _columns(block, ids_data, args[1], boxes_data, skews_data)
-            words = _reached(block, columns, args[4], args[5], lanes // BLOCK_WIDTH)
-            place = builder.gep(out, [args[7]], inbounds=True)
-            builder.store(words.value, builder.bitcast(place, words.value.type.as_pointer()), 4)
+            words = _reached_blocks(block, columns, args[4], args[5], lanes // BLOCK_WIDTH)
+            pointer = builder.gep(out, [args[7]], inbounds=True)
+            builder.store(words.value, builder.bitcast(pointer, words.value.type.as_pointer()), 4)
             return context.get_dummy_value()
 
         index, single = types.intp, types.float32

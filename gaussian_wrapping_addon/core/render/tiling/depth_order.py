@@ -13,7 +13,7 @@ from ...kernels.parallel import run_chunks
 
 _DIGIT_BITS = 10
 _BUCKETS = 1 << _DIGIT_BITS
-_MOST_DIGITS = 4
+_MAX_DIGITS = 4
 # Below this a second thread costs more than it saves.
 _KEYS_PER_PART = 8192
 _COARSE_BITS = 10
@@ -35,8 +35,8 @@ def _coarse_histogram(
 def _sort_part(
     keys: np.ndarray,
     bounds: np.ndarray,
-    low: int,
-    high: int,
+    first_key: int,
+    end_key: int,
     packed: np.ndarray,
     other: np.ndarray,
     order: np.ndarray,
@@ -50,8 +50,8 @@ def _sort_part(
     for run in range(len(bounds)):
         for k in range(bounds[run, 0], bounds[run, 1]):
             # Every key is written; those of other parts are overwritten by the next.
-            key = np.int64(keys[k]) - low
-            belongs = (key >= 0) & (key < high - low)
+            key = np.int64(keys[k]) - first_key
+            belongs = (key >= 0) & (key < end_key - first_key)
             packed[end] = (np.uint64(key) << np.uint64(32)) | np.uint64(k)
             largest = max(largest, key if belongs else np.int64(0))
             end += np.uint64(belongs)
@@ -61,7 +61,7 @@ def _sort_part(
     digits = (bits + _DIGIT_BITS - 1) // _DIGIT_BITS
     width = np.uint64((bits + digits - 1) // digits) if digits else np.uint64(0)
     mask = (np.uint64(1) << width) - np.uint64(1)
-    heads = np.zeros((_MOST_DIGITS, _BUCKETS), np.int64)
+    heads = np.zeros((_MAX_DIGITS, _BUCKETS), np.int64)
     for k in range(begin, end):
         key = packed[k] >> np.uint64(32)
         for digit in range(digits):
@@ -75,9 +75,9 @@ def _sort_part(
         shift = np.uint64(32) + width * np.uint64(digit)
         for k in range(begin, end):
             bucket = np.int64((packed[k] >> shift) & mask)
-            place = heads[digit, bucket]
-            heads[digit, bucket] = place + 1
-            other[place] = packed[k]
+            index = heads[digit, bucket]
+            heads[digit, bucket] = index + 1
+            other[index] = packed[k]
         packed, other = other, packed
     for k in range(begin, end):
         order[k] = np.int32(packed[k] & _INDEX_MASK)

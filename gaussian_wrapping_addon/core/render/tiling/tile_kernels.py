@@ -20,7 +20,7 @@ ID = 0
 """Columns of a record: Gaussian, first and end row of tiles, its first span, its first slot."""
 RECORD_VALUES = 5
 # Pairs listed before they are scattered, and written for each span however short it is.
-_FLUSH_PAIRS = 1024
+_FLUSH_COUNT = 1024
 _AHEAD = 4
 
 
@@ -98,7 +98,7 @@ def span_tiles(
     end_record, pairs, lowest_key, highest_key : int
     """
     changes[:] = 0
-    all_pairs = 0
+    all_intersections = 0
     bits = depths.view(np.uint32)
     lowest, highest = np.int64(0xFFFFFFFF), np.int64(0)
     for i in range(begin, end):
@@ -106,7 +106,7 @@ def span_tiles(
             continue
         first_row, last_row = ranges[i, 0] // _TILE, ranges[i, 1] // _TILE
         first, last = ranges[i, 2] // _TILE, ranges[i, 3] // _TILE
-        pairs = 0
+        intersections = 0
         x0, x1 = np.float64(boxes[i, 0]), np.float64(boxes[i, 2])
         y0, y1 = np.float64(boxes[i, 1]), np.float64(boxes[i, 3])
         half_x, half_y = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
@@ -117,7 +117,7 @@ def span_tiles(
                 spans[at, 0], spans[at, 1] = first, last + 1
                 changes[row, first] += 1
                 changes[row, last + 1] -= 1
-            pairs = (last - first + 1) * (last_row - first_row + 1)
+            intersections = (last - first + 1) * (last_row - first_row + 1)
         else:
             center_x, center_y = 0.5 * (x1 + x0), 0.5 * (y1 + y0)
             inverse = 1.0 / half_y
@@ -151,8 +151,8 @@ def span_tiles(
                 spans[at, 0], spans[at, 1] = first_tile, end_tile
                 changes[row, first_tile] += 1
                 changes[row, end_tile] -= 1
-                pairs += end_tile - first_tile
-        if pairs == 0:
+                intersections += end_tile - first_tile
+        if intersections == 0:
             continue
         key = bits[i]
         lowest, highest = min(lowest, np.int64(key)), max(highest, np.int64(key))
@@ -160,12 +160,12 @@ def span_tiles(
         records[record, 1] = first_row
         records[record, 2] = last_row + 1
         records[record, 3] = span
-        records[record, 4] = pairs
+        records[record, 4] = intersections
         keys[record] = key
         record += 1
         span += last_row - first_row + 1
-        all_pairs += pairs
-    return record, all_pairs, lowest, highest
+        all_intersections += intersections
+    return record, all_intersections, lowest, highest
 
 
 @kernel(fast=False)
@@ -179,46 +179,46 @@ def count_band(
     records: np.ndarray,
 ) -> int:
     """Write the numbers of pairs within a band of tiles in place of the slots; return their sum."""
-    all_pairs = 0
+    all_intersections = 0
     first_band_row, end_band_row = first_tile // tiles_x, (end_tile - 1) // tiles_x + 1
     for k in range(begin, end):
-        pairs = 0
+        intersections = 0
         begin_row = records[k, 1]
         offset = records[k, 3] - begin_row
         for row in range(max(begin_row, first_band_row), min(records[k, 2], end_band_row)):
             low: Any = max(row * tiles_x + np.int64(spans[offset + row, 0]), first_tile)
             high: Any = min(row * tiles_x + np.int64(spans[offset + row, 1]), end_tile)
-            pairs += max(high - low, 0)
-        records[k, 4] = pairs
-        all_pairs += pairs
-    return all_pairs
+            intersections += max(high - low, 0)
+        records[k, 4] = intersections
+        all_intersections += intersections
+    return all_intersections
 
 
 @kernel(fast=False)
-def place_slots(
+def assign_slots(
     begin: int,
     end: int,
     begin_gaussian: int,
     end_gaussian: int,
     slot: int,
     records: np.ndarray,
-    pair_offsets: np.ndarray,
+    intersection_offsets: np.ndarray,
 ) -> None:
     """Turn the numbers of pairs into first slots, counting on from ``slot``.
 
-    Writes ``pair_offsets`` of the Gaussians ``begin_gaussian .. end_gaussian``, whose records are
-    ``begin .. end``.
+    Writes ``intersection_offsets`` of the Gaussians ``begin_gaussian .. end_gaussian``, whose
+    records are ``begin .. end``.
     """
     i = begin_gaussian
     for k in range(begin, end):
         while i <= records[k, 0]:
-            pair_offsets[i] = slot
+            intersection_offsets[i] = slot
             i += 1
-        pairs = records[k, 4]
+        intersections = records[k, 4]
         records[k, 4] = slot
-        slot += pairs
+        slot += intersections
     while i < end_gaussian:
-        pair_offsets[i] = slot
+        intersection_offsets[i] = slot
         i += 1
 
 
@@ -235,15 +235,21 @@ def rank_records(
 
 @inline
 def _scatter(
-    filled: Any, tiles: Any, slots: Any, ids: Any, heads: Any, gaussian_ids: Any, pair_slots: Any
+    filled: Any,
+    tiles: Any,
+    slots: Any,
+    ids: Any,
+    heads: Any,
+    gaussian_ids: Any,
+    intersection_slots: Any,
 ) -> None:
     """Move the listed pairs to the heads of their tiles."""
-    for pair in range(filled):
-        listed_tile = np.uint64(tiles[pair])
-        place = np.uint64(heads[listed_tile])
-        heads[listed_tile] = place + np.uint64(1)
-        gaussian_ids[place] = ids[pair]
-        pair_slots[place] = slots[pair]
+    for intersection in range(filled):
+        listed_tile = np.uint64(tiles[intersection])
+        index = np.uint64(heads[listed_tile])
+        heads[listed_tile] = index + np.uint64(1)
+        gaussian_ids[index] = ids[intersection]
+        intersection_slots[index] = slots[intersection]
 
 
 @kernel(fast=False)
@@ -257,7 +263,7 @@ def scatter_tiles(
     spans: np.ndarray,
     heads: np.ndarray,
     gaussian_ids: np.ndarray,
-    pair_slots: np.ndarray,
+    intersection_slots: np.ndarray,
 ) -> None:
     """Write the pairs of the tiles ``first_tile .. end_tile``, part of a band, at their ``heads``.
 
@@ -265,7 +271,7 @@ def scatter_tiles(
     stays in the cache, some of them beyond the end of their span and overwritten by the next: few
     spans are longer than that, so the processor does not mispredict where they end.
     """
-    room = _FLUSH_PAIRS + tiles_x + _AHEAD
+    room = _FLUSH_COUNT + tiles_x + _AHEAD
     tiles = np.empty(room, np.int32)
     slots = np.empty(room, np.int32)
     ids = np.empty(room, np.int32)
@@ -289,18 +295,18 @@ def scatter_tiles(
             listed = max(min(high, end_tile) - tile, 0)
             at = slot + (tile - low)
             for ahead in range(_AHEAD):
-                place = filled + np.uint64(ahead)
-                tiles[place] = tile + ahead
-                slots[place] = at + ahead
-                ids[place] = i
+                index = filled + np.uint64(ahead)
+                tiles[index] = tile + ahead
+                slots[index] = at + ahead
+                ids[index] = i
             for ahead in range(_AHEAD, listed):
-                place = filled + np.uint64(ahead)
-                tiles[place] = tile + ahead
-                slots[place] = at + ahead
-                ids[place] = i
+                index = filled + np.uint64(ahead)
+                tiles[index] = tile + ahead
+                slots[index] = at + ahead
+                ids[index] = i
             filled += np.uint64(listed)
             slot += width
-            if filled >= np.uint64(_FLUSH_PAIRS):
-                _scatter(filled, tiles, slots, ids, heads, gaussian_ids, pair_slots)
+            if filled >= np.uint64(_FLUSH_COUNT):
+                _scatter(filled, tiles, slots, ids, heads, gaussian_ids, intersection_slots)
                 filled = np.uint64(0)
-    _scatter(filled, tiles, slots, ids, heads, gaussian_ids, pair_slots)
+    _scatter(filled, tiles, slots, ids, heads, gaussian_ids, intersection_slots)

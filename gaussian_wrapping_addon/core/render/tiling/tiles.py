@@ -16,15 +16,15 @@ from .depth_order import order_by_keys
 from .tile_kernels import (
     ID,
     RECORD_VALUES,
+    assign_slots,
     count_band,
-    place_slots,
     range_pixels,
     rank_records,
     scatter_tiles,
     span_tiles,
 )
 
-_MAX_PAIRS = 2**31 - 1
+_MAX_INTERSECTIONS = 2**31 - 1
 _MAX_TILES_ACROSS = 2**16 - 1
 _CHUNKS_PER_THREAD = 2
 
@@ -42,10 +42,10 @@ class TileLists:
     """(tiles + 1,) int64: the pairs of tile t are ``start[t] .. start[t + 1]``."""
     gaussian_ids: np.ndarray
     """(pairs,) int32, by increasing distance within a tile, ties by index."""
-    pair_slots: np.ndarray
+    intersection_slots: np.ndarray
     """(pairs,) int32: slot of each pair."""
-    pair_offsets: np.ndarray
-    """(n + 1,) int64: the slots of Gaussian i are ``pair_offsets[i] .. pair_offsets[i + 1]``."""
+    intersection_offsets: np.ndarray
+    """(n + 1,) int64: the slots of Gaussian i are ``[offsets[i], offsets[i + 1])``."""
     pixel_ranges: np.ndarray
     """(n, 4) int32: first and last row, first and last column of pixels whose centre lies in the
     box, inside the image; empty (first > last) where not visible."""
@@ -60,7 +60,7 @@ class TileBinning:
     ----------
     ids : (v,) int32
         The Gaussians that reach a tile, increasing.
-    tile_pairs : (tiles,) int64
+    tile_counts : (tiles,) int64
         Number of Gaussians that reach each tile.
     pixel_ranges, tiles_x, tiles_y
         As in :class:`TileLists`.
@@ -101,7 +101,7 @@ class TileBinning:
 
         run_chunks(ranges, np.arange(chunks + 1), threads)
         starts = np.cumsum(found, axis=0)
-        if starts[-1, 1] > _MAX_PAIRS:
+        if starts[-1, 1] > _MAX_INTERSECTIONS:
             raise ResourceError(
                 f"The Gaussians reach {starts[-1, 1]} rows of tiles.", "Render a smaller image."
             )
@@ -133,7 +133,7 @@ class TileBinning:
         # Gaussians that turned out to reach no tile leave gaps at the ends of the runs.
         self._runs = np.stack([starts[:-1, 0], results[:, 0]], 1)  # (chunks, 2) runs of records
         # The records hold numbers of pairs of the whole image until slots take their place.
-        self._whole_pairs: np.ndarray | None = results[:, 1]
+        self._image_intersections: np.ndarray | None = results[:, 1]
         seen = int((self._runs[:, 1] - self._runs[:, 0]).sum())
         self.ids = store.take("ids", seen, np.int32)
         at = 0
@@ -141,38 +141,40 @@ class TileBinning:
             self.ids[at : at + end - begin] = self._records[begin:end, ID]
             at += end - begin
         per_tile = changes.sum(0, dtype=np.int64).cumsum(1)  # (tiles_y, tiles_x + 1)
-        self.tile_pairs = np.ascontiguousarray(per_tile[:, :-1]).reshape(-1)
+        self.tile_counts = np.ascontiguousarray(per_tile[:, :-1]).reshape(-1)
         extent = (0, 0)
         if seen:
             extent = int(results[:, 2].min()), int(results[:, 3].max())
         self._order = order_by_keys(keys, self._runs, extent, threads, store)
 
-    def bands(self, most_pairs: int) -> list[tuple[int, int]]:
-        """Cut the tiles into runs of at most ``most_pairs`` pairs, or of a single tile.
+    def bands(self, max_intersections: int) -> list[tuple[int, int]]:
+        """Cut the tiles into runs of at most ``max_intersections`` pairs, or of a single tile.
 
         Returns
         -------
         list of (first, end)
             At least one band, even where nothing is visible.
         """
-        below = np.concatenate([[0], np.cumsum(self.tile_pairs)])
-        tiles = len(self.tile_pairs)
+        below = np.concatenate([[0], np.cumsum(self.tile_counts)])
+        tiles = len(self.tile_counts)
         bands, first = [], 0
         while first < tiles:
-            fitting = int(np.searchsorted(below, below[first] + most_pairs, side="right")) - 1
+            fitting = (
+                int(np.searchsorted(below, below[first] + max_intersections, side="right")) - 1
+            )
             end = min(max(fitting, first + 1), tiles)
             bands.append((first, end))
             first = end
         return bands
 
-    def lists(self, first: int, end: int, most_pairs: int | None = None) -> TileLists:
+    def lists(self, first: int, end: int, max_intersections: int | None = None) -> TileLists:
         """Return the lists of the tiles ``first .. end``; those made before are overwritten.
 
         Parameters
         ----------
         first, end : int
             Any run of tiles.
-        most_pairs : int, optional
+        max_intersections : int, optional
             No memory is reserved for more pairs than these, beyond what the band needs.
 
         Raises
@@ -181,21 +183,23 @@ class TileBinning:
             If they would hold more than 2^31 - 1 pairs.
         """
         store, threads = self._store, self.threads
-        tiles = len(self.tile_pairs)
+        tiles = len(self.tile_counts)
         start = store.take("start", tiles + 1, np.int64)
         start[: first + 1] = 0
-        np.cumsum(self.tile_pairs[first:end], out=start[first + 1 : end + 1])
-        start[end:] = pairs = int(start[end])
-        if pairs > _MAX_PAIRS:
+        np.cumsum(self.tile_counts[first:end], out=start[first + 1 : end + 1])
+        start[end:] = intersections = int(start[end])
+        if intersections > _MAX_INTERSECTIONS:
             raise ResourceError(
-                f"{pairs} pairs of Gaussian and tile do not fit.",
+                f"{intersections} pairs of Gaussian and tile do not fit.",
                 "Render a smaller image or with a smaller budget.",
             )
-        pair_offsets = self._offsets(first, end)
+        intersection_offsets = self._offsets(first, end)
         heads = store.take("heads", tiles, np.int64)
         heads[:] = start[:-1]
-        gaussian_ids = store.take("gaussian ids", pairs, np.int32, most_pairs)
-        pair_slots = store.take("pair slots", pairs, np.int32, most_pairs)
+        gaussian_ids = store.take("gaussian ids", intersections, np.int32, max_intersections)
+        intersection_slots = store.take(
+            "intersection slots", intersections, np.int32, max_intersections
+        )
         ranked = store.take("ranked", (len(self._order), RECORD_VALUES), np.int32)
 
         def rank(begin: int, stop: int) -> None:
@@ -214,17 +218,17 @@ class TileBinning:
                 self._spans,
                 heads,
                 gaussian_ids,
-                pair_slots,
+                intersection_slots,
             )
 
         # Each thread walks the whole order and keeps what falls into its tiles.
-        bounds = first + balanced_bounds(self.tile_pairs[first:end], threads)
+        bounds = first + balanced_bounds(self.tile_counts[first:end], threads)
         run_chunks(scatter, bounds, threads)
         return TileLists(
             start,
             gaussian_ids,
-            pair_slots,
-            pair_offsets,
+            intersection_slots,
+            intersection_offsets,
             self.pixel_ranges,
             self.tiles_x,
             self.tiles_y,
@@ -233,7 +237,7 @@ class TileBinning:
     def _offsets(self, first: int, end: int) -> np.ndarray:
         """Number the slots of a band; return (n + 1,) offsets."""
         chunks, threads = len(self._runs), self.threads
-        offsets = self._store.take("pair offsets", self._count + 1, np.int64)
+        offsets = self._store.take("intersection offsets", self._count + 1, np.int64)
         totals = np.zeros(chunks + 1, np.int64)
 
         def count(first_chunk: int, end_chunk: int) -> None:
@@ -243,22 +247,22 @@ class TileBinning:
                     begin, stop, first, end, self.tiles_x, self._spans, self._records
                 )
 
-        if self._whole_pairs is not None and (first, end) == (0, len(self.tile_pairs)):
-            totals[1:] = self._whole_pairs
+        if self._image_intersections is not None and (first, end) == (0, len(self.tile_counts)):
+            totals[1:] = self._image_intersections
         else:
             run_chunks(count, np.arange(chunks + 1), threads)
-        self._whole_pairs = None
+        self._image_intersections = None
         slots = np.cumsum(totals)
 
-        def place(first_chunk: int, end_chunk: int) -> None:
+        def assign(first_chunk: int, end_chunk: int) -> None:
             for chunk in range(first_chunk, end_chunk):
                 begin, stop = self._runs[chunk]
                 begin_gaussian, end_gaussian = self._gaussians[chunk : chunk + 2]
-                place_slots(
+                assign_slots(
                     begin, stop, begin_gaussian, end_gaussian, slots[chunk], self._records, offsets
                 )
 
-        run_chunks(place, np.arange(chunks + 1), threads)
+        run_chunks(assign, np.arange(chunks + 1), threads)
         offsets[self._count] = slots[-1]
         return offsets
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...errors import ResourceError
-from ...gaussians.initialisation import FEW_POINTS
+from ...gaussians.initialisation import MIN_START_POINTS
 from ...machine import available_memory_bytes
 from ...report_warning import ReportWarning
 from ...settings import TrainingSettings
@@ -185,7 +185,7 @@ def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float
     """
     schedule = _schedule(facts, settings)
     limit = schedule.growth_limit()
-    start = min(limit, max(facts.points, FEW_POINTS))
+    start = min(limit, max(facts.points, MIN_START_POINTS))
     top = limit if settings.growth == "on" else start + growth * (limit - start)
     if settings.growth == "off":
         top = start

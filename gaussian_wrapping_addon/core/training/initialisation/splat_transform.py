@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...dataset.loading.splat_cameras import even_directions
+from ...dataset.loading.splat_cameras import fibonacci_directions
 from ...dataset.readers.source_model import quaternion_from_rotation
 from ...dataset.similarity import Similarity
 from ...gaussians.model import OrientedGaussians
@@ -96,7 +96,7 @@ def rotate_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
 @functools.cache
 def _directions() -> Tensor:
     """Return (m, 3) evenly spread unit vectors: a spherical Fibonacci lattice."""
-    return torch.from_numpy(even_directions(_DIRECTIONS))
+    return torch.from_numpy(fibonacci_directions(_DIRECTIONS))
 
 
 def with_degree(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:

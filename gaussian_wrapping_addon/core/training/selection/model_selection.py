@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import UsageError
-from ...settings import DECISIONS
+from ...settings import SELECTION_MODES
 
 ON, OFF = "on", "off"
 
@@ -49,10 +49,10 @@ class Decision:
     """Whether the photos were measured; false if the settings alone decide."""
 
     def __post_init__(self) -> None:
-        if self.setting not in DECISIONS:
+        if self.setting not in SELECTION_MODES:
             raise UsageError(
                 f"The setting {self.name} is {self.setting!r}.",
-                f"Give one of {', '.join(DECISIONS)}.",
+                f"Give one of {', '.join(SELECTION_MODES)}.",
             )
 
     @property

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import even_directions
+from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import fibonacci_directions
 from gaussian_wrapping_addon.core.dataset.readers.source_model import rotation_from_quaternion
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
@@ -126,7 +126,7 @@ def test_a_baked_filter_changes_no_picture() -> None:
 
 def test_the_vote_turns_a_shell_of_discs_outwards() -> None:
     shell, normals = shell_of_discs(1500)
-    cameras = [look_at(tuple(4.0 * d)) for d in even_directions(12)]
+    cameras = [look_at(tuple(4.0 * d)) for d in fibonacci_directions(12)]
     voted = voted_orientation(shell, cameras, threads=1)
     seen = voted[:, 3] != 0
     assert seen.mean() > 0.95
@@ -138,7 +138,7 @@ def _scene(shell: OrientedGaussians) -> tuple[Scene, Pictures]:
     """Return a scene whose photos show a shell that stands in the scene frame."""
     cameras = [
         look_at(tuple(4.0 * d), width=96, height=96, focal=110.0, name=f"{i}")
-        for i, d in enumerate(even_directions(9))
+        for i, d in enumerate(fibonacci_directions(9))
     ]
     options = RenderOptions(depth=False, threads=1)
     photos = [

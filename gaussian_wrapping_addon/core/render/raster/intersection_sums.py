@@ -13,12 +13,12 @@ from .raster_backward import ABS_U, ABS_V
 
 
 @kernel(fast=False)
-def add_pair_gradients(
+def add_intersection_gradients(
     begin: int,
     end: int,
     ids: np.ndarray,
-    pairs: np.ndarray,
-    pair_offsets: np.ndarray,
+    intersections: np.ndarray,
+    intersection_offsets: np.ndarray,
     fresh: bool,
     grad_params: np.ndarray,
 ) -> None:
@@ -35,15 +35,15 @@ def add_pair_gradients(
         else:
             for column in range(ROW_VALUES):
                 total[column] = grad_params[i, column]
-        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
+        for slot in range(intersection_offsets[i], intersection_offsets[i + 1]):
             for column in range(ROW_VALUES):
-                total[column] += pairs[slot, column]
+                total[column] += intersections[slot, column]
         for column in range(ROW_VALUES):
             grad_params[i, column] = total[column]
 
 
 @kernel(fast=False)
-def take_screen_gradients(
+def write_screen_gradients(
     begin: int,
     end: int,
     ids: np.ndarray,
@@ -73,12 +73,12 @@ def take_screen_gradients(
 
 
 @kernel(fast=False)
-def add_pair_weights(
+def add_intersection_weights(
     begin: int,
     end: int,
     ids: np.ndarray,
-    pair_weights: np.ndarray,
-    pair_offsets: np.ndarray,
+    intersection_weights: np.ndarray,
+    intersection_offsets: np.ndarray,
     weight_sum: np.ndarray,
     weight_max: np.ndarray,
 ) -> None:
@@ -86,14 +86,14 @@ def add_pair_weights(
     for k in range(begin, end):
         i = ids[k]
         total, largest = weight_sum[i], weight_max[i]
-        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
-            total += pair_weights[slot, 0]
-            largest = max(largest, pair_weights[slot, 1])
+        for slot in range(intersection_offsets[i], intersection_offsets[i + 1]):
+            total += intersection_weights[slot, 0]
+            largest = max(largest, intersection_weights[slot, 1])
         weight_sum[i], weight_max[i] = total, largest
 
 
 @kernel(fast=False)
-def mark_seen(
+def mark_visible(
     begin: int,
     end: int,
     ids: np.ndarray,
