@@ -50,8 +50,8 @@ def mip_filter(
 ) -> np.ndarray:
     """Return the filter's standard deviation of each Gaussian (docs/method.md, section 1.5).
 
-    ``f = z_min / focal_max * sqrt(0.2)``, with ``z_min`` the smallest z-depth over the cameras
-    whose image, enlarged by 15 % on each side, holds the mean.
+    ``f = z_min / focal_max * sqrt(FILTER_VARIANCE_PX)``, with ``z_min`` the smallest z-depth over
+    the cameras whose image, enlarged by 15 % on each side, contains the mean.
 
     Parameters
     ----------

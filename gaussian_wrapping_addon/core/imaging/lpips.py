@@ -189,8 +189,8 @@ def _find_files() -> tuple[Path, Path]:
 
 
 def _first_file(folders: list[Path], pattern: str) -> Path | None:
-    for place in folders:
-        files = sorted(place.glob(pattern)) if place.is_dir() else [place]
+    for path in folders:
+        files = sorted(path.glob(pattern)) if path.is_dir() else [path]
         for file in files:
             if file.is_file() and file.match(pattern):
                 return file

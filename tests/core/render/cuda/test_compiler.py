@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""NVRTC compiles the CUDA text for every GPU generation in use; errors are typed and tell why."""
+"""NVRTC compiles the CUDA source for all current GPU generations; errors are typed, with reason."""
 
 from __future__ import annotations
 

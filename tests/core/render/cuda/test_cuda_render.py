@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The renderer on a real GPU equals the CPU's; without one, it says why it cannot run."""
+"""The renderer on a real GPU equals the CPU's; without one, it reports why it cannot run."""
 
 from __future__ import annotations
 
