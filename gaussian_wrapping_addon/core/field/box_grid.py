@@ -109,7 +109,7 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
 
     table_begin, table_mask, slot_key_parts, slot_cell_parts = [], [], [], []
     begin_parts, owner_parts = [np.zeros(1, np.int64)], []
-    slots = cells = pairs = 0
+    slots = cells = entries = 0
     for size, number in zip(level_size.tolist(), used.tolist(), strict=True):
         rows = np.flatnonzero(level == number)
         sizes = np.full(len(rows), size)
@@ -130,10 +130,10 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
         table_mask.append(capacity - 1)
         slot_key_parts.append(slot_keys)
         slot_cell_parts.append(slot_cells)
-        ends = np.concatenate([first[1:], [len(keys)]]) + pairs
+        ends = np.concatenate([first[1:], [len(keys)]]) + entries
         begin_parts.append(ends.astype(np.int64))
         owner_parts.append(rows[owners[order]].astype(np.int32))
-        slots, cells, pairs = slots + capacity, cells + len(unique_keys), pairs + len(keys)
+        slots, cells, entries = slots + capacity, cells + len(unique_keys), entries + len(keys)
     return BoxGrid(
         origin,
         level_size,

@@ -21,7 +21,7 @@ from ..render.projection.projection import RawArrays
 from ..render.types.options import RenderOptions
 from ..render.view_renderer import ViewRenderer
 
-MAX_SIGHTINGS = 120_000
+MAX_DEPTH_SAMPLES = 120_000
 """Points kept, about evenly over the surface (memory and time of the triangulation)."""
 
 MAX_SIDE_PX = 960
@@ -33,12 +33,12 @@ DEPTHS_PX = (0.5, 1.0, 2.0)
 STEP_OUT_PX = 0.5
 """Step towards the camera: there that camera sees more than half, so it is empty."""
 
-_POOL = 8 * MAX_SIGHTINGS
+_POOL = 8 * MAX_DEPTH_SAMPLES
 """Points that wait for thinning at a time."""
 
 
 @dataclass(frozen=True)
-class Sightings:
+class DepthSamples:
     """Points on the cameras' isosurfaces."""
 
     points: np.ndarray  # (n, 3) float64 scene frame
@@ -48,25 +48,25 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.points)
 
-    def kept(self, index: np.ndarray) -> Sightings:
+    def kept(self, index: np.ndarray) -> DepthSamples:
         """Return those of an index or mask."""
-        return Sightings(self.points[index], self.directions[index], self.footprints[index])
+        return DepthSamples(self.points[index], self.directions[index], self.footprints[index])
 
 
 Contains = Callable[[np.ndarray], np.ndarray]
 """Maps (n, 3) points to (n,) bool."""
 
 
-def find_sightings(
+def sample_depth_maps(
     gaussians: OrientedGaussians,
     cameras: Sequence[Camera],
     contains: Contains,
     progress: Progress,
     *,
-    most: int = MAX_SIGHTINGS,
+    most: int = MAX_DEPTH_SAMPLES,
     near_z: float = tolerances.NEAR_Z,
     threads: int = 0,
-) -> Sightings:
+) -> DepthSamples:
     """Collect the points of the cameras' depth maps that lie in a volume, thinned evenly.
 
     Parameters
@@ -95,49 +95,49 @@ def find_sightings(
         inside = contains(points)
         toward = rays[inside] @ camera.rotation
         toward /= np.linalg.norm(toward, axis=1)[:, None]
-        found.append(Sightings(points[inside], toward, z[inside] / max(camera.fx, camera.fy)))
+        found.append(DepthSamples(points[inside], toward, z[inside] / max(camera.fx, camera.fy)))
         waiting += len(found[-1])
         if waiting > _POOL:
-            found = [thinned(_joined(found), most)]
+            found = [thin_evenly(_concatenated(found), most)]
             waiting = len(found[0])
-    return thinned(_joined(found), most)
+    return thin_evenly(_concatenated(found), most)
 
 
-def _joined(parts: list[Sightings]) -> Sightings:
+def _concatenated(parts: list[DepthSamples]) -> DepthSamples:
     if not parts:
-        return Sightings(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    return Sightings(
+        return DepthSamples(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    return DepthSamples(
         np.concatenate([part.points for part in parts]),
         np.concatenate([part.directions for part in parts]),
         np.concatenate([part.footprints for part in parts]),
     )
 
 
-def thinned(sightings: Sightings, most: int) -> Sightings:
+def thin_evenly(depth_samples: DepthSamples, most: int) -> DepthSamples:
     """Keep one sighting, the sharpest, of each cell and octant of directions; at most ``most``."""
-    if len(sightings) == 0:
-        return sightings
-    low, high = sightings.points.min(0), sightings.points.max(0)
-    side = float(np.median(sightings.footprints))
+    if len(depth_samples) == 0:
+        return depth_samples
+    low, high = depth_samples.points.min(0), depth_samples.points.max(0)
+    side = float(np.median(depth_samples.footprints))
     side = max(side, float((high - low).max()) / 2**20)  # cell numbers fit
-    octant = (sightings.directions > 0) @ np.array([1, 2, 4])  # (n,)
-    order = np.argsort(sightings.footprints, kind="stable")
+    octant = (depth_samples.directions > 0) @ np.array([1, 2, 4])  # (n,)
+    order = np.argsort(depth_samples.footprints, kind="stable")
     while True:
-        cell = np.floor((sightings.points - low) / side).astype(np.int64)  # (n, 3)
+        cell = np.floor((depth_samples.points - low) / side).astype(np.int64)  # (n, 3)
         key = ((cell[:, 0] << 20 | cell[:, 1]) << 20 | cell[:, 2]) << 3 | octant
         _, first = np.unique(key[order], return_index=True)
         if len(first) <= most:
-            return sightings.kept(np.sort(order[first]))
+            return depth_samples.kept(np.sort(order[first]))
         # A surface: the number falls with the square of the side.
         side *= max(1.1, float(np.sqrt(len(first) / most)))
 
 
 def bracket_pairs(
-    sightings: Sightings, is_empty: Callable[[np.ndarray], np.ndarray]
+    depth_samples: DepthSamples, is_empty: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return points (k, 3) outside and inside of the solid, in pairs across its surface.
 
-    Sightings behind which no camera agrees that there is anything are left out: what one camera
+    Samples behind which no camera agrees that there is anything are left out: what one camera
     takes for opaque, another may see through.
 
     Parameters
@@ -145,15 +145,15 @@ def bracket_pairs(
     is_empty : callable
         Maps (n, 3) points to (n,) bool, over all cameras.
     """
-    step = sightings.directions * sightings.footprints[:, None]  # (n, 3) one pixel
-    inner = sightings.points.copy()
-    waiting = np.arange(len(sightings))
+    step = depth_samples.directions * depth_samples.footprints[:, None]  # (n, 3) one pixel
+    inner = depth_samples.points.copy()
+    waiting = np.arange(len(depth_samples))
     for depth in DEPTHS_PX:
-        trial = sightings.points[waiting] + depth * step[waiting]
+        trial = depth_samples.points[waiting] + depth * step[waiting]
         solid = ~is_empty(trial)
         inner[waiting[solid]] = trial[solid]
         waiting = waiting[~solid]
-    paired = np.ones(len(sightings), np.bool_)
+    paired = np.ones(len(depth_samples), np.bool_)
     paired[waiting] = False
-    outer = sightings.points - STEP_OUT_PX * step
+    outer = depth_samples.points - STEP_OUT_PX * step
     return outer[paired], inner[paired]

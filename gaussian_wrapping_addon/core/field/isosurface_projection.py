@@ -19,7 +19,7 @@ from .vector_field import MIN_SLOPE, VectorFieldResult
 TOLERANCE = 0.01
 """Points no further than this from 0.5 are on the surface: about the error that dropped tails of
 Gaussians leave in the field."""
-AIM = 0.002
+TARGET_RESIDUAL = 0.002
 """Points move on until they are this close, where the field is smooth enough. Those that a bracket
 brings there end anywhere below it, so it bounds the median of any scene. On trained scenes the
 median is 0.0003 to 0.0004, for an eighth to a sixth more evaluations than with 0.005 (0.0009 to
@@ -130,7 +130,7 @@ def project_to_isosurface(
     progress : Progress, optional
     tolerance : float
         Largest ``|v - 0.5|`` of a point that is kept; 1e-3 to 2e-2 make sense. Points that get
-        there move on until they are within :data:`AIM`, or can not.
+        there move on until they are within :data:`TARGET_RESIDUAL`, or can not.
     max_steps : int
         Batches of vacancy evaluations at most; points still under way then are dropped.
     max_travel_sigmas : float
@@ -144,26 +144,26 @@ def project_to_isosurface(
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
     centers = np.array([camera.center for camera in vacancy_field.cameras]).reshape(-1, 3)
     vectors = vector_field.evaluate(points)
-    answer = vacancy_field.vacancy(points)
-    walk = _Walk(points, answer, vectors, centers, tolerance, max_travel_sigmas)
+    evaluated = vacancy_field.vacancy(points)
+    search = _Search(points, evaluated, vectors, centers, tolerance, max_travel_sigmas)
     rounds, evaluations = 1, len(points)
-    while len(walk.rows) and rounds < max_steps:
-        share = 1.0 - len(walk.rows) / max(1, len(points))
+    while len(search.rows) and rounds < max_steps:
+        share = 1.0 - len(search.rows) / max(1, len(points))
         progress.update(share, "Moving points onto the surface")
-        trial = walk.next_trials()
+        trial = search.next_trials()
         if len(trial) == 0:
             break
-        answer = vacancy_field.vacancy(trial)
+        evaluated = vacancy_field.vacancy(trial)
         rounds, evaluations = rounds + 1, evaluations + len(trial)
-        accepted = walk.judge(trial, answer)
+        accepted = search.update(trial, evaluated)
         if len(accepted):
-            fresh = vector_field.evaluate(walk.x[accepted])
-            walk.V[accepted], walk.outward[accepted] = fresh.V, fresh.outward
+            fresh = vector_field.evaluate(search.x[accepted])
+            search.V[accepted], search.outward[accepted] = fresh.V, fresh.outward
     progress.update(1.0, "Points are on the surface")
-    return walk.result(rounds, evaluations)
+    return search.result(rounds, evaluations)
 
 
-class _Walk:
+class _Search:
     """State of every point (full-length arrays) and ``rows``, the points still under way."""
 
     def __init__(
@@ -178,7 +178,7 @@ class _Walk:
         n = len(points)
         self.centers = centers
         self.tolerance = tolerance
-        self.aim = min(AIM, tolerance)
+        self.target = min(TARGET_RESIDUAL, tolerance)
         self.sigma = vectors.sigma_local
         self.max_travel = max_travel_sigmas * self.sigma
         self.start = points
@@ -209,7 +209,7 @@ class _Walk:
         self.phase = np.full(n, _NEWTON, np.int8)
         self.status = np.full(n, ProjectionStatus.DROPPED, np.uint8)
         seen = first.camera >= 0
-        done = seen & (np.abs(self.v - tolerances.ISO_LEVEL) <= self.aim)
+        done = seen & (np.abs(self.v - tolerances.ISO_LEVEL) <= self.target)
         self.status[done] = ProjectionStatus.CONVERGED
         # Unseen points have no vacancy of their own; without Gaussians there is no length.
         self.rows = np.flatnonzero(seen & ~done & (self.sigma > 0.0))
@@ -249,14 +249,16 @@ class _Walk:
         alive = np.ones(len(rows), bool)
         phase = self.phase[rows]
         trial[phase == _NEWTON] = self._newton(rows[phase == _NEWTON])
-        trial[phase == _BRACKET], alive[phase == _BRACKET] = self._cut(rows[phase == _BRACKET])
+        trial[phase == _BRACKET], alive[phase == _BRACKET] = self._false_position(
+            rows[phase == _BRACKET]
+        )
         march = np.flatnonzero(phase == _MARCH)
         trial[march] = self._march(rows[march])
-        spent = self._is_spent(rows[march], trial[march])
-        again = march[spent & ~self.along_ray[rows[march]]]
+        exhausted = self._is_exhausted(rows[march], trial[march])
+        again = march[exhausted & ~self.along_ray[rows[march]]]
         self._begin_march(rows[again], along_ray=True)
         trial[again] = self._march(rows[again])
-        alive[march] = ~self._is_spent(rows[march], trial[march])
+        alive[march] = ~self._is_exhausted(rows[march], trial[march])
         alive &= self._travel(rows, trial) <= self.max_travel[rows]
         self.rows = rows[alive]
         return trial[alive]
@@ -264,15 +266,15 @@ class _Walk:
     def _travel(self, rows: np.ndarray, trial: np.ndarray) -> np.ndarray:
         return np.linalg.norm(trial - self.start[rows], axis=1)
 
-    def _is_spent(self, rows: np.ndarray, trial: np.ndarray) -> np.ndarray:
+    def _is_exhausted(self, rows: np.ndarray, trial: np.ndarray) -> np.ndarray:
         inward = self.v[rows] > tolerances.ISO_LEVEL
         too_far = self._travel(rows, trial) > self.max_travel[rows]
         too_far |= inward & (self.marched[rows] > MAX_INWARD_MARCH)
         # Outwards, the last step ends at the limit itself.
         before = np.where(self.marched[rows] > 1, 2.0 ** (self.marched[rows] - 2), 0.0)
-        return too_far | (~inward & (before >= self._room(rows)))
+        return too_far | (~inward & (before >= self._remaining_sigmas(rows)))
 
-    def _room(self, rows: np.ndarray) -> np.ndarray:
+    def _remaining_sigmas(self, rows: np.ndarray) -> np.ndarray:
         """Sigmas that a march from the current point may go in any direction."""
         gone = self._travel(rows, self.x[rows])
         return (1.0 - 1e-9) * (self.max_travel[rows] - gone) / self.sigma[rows]
@@ -302,11 +304,11 @@ class _Walk:
         count = self.marched[rows]
         # Inwards, longer steps could miss a thin wall.
         occupied = self.v[rows] < tolerances.ISO_LEVEL
-        outward = np.minimum(2.0 ** (count - 1), self._room(rows))
+        outward = np.minimum(2.0 ** (count - 1), self._remaining_sigmas(rows))
         reach = np.where(occupied, outward, count) * self.sigma[rows]
         return self.x[rows] + reach[:, None] * self.direction[rows]
 
-    def _cut(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _false_position(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         self.cuts[rows] += 1
         at = self.weights[rows, 0] / (self.weights[rows, 0] - self.weights[rows, 1])
         at = np.where(self.cuts[rows] % 3 == 0, 0.5, np.clip(at, 0.02, 0.98))
@@ -317,18 +319,18 @@ class _Walk:
 
     # -- what the answer means --------------------------------------------------------------------
 
-    def judge(self, trial: np.ndarray, answer: VacancyResult) -> np.ndarray:
+    def update(self, trial: np.ndarray, evaluated: VacancyResult) -> np.ndarray:
         """Digest the vacancy of the trials; return the rows where Newton moved on."""
         rows = self.rows
-        v = answer.vacancy.astype(np.float64)
-        seen = answer.camera >= 0
+        v = evaluated.vacancy.astype(np.float64)
+        seen = evaluated.camera >= 0
         error = np.abs(v - tolerances.ISO_LEVEL)
         better = seen & (error < np.abs(self.best_v[rows] - tolerances.ISO_LEVEL))
         self.best_x[rows[better]] = trial[better]
         self.best_v[rows[better]] = v[better]
-        self.best_camera[rows[better]] = answer.camera[better]
+        self.best_camera[rows[better]] = evaluated.camera[better]
 
-        done = seen & (error <= self.aim)
+        done = seen & (error <= self.target)
         newton = self.phase[rows] == _NEWTON
         march = self.phase[rows] == _MARCH
         cut = self.phase[rows] == _BRACKET
@@ -350,7 +352,7 @@ class _Walk:
         shown = np.log(v[taken] / self.v[now]) / np.where(expected == 0.0, 1.0, expected)
         shown = np.where(np.isfinite(shown), shown, 1.0)
         self.slope[now] = np.clip(shown, 1.0 / SLOPE_RATIO, SLOPE_RATIO)
-        self.x[now], self.v[now], self.camera[now] = trial[taken], v[taken], answer.camera[taken]
+        self.x[now], self.v[now], self.camera[now] = trial[taken], v[taken], evaluated.camera[taken]
         self.halvings[now] = 0
         self.steps[now] += 1
         self.halvings[rows[newton & ~taken & ~crossed & ~done]] += 1

@@ -10,7 +10,7 @@ import numpy as np
 from .. import tolerances
 
 
-def level_errors(vacancy: Any, points: np.ndarray) -> dict[str, Any]:
+def isosurface_residuals(vacancy: Any, points: np.ndarray) -> dict[str, Any]:
     """Measure ``|v - 0.5|`` at points that should lie on the isosurface; nothing without points.
 
     Parameters

@@ -202,7 +202,7 @@ class VectorField:
             )  # fmt: skip
 
         if count and len(self._table):
-            order = self._visiting_order(points)
+            order = self._evaluation_order(points)
             chunks = max(1, count // POINTS_PER_CHUNK // self.threads)
             run_chunks(work, even_bounds(count, self.threads, chunks), self.threads)
         nearest = np.full(count, -1, np.int32)
@@ -216,7 +216,7 @@ class VectorField:
             sigma_local[lost] = np.median(self._thickness[index], axis=1)
         return VectorFieldResult(V, sigma_local, nearest, self._outward(V, sigma_local, nearest))
 
-    def _visiting_order(self, points: np.ndarray) -> np.ndarray:
+    def _evaluation_order(self, points: np.ndarray) -> np.ndarray:
         """Return an order in which neighbours follow each other: 2 to 3 times faster than random.
 
         The compiled loop then finds the same Gaussians in the processor's caches.

@@ -16,7 +16,7 @@ import numpy as np
 from ..dataset.scene import Scene
 from ..errors import ParseError, UsageError
 from ..files import read_json, write_bytes, write_json
-from ..settings import RESULT_FREE, TrainingSettings, to_json
+from ..settings import RESULT_INDEPENDENT, TrainingSettings, to_json
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ def fingerprint(
     start : Path, optional
         File of Gaussians that the training starts from; its content counts.
     """
-    described = {k: v for k, v in to_json(settings).items() if k not in RESULT_FREE}
+    described = {k: v for k, v in to_json(settings).items() if k not in RESULT_INDEPENDENT}
     described.pop("extra_iterations")  # a longer run starts as the shorter one does
     digest = hashlib.sha256()
     digest.update(repr((VERSION, sorted(described.items()), seed)).encode())

@@ -52,12 +52,12 @@ def divisor_for(photos: PhotoSource, index: int, longest_px: int) -> int:
     return max(1, min(divisor, camera.width, camera.height))
 
 
-def spread(views: Sequence[int], count: int) -> list[int]:
+def evenly_spaced(views: Sequence[int], count: int) -> list[int]:
     """Return at most ``count`` of the views, evenly spread."""
     if not views:
         return []
-    places = np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)
-    return [views[place] for place in places.tolist()]
+    positions = np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)
+    return [views[position] for position in positions.tolist()]
 
 
 def measure_held_out(
@@ -99,7 +99,7 @@ def measure_held_out(
     renderer = renderer or ViewRenderer()
     raw = RawArrays.from_gaussians(gaussians)
     figures = []
-    for view in spread(held_out, MEASURED_VIEWS):
+    for view in evenly_spaced(held_out, MEASURED_VIEWS):
         if check is not None:
             check()
         divisor = divisor_for(photos, view, MEASURED_PX)
@@ -158,10 +158,10 @@ class LiveView:
         self._photos, self._held_out, self._folder = photos, list(held_out), folder
         self._every_s, self._threads, self._clock = settings.preview_every_s, threads, clock
         self._renderer = ViewRenderer()
-        self._looked_s = clock()
-        self._shown = self._held_out[len(self._held_out) // 2] if self._held_out else 0
+        self._updated_s = clock()
+        self._shown_view = self._held_out[len(self._held_out) // 2] if self._held_out else 0
 
-    def look(
+    def update(
         self,
         gaussians: OrientedGaussians,
         iteration: int,
@@ -179,7 +179,7 @@ class LiveView:
         """
         if self._every_s <= 0:
             return None
-        if not force and self._clock() - self._looked_s < self._every_s:
+        if not force and self._clock() - self._updated_s < self._every_s:
             return None
         figures = {}
         quality = measure_held_out(
@@ -194,16 +194,16 @@ class LiveView:
             figures = {"held_out_psnr": quality, "held_out_iteration": float(iteration)}
         self._write(gaussians, exposure_correction)
         # After the work: looks that take long on a slow machine do not follow one on the other.
-        self._looked_s = self._clock()
+        self._updated_s = self._clock()
         return figures
 
     def _write(self, gaussians: OrientedGaussians, correction: Correction | None) -> None:
-        divisor = divisor_for(self._photos, self._shown, (PREVIEW_PX - GAP_PX) // 2)
+        divisor = divisor_for(self._photos, self._shown_view, (PREVIEW_PX - GAP_PX) // 2)
         raw = RawArrays.from_gaussians(gaussians)
         image = _rendered(
-            self._renderer, raw, self._photos, self._shown, divisor, self._threads, correction
+            self._renderer, raw, self._photos, self._shown_view, divisor, self._threads, correction
         )
-        picture = side_by_side(self._photos.photo(self._shown, divisor), image)
+        picture = side_by_side(self._photos.photo(self._shown_view, divisor), image)
         try:
             write_bytes(self._folder / PREVIEW_FILE, png(picture))
             write_bytes(self._folder / PIXELS_FILE, npy(picture))

@@ -10,11 +10,11 @@ from typing import Any
 
 from ..gaussians.model import OrientedGaussians
 from ..report_warning import ReportWarning
-from .selection.model_selection import Needs
+from .selection.model_selection import ModelSelection
 
 
 @dataclass(frozen=True)
-class HeldOutFigure:
+class HeldOutMetrics:
     """How well one photo that was never trained on is reproduced."""
 
     name: str
@@ -40,12 +40,12 @@ class TrainingResult:
     iterations: int
     history: tuple[dict[str, float], ...]
     """Loss, PSNR of the trained photos and number of Gaussians along the way."""
-    held_out: tuple[HeldOutFigure, ...]
+    held_out: tuple[HeldOutMetrics, ...]
     seconds: float
     warnings: tuple[ReportWarning, ...]
     lpips_note: str = ""
     """Why the held-out photos have no LPIPS."""
-    needs: Needs = field(default_factory=Needs)
+    model_selection: ModelSelection = field(default_factory=ModelSelection)
     """What was decided for the scene."""
     exposure_fitted: bool = False
     """Held-out photos were measured in their own exposure, fitted crosswise on their halves."""
@@ -74,7 +74,7 @@ class TrainingResult:
             "held_out": [figure.to_json() for figure in self.held_out],
             "history": [dict(entry) for entry in self.history],
             "warnings": [warning.to_json() for warning in self.warnings],
-            "decisions": self.needs.to_json(),
+            "decisions": self.model_selection.to_json(),
             "held_out_exposure_fitted": self.exposure_fitted,
             "sh_degree": self.gaussians.sh_degree,
         }

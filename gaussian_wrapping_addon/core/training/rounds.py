@@ -14,16 +14,16 @@ from ..dataset.photo_source import PhotoSource
 from ..gaussians.mip_filter import mip_filter
 from ..gaussians.model import OrientedGaussians
 from ..progress import Progress
-from .cancelling import checked
+from .cancellation import cancellable
 from .density.contribution import contributions, least_contributors, prune_contributors
 from .density.density_control import densify_and_prune, reset_opacity
 from .density.wrapping import WrapView, normal_errors, start_orientation, wrap
 from .iteration import Stepper
 from .live_view import divisor_for
 from .schedule import Schedule
-from .selection.harmonics_selection import harmonics_need
-from .selection.harmonics_trial import NeedView
-from .selection.model_selection import wrapping_need
+from .selection.harmonics_selection import select_harmonics
+from .selection.harmonics_trial import TrialView
+from .selection.model_selection import select_wrapping
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
@@ -76,7 +76,7 @@ class Rounds:
         if iteration > 0 and schedule.divisor(iteration) != schedule.divisor(iteration - 1):
             self.filter(state)
         if schedule.starts_depth(iteration):
-            state.visits.clear()  # errors of colour rise where other terms join
+            state.error_history.clear()  # errors of colour rise where other terms join
         if schedule.starts_orientation(iteration):
             start_orientation(state.adam, self._views(VOTE_DIVISOR), threads=self.threads)
         if self.settings.harmonics == "on":
@@ -104,7 +104,7 @@ class Rounds:
             self.filter(state)
         if schedule.resets_opacity(iteration):
             reset_opacity(adam)
-            state.visits.clear()
+            state.error_history.clear()
         tries = self.settings.harmonics == "auto" and not schedule.refines
         if tries and schedule.tries_harmonics(iteration):
             self._try_harmonics(state)
@@ -126,18 +126,22 @@ class Rounds:
     def _densify(self, state: TrainingState) -> None:
         """Add and prune; stop adding for good where it does not pay any more."""
         setting, limit = self.settings.growth, self.schedule.budget(state.iteration)
-        known = state.needs.get("growth")
+        known = state.model_selection.get("growth")
         if setting != "auto":
             stopped = setting == "off"
             if known is None:
-                need = state.visits.need()
-                state.needs = state.needs.with_decision(need.decision(setting))
+                evidence = state.error_history.growth_evidence()
+                state.model_selection = state.model_selection.with_decision(
+                    evidence.decision(setting)
+                )
         else:
             stopped = known is not None and known.chosen == "stopped"
             if not stopped:
-                need = state.visits.need()
-                state.needs = state.needs.with_decision(need.decision(setting))
-                stopped = not need.pays
+                evidence = state.error_history.growth_evidence()
+                state.model_selection = state.model_selection.with_decision(
+                    evidence.decision(setting)
+                )
+                stopped = not evidence.pays
         weights = self._region_weights(state)
         densify_and_prune(
             state.adam, state.statistics, 0 if stopped else limit, state.random, weights
@@ -157,7 +161,7 @@ class Rounds:
 
     def _wrap(self, state: TrainingState) -> bool:
         """Clone with the opposite orientation, where the scene needs it; tell whether it did."""
-        known = state.needs.get("wrapping")
+        known = state.model_selection.get("wrapping")
         if known is not None and known.chosen == "off":
             return False
         gaussians = state.adam.gaussians()
@@ -167,8 +171,8 @@ class Rounds:
                 gaussians.detached(), self._views(VOTE_DIVISOR), self.stepper.renderer,
                 threads=self.threads,
             )  # fmt: skip
-            known = wrapping_need(errors, shown.share, self.settings.wrapping)
-            state.needs = state.needs.with_decision(known)
+            known = select_wrapping(errors, shown.share, self.settings.wrapping)
+            state.model_selection = state.model_selection.with_decision(known)
             if known.chosen == "off":
                 return False
         wrap(state.adam, errors, self.settings.wrap_share, self.settings.max_gaussians)
@@ -181,14 +185,14 @@ class Rounds:
         time, and the later they are, the more of what changes with the view has gone into shapes.
         """
         degree = state.degree + 1
-        known = state.needs.get("harmonics")
+        known = state.model_selection.get("harmonics")
         refused = known is not None and known.figures.get("degree_tried") == degree
         if degree > self.settings.sh_degree or refused:
             return
-        found = harmonics_need(
+        found = select_harmonics(
             state.adam.gaussians().detached(),
-            [self._need_view(state, view) for view in checked(self.views, self.progress)],
-            [self._need_view(state, view) for view in checked(self.held_out, self.progress)],
+            [self._trial_view(state, view) for view in cancellable(self.views, self.progress)],
+            [self._trial_view(state, view) for view in cancellable(self.held_out, self.progress)],
             degree,
             threads=self.threads,
             check=self.progress.check,
@@ -197,16 +201,18 @@ class Rounds:
             state.degree = degree
             coefficients = found.coefficients
             state.adam.array("sh")[:, : coefficients.shape[1]] = coefficients
-            state.visits.clear()
-        state.needs = state.needs.with_decision(found.decision("auto", state.degree))
+            state.error_history.clear()
+        state.model_selection = state.model_selection.with_decision(
+            found.decision("auto", state.degree)
+        )
 
-    def _need_view(self, state: TrainingState, view: int) -> NeedView:
+    def _trial_view(self, state: TrainingState, view: int) -> TrialView:
         divisor = divisor_for(self.photos, view, TRIAL_SIDE_PX)
         correction = None
         if state.exposure is not None and view in self.views:
             gain, offset = state.exposure.factors(view)
             correction = (gain, offset)
-        return NeedView(
+        return TrialView(
             self.photos.camera(view, divisor),
             self.photos.photo(view, divisor),
             self.photos.mask(view, divisor),
@@ -226,6 +232,6 @@ class Rounds:
         spread = np.linspace(0, len(self.views) - 1, count).round().astype(int)
         side = self.schedule.long_side_px
         divisor = divisor if side / divisor >= 2 * tolerances.TILE_PX else 1
-        for position in checked(spread.tolist(), self.progress):
+        for position in cancellable(spread.tolist(), self.progress):
             view = self.views[position]
             yield WrapView(self.photos.camera(view, divisor), self.photos.mask(view, divisor))

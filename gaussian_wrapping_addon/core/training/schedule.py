@@ -163,13 +163,13 @@ class Schedule:
         return begin < iteration <= end and iteration % self.settings.densify_every == 0
 
     @property
-    def spares(self) -> bool:
+    def compact(self) -> bool:
         """Tell whether Gaussians that show little are held small and few."""
         return self.settings.growth != "on"
 
     def prunes(self, iteration: int) -> bool:
         """Tell whether Gaussians of little contribution go after this iteration's step."""
-        wanted = self.spares and self.settings.prune_share > 0.0
+        wanted = self.compact and self.settings.prune_share > 0.0
         return wanted and iteration in {self._at(x) for x in PRUNE_AT}
 
     def growth_limit(self) -> int:

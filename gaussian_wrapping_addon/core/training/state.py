@@ -14,8 +14,8 @@ from ..report_warning import ReportWarning, read_warnings
 from .appearance.photo_exposure import Exposure
 from .density.density_control import DensityStatistics
 from .optimizer.adam import TRAINED, Adam
-from .selection.growth_selection import GrowthHistory
-from .selection.model_selection import Needs
+from .selection.growth_selection import ErrorHistory
+from .selection.model_selection import ModelSelection
 
 _MOMENTS = ("first", "second")
 _STATISTICS = ("gradient", "gradient_abs", "views")
@@ -40,11 +40,11 @@ class TrainingState:
     loss_average: float = 0.0
     degree: int = 0
     """Of the harmonics in use."""
-    needs: Needs = field(default_factory=Needs)
+    model_selection: ModelSelection = field(default_factory=ModelSelection)
     """What was decided so far."""
     exposure: Exposure | None = None
     """Where exposures are modelled."""
-    visits: GrowthHistory = field(default_factory=GrowthHistory)
+    error_history: ErrorHistory = field(default_factory=ErrorHistory)
     """Errors of the photos, by which growth is judged."""
     warnings: list[ReportWarning] = field(default_factory=list)
     history: list[dict[str, float]] = field(default_factory=list)
@@ -83,7 +83,7 @@ class TrainingState:
             arrays[f"statistics.{name}"] = getattr(self.statistics, name).copy()
         if self.exposure is not None:
             arrays |= {f"exposure.{k}": v for k, v in self.exposure.to_arrays().items()}
-        return arrays | {f"visits.{k}": v for k, v in self.visits.to_arrays().items()}
+        return arrays | {f"visits.{k}": v for k, v in self.error_history.to_arrays().items()}
 
     def to_json(self) -> dict[str, Any]:
         """Return everything else as plain JSON values."""
@@ -98,7 +98,7 @@ class TrainingState:
             "history": [dict(entry) for entry in self.history],
             "seconds": self.seconds,
             "degree": self.degree,
-            "needs": self.needs.to_json(),
+            "needs": self.model_selection.to_json(),
             "warnings": [warning.to_json() for warning in self.warnings],
         }
 
@@ -142,11 +142,11 @@ class TrainingState:
         state.history = [{k: float(v) for k, v in entry.items()} for entry in values["history"]]
         state.seconds = float(values["seconds"])
         state.degree = int(values["degree"])
-        state.needs = Needs.from_json(values["needs"])
+        state.model_selection = ModelSelection.from_json(values["needs"])
         state.warnings = list(read_warnings(values["warnings"]))
         exposure = _part(arrays, "exposure.")
         state.exposure = Exposure.restore(exposure) if exposure else None
-        state.visits = GrowthHistory.restore(_part(arrays, "visits."))
+        state.error_history = ErrorHistory.restore(_part(arrays, "visits."))
         return state
 
 

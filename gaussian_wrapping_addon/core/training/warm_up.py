@@ -29,7 +29,7 @@ _DISTANCE = 4.0
 _DECIDED = ("harmonics", "exposure", "multi_view", "wrapping", "growth")
 
 
-class _Photos:
+class _NoisePhotos:
     """Grey noise in memory, with the interface of ``PhotoStore``."""
 
     def __init__(self, scene: Scene) -> None:
@@ -99,9 +99,9 @@ def compile_kernels(
     )  # fmt: skip
     scene = tiny_scene()
     quiet = Progress(is_cancelled=progress.cancelled)
-    with tempfile.TemporaryDirectory(dir=folder, prefix="warm-up-") as place:
+    with tempfile.TemporaryDirectory(dir=folder, prefix="warm-up-") as temporary:
         try:
-            train(scene, _Photos(scene), tiny, Path(place), quiet, threads=threads)
+            train(scene, _NoisePhotos(scene), tiny, Path(temporary), quiet, threads=threads)
         except Cancelled:
             raise
         except Exception as error:

@@ -42,13 +42,13 @@ class Window:
         return np.ascontiguousarray(part)
 
 
-def windows(width: int, height: int, most_pixels: int) -> list[Window]:
-    """Split an image into equal windows of about ``most_pixels`` at most, row by row.
+def windows(width: int, height: int, max_pixels: int) -> list[Window]:
+    """Split an image into equal windows of about ``max_pixels`` at most, row by row.
 
     With many pixels an iteration measures nearly the same gradient as with a part of them, and
     steps in between are worth more than exactness; so time goes into iterations.
     """
-    count = max(1, math.ceil(math.sqrt(width * height / most_pixels)))
+    count = max(1, math.ceil(math.sqrt(width * height / max_pixels)))
     columns = min(count, max(1, width // (2 * OVERLAP_PX)))
     rows = min(count, max(1, height // (2 * OVERLAP_PX)))
     wide, high = _side(width, columns), _side(height, rows)

@@ -24,7 +24,7 @@ DEPTH_TAIL = 1e-5
 """In front of the depth where a Gaussian's value first exceeds this, it is left out."""
 STRIP_MARGIN_PX = 0.05
 """Several float32 roundings of a coordinate on the virtual screen."""
-MAX_PAIRS = 2**31 - 1
+MAX_TILE_INTERSECTIONS = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def bin_camera(
     list_tiles(footprints, tile_px, tiles_x, tiles_y, start[1:], tile_ids, False)
     longest = int(start.max())
     np.cumsum(start, out=start)
-    if start[-1] > MAX_PAIRS:
+    if start[-1] > MAX_TILE_INTERSECTIONS:
         raise ResourceError(
             f"Camera {camera.name} would list {start[-1]} pairs of Gaussian and tile.",
             "Train with fewer Gaussians.",

@@ -153,7 +153,7 @@ class CudaVacancyField(VacancyField):
         """Project and bin the Gaussians for all cameras now, and send them to the GPU."""
         progress = progress or Progress()
         with self._on_device():
-            for done, index in enumerate(self.visiting_order().tolist()):
+            for done, index in enumerate(self.evaluation_order().tolist()):
                 progress.update(done / len(self.cameras), "Preparing cameras")
                 self._device_bins(index)
 
@@ -168,15 +168,15 @@ class CudaVacancyField(VacancyField):
         seen: np.ndarray | None,
         progress: Progress,
     ) -> None:
-        order = self.visiting_order()
+        order = self.evaluation_order()
         with self._on_device():
             query = _Query.of(points, self._in_region(points), best, winner, self._torch_device)
             for done, index in enumerate(order.tolist()):
-                self._look(index, query, settled)
+                self._evaluate_query(index, query, settled)
                 progress.update((done + 1) / len(order), "Looking from each camera")
             query.read(best, winner, seen)
 
-    def _one_camera(
+    def _evaluate_camera(
         self,
         index: int,
         points: np.ndarray,
@@ -188,10 +188,10 @@ class CudaVacancyField(VacancyField):
     ) -> None:
         with self._on_device():
             query = _Query.of(points, inside, best, winner, self._torch_device)
-            self._look(index, query, settled)
+            self._evaluate_query(index, query, settled)
             query.read(best, winner, seen)
 
-    def _look(self, index: int, query: _Query, settled: float) -> None:
+    def _evaluate_query(self, index: int, query: _Query, settled: float) -> None:
         """Raise what is known of the query's points by one camera."""
         view = self._screens[index]
         self._kernels.launch_each(

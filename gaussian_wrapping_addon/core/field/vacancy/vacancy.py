@@ -159,7 +159,7 @@ class VacancyField:
         Otherwise the first query that needs a camera does it.
         """
         progress = progress or Progress()
-        for done, index in enumerate(self.visiting_order().tolist()):
+        for done, index in enumerate(self.evaluation_order().tolist()):
             progress.update(done / len(self.cameras), "Preparing cameras")
             self._bins(index)
 
@@ -220,7 +220,7 @@ class VacancyField:
         for begin in range(0, len(points), POINTS_PER_PASS):
             end = min(begin + POINTS_PER_PASS, len(points))
             inside = self._in_region(points[begin:end])
-            self._one_camera(
+            self._evaluate_camera(
                 camera_index, points[begin:end], inside, 2.0, best[begin:end], winner[begin:end]
             )
         return np.where(winner >= 0, best, np.float32(np.nan))
@@ -260,7 +260,7 @@ class VacancyField:
                 )  # fmt: skip
         return gradient
 
-    def visiting_order(self) -> np.ndarray:
+    def evaluation_order(self) -> np.ndarray:
         """Return camera indices, most frequent winners first; ties are spread over the list."""
         count = len(self.cameras)
         bits = max(1, (count - 1).bit_length())
@@ -344,12 +344,12 @@ class VacancyField:
         progress: Progress,
     ) -> None:
         inside = self._in_region(points)
-        order = self.visiting_order()
+        order = self.evaluation_order()
         for done, index in enumerate(order.tolist()):
-            self._one_camera(index, points, inside, settled, best, winner, seen)
+            self._evaluate_camera(index, points, inside, settled, best, winner, seen)
             progress.update((done + 1) / len(order), "Looking from each camera")
 
-    def _one_camera(
+    def _evaluate_camera(
         self,
         index: int,
         points: np.ndarray,

@@ -26,7 +26,7 @@ from ...report_warning import ReportWarning
 PARENT_POLL_S = 1.0
 
 
-def answer(
+def run_command(
     work: Callable[[], Iterable[str | ReportWarning]], memory_hint: str = "Close other programs."
 ) -> int:
     """Emit the lines and warnings of ``work`` as they come, or its error; return the exit code.
@@ -34,7 +34,7 @@ def answer(
     The process ends when the one that asked does.
     """
     # Not the caller's own id: where Python is started through a launcher, that is the parent.
-    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=exit_with_parent, args=(os.getppid(),), daemon=True).start()
     try:
         for line in work():
             if isinstance(line, ReportWarning):
@@ -63,7 +63,7 @@ def answer(
     return EXIT_DONE
 
 
-def end_with(parent: int) -> None:
+def exit_with_parent(parent: int) -> None:
     """End this process when the one that asked has gone: nobody waits for the answer."""
     while os.getppid() == parent:
         time.sleep(PARENT_POLL_S)

@@ -285,7 +285,7 @@ def estimate(
     return Estimate(low_s, high_s, round(memory), round(disk) + OTHER_DISK_BYTES, count)
 
 
-def judge(expected: Estimate, machine: Machine) -> list[ReportWarning]:
+def check_resources(expected: Estimate, machine: Machine) -> list[ReportWarning]:
     """Refuse where the disk is clearly too full; return warnings about memory.
 
     Raises

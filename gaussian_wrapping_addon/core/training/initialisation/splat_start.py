@@ -27,7 +27,7 @@ from ...render.types.options import RenderOptions
 from ...report_warning import ReportWarning
 from ...settings import TrainingSettings
 from ..density.orientation import orient
-from .splat_motion import move_gaussians, with_degree
+from .splat_transform import transform_gaussians, with_degree
 
 _logger = logging.getLogger(__name__)
 
@@ -129,7 +129,7 @@ def start_from_splat(
     progress.check()
     # Degrees do not mix in a rotation: those that are cut need not be rotated.
     wanted = with_degree(baked(splat.gaussians), settings.sh_degree)
-    moved = move_gaussians(wanted, scene.world_from_scene.inverse())
+    moved = transform_gaussians(wanted, scene.world_from_scene.inverse())
     cameras = [photos.camera(i, 1) for i in view_indices]
     gaussians = fit_filter(moved, cameras, threads=threads)
     warnings, facts = list(splat.warnings), dict(splat.facts)
@@ -139,14 +139,16 @@ def start_from_splat(
             "photos show most of are kept."
         )
         warnings.append(ReportWarning("gaussians-over-cap", text))
-        chosen = _spread(view_indices, WEIGHT_VIEWS)
+        chosen = _evenly_spaced(view_indices, WEIGHT_VIEWS)
         small = [photos.camera(i, _divisor(photos, i)) for i in chosen]
-        weights = _shown(gaussians, small, progress, threads=threads)
+        weights = _mean_weights(gaussians, small, progress, threads=threads)
         # A stable order makes the choice among equals a function of the file alone.
         kept = np.sort(np.argsort(-weights, kind="stable")[: settings.max_gaussians])
         gaussians = gaussians.select(torch.from_numpy(kept))
     facts["splat_kept"] = len(gaussians)
-    matched, unlike = _match(gaussians, photos, view_indices, progress, threads=threads)
+    matched, unlike = _compare_with_photos(
+        gaussians, photos, view_indices, progress, threads=threads
+    )
     facts["splat_psnr"] = round(matched, 2)
     if unlike:
         raise DatasetError(
@@ -156,7 +158,7 @@ def start_from_splat(
             "splat alone, without photos.",
         )
     if not splat.oriented:
-        chosen = _spread(view_indices, WEIGHT_VIEWS)
+        chosen = _evenly_spaced(view_indices, WEIGHT_VIEWS)
         small = [photos.camera(i, _divisor(photos, i)) for i in chosen]
         gaussians = orient(gaussians, small, threads=threads)
     return SplatStart(gaussians, tuple(warnings), facts)
@@ -213,7 +215,7 @@ def _logit(opacity: torch.Tensor) -> torch.Tensor:
     return torch.log(clamped) - torch.log1p(-clamped)
 
 
-def _spread(indices: Sequence[int], count: int) -> list[int]:
+def _evenly_spaced(indices: Sequence[int], count: int) -> list[int]:
     """Return at most ``count`` of the indices, evenly spread."""
     positions = np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int)
     return [indices[i] for i in positions.tolist()]
@@ -225,7 +227,7 @@ def _divisor(photos: PhotoSource, index: int) -> int:
     return _SMALL_DIVISOR if min(camera.width, camera.height) >= 32 * _SMALL_DIVISOR else 1
 
 
-def _shown(
+def _mean_weights(
     gaussians: OrientedGaussians, cameras: Sequence[Camera], progress: Progress, *, threads: int
 ) -> np.ndarray:
     """(n,) share of all views' pixels that each Gaussian gives."""
@@ -240,7 +242,7 @@ def _shown(
     return total
 
 
-def _match(
+def _compare_with_photos(
     gaussians: OrientedGaussians,
     photos: PhotoSource,
     view_indices: Sequence[int],
@@ -255,7 +257,7 @@ def _match(
     """
     options = RenderOptions(depth=False, threads=threads)
     errors, spreads = [], []
-    for index in _spread(view_indices, MATCH_VIEWS):
+    for index in _evenly_spaced(view_indices, MATCH_VIEWS):
         progress.check()
         divisor = _divisor(photos, index)
         with torch.no_grad():

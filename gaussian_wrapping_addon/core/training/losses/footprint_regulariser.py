@@ -8,14 +8,14 @@ import numpy as np
 from ...render.types.gradients import VisibleGradients
 
 
-def add_overlap_price(
+def add_footprint_regulariser(
     gradients: VisibleGradients,
     log_scales: np.ndarray,
     boxes: np.ndarray,
     size_px: tuple[int, int],
-    price: float,
+    weight: float,
 ) -> float:
-    """Add the gradient of ``price`` times the mean number of Gaussians over a pixel.
+    """Add the gradient of ``weight`` times the mean number of Gaussians over a pixel.
 
     Blending costs time for every Gaussian whose footprint holds a pixel, seen or hidden. Photos
     alone do not mind: half transparent layers that overlap a hundredfold show the same as a few
@@ -32,7 +32,7 @@ def add_overlap_price(
         Footprints on the screen: x0, y0, x1, y1 in pixels.
     size_px : (int, int)
         Width and height of the image; what lies outside costs nothing.
-    price : float
+    weight : float
         Of one Gaussian over every pixel, in the unit of the loss.
 
     Returns
@@ -46,6 +46,6 @@ def add_overlap_price(
     area = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])  # (v,)
     area /= np.float32(width * height)
     squares = np.exp(2.0 * log_scales[ids])  # (v, 3)
-    squares *= (2.0 * price * area / squares.sum(1))[:, None]
+    squares *= (2.0 * weight * area / squares.sum(1))[:, None]
     gradients.log_scales[...] += squares
     return float(area.sum())

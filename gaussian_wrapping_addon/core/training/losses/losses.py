@@ -22,7 +22,7 @@ _NO_MASK = np.zeros((0, 0), np.bool_)
 
 
 @dataclass
-class ColorFigures:
+class ColorMetrics:
     """What the colour loss measured on the way, over unmasked values."""
 
     l1: float
@@ -31,7 +31,7 @@ class ColorFigures:
 
 
 @dataclass
-class NormalFigures:
+class NormalMetrics:
     """What the normal losses measured on the way: means of ``1 - cos`` over all pixels."""
 
     depth_normal: float
@@ -48,7 +48,7 @@ def color_loss(
     lambda_dssim: float = 0.2,
     threads: int = 0,
     store: ArrayStore | None = None,
-) -> tuple[float, np.ndarray, ColorFigures]:
+) -> tuple[float, np.ndarray, ColorMetrics]:
     """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and figures.
 
     See docs/method.md, section 3.1.
@@ -70,7 +70,7 @@ def color_loss(
     loss : float
         0 where the mask leaves no pixel.
     gradient : (h, w, 3), of the image's type
-    figures : ColorFigures
+    figures : ColorMetrics
 
     Raises
     ------
@@ -85,7 +85,7 @@ def color_loss(
     found = compare(image, photo, mask, weights=weights, threads=threads, out=out)
     assert found.gradient is not None
     value = (1.0 - lambda_dssim) * found.absolute + lambda_dssim * (1.0 - found.similarity)
-    return value, found.gradient, ColorFigures(found.absolute, found.squared, found.similarity)
+    return value, found.gradient, ColorMetrics(found.absolute, found.squared, found.similarity)
 
 
 def normals_from_depth(
@@ -138,7 +138,7 @@ def normal_losses(
     max_jump: float = 0.0,
     threads: int = 0,
     store: ArrayStore | None = None,
-) -> tuple[float, ImageGradients, NormalFigures]:
+) -> tuple[float, ImageGradients, NormalMetrics]:
     """Return ``lambda_DN L_DN + lambda_N L_N``, gradients and both means.
 
     See docs/method.md, sections 3.2 and 3.3.
@@ -165,7 +165,7 @@ def normal_losses(
     loss : float
     gradients : ImageGradients
         Of all four images, none of the colour.
-    figures : NormalFigures
+    figures : NormalMetrics
 
     Raises
     ------
@@ -203,7 +203,7 @@ def normal_losses(
         alpha=by_alpha,
         depth=by_depth,
     )
-    return value, gradients, NormalFigures(depth_normal, oriented, share)
+    return value, gradients, NormalMetrics(depth_normal, oriented, share)
 
 
 def _take(store: ArrayStore | None, name: str, like: np.ndarray) -> np.ndarray:

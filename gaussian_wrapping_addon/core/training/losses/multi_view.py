@@ -42,8 +42,8 @@ from .multi_view_kernels import (
 from .pixel_choice import NO_MASK, choose_pixels, grey_image
 
 __all__ = [
-    "MultiViewFigures",
     "MultiViewLoss",
+    "MultiViewMetrics",
     "MultiViewOptions",
     "add_image_gradients",
     "merge_gradients",
@@ -90,7 +90,7 @@ class MultiViewOptions:
 
 
 @dataclass(frozen=True)
-class MultiViewFigures:
+class MultiViewMetrics:
     """What the terms measured on the way."""
 
     photometric: float
@@ -116,7 +116,7 @@ class MultiViewLoss:
     """On ``depth`` and ``geometric_normal`` of the rendered view; none on the others."""
     other: VisibleGradients | None
     """On the Gaussians, by way of the other view's depth; ``None`` where that has no part."""
-    figures: MultiViewFigures
+    figures: MultiViewMetrics
 
 
 def multi_view_losses(
@@ -179,20 +179,20 @@ def multi_view_losses(
     pixels = choose_pixels(
         grey, image.depth, mask, settings.pixels, random, threads=threads, store=store
     )
-    pair = _Pair(image, camera, other_camera, pixels, options.near_z, threads)
+    pair = _ViewPair(image, camera, other_camera, pixels, options.near_z, threads)
     kept_there = NO_MASK if other_mask is None else np.ascontiguousarray(other_mask, np.bool_)
-    places, moves = pair.lift(kept_there)
+    positions, position_slopes = pair.lift(kept_there)
     by_depth = store.zeros("multi-view by depth", image.depth.shape, np.float32)
     by_normal = store.zeros("multi-view by normal", image.geometric_normal.shape, np.float32)
     on_images = ImageGradients(depth=by_depth, geometric_normal=by_normal)
     given = np.isfinite(image.depth.reshape(-1)[pixels])  # (m,)
     given &= np.isfinite(image.geometric_normal.reshape(-1, 3)[pixels]).all(1)
-    if not np.isfinite(places[:, 0]).any():
-        nothing = MultiViewFigures(0.0, 0.0, len(pixels), 0, 0, int((~given).sum()))
+    if not np.isfinite(positions[:, 0]).any():
+        nothing = MultiViewMetrics(0.0, 0.0, len(pixels), 0, 0, int((~given).sum()))
         return MultiViewLoss(0.0, on_images, None, nothing)
     view = query_view(gaussians, other_camera, options)
-    answer = solve_depths(view, places)
-    noise, by_found, by_places = pair.back(places, answer.values)
+    depths = solve_depths(view, positions)
+    noise, by_found, by_positions = pair.reproject(positions, depths.values)
     valid = noise < np.inf  # (m,)
     weights = np.where(valid, np.exp(-noise), 0.0)
     lambda_photometric = settings.weight * settings.lambda_photometric
@@ -216,14 +216,14 @@ def multi_view_losses(
     share = lambda_geometric * weights / max(1, int(valid.sum()))
     other, broken = None, 0
     if lambda_geometric != 0.0 and valid.any():
-        other, on_places, broken = _other_gradients(gaussians, view, answer, share * by_found)
-        on_places = share[:, None] * by_places + on_places
-        pixel_depth = pixel_depth + (on_places * moves).sum(1)
+        other, on_positions, broken = _other_gradients(gaussians, view, depths, share * by_found)
+        on_positions = share[:, None] * by_positions + on_positions
+        pixel_depth = pixel_depth + (on_positions * position_slopes).sum(1)
     sound = given & np.isfinite(pixel_depth) & np.isfinite(pixel_normal).all(1)
     rows = pixels[sound]
     by_depth.reshape(-1)[rows] = pixel_depth[sound]
     by_normal.reshape(-1, 3)[rows] = pixel_normal[sound]
-    figures = MultiViewFigures(
+    figures = MultiViewMetrics(
         photometric,
         geometric,
         len(pixels),
@@ -235,7 +235,7 @@ def multi_view_losses(
     return MultiViewLoss(value, on_images, other, figures)
 
 
-class _Pair:
+class _ViewPair:
     """Two views and the pixels of the first, as the kernels take them."""
 
     def __init__(
@@ -258,33 +258,33 @@ class _Pair:
     def lift(self, other_mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return places in the other view (m, 2) float32, and how they move with the depth."""
         count = len(self.pixels)
-        places, moves = np.empty((count, 2), np.float32), np.empty((count, 2))
+        positions, position_slopes = np.empty((count, 2), np.float32), np.empty((count, 2))
 
         def run(begin: int, end: int) -> None:
             lift_range(
                 begin, end, self.pixels, self.image.depth, self.camera, self.other, self.pose,
-                self.near_z, other_mask, places, moves,
+                self.near_z, other_mask, positions, position_slopes,
             )  # fmt: skip
 
         run_chunks(run, self.bounds, self.threads)
-        return places, moves
+        return positions, position_slopes
 
-    def back(
-        self, places: np.ndarray, found: np.ndarray
+    def reproject(
+        self, positions: np.ndarray, found: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return noise (m,), its derivatives by depth (m,) and place (m, 2) in the other view."""
         count = len(self.pixels)
-        noise, by_found, by_places = np.empty(count), np.empty(count), np.empty((count, 2))
+        noise, by_found, by_positions = np.empty(count), np.empty(count), np.empty((count, 2))
         width = self.image.depth.shape[1]
 
         def run(begin: int, end: int) -> None:
             return_range(
-                begin, end, self.pixels, width, places, found, self.camera, self.other, self.pose,
-                self.near_z, noise, by_found, by_places,
+                begin, end, self.pixels, width, positions, found, self.camera, self.other,
+                self.pose, self.near_z, noise, by_found, by_positions,
             )  # fmt: skip
 
         run_chunks(run, self.bounds, self.threads)
-        return noise, by_found, by_places
+        return noise, by_found, by_positions
 
     def compare(
         self,
@@ -314,11 +314,11 @@ class _Pair:
 
 
 def _other_gradients(
-    gaussians: RawArrays, view: QueryView, answer: QueryResult, by_found: np.ndarray
+    gaussians: RawArrays, view: QueryView, depths: QueryResult, by_found: np.ndarray
 ) -> tuple[VisibleGradients, np.ndarray, int]:
     """Return gradients on the Gaussians (m', ...) and places (m, 2), and Gaussians dropped."""
     grad_params = np.zeros_like(view.screen.params)
-    by_places, _ = add_query_gradients(view, answer, by_found, grad_params)
+    by_positions, _ = add_query_gradients(view, depths, by_found, grad_params)
     # Everything is finite where the sum of the absolute values is.
     with np.errstate(all="ignore"):
         sizes = np.abs(grad_params[:, :_GEOMETRY_COLUMNS]).sum(1)  # (n,)
@@ -328,7 +328,7 @@ def _other_gradients(
     found = project_backward_visible(
         gaussians, view.camera, view.options, view.screen, grad_params, ids
     )
-    return found, by_places.astype(np.float64), int(wild.sum())
+    return found, by_positions.astype(np.float64), int(wild.sum())
 
 
 def _mean(values: np.ndarray, where: np.ndarray) -> float:

@@ -81,8 +81,8 @@ def lift_range(
     pose: np.ndarray,
     near_z: float,
     other_mask: np.ndarray,
-    places: np.ndarray,
-    moves: np.ndarray,
+    positions: np.ndarray,
+    position_slopes: np.ndarray,
 ) -> None:
     """Where pixels land in the other view, and how that moves with their depth.
 
@@ -94,9 +94,9 @@ def lift_range(
     camera, other : (6,) float64
     pose : (3, 4) float64
         Other camera from reference camera.
-    places : (m, 2) float32
+    positions : (m, 2) float32
         Written: pixels of the other view; NaN behind ``near_z``, off the image, in its mask.
-    moves : (m, 2) float64
+    position_slopes : (m, 2) float64
         Written: derivative with respect to the depth.
     """
     width = depth.shape[1]
@@ -109,17 +109,17 @@ def lift_range(
         a1 = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]
         a2 = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
         h2 = a2 * z + pose[2, 3]
-        places[k, 0] = places[k, 1] = np.float32(math.nan)
-        moves[k, 0] = moves[k, 1] = 0.0
+        positions[k, 0] = positions[k, 1] = np.float32(math.nan)
+        position_slopes[k, 0] = position_slopes[k, 1] = 0.0
         if not h2 > near_z:
             continue
         u, v = (a0 * z + pose[0, 3]) / h2, (a1 * z + pose[1, 3]) / h2
         at_x, at_y = other[0] * u + other[2], other[1] * v + other[3]
         if not _on_image(at_x, at_y, other) or _masked(other_mask, at_x, at_y):
             continue
-        places[k, 0], places[k, 1] = np.float32(at_x), np.float32(at_y)
-        moves[k, 0] = other[0] * (a0 - u * a2) / h2
-        moves[k, 1] = other[1] * (a1 - v * a2) / h2
+        positions[k, 0], positions[k, 1] = np.float32(at_x), np.float32(at_y)
+        position_slopes[k, 0] = other[0] * (a0 - u * a2) / h2
+        position_slopes[k, 1] = other[1] * (a1 - v * a2) / h2
 
 
 @kernel(fast=False, fused=True)
@@ -128,7 +128,7 @@ def return_range(
     end: int,
     pixels: np.ndarray,
     width: int,
-    places: np.ndarray,
+    positions: np.ndarray,
     found: np.ndarray,
     camera: np.ndarray,
     other: np.ndarray,
@@ -136,13 +136,13 @@ def return_range(
     near_z: float,
     noise: np.ndarray,
     by_found: np.ndarray,
-    by_places: np.ndarray,
+    by_positions: np.ndarray,
 ) -> None:
     """How far from their pixel points come back, with derivatives.
 
     Parameters
     ----------
-    places : (m, 2) float32
+    positions : (m, 2) float32
         In the other view.
     found : (m,) float32
         Depth of the other view there; 0 where there is none.
@@ -153,12 +153,12 @@ def return_range(
     """
     for k in range(begin, end):
         noise[k] = math.inf
-        by_found[k] = by_places[k, 0] = by_places[k, 1] = 0.0
+        by_found[k] = by_positions[k, 0] = by_positions[k, 1] = 0.0
         z = float(found[k])
         if not z > near_z:
             continue
-        x = (float(places[k, 0]) - other[2]) / other[0]
-        y = (float(places[k, 1]) - other[3]) / other[1]
+        x = (float(positions[k, 0]) - other[2]) / other[0]
+        y = (float(positions[k, 1]) - other[3]) / other[1]
         c0, c1, c2 = x * z - pose[0, 3], y * z - pose[1, 3], z - pose[2, 3]
         b0 = pose[0, 0] * c0 + pose[1, 0] * c1 + pose[2, 0] * c2
         b1 = pose[0, 1] * c0 + pose[1, 1] * c1 + pose[2, 1] * c2
@@ -182,7 +182,7 @@ def return_range(
         e1 = pose[1, 0] * g0 + pose[1, 1] * g1 + pose[1, 2] * g2
         e2 = pose[2, 0] * g0 + pose[2, 1] * g1 + pose[2, 2] * g2
         by_found[k] = e0 * x + e1 * y + e2
-        by_places[k, 0], by_places[k, 1] = e0 * z / other[0], e1 * z / other[1]
+        by_positions[k, 0], by_positions[k, 1] = e0 * z / other[0], e1 * z / other[1]
 
 
 @inline

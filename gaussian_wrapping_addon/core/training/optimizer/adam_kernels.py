@@ -71,13 +71,13 @@ class _Emitter:
         chosen = ir.Constant(ir.VectorType(_WORD, len(lanes)), lanes)
         return self.builder.shuffle_vector(a, b, chosen)
 
-    def advance(self, x: Any, g: Any, places: tuple[Any, Any, Any], up: Any, down: Any) -> Any:
+    def advance(self, x: Any, g: Any, addresses: tuple[Any, Any, Any], up: Any, down: Any) -> Any:
         """Update the moments and return the new values; columns of negative rate stay.
 
-        ``places``: addresses of first moment, second moment and rate.
+        ``addresses``: addresses of first moment, second moment and rate.
         """
         b = self.builder
-        m, v, rate = (b.load(place, align=4) for place in places)
+        m, v, rate = (b.load(address, align=4) for address in addresses)
         one = np.float32(1.0)
         keep1, take1 = self.constant(BETA1), self.constant(float(one - np.float32(BETA1)))
         keep2, take2 = self.constant(BETA2), self.constant(float(one - np.float32(BETA2)))
@@ -87,8 +87,8 @@ class _Emitter:
         size = b.fadd(b.fmul(b.call(root, [new_v]), self.splat(down)), self.constant(EPSILON))
         step = b.fdiv(b.fmul(b.fmul(rate, self.splat(up)), new_m), size)
         moves = b.fcmp_ordered(">=", rate, ir.Constant(self.vector, None))
-        b.store(b.select(moves, new_m, m), places[0], align=4)
-        b.store(b.select(moves, new_v, v), places[1], align=4)
+        b.store(b.select(moves, new_m, m), addresses[0], align=4)
+        b.store(b.select(moves, new_v, v), addresses[1], align=4)
         return b.select(moves, b.fsub(x, step), x)
 
 
@@ -107,7 +107,7 @@ def _step_small(  # type: ignore[no-untyped-def]
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         emit = _Emitter(context, builder, sig, args)
 
-        def places(first: int, row: Any) -> list[Any]:
+        def addresses(first: int, row: Any) -> list[Any]:
             found = []
             for k, values in enumerate(_SMALL_VALUES):
                 at = builder.mul(row, ir.Constant(row.type, values))
@@ -122,9 +122,9 @@ def _step_small(  # type: ignore[no-untyped-def]
             rest = emit.shuffled(mean_opacity, scales, list(range(8)))
             return emit.shuffled(turns, rest, list(range(LANES)))
 
-        targets, first_rate = places(0, args[5]), ir.Constant(args[5].type, 0)
+        targets, first_rate = addresses(0, args[5]), ir.Constant(args[5].type, 0)
         moved = emit.advance(
-            joined(targets), joined(places(6, args[11])), emit.state(12, 15, first_rate),
+            joined(targets), joined(addresses(6, args[11])), emit.state(12, 15, first_rate),
             args[16], args[17],
         )  # fmt: skip
         at = 0

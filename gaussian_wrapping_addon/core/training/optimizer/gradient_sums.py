@@ -47,13 +47,13 @@ def merge_gradients(
     listed[first.ids] = True
     listed[second.ids] = True
     ids = np.flatnonzero(listed).astype(np.int32)
-    place = taken.take("merged place", count, np.int32)
-    place[ids] = np.arange(len(ids), dtype=np.int32)
+    new_row = taken.take("merged place", count, np.int32)
+    new_row[ids] = np.arange(len(ids), dtype=np.int32)
     rows = []
     for name, part in (("merged first", first), ("merged second", second)):
         row_of = taken.take(name, len(ids), np.int32)
         row_of.fill(-1)
-        row_of[place[part.ids]] = np.arange(len(part.ids), dtype=np.int32)
+        row_of[new_row[part.ids]] = np.arange(len(part.ids), dtype=np.int32)
         rows.append(row_of)
     sums = {}
     for name in _TENSORS:

@@ -32,7 +32,7 @@ disagree by 1.2 % of white, an error that alone limits the PSNR to 38 dB. Of the
 chosen on, rendered at one exposure, a matte body shows 0.002 and a thin fence lit from one side
 0.011; photos altered by factors of light up to 1.35 either way show 0.060."""
 
-ERRORS_AWAY = 4.0
+MIN_STANDARD_ERRORS = 4.0
 """The spread must also be this many standard errors of a photo's gain."""
 
 OUTLIER_SPREADS = 3.0
@@ -54,7 +54,7 @@ MIN_POINTS_IN_PART = 12
 MIN_PART_SHARE = 0.2
 """Of the photos in which a part must be known for it to have a say."""
 
-LOOK_SIDE_PX = 128
+SAMPLE_SIDE_PX = 128
 """Photos are looked at as small as their long side stays at least this: averaged pixels carry less
 noise, and forgive errors of the poses."""
 
@@ -64,7 +64,7 @@ MAX_SAMPLES = 2_000_000
 
 BUFFER_CELLS = 24
 """Cells of the depth buffer along the long side of a photo."""
-BEHIND_SHARE = 0.06
+OCCLUSION_SHARE = 0.06
 """A point this share of the depth behind the nearest around it is taken for hidden."""
 
 ROUNDS = 24
@@ -76,7 +76,7 @@ PRIOR_POINTS = 5.0
 
 
 @dataclass(frozen=True)
-class ExposureNeed:
+class ExposureEvidence:
     """Whether gains and offsets per photo are to be trained, and why."""
 
     needed: bool
@@ -121,7 +121,7 @@ class LogGains:
     """(photos, 3) points by weight."""
 
 
-def exposure_need(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> ExposureNeed:
+def select_exposure(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> ExposureEvidence:
     """Decide from the colours of the sparse points whether exposures are to be modelled.
 
     Parameters
@@ -134,7 +134,7 @@ def exposure_need(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> Ex
 
     Returns
     -------
-    ExposureNeed
+    ExposureEvidence
         ``known=False`` and ``needed=False`` where the points are too few: the brightness of whole
         photos says nothing, since they show different things.
     """
@@ -152,12 +152,12 @@ def exposure_need(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> Ex
     colors, valid = sample_points(points, photos, views)
     reference = np.asarray(scene.point_colors).reshape(-1, 3)[kept] / 255.0
     found = solve_log_gains(colors, valid, reference)
-    parts = [solve_log_gains(colors[p], valid[p], reference[p]) for p in split_by_place(points)]
+    parts = [solve_log_gains(colors[p], valid[p], reference[p]) for p in split_spatially(points)]
     shared = int(np.count_nonzero(valid.any(axis=2).sum(axis=1) >= 2))
-    return judge(found, parts, views, count, shared)
+    return exposure_evidence(found, parts, views, count, shared)
 
 
-def split_by_place(points: np.ndarray) -> list[np.ndarray]:
+def split_spatially(points: np.ndarray) -> list[np.ndarray]:
     """Return the indices of up to :data:`PARTS` parts: halves by number along the widest axis."""
     parts = [np.arange(len(points))]
     while len(parts) < PARTS and len(points) >= 2 * len(parts) * MIN_PART_POINTS:
@@ -186,24 +186,26 @@ def sample_points(
     """
     colors = np.zeros((len(points), len(views), 3), np.float32)
     valid = np.zeros(colors.shape, bool)
-    for place, view in enumerate(views):
+    for slot, view in enumerate(views):
         base = photos.camera(view, 1)
         side = max(base.width, base.height)
-        divisor = next((d for d in (4, 2) if side >= d * LOOK_SIDE_PX), 1)
+        divisor = next((d for d in (4, 2) if side >= d * SAMPLE_SIDE_PX), 1)
         camera, photo = photos.camera(view, divisor), photos.photo(view, divisor)
         mask = photos.mask(view, divisor)
         rows, columns, depth, seen = pixels_of(points, camera)
-        shown = _in_front(rows, columns, depth, max(camera.width, camera.height))
+        shown = _unoccluded(rows, columns, depth, max(camera.width, camera.height))
         if mask is not None:
             shown &= mask[rows, columns]
         rows, columns, seen = rows[shown], columns[shown], seen[shown]
         value = photo[rows, columns].astype(np.float32) / np.float32(255.0)  # (m, 3)
-        colors[seen, place] = value
-        valid[seen, place] = (value >= FIT_DARKEST) & (value <= FIT_BRIGHTEST)
+        colors[seen, slot] = value
+        valid[seen, slot] = (value >= FIT_DARKEST) & (value <= FIT_BRIGHTEST)
     return colors, valid
 
 
-def _in_front(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, side_px: int) -> np.ndarray:
+def _unoccluded(
+    rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, side_px: int
+) -> np.ndarray:
     """Tell which points no other one in the same or a neighbouring cell stands well before."""
     cell = max(1.0, side_px / BUFFER_CELLS)
     y, x = (rows / cell).astype(np.int64) + 1, (columns / cell).astype(np.int64) + 1
@@ -214,7 +216,7 @@ def _in_front(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, side_px:
         for dx in (-1, 0, 1):
             inner = nearest[1 + dy : nearest.shape[0] - 1 + dy, 1 + dx : nearest.shape[1] - 1 + dx]
             around[1:-1, 1:-1] = np.minimum(around[1:-1, 1:-1], inner)
-    return depth <= (1.0 + BEHIND_SHARE) * around[y, x]
+    return depth <= (1.0 + OCCLUSION_SHARE) * around[y, x]
 
 
 def solve_log_gains(
@@ -251,7 +253,7 @@ def solve_log_gains(
         weight = present * ((1.0 + square / np.float32(scale**2)) ** -2)[..., None]
         total = weight.sum(axis=0)  # (photos, 3)
         gain = (weight * (logs - level[:, None])).sum(axis=0) / (total + PRIOR_POINTS)
-        gain -= _middle(gain, total)
+        gain -= _median_gain(gain, total)
         per_point = weight.sum(axis=1)  # (n, 3)
         fresh = (weight * (logs - gain)).sum(axis=1) / np.maximum(per_point, 1e-9)
         level = np.where(per_point > 1e-3, fresh, level)
@@ -265,9 +267,9 @@ def solve_log_gains(
     return LogGains(gain.astype(np.float64), errors, total)
 
 
-def judge(
+def exposure_evidence(
     found: LogGains, parts: Sequence[LogGains], views: Sequence[int], count: int, points: int
-) -> ExposureNeed:
+) -> ExposureEvidence:
     """Decide from gains and their standard errors.
 
     Parameters
@@ -293,13 +295,13 @@ def judge(
             points=points,
         )
     values = found.values[known] - np.median(found.values[known], axis=0)  # (known, 3)
-    agreed = _agreed(parts, values, known)
+    consensus = _consensus(parts, values, known)
     errors = found.errors[known]
-    spread, error = _spread(agreed), float(np.median(errors))
-    limit = np.maximum(OUTLIER_SPREADS * NEEDED_SPREAD, ERRORS_AWAY * errors)
-    far = (np.abs(agreed) > limit) & (np.abs(values) > limit)
+    spread, error = _spread(consensus), float(np.median(errors))
+    limit = np.maximum(OUTLIER_SPREADS * NEEDED_SPREAD, MIN_STANDARD_ERRORS * errors)
+    far = (np.abs(consensus) > limit) & (np.abs(values) > limit)
     outliers = int(np.count_nonzero(far.any(axis=1)))
-    differs = spread > max(NEEDED_SPREAD, ERRORS_AWAY * error)
+    differs = spread > max(NEEDED_SPREAD, MIN_STANDARD_ERRORS * error)
     several = outliers >= max(2.0, OUTLIER_SHARE * number)
     needed = bool(differs or several)
     log_gains = np.zeros((count, 3))
@@ -311,12 +313,12 @@ def judge(
         f"together {100 * _spread(values):.1f} %), and {outliers} photos differ by more than "
         f"{100 * OUTLIER_SPREADS * NEEDED_SPREAD:.1f} %."
     )
-    return ExposureNeed(
+    return ExposureEvidence(
         needed, True, spread, _spread(values), error, outliers, number, points, log_gains, evidence
     )
 
 
-def _agreed(parts: Sequence[LogGains], values: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _consensus(parts: Sequence[LogGains], values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """(known, 3) medians over the parts of each photo's gain, median 0 over the photos.
 
     A part sees only some of the photos, and its gains are those against their median: at the level
@@ -334,18 +336,18 @@ def _agreed(parts: Sequence[LogGains], values: np.ndarray, known: np.ndarray) ->
         return values
     stacked = np.stack(rows)  # (parts, known, 3)
     said = np.isfinite(stacked[..., 0]).any(axis=0)
-    agreed = values.copy()
-    agreed[said] = np.nanmedian(stacked[:, said], axis=0)
-    return agreed - np.median(agreed, axis=0)
+    consensus = values.copy()
+    consensus[said] = np.nanmedian(stacked[:, said], axis=0)
+    return consensus - np.median(consensus, axis=0)
 
 
 def _spread(values: np.ndarray) -> float:
     return float((1.4826 * np.median(np.abs(values), axis=0)).max())
 
 
-def _unknown(count: int, evidence: str, *, photos: int = 0, points: int = 0) -> ExposureNeed:
+def _unknown(count: int, evidence: str, *, photos: int = 0, points: int = 0) -> ExposureEvidence:
     zeros = np.zeros((count, 3))
-    return ExposureNeed(False, False, 0.0, 0.0, 0.0, 0, photos, points, zeros, evidence)
+    return ExposureEvidence(False, False, 0.0, 0.0, 0.0, 0, photos, points, zeros, evidence)
 
 
 def _median_of(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -363,7 +365,7 @@ def _median_of(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(number > 0, middle, 0.0).astype(values.dtype)
 
 
-def _middle(gain: np.ndarray, total: np.ndarray) -> np.ndarray:
+def _median_gain(gain: np.ndarray, total: np.ndarray) -> np.ndarray:
     """(3,) median of the gains of the photos with points."""
     known = (total >= MIN_POINTS).all(axis=1)
     if not known.any():

@@ -40,7 +40,7 @@ _ERROR_FLOOR = 1e-10
 
 
 @dataclass(frozen=True)
-class GrowthNeed:
+class GrowthEvidence:
     """Whether growth pays at a moment."""
 
     pays: bool
@@ -80,7 +80,7 @@ class GrowthNeed:
         return Decision("growth", setting, chosen, evidence, figures)
 
 
-class GrowthHistory:
+class ErrorHistory:
     """The errors of the trained photos, visit by visit; part of a training's state."""
 
     def __init__(self) -> None:
@@ -115,7 +115,7 @@ class GrowthHistory:
         return {"visits": np.array(self._rows, np.float64).reshape(-1, _COLUMNS)}
 
     @classmethod
-    def restore(cls, arrays: dict[str, np.ndarray]) -> GrowthHistory:
+    def restore(cls, arrays: dict[str, np.ndarray]) -> ErrorHistory:
         """Build from :meth:`to_arrays`.
 
         Raises
@@ -123,15 +123,15 @@ class GrowthHistory:
         KeyError, ValueError
             The array is missing or has another shape.
         """
-        visits = arrays["visits"]
-        if visits.ndim != 2 or visits.shape[1] != _COLUMNS:
-            raise ValueError(f"visits are {visits.shape}")
+        errors = arrays["visits"]
+        if errors.ndim != 2 or errors.shape[1] != _COLUMNS:
+            raise ValueError(f"visits are {errors.shape}")
         history = cls()
-        for row in visits.tolist():
+        for row in errors.tolist():
             history.add(int(row[0]), int(row[1]), int(row[2]), row[3], int(row[4]))
         return history
 
-    def need(self) -> GrowthNeed:
+    def growth_evidence(self) -> GrowthEvidence:
         """Return whether more Gaussians still pay.
 
         The last visit of each photo is compared with the latest earlier one that had fewer
@@ -146,15 +146,15 @@ class GrowthHistory:
         gains = np.array(list(self._gains()))
         nan = math.nan
         if len(gains) < MIN_VIEWS:
-            return GrowthNeed(True, False, nan, nan, len(gains), gaussians, iteration)
+            return GrowthEvidence(True, False, nan, nan, len(gains), gaussians, iteration)
         median = float(np.median(gains))
         # Of a median of normally spread values: 1.2533 times that of a mean.
         spread = _SPREAD_OF_MAD * float(np.median(np.abs(gains - median)))
         spread *= 1.2533 / math.sqrt(len(gains))
         if median + CERTAINTY * spread < -MIN_GAIN_DB:  # something else made the errors rise
-            return GrowthNeed(True, False, nan, nan, len(gains), gaussians, iteration)
+            return GrowthEvidence(True, False, nan, nan, len(gains), gaussians, iteration)
         pays = median + CERTAINTY * spread >= MIN_GAIN_DB
-        return GrowthNeed(pays, True, median, spread, len(gains), gaussians, iteration)
+        return GrowthEvidence(pays, True, median, spread, len(gains), gaussians, iteration)
 
     def _gains(self) -> Iterator[float]:
         """Yield dB per doubling of each photo that can be compared."""
@@ -162,12 +162,12 @@ class GrowthHistory:
         for row in self._rows:
             by_view.setdefault(row[1], []).append(row)
         for view in sorted(by_view):
-            visits = by_view[view]
-            _, _, now, error, divisor = visits[-1]
+            errors = by_view[view]
+            _, _, now, error, divisor = errors[-1]
             # A photo not seen at the current size says nothing about the present.
             if divisor != self._rows[-1][4]:
                 continue
-            for _, _, then, before, size in reversed(visits[:-1]):
+            for _, _, then, before, size in reversed(errors[:-1]):
                 growth = now / max(1, then)
                 if size != divisor or growth > MAX_GROWTH:
                     break

@@ -20,7 +20,7 @@ from ...errors import UsageError
 from ...gaussians.model import OrientedGaussians
 from ...kernels.parallel import default_threads
 from ...render.projection.harmonics_kernels import MAX_DEGREE
-from .harmonics_trial import HarmonicsTrial, NeedView, shown_weights
+from .harmonics_trial import HarmonicsTrial, TrialView, summed_weights
 from .model_selection import OFF, Decision
 
 MAX_FIT_VIEWS = 40
@@ -30,11 +30,11 @@ MAX_HELD_OUT = 10
 MIN_FIT_VIEWS = 4
 """A fold is fitted to at least so many views: from fewer nothing can be told."""
 
-FALL = 0.4
+MIN_RELATIVE_REDUCTION = 0.4
 """Share by which the slow error of a place must fall to count. At 0.3, exposures that the gains of
 training only nearly undo look like gloss: 0.08 of a matte surface against 0.11 of a glossy one."""
 
-VISIBLE = 0.007
+MIN_REDUCTION_RMS = 0.007
 """Root of the least fall of a place's mean squared slow error that counts, of white: about two
 steps of an 8-bit photo. Shares of smaller errors fall and rise by chance: without this limit 0.07
 of a matte room count."""
@@ -54,7 +54,7 @@ WELL_SEEN_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class HarmonicsNeed:
+class HarmonicsEvidence:
     """What trying a degree has shown."""
 
     degree: int
@@ -99,21 +99,21 @@ class HarmonicsNeed:
             evidence = (
                 f"On {100 * self.share:.1f} % of the well-seen surface, colours that change with "
                 f"the viewing direction (degree {self.degree}) visibly lower the error by "
-                f"{100 * FALL:.0f} % or more (worth it from {100 * NEEDED_SHARE:.1f} %), judged on "
-                f"{self.judged} photos by folds."
+                f"{100 * MIN_RELATIVE_REDUCTION:.0f} % or more (worth it from "
+                f"{100 * NEEDED_SHARE:.1f} %), judged on {self.judged} photos by folds."
             )
         return Decision("harmonics", setting, f"degree {degree}", evidence, figures)
 
 
-def harmonics_need(
+def select_harmonics(
     gaussians: OrientedGaussians,
-    views: Sequence[NeedView],
-    held_out: Sequence[NeedView],
+    views: Sequence[TrialView],
+    held_out: Sequence[TrialView],
     degree: int,
     *,
     threads: int = 0,
     check: Callable[[], None] | None = None,
-) -> HarmonicsNeed:
+) -> HarmonicsEvidence:
     """Try a degree of the harmonics on Gaussians that were trained below it.
 
     The photos are halved. Each half is judged by what was fitted to the training views of the
@@ -121,17 +121,18 @@ def harmonics_need(
     not yet made of the lower degrees is not taken for view dependence; these are settled first.
 
     The squared slow errors are sent backwards to the Gaussians and summed over all photos. A
-    Gaussian counts, with the weight that it is shown with, where this error falls by :data:`FALL`
-    or more and visibly (:data:`VISIBLE`), and falls in most photos that show it: a single photo
-    must not decide. Surfaces that are wrong by as much as a Gaussian is wide count too.
+    Gaussian counts, with the weight that it is shown with, where this error falls by
+    :data:`MIN_RELATIVE_REDUCTION` or more and visibly (:data:`MIN_REDUCTION_RMS`), and falls in
+    most photos that show it: a single photo must not decide. Surfaces that are wrong by as much as
+    a Gaussian is wide count too.
 
     Parameters
     ----------
     gaussians : OrientedGaussians
         Coefficients of ``degree`` and above are taken as 0. Scene frame.
-    views : sequence of NeedView
+    views : sequence of TrialView
         Training views at a small size (about 144 pixels); :data:`MAX_FIT_VIEWS` of them are used.
-    held_out : sequence of NeedView
+    held_out : sequence of TrialView
         Photos never trained on; they judge and are never fitted to.
     degree : int
         The degree to try, from 1 to 3.
@@ -142,7 +143,7 @@ def harmonics_need(
 
     Returns
     -------
-    HarmonicsNeed
+    HarmonicsEvidence
 
     Raises
     ------
@@ -151,46 +152,46 @@ def harmonics_need(
     """
     if not 1 <= degree <= MAX_DEGREE:
         raise UsageError(f"Degree {degree} cannot be tried.", f"Give 1 to {MAX_DEGREE}.")
-    threads, check = threads or default_threads(), check or _never
-    fitted, judging = _spread(views, MAX_FIT_VIEWS), _spread(held_out, MAX_HELD_OUT)
-    unknown = HarmonicsNeed(degree, 0.0, 0.0, 0.0, False, 0, None)
+    threads, check = threads or default_threads(), check or _no_check
+    fitted, judging = _evenly_spaced(views, MAX_FIT_VIEWS), _evenly_spaced(held_out, MAX_HELD_OUT)
+    unknown = HarmonicsEvidence(degree, 0.0, 0.0, 0.0, False, 0, None)
     halves = _halves(fitted)
     if min(len(half) for half in halves) < MIN_FIT_VIEWS or len(gaussians) == 0:
         return unknown
-    shown = shown_weights(gaussians, [*fitted, *judging], threads, check)
-    tally = _Tally(len(gaussians))
+    shown = summed_weights(gaussians, [*fitted, *judging], threads, check)
+    statistics = _ErrorStatistics(len(gaussians))
     for half, other, apart in zip(halves, reversed(halves), _halves(judging), strict=True):
         trial = HarmonicsTrial(gaussians, half, degree, shown, threads, check)
-        trial.settle()
+        trial.fit_lower_degrees()
         without, with_degree = trial.fit(degree - 1, degree)
         for view in (*other, *apart):
             compared = trial.compare(view, without, with_degree)
-            tally.add(compared.without, compared.with_degree, compared.weights)
-            tally.slow += compared.slow
-            tally.whole += compared.whole
-    share, well_seen = tally.shares()
+            statistics.add(compared.without, compared.with_degree, compared.weights)
+            statistics.low_frequency += compared.low_frequency
+            statistics.total += compared.total
+    share, well_seen = statistics.shares()
     if well_seen < WELL_SEEN_SHARE:
         return unknown
     needed = share > NEEDED_SHARE
     coefficients = None
     if needed:
         trial = HarmonicsTrial(gaussians, fitted, degree, shown, threads, check)
-        trial.settle()
+        trial.fit_lower_degrees()
         (coefficients,) = trial.fit(degree)
     judged = len(fitted) + len(judging)
-    return HarmonicsNeed(
-        degree, share, tally.gain_db(), well_seen, needed, judged, coefficients
+    return HarmonicsEvidence(
+        degree, share, statistics.gain_db(), well_seen, needed, judged, coefficients
     )  # fmt: skip
 
 
-class _Tally:
+class _ErrorStatistics:
     """Sums over the judging photos, for each of n Gaussians and as a whole."""
 
     def __init__(self, count: int) -> None:
         self.without, self.with_degree = np.zeros(count), np.zeros(count)
         self.weights = np.zeros(count)
         self.photos, self.better = np.zeros(count, np.int64), np.zeros(count, np.int64)
-        self.slow, self.whole = np.zeros(2), 0.0
+        self.low_frequency, self.total = np.zeros(2), 0.0
 
     def add(self, without: np.ndarray, with_degree: np.ndarray, weights: np.ndarray) -> None:
         """Take in a photo: (n,) each."""
@@ -207,18 +208,18 @@ class _Tally:
         total, shown = float(self.weights[seen].sum()), float(self.weights.sum())
         if total <= 0.0:
             return 0.0, 0.0
-        gains = seen & (self.without - self.with_degree > VISIBLE**2 * self.weights)
-        gains &= self.with_degree < (1.0 - FALL) * self.without
+        gains = seen & (self.without - self.with_degree > MIN_REDUCTION_RMS**2 * self.weights)
+        gains &= self.with_degree < (1.0 - MIN_RELATIVE_REDUCTION) * self.without
         gains &= 2 * self.better > self.photos
         return float(self.weights[gains].sum()) / total, total / shown
 
     def gain_db(self) -> float:
         """Return what the degree explains of the slow error, as a part of the whole error."""
-        explained = float(self.slow[0] - self.slow[1]) / max(self.whole, 1e-12)
+        explained = float(self.low_frequency[0] - self.low_frequency[1]) / max(self.total, 1e-12)
         return -10.0 * math.log10(1.0 - min(explained, 1.0 - 1e-6))
 
 
-def _spread(views: Sequence[NeedView], most: int) -> list[NeedView]:
+def _evenly_spaced(views: Sequence[TrialView], most: int) -> list[TrialView]:
     """Return the views of which some pixels count, at most so many, spread evenly."""
     usable = [view for view in views if view.mask is None or view.mask.any()]
     count = min(len(usable), most)
@@ -226,7 +227,7 @@ def _spread(views: Sequence[NeedView], most: int) -> list[NeedView]:
     return [usable[i] for i in chosen.tolist()]
 
 
-def _halves(views: Sequence[NeedView]) -> tuple[list[NeedView], list[NeedView]]:
+def _halves(views: Sequence[TrialView]) -> tuple[list[TrialView], list[TrialView]]:
     """Return the views in two halves: of each pair of neighbours one, drawn with a fixed seed.
 
     Any rule without chance fails a capture that repeats in step with it: two heights in turn, three
@@ -240,5 +241,5 @@ def _halves(views: Sequence[NeedView]) -> tuple[list[NeedView], list[NeedView]]:
     )
 
 
-def _never() -> None:
+def _no_check() -> None:
     """Ask for nothing."""

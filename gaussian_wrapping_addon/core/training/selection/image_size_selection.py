@@ -49,7 +49,7 @@ class PhotoDetail:
 
 
 @dataclass(frozen=True)
-class ImageNeed:
+class ImageSizeEvidence:
     """The largest useful size of a scene's photos."""
 
     useful_px: int
@@ -60,7 +60,7 @@ class ImageNeed:
     noise: float
     photos: int
 
-    def wants_full(self, setting: str = "auto") -> bool:
+    def uses_full_size(self, setting: str = "auto") -> bool:
         """Tell whether photos are trained on at full size; else at half of it."""
         return setting == "on" or (setting == "auto" and 2 * self.useful_px > self.side_px)
 
@@ -82,7 +82,7 @@ class ImageNeed:
             "photos": float(self.photos),
             "limit": DETAIL_RMS,
         }
-        size_px = self.side_px if self.wants_full(setting) else self.side_px // 2
+        size_px = self.side_px if self.uses_full_size(setting) else self.side_px // 2
         return Decision("full_size", setting, f"{size_px} px", evidence, figures)
 
 
@@ -121,7 +121,7 @@ def photo_detail(photo: np.ndarray, mask: np.ndarray | None = None) -> PhotoDeta
     return PhotoDetail(side, useful, detail, noise)
 
 
-def image_need(details: Sequence[PhotoDetail]) -> ImageNeed:
+def select_image_size(details: Sequence[PhotoDetail]) -> ImageSizeEvidence:
     """Return the useful size of a spread of photos: of half of them it keeps all detail.
 
     Raises
@@ -133,7 +133,7 @@ def image_need(details: Sequence[PhotoDetail]) -> ImageNeed:
         raise ValueError("no photo was measured")
     # The upper one of two middle photos: detail is kept where half of the photos have it.
     chosen = sorted(details, key=lambda d: (d.useful_px, d.side_px))[len(details) // 2]
-    return ImageNeed(
+    return ImageSizeEvidence(
         chosen.useful_px,
         chosen.side_px,  # of the same photo: sizes may differ without any being halved
         float(np.median([d.detail for d in details])),

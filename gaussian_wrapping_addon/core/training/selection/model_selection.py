@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import UsageError
-from ...settings import DECISIONS
+from ...settings import SELECTION_MODES
 
 ON, OFF = "on", "off"
 
@@ -48,10 +48,10 @@ class Decision:
     """Whether the photos were asked; false where the settings alone decide."""
 
     def __post_init__(self) -> None:
-        if self.setting not in DECISIONS:
+        if self.setting not in SELECTION_MODES:
             raise UsageError(
                 f"The setting {self.name} is {self.setting!r}.",
-                f"Give one of {', '.join(DECISIONS)}.",
+                f"Give one of {', '.join(SELECTION_MODES)}.",
             )
 
     @property
@@ -90,7 +90,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Needs:
+class ModelSelection:
     """The decisions of a scene, in the order in which they were first taken; one of each name."""
 
     decisions: tuple[Decision, ...] = ()
@@ -110,18 +110,20 @@ class Needs:
         decision = self.get(name)
         return decision is not None and decision.chosen == value
 
-    def with_decision(self, decision: Decision) -> Needs:
+    def with_decision(self, decision: Decision) -> ModelSelection:
         """Return these and one more; a later decision takes the place of one of the same name."""
         if self.get(decision.name) is None:
-            return Needs((*self.decisions, decision))
-        return Needs(tuple(decision if d.name == decision.name else d for d in self.decisions))
+            return ModelSelection((*self.decisions, decision))
+        return ModelSelection(
+            tuple(decision if d.name == decision.name else d for d in self.decisions)
+        )
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return plain JSON values."""
         return [decision.to_json() for decision in self.decisions]
 
     @classmethod
-    def from_json(cls, values: Any) -> Needs:
+    def from_json(cls, values: Any) -> ModelSelection:
         """Build from :meth:`to_json`'s values.
 
         Raises
@@ -131,10 +133,10 @@ class Needs:
         """
         if not isinstance(values, list):
             raise UsageError("Stored decisions are no list.", "Train the scene again.")
-        needs = cls()
+        model_selection = cls()
         for entry in values:
-            needs = needs.with_decision(Decision.from_json(entry))
-        return needs
+            model_selection = model_selection.with_decision(Decision.from_json(entry))
+        return model_selection
 
 
 def decide(
@@ -145,7 +147,7 @@ def decide(
     return Decision(name, setting, chosen, evidence, dict(figures or {}))
 
 
-def multi_view_need(neighbours: Sequence[np.ndarray], setting: str = "auto") -> Decision:
+def select_multi_view(neighbours: Sequence[np.ndarray], setting: str = "auto") -> Decision:
     """Decide whether the multi-view terms are used (docs/method.md, section 3.4).
 
     They compare a photo with one taken from a similar place, and are on as soon as any photo has
@@ -179,7 +181,7 @@ def multi_view_need(neighbours: Sequence[np.ndarray], setting: str = "auto") -> 
     return decide("multi_view", setting, True, evidence, figures)
 
 
-def wrapping_need(errors: np.ndarray, weights: np.ndarray, setting: str = "auto") -> Decision:
+def select_wrapping(errors: np.ndarray, weights: np.ndarray, setting: str = "auto") -> Decision:
     """Decide whether orientation is trained and clones of opposite orientation are made.
 
     Behind a thin part the orientation of its Gaussians is seen from the wrong side. Such Gaussians

@@ -118,7 +118,7 @@ def test_a_truth_must_be_whole() -> None:
     with pytest.raises(DatasetError, match="not both"):
         Truth(samples, np.zeros((3, 3)))
     with pytest.raises(DatasetError, match="no samples"):
-        Truth(SurfaceSamples.none())
+        Truth(SurfaceSamples.empty())
     with pytest.raises(DatasetError, match="seen"):
         Truth(samples, seen=np.zeros(3, bool))
     assert Truth(samples).judged().all()

@@ -15,7 +15,7 @@ from ..progress import Progress
 Item = TypeVar("Item")
 
 
-def checked(items: Iterable[Item], progress: Progress) -> Iterator[Item]:
+def cancellable(items: Iterable[Item], progress: Progress) -> Iterator[Item]:
     """Yield the items, asking for cancelling before each one is made.
 
     A wrapping round renders up to sixty views, which takes longer than the two seconds within
@@ -37,7 +37,7 @@ def checked(items: Iterable[Item], progress: Progress) -> Iterator[Item]:
         yield item
 
 
-class CheckedPhotos:
+class CancellablePhotos:
     """Photos that ask for cancelling whenever one is fetched.
 
     For what looks at all photos before the first iteration, or after the last.

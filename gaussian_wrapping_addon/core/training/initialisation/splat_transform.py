@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...dataset.loading.splat_cameras import even_directions
+from ...dataset.loading.splat_cameras import fibonacci_directions
 from ...dataset.readers.source_model import quaternion_from_rotation
 from ...dataset.similarity import Similarity
 from ...gaussians.model import OrientedGaussians
@@ -20,7 +20,7 @@ _DIRECTIONS = 64
 """Directions in which rotated harmonics must agree; 16 would do, more are better conditioned."""
 
 
-def move_gaussians(
+def transform_gaussians(
     gaussians: OrientedGaussians, target_from_source: Similarity
 ) -> OrientedGaussians:
     """Return what looks from a moved camera as the Gaussians do from the camera before.
@@ -37,22 +37,22 @@ def move_gaussians(
         float64, target frame.
     """
     wide = {name: t.detach().cpu().double() for name, t in gaussians.tensors()}
-    move = target_from_source
-    rotation = torch.from_numpy(np.array(move.rotation, np.float64))
-    means = torch.from_numpy(move.points(wide["means"].numpy()))
+    similarity = target_from_source
+    rotation = torch.from_numpy(np.array(similarity.rotation, np.float64))
+    means = torch.from_numpy(similarity.points(wide["means"].numpy()))
     direction = wide["orientation"][:, :3] @ rotation.T
     return OrientedGaussians(
         means=means,
-        log_scales=wide["log_scales"] + math.log(move.scale),
-        quats=_turned(wide["quats"], quaternion_from_rotation(move.rotation)),
+        log_scales=wide["log_scales"] + math.log(similarity.scale),
+        quats=_rotated(wide["quats"], quaternion_from_rotation(similarity.rotation)),
         opacity_logits=wide["opacity_logits"],
         sh=rotate_harmonics(wide["sh"], rotation),
         orientation=torch.cat([direction, wide["orientation"][:, 3:]], dim=1),
-        filter_3d=wide["filter_3d"] * move.scale,
+        filter_3d=wide["filter_3d"] * similarity.scale,
     )
 
 
-def _turned(quats: Tensor, turn: np.ndarray) -> Tensor:
+def _rotated(quats: Tensor, turn: np.ndarray) -> Tensor:
     """Return the (n, 4) products ``turn * quats`` of quaternions w x y z."""
     a, b, c, d = turn.tolist()
     left = quats.new_tensor([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
@@ -94,7 +94,7 @@ def rotate_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
 @functools.cache
 def _directions() -> Tensor:
     """(m, 3) unit vectors spread evenly: a spherical Fibonacci lattice."""
-    return torch.from_numpy(even_directions(_DIRECTIONS))
+    return torch.from_numpy(fibonacci_directions(_DIRECTIONS))
 
 
 def with_degree(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:
