@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Memory of machines and containers, as the system's files tell it."""
+"""Memory of machines and containers, from the system's files."""
 
 from __future__ import annotations
 

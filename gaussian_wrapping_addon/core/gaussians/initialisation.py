@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The first Gaussians: from sparse points, more along the cameras' rays where these are few."""
+"""Initial Gaussians: from sparse points, and along camera rays if these are few."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..errors import DatasetError
 from .model import OrientedGaussians
 
 PhotoLoader = Callable[[int], tuple[Camera, np.ndarray, np.ndarray | None]]
-"""Gives camera, (h, w, 3) uint8 photo and (h, w) bool mask or ``None``, at a small size."""
+"""Returns camera, (h, w, 3) uint8 photo and (h, w) bool mask or ``None``, at a small size."""
 
 INITIAL_OPACITY = 0.1
 SH_C0 = 0.28209479177387814
@@ -27,18 +27,19 @@ MIN_START_POINTS = 5000
 """With fewer sparse points, more are added until there are this many."""
 
 MAX_DISTANCE = 20.0 * tolerances.SCENE_RADIUS
-"""Points farther from the cameras' middle are pulled in along their direction, which hardly moves
-them on any photo: outliers of the reconstruction reach 1e6 units and would waste float32."""
+"""Points farther from the cameras' centroid are moved to this distance along their direction, which
+hardly changes their projections: outliers of the reconstruction reach 1e6 units and would waste
+float32 precision."""
 
 MIN_SPACING_SQ = 1e-7
 """Squared distances between neighbours are clamped to this (docs/method.md, section 1.3)."""
 
 MAX_SPACING_SHARE = 0.1
-"""A first Gaussian is no larger than this share of its distance to the nearest camera."""
+"""Largest size of an initial Gaussian relative to its distance to the nearest camera."""
 
 _DEPTH_NEIGHBOURS = 4
 _DEPTH_JITTER = 0.05
-"""Spread of the filled-up points around the depth of the nearest sparse points, share of it."""
+"""Relative standard deviation of added points around the depth of the nearest sparse points."""
 
 _DEPTH_TRIALS = 8
 
@@ -63,13 +64,13 @@ def initial_gaussians(
     ----------
     scene : Scene
     view_indices : list of int
-        Views that may be looked at (not the held-out ones).
+        Views to use (without held-out ones).
     load_photo : callable
-        Gives camera, photo and mask of a view; only called where points are few.
+        Returns camera, photo and mask of a view; only called if points are few.
     max_gaussians : int
-        Never exceeded; a random choice of the points is taken.
+        Upper bound; a random subset of the points is used if there are more.
     sh_degree : int
-        Of the harmonics to make room for.
+        Degree of the harmonics to allocate.
     seed : int
 
     Returns
@@ -80,7 +81,7 @@ def initial_gaussians(
     Raises
     ------
     DatasetError
-        If there is no view, or points are few and masks leave nothing of all photos.
+        If there is no view, or points are few and the masks exclude all pixels.
     """
     if not view_indices:
         raise DatasetError("There is no view to train on.", "Add photos.")
@@ -104,13 +105,13 @@ def initial_gaussians(
 
 
 def clamp_distances(points: np.ndarray) -> np.ndarray:
-    """Return points with their distance from the scene's middle capped at :data:`MAX_DISTANCE`."""
+    """Return points with their distance from the scene centre clamped to :data:`MAX_DISTANCE`."""
     distance = np.linalg.norm(points, axis=1, keepdims=True)
     return points * np.minimum(1.0, MAX_DISTANCE / np.maximum(distance, MAX_DISTANCE))
 
 
 def _spacing(points: np.ndarray, cameras: list[Camera]) -> np.ndarray:
-    """(n,) root mean squared distance to the three nearest neighbours, capped by what is seen."""
+    """(n,) RMS distance to the three nearest neighbours, capped by the distance to the cameras."""
     neighbours = min(3, len(points) - 1)
     if neighbours > 0:
         distance, _ = cKDTree(points).query(points, k=neighbours + 1)
@@ -153,11 +154,11 @@ def _points_along_rays(
     load_photo: PhotoLoader,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``wanted`` more points with colours in [0, 1], taken from pixels of the photos."""
+    """Return ``wanted`` additional points with colours in [0, 1], from pixels of the photos."""
     views = [load_photo(i) for i in view_indices]
     views = [view for view in views if view[2] is None or view[2].any()]
     if not views:
-        raise DatasetError("The masks leave nothing of any photo.", "Check the masks.")
+        raise DatasetError("The masks exclude all pixels of all photos.", "Check the masks.")
     cameras = [camera for camera, _, _ in views]
     share = np.full(len(views), wanted // len(views))
     share[: wanted - int(share.sum())] += 1
@@ -184,7 +185,7 @@ def _points_along_rays(
 def _depth_near_points(
     points: np.ndarray, camera: Camera, pixels: np.ndarray, random: np.random.Generator
 ) -> np.ndarray | None:
-    """(m,) depth of one of the sparse points nearest on the photo, or ``None`` without points."""
+    """(m,) depth of one of the sparse points nearest in the image; ``None`` without points."""
     if len(points) == 0:
         return None
     where, depth = camera.project(points)
@@ -203,7 +204,7 @@ def _depth_near_points(
 def _most_seen_depth(
     camera: Camera, pixels: np.ndarray, cameras: list[Camera], random: np.random.Generator
 ) -> np.ndarray:
-    """(m,) of several random depths the one whose position most cameras see."""
+    """(m,) out of several random depths, that of the position most cameras see."""
     near, far = 0.1 * tolerances.SCENE_RADIUS, 4.0 * tolerances.SCENE_RADIUS
     best = np.zeros(len(pixels))
     most = np.full(len(pixels), -1)
@@ -216,7 +217,7 @@ def _most_seen_depth(
         axis=1,
     )
     for _ in range(_DEPTH_TRIALS):
-        # Uniform in inverse depth: as many positions near the cameras as a photo can tell apart.
+        # Uniform in inverse depth, which matches the depth resolution of the photos.
         depth = 1.0 / random.uniform(1.0 / far, 1.0 / near, len(pixels))
         positions = (rays * depth[:, None]) @ camera.rotation + camera.center
         seen = np.zeros(len(pixels), int)

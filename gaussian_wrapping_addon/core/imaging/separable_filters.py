@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Filters on explicit vectors, for the separable window of the structural similarity.
+"""Vectorised separable filters for the SSIM window.
 
-Indices are not checked: a run reads and writes :data:`LANES` neighbouring values. Weights come as a
-tuple, so that they stay in registers: a loop over an array of them would load them again for each
+Indices are not checked: a run reads and writes :data:`LANES` neighbouring values. Weights are
+passed as a tuple so that they stay in registers: a loop over an array would reload them for each
 run, as LLVM cannot prove that the target is another array.
 """
 
@@ -16,18 +16,18 @@ from numba.core.errors import RequireLiteralValue
 from numba.extending import intrinsic
 
 LANES = 16
-"""Values of a run. LLVM splits it into as many registers as the processor needs."""
+"""Values per run. LLVM splits a run into as many registers as needed."""
 
 TAPS = 11
 HALF = TAPS // 2 + 1
 RING = TAPS + 1
-"""Rows that two neighbouring windows reach."""
+"""Rows covered by two neighbouring windows."""
 
 _WORD = ir.IntType(32)
 
 
 class _Runs:
-    """Emits loads, sums and stores of runs of one function."""
+    """Emits loads, sums and stores of runs within one function."""
 
     def __init__(self, context: Any, builder: Any, kind: Any) -> None:
         self.context, self.builder = context, builder
@@ -52,7 +52,7 @@ class _Runs:
         return self.builder.load(self.pointer(array_type, array, at), align=self.align)
 
     def weighted(self, weights: list[Any], runs: list[Any]) -> Any:
-        """Return the sum of 11 runs by the symmetric weights whose first six are given."""
+        """Return the sum of 11 runs with symmetric weights, of which the first six are given."""
         b, total = self.builder, None
         for tap, weight in enumerate(weights):
             mirrored = len(runs) - 1 - tap
@@ -90,10 +90,10 @@ def filter_run(typingctx, target, target_at, source, source_at, step, weights): 
 def filter_two_runs(  # type: ignore[no-untyped-def]
     typingctx, target, target_at, apart, source, source_at, step, weights, first
 ):
-    """Filter a ring of 12 rows for two windows that begin in neighbouring rows, loading it once.
+    """Filter a ring of 12 rows for two windows that start in neighbouring rows, loading it once.
 
     ``first``: the slot of the first window's first row, a constant, so that all 12 addresses are
-    one register and constants. The second window's result goes to ``target_at + apart``.
+    one register plus constants. The second window's result is written to ``target_at + apart``.
     """
     if not isinstance(first, types.IntegerLiteral):
         raise RequireLiteralValue("the first slot is no constant")

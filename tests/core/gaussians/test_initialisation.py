@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The first Gaussians: from points, from few points, from none, from bad ones."""
+"""Initial Gaussians from many, few, no, and invalid points."""
 
 from __future__ import annotations
 

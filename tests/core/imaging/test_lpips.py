@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""LPIPS over random weights of the right shapes; the real ones are nowhere in the repository."""
+"""LPIPS with random weights of the right shapes; the real ones are not in the repository."""
 
 from __future__ import annotations
 

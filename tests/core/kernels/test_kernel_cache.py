@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The same bits from fresh and from cached kernels; stale caches; life without a cache."""
+"""Fresh and cached kernels are bitwise equal; stale caches; operation without a cache."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bands of tiles keep to the budget and change nothing; warm renderings allocate nothing large."""
+"""Bands of tiles respect the budget and do not change results; later renderings reuse memory."""
 
 from __future__ import annotations
 

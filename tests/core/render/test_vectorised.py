@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The compiled kernels use packed arithmetic; a harmless-looking edit can turn it off silently."""
+"""The kernels compile to packed arithmetic; a harmless-looking edit can silently disable that."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Projection and binning on the device: what of a view comes before its pixels, as tensors."""
+"""Projection and tile binning on the GPU, as tensors: what precedes rasterisation."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from .source import THREADS_PER_BLOCK
 WARPS = THREADS_PER_BLOCK // 32
 ROW_VALUES = 24
 KEPT_BYTES = 4 + 4 + 4 * WARPS
-"""Of each pair between forward and backward: Gaussian, slot, masks of contributing pixels."""
+"""Memory per intersection kept for the backward pass: Gaussian, slot, contribution masks."""
 PASSING_BYTES = 4 * ROW_VALUES
-"""Of each pair of a band at a time: its gradient row; binning needs less."""
+"""Temporary memory per intersection of one band: its gradient row; binning needs less."""
 _MAX_INTERSECTIONS = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class DeviceScreen:
-    """Screen Gaussians as ``projection.ScreenGaussians``, on the device."""
+    """Screen Gaussians like ``projection.ScreenGaussians``, on the device."""
 
     params: Tensor  # (n, 24) float32
     boxes: Tensor  # (n, 4) float32
@@ -40,16 +40,16 @@ class DeviceScreen:
 
 @dataclass(frozen=True)
 class Band:
-    """Tile lists of some rows of tiles, as ``tiles.TileLists``, on the device."""
+    """Tile lists of a band of tile rows like ``tiles.TileLists``, on the device."""
 
     first_row: int
-    """First row of tiles; the tiles are numbered from its first one."""
+    """First tile row; the tiles are numbered from its first one."""
     tiles: int
     start: Tensor  # (tiles + 1,) int64
-    gaussian_ids: Tensor  # (pairs,) int32
-    intersection_slots: Tensor  # (pairs,) int32
+    gaussian_ids: Tensor  # (intersections,) int32
+    intersection_slots: Tensor  # (intersections,) int32
     intersection_offsets: Tensor  # (n + 1,) int64
-    masks: Tensor  # (pairs, 8) int32: pixels of each warp that the Gaussian contributed to
+    masks: Tensor  # (intersections, 8) int32: pixels of each warp that the Gaussian contributed to
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class RawTensors:
 
 
 def project(kernels: Kernels, raw: RawTensors) -> DeviceScreen:
-    """Activate and project, in float64 as ``projection.project_gaussians``."""
+    """Activate and project in float64, like ``projection.project_gaussians``."""
     count, device = len(raw.gaussians), raw.gaussians.means.device
     screen = DeviceScreen(
         torch.empty((count, ROW_VALUES), device=device),
@@ -111,22 +111,22 @@ def project(kernels: Kernels, raw: RawTensors) -> DeviceScreen:
 def bin_bands(
     kernels: Kernels, screen: DeviceScreen, camera: Camera, budget_bytes: int
 ) -> Iterator[Band]:
-    """Yield the tile lists of a view, in as few bands of tile rows as the budget allows.
+    """Yield the tile lists of a view in bands of tile rows, as few as the budget allows.
 
     Parameters
     ----------
     budget_bytes : int
-        Half of it is for what all bands keep until the gradient, half for the gradient rows of
+        Half of it is for what all bands keep for the backward pass, half for the gradient rows of
         one band at a time.
 
     Raises
     ------
     ResourceError
-        If one row of tiles, or all lists together, need more.
+        If one tile row, or all lists together, exceed it.
     """
     tile = tolerances.TILE_PX
     tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)
-    # Invisible rows have infinite depth and come last; ties keep the order of indices.
+    # Invisible rows have infinite depth and come last; ties are ordered by index.
     order = torch.sort(screen.depths, stable=True).indices  # (n,) int64
     half = budget_bytes // 2
     max_band_intersections = min(half // PASSING_BYTES, _MAX_INTERSECTIONS)
@@ -149,7 +149,7 @@ def bin_bands(
         kept += intersections * KEPT_BYTES
         if kept > half:
             raise ResourceError(
-                f"The tile lists of view {camera.name!r} need more than {half} bytes of the GPU.",
+                f"The tile lists of view {camera.name!r} need over {half} bytes of GPU memory.",
                 "Use smaller images or fewer Gaussians, or render on the CPU.",
             )
         yield _list(
@@ -160,7 +160,7 @@ def bin_bands(
 def _count(
     kernels: Kernels, screen: DeviceScreen, camera: Camera, first_row: int, end_row: int
 ) -> Tensor:
-    """(n,) int64 tiles that each Gaussian reaches in rows of tiles."""
+    """(n,) int64 number of tiles that each Gaussian reaches in some tile rows."""
     count = len(screen.params)
     counts = torch.empty(count, dtype=torch.int64, device=screen.params.device)
     kernels.launch_each(
@@ -208,7 +208,7 @@ def _list(
         *unsorted.unbind(),
     )
     tiles = tiles_x * (end_row - first_row)
-    # Short keys take half as many passes of the radix sort.
+    # Short keys need half as many passes of the radix sort.
     keys = unsorted[0].to(torch.int16 if tiles < 2**15 else torch.int32)
     by_tile = torch.sort(keys, stable=True)
     edges = torch.arange(tiles + 1, dtype=keys.dtype, device=device)
@@ -224,7 +224,7 @@ def _list(
 
 
 def _offsets(counts: Tensor) -> Tensor:
-    """(n + 1,) int64 running sum that begins at 0."""
+    """(n + 1,) int64 exclusive running sum."""
     offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
     torch.cumsum(counts, 0, out=offsets[1:])
     return offsets

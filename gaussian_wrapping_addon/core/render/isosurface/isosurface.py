@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled solver of the 0.5-isosurface depth of a block of pixels, from its list of visits.
+"""Compiled solver of the 0.5-isosurface depth of a block of pixels, from its contributor list.
 
 Along a pixel's ray ``T(t) = prod_i (1 - min(0.99, alpha_i exp(-s_i max(t_i - t, 0)^2 / 2)))`` falls
 with t; the depth is where it crosses 0.5 (docs/method.md, section 2.4). Each pixel keeps a bracket,
 starts where the Gaussian at which the blending crosses 0.5 would cross it alone, and takes Halley
-steps on log T; a step that leaves the bracket, or too many steps, is replaced by bisection.
+steps on log T. A step that leaves the bracket, or every second one after the first few, is replaced
+by bisection.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from .isosurface_steps import (
 )
 
 _NEWTON_STEPS = 8
-"""From here on every second step is a bisection, which bounds the number of steps."""
+"""After these, every second step is a bisection, which bounds the number of steps."""
 _MAX_STEPS = 80
 _NO_PIXELS = np.uint64(0)
 
@@ -49,18 +50,18 @@ def solve_block(lanes: Any, m: Any, b: Any, lists: Any, count: Any) -> None:
     lanes : int
         8 or 16.
     m : (n,) float32
-        The tile's scratch, where blending left brackets and first guesses; depth and slope are
+        The tile's scratch, with brackets and initial guesses from blending; depth and slope are
         written.
     b : int
-        Where the block begins in each plane.
+        Start of the block in each plane.
     lists : (n,) float32
-        Entries of the block, ``count`` of them; none where no pixel has an isosurface. Reordered.
+        Entries of the block, ``count`` of them; none if no pixel has an isosurface. Reordered.
     """
     is_open = _NO_PIXELS
     if count > 0:
         is_open = open_16(m) if lanes == 16 else open_8(m)
     if is_open != _NO_PIXELS and m[NEAREST] <= ZERO:
-        # Some Gaussian may reach the camera: light must pass at depth 0 for a crossing to exist.
+        # Some Gaussian may reach the camera: a crossing needs T > 0.5 at depth 0.
         if lanes == 16:
             evaluate_16(m, lists, count, ZERO)
             is_open = drop_occluded_16(m)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vector code of the isosurface solver: one block of pixels against its list of visits."""
+"""Vector code of the isosurface solver: one block of pixels and its contributor list."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ LIST_VALUES = 3
 """Values per entry: opacity before the cap (0 where none), z-depth of the peak, sharpness
 (1 / sigma^2 along the ray)."""
 
-# One vector each, behind the planes of the tile's scratch array.
+# One vector each, after the planes of the tile's scratch array.
 AT_DEPTH, SLOPES = FORWARD_PLANES * STRIDE, FORWARD_PLANES * STRIDE + TILE
 _LOW, _HIGH, _OPEN = AT_DEPTH + 2 * TILE, AT_DEPTH + 3 * TILE, AT_DEPTH + 4 * TILE
 _PRODUCT, _FIRST, _SECOND = AT_DEPTH + 5 * TILE, AT_DEPTH + 6 * TILE, AT_DEPTH + 7 * TILE
 _SHARPEST, NEAREST = AT_DEPTH + 8 * TILE, AT_DEPTH + 9 * TILE
 _PREFIX = AT_DEPTH + 10 * TILE
-"""Product of the Gaussians that lie wholly before the brackets."""
+"""Transmittance of the Gaussians that lie wholly in front of the brackets."""
 _AT_CROSSING = AT_DEPTH + 11 * TILE
 """1/sigma of the Gaussian at which the blending crosses 0.5."""
 SOLVER_VALUES = 12 * TILE
@@ -34,56 +34,56 @@ SOLVER_VALUES = 12 * TILE
 _NEWTON_FLOOR = 1e-6
 _LOG_2 = math.log(2.0)
 _MIN_OPTICAL_DEPTH = 1e-3
-"""Of -log T, where its logarithm is taken: far from 0.5 no slope is extrapolated."""
+"""Lower bound of -log T where its logarithm is taken: far from 0.5 no slope is extrapolated."""
 _APPROXIMATE_STEPS = 2
-"""Newton steps on a cheap likeness of T first: half the cost of a true one each."""
-# Halley's correction of a Newton step stays within these factors.
+"""Initial Newton steps on a cheap approximation of T, at half the cost of an exact step each."""
+# Bounds of Halley's correction factor of a Newton step.
 _MIN_CORRECTION, _MAX_CORRECTION = 0.5, 2.0
 # Converged: the cube of the step, in units of the thinnest Gaussian's sigma along the ray, is below
-# this share of the depth, and the step itself small enough to extrapolate the slope ...
+# this fraction of the depth, and the step itself small enough to extrapolate the slope ...
 _CUBE_SHARE, _STEP_SIGMAS = 2e-7, 0.003
 _STEP_SIGMAS_ALONE = 1e-5
-# ... or the step is below the rounding of the depth, and not because a layer is steep that may
-# end before the level is reached ...
+# ... or the step is below the rounding error of the depth, and not because of a steep layer that
+# may end before the level is reached ...
 _STEP_SHARE, _LEVEL_NEAR = 2.5e-7, 1e-3
-# ... or the transmittance equal to 0.5 within its own rounding.
+# ... or the transmittance equals 0.5 within its own rounding error.
 _LEVEL_MARGIN = 3e-7
 _LEVEL_FAR, _FLAT = 0.05, 0.02
 _COARSE = 8e3
-"""Depth in sigmas from which on a rounding of a float32 depth is over 1e-3 of a sigma."""
+"""Depth in sigmas beyond which the rounding of a float32 depth exceeds 1e-3 sigma."""
 # exp(-x / 2) is below 3e-7 beyond this x = sharpness d^2.
 NEGLIGIBLE = 30.0
 _TINY = 1e-30
 
 
 def entry_index(block: Block, number: Any) -> Any:
-    """Return where an entry of a list begins."""
+    """Return the index of the first value of a list entry."""
     size = block.index(LIST_VALUES * block.lanes)
     return block.builder.mul(number, size, flags=("nuw", "nsw"))
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where the blending of each pixel crossed 0.5: the Gaussian there, and what it stood in."""
+    """Where the blending of each pixel crossed 0.5: the Gaussian there and the transmittances."""
 
     before: Vector  # transmittance in front of that Gaussian; 0 where nothing crosses
     alpha: Vector
     peak: Vector
     sharpness: Vector
-    final: Vector  # transmittance behind everything
+    final: Vector  # final transmittance
     high: Vector  # deepest peak up to the crossing
 
 
 def start_solver(
     block: Block, state: Any, crossing: Crossing, sharpest: Vector, nearest: Any, limit: Any
 ) -> Any:
-    """Write brackets and first guesses; return which pixels have an isosurface, as bits."""
+    """Write brackets and initial guesses; return as bits which pixels have an isosurface."""
     crossed = (
         (crossing.before > 0.0)
         & (crossing.final <= block.splat(limit))
         & (crossing.final < constants.ISO_LEVEL)
     )
-    # Alone, the Gaussian at the crossing lets 0.5 through where exp(-s d^2 / 2) = ratio.
+    # The Gaussian at the crossing alone reaches T = 0.5 where exp(-s d^2 / 2) = ratio.
     light = crossing.alpha.min(float(constants.ALPHA_MAX)) * crossing.before
     ratio = ((crossing.before - float(constants.ISO_LEVEL)) / light.max(_TINY)).max(_TINY).min(1.0)
     ahead = (ratio.log() * -2.0 / crossing.sharpness.max(_TINY)).max(0.0).sqrt()
@@ -106,7 +106,7 @@ def start_solver(
 
 
 class _Solver:
-    """The vectors of the solver in the scratch array, and the entries of its block."""
+    """Access to the solver's vectors in the scratch array and to the entries of its block."""
 
     def __init__(self, lanes: int, context: Any, builder: Any, sig: Any, args: Any) -> None:
         self.block = Block(lanes, context, builder)
@@ -117,22 +117,22 @@ class _Solver:
         return self.block.load(self.state, self.block.index(plane))
 
     def write(self, value: Vector | float, plane: int) -> None:
-        """Keep a vector of the solver's state."""
+        """Store a vector of the solver's state."""
         self.block.store(value, self.state, self.block.index(plane))
 
     def entry(self, lists: Any, number: Any) -> tuple[list[Any], list[Vector]]:
-        """Return the places of an entry's columns, and the columns."""
+        """Return the offsets of an entry's columns, and the columns."""
         block = self.block
         base = entry_index(block, number)
         offsets = [block.offset(base, column * block.lanes) for column in range(LIST_VALUES)]
         return offsets, [block.load(lists, offset) for offset in offsets]
 
     def is_open(self) -> Mask:
-        """Return which pixels are not solved."""
+        """Return which pixels are not yet solved."""
         return self.read(_OPEN) > 0.0
 
     def set_open(self, is_open: Mask) -> Any:
-        """Keep which pixels are not solved; return them as bits."""
+        """Store which pixels are not yet solved; return them as bits."""
         self.write(is_open.select(1.0, 0.0), _OPEN)
         return is_open.bits()
 
@@ -176,7 +176,7 @@ def _evaluate_intrinsic(lanes: int) -> Any:
 
 
 def _log_of_twice(product: Vector) -> Vector:
-    """Return log(2 product) by the series of artanh: exact near 0.5, monotone elsewhere."""
+    """Return log(2 product) by the artanh series: accurate near 0.5, monotonic elsewhere."""
     twice = product * 2.0
     y = (twice - 1.0) / (twice + 1.0)
     square = y * y
@@ -197,7 +197,7 @@ def _approach_intrinsic(lanes: int) -> Any:
                 _, (alpha, peak, sharpness) = solver.entry(entries, n)
                 ahead = (peak - guess.get()).max(0.0)
                 log_slope = sharpness * ahead
-                # (1 - x / 8)^8 in place of exp(-x).
+                # (1 - x / 8)^8 approximates exp(-x).
                 fall = (1.0 - log_slope * ahead * (0.5 / 8.0)).max(0.0)
                 fall = fall * fall
                 fall = fall * fall
@@ -298,8 +298,7 @@ def _step_intrinsic(lanes: int) -> Any:
             t, low, high = solver.read(AT_DEPTH), solver.read(_LOW), solver.read(_HIGH)
             sharpest, product = solver.read(_SHARPEST), solver.read(_PRODUCT).max(_TINY)
             excess = _log_of_twice(product)
-            # The slope of -log T, its growth with depth, and Halley's correction of the Newton
-            # step with them.
+            # First and second derivative of -log T, and Halley's correction of the Newton step.
             inverse = 1.0 / product
             slope = solver.read(_FIRST) * inverse * -1.0
             growth = slope * slope - solver.read(_SECOND) * inverse
@@ -322,11 +321,11 @@ def _step_intrinsic(lanes: int) -> Any:
             done = done | (sigmas < _STEP_SIGMAS_ALONE)
             done = done | ((size <= t * _STEP_SHARE) & (level < _LEVEL_NEAR))
             done = done | (level <= _LEVEL_MARGIN) | (high - low <= high * _STEP_SHARE)
-            # A small last step is taken, and the slope extrapolated over it: log(-log T) is a
-            # parabola before a single Gaussian. Else, or where a rounding of the depth is much of
-            # a sigma, the pixel stays where the slope is known, for its gradient must be that of
-            # the depth that is stored. Rounding may put the step on the bracket's end, hence no
-            # test for inside.
+            # A small last step is taken and the slope extrapolated over it: log(-log T) is a
+            # parabola in front of a single Gaussian. Otherwise, or if the depth's rounding error is
+            # a large part of a sigma, the pixel stays where the slope is known, because the
+            # gradient must be that of the stored depth. Rounding may put the step on the bracket's
+            # end, hence no test for inside.
             settled = small.select(moved.max(low).min(high), t)
             moved = done.select(settled, inside.select(moved, (low + high) * 0.5))
             over = settled - t
@@ -336,8 +335,8 @@ def _step_intrinsic(lanes: int) -> Any:
             gain = (ratio + ratio_change * 0.5) * over
             final = (ratio + ratio_change) * depth * ((gain * 0.5 + 1.0) * gain + 1.0)
             final = small.select(final, slope)
-            # A layer thinner than a rounding of the depth: T jumps over 0.5 where it is flat.
-            # Its gradient is lost; rather let it be too small than a thousand times too large.
+            # For a layer thinner than the depth's rounding error, T jumps past 0.5 from a flat part
+            # and the gradient is lost: too small is better than a thousand times too large.
             alone = solver.read(_AT_CROSSING)
             lost = (level > _LEVEL_FAR) & (slope < alone * _FLAT)
             final = lost.select(alone * 2.0, final.max(alone * tolerances.SLOPE_FLOOR))

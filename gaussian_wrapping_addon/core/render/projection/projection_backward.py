@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Compiled analytic gradient of the projection, the reverse of ``projection_kernels.py``.
 
-With ``weight_k = 1 / scale_k^2`` everything the forward writes is built of
+With ``weight_k = 1 / scale_k^2`` all outputs of the forward pass are functions of
 
     e_k = axis_k . w0,           h = sum_k axis_k e_k weight_k,     a0 = sum_k e_k^2 weight_k,
     B = sum_k (r0, r1)_k (r0, r1)_k^T weight_k,
     F = sum_k f_k f_k^T weight_i weight_j,   f_k = (r0 - u r2, r1 - v r2)_k,   (i, j) != k;
 
-the gradient is gathered on a0, h, B, F and (u, v, z) first, then on axes and log weights. Like the
-forward it works on blocks of Gaussians (``projection_math.py``).
+the gradient is accumulated on a0, h, B, F and (u, v, z) first, then on axes and log weights. Like
+the forward pass it works on blocks of Gaussians (``projection_math.py``).
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ from .projection_math import BLOCK, QUEUE, block_scratch
 _QUATERNION_MIN_SQ = tolerances.QUATERNION_MIN_NORM**2
 _USED_COLUMNS = 23
 
-# Planes of the scratch array behind those of the activation: gradients on the columns of params, on
-# the basis functions, and on what is trained. The rotation's takes the rotation's place.
+# Planes of the scratch array after those of the activation: gradients on the columns of params, on
+# the basis functions, and on trained parameters. That on the rotation overwrites the rotation.
 _GRAD = ACTIVATED_PLANES * BLOCK
 _WEIGHT = _GRAD + _USED_COLUMNS * BLOCK
 _GRAD_MEAN = _WEIGHT + BASIS_COUNT * BLOCK
@@ -57,8 +57,8 @@ _PLANES = _GRAD_LOGIT // BLOCK + 1
 _WRITTEN_PLANES = _PLANES - _GRAD_MEAN // BLOCK
 
 _GRADIENT_MAX = 1e38
-"""Gradients beyond are not held: a third of float32's largest number, so that squared lengths and
-sums of a few views stay within float64 and float32."""
+"""Larger gradients are dropped: a third of the largest float32, so that squared norms fit float64
+and sums of a few views fit float32."""
 _BASIS_MAX = 3.0  # no basis function is larger on the sphere
 
 
@@ -67,7 +67,7 @@ def _axis_gradient(
     r: Any, e: Any, f0: Any, f1: Any, weight: Any, others: Any, spread: Any,
     g_a0: Any, g_h: Any, g_b: Any, g_f: Any,
 ) -> Any:  # fmt: skip
-    """Return one axis' gradients: on e, f0, f1, on its own r0 r1 r2 directly, on two log weights.
+    """Return one axis' gradients: on e, f0, f1, directly on its r0 r1 r2, on two log weights.
 
     ``g_h`` (3), ``g_b`` and ``g_f`` (xx, xy, yy) are on h, B and F; ``spread`` is the gradient on
     ``cov_zz`` times the axis' variance.
@@ -78,7 +78,7 @@ def _axis_gradient(
     b0, b1 = 2.0 * r[0] * g_b[0] + r[1] * g_b[1], r[0] * g_b[1] + 2.0 * r[1] * g_b[2]
     k0, k1 = 2.0 * f0 * g_f[0] + f1 * g_f[1], f0 * g_f[1] + 2.0 * f1 * g_f[2]
     along = r[2] * spread
-    # B and F are quadratic: half of position times slope is their share of the sum.
+    # B and F are quadratic: their part of the sum is half of value times slope.
     log_self = 2.0 * (r[2] * along - scaled * (h_dot + e * g_a0)) - weight * (r[0] * b0 + r[1] * b1)
     log_others = -others * (f0 * k0 + f1 * k1)
     return (
@@ -91,7 +91,7 @@ def _axis_gradient(
 
 @part(fast=False, fused=True)
 def _shape_gradients(m: Any, camera: Any) -> None:
-    """From the gradients on columns 0-12 and 19-22 to those on mean, log scales and rotation."""
+    """Propagate gradients from columns 0-12 and 19-22 to mean, log scales and rotation."""
     c = load_camera_axes(camera)
     t0, t1, t2 = camera[9], camera[10], camera[11]
     fx, fy = camera[15], camera[16]
@@ -139,7 +139,7 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         fyy = fa1 * fa1 * others0 + fb1 * fb1 * others1 + fd1 * fd1 * others2
         cov_zz = a[2] * a[2] * var0 + b[2] * b[2] * var1 + d[2] * d[2] * var2
 
-        # Gradient on the sums.
+        # Gradients on the sums.
         ia = 1.0 / a0
         zz = z * z
         scale_xx, scale_xy, scale_yy = ia * ifx * ifx, ia * ifx * ify, ia * ify * ify
@@ -172,7 +172,7 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         g_b, g_f = (g_bxx, g_bxy, g_byy), (g_fxx, g_fxy, g_fyy)
         g_cov = 0.5 * m[_GRAD + 22 * BLOCK + lane] / math.sqrt(cov_zz)
 
-        # Down to axes, weights and the ray through the mean.
+        # Gradients on axes, weights and the ray through the mean.
         ga = _axis_gradient(a, e0, fa0, fa1, w0, others0, var0 * g_cov, g_a0, g_h, g_b, g_f)
         gb = _axis_gradient(b, e1, fb0, fb1, w1, others1, var1 * g_cov, g_a0, g_h, g_b, g_f)
         gd = _axis_gradient(d, e2, fd0, fd1, w2, others2, var2 * g_cov, g_a0, g_h, g_b, g_f)
@@ -208,7 +208,7 @@ def _shape_gradients(m: Any, camera: Any) -> None:
 
 @part(fast=False, fused=True)
 def _raw_gradients(m: Any) -> None:
-    """From the gradients on activated values to those on raw ones, and the viewing direction's."""
+    """Propagate gradients from activated to raw values, including those of the view direction."""
     for lane in range(BLOCK):
         w, x = m[QUAT + lane], m[QUAT + BLOCK + lane]
         y, z = m[QUAT + 2 * BLOCK + lane], m[QUAT + 3 * BLOCK + lane]
@@ -238,7 +238,7 @@ def _raw_gradients(m: Any) -> None:
         m[_GRAD_QUAT + 2 * BLOCK + lane] = (gy - along * y) * inverse
         m[_GRAD_QUAT + 3 * BLOCK + lane] = (gz - along * z) * inverse
     for lane in range(BLOCK):
-        # d(effective log scale) = kept d(log scale); the filter also dims the opacity.
+        # d(effective log scale) = raw share * d(log scale); the filter also reduces the opacity.
         g = m[_GRAD + 11 * BLOCK + lane] * m[OPACITY + lane]
         m[_GRAD_LOGIT + lane] = g * m[TRANSPARENCY + lane]
         k0, k1, k2 = (
@@ -272,9 +272,9 @@ def _raw_gradients(m: Any) -> None:
 
 @part(fast=False, fused=True)
 def _drop_overflows(m: Any) -> None:
-    """Set what is written of a Gaussian to 0 where float32 cannot hold all of it."""
+    """Set all gradients of a Gaussian to 0 if any of them overflows float32."""
     for lane in range(BLOCK):
-        # NaN and infinity survive a sum of sizes.
+        # NaN and infinity propagate through a sum of absolute values.
         red, green = m[_GRAD + 13 * BLOCK + lane], m[_GRAD + 14 * BLOCK + lane]
         blue = m[_GRAD + 15 * BLOCK + lane]
         size = _BASIS_MAX * (abs(red) + abs(green) + abs(blue))
@@ -316,9 +316,9 @@ def backward_range(
 ) -> None:
     """Write the gradients of the Gaussians ``begin .. end``, or of ``ids[begin .. end]``.
 
-    Those that are not visible, or whose gradient float32 cannot hold, have none. With ``compact``
-    row k of the ``grad_`` arrays is overwritten with the gradient of ``ids[k]``; without, ``ids``
-    is not read and the gradient of Gaussian i is added to row i.
+    The gradient is 0 for Gaussians that are not visible or if it overflows float32. With
+    ``compact`` row k of the ``grad_`` arrays is overwritten with the gradient of ``ids[k]``;
+    without, ``ids`` is not read and the gradient of Gaussian i is added to row i.
     """
     m = block_scratch(_PLANES)
     m[_WEIGHT : _WEIGHT + BASIS_COUNT * BLOCK] = 0.0
@@ -356,7 +356,7 @@ def backward_range(
             for lane in range(min(BLOCK, count - first)):
                 row = queue[first + lane]
                 i = np.int64(ids[row]) if compact else row
-                # A colour clamped at 0 does not move.
+                # A colour clamped to 0 has no gradient.
                 red = m[_GRAD + 13 * BLOCK + lane] if params[i, 13] > 0.0 else 0.0
                 green = m[_GRAD + 14 * BLOCK + lane] if params[i, 14] > 0.0 else 0.0
                 blue = m[_GRAD + 15 * BLOCK + lane] if params[i, 15] > 0.0 else 0.0

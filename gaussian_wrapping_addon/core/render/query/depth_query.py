@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Isosurface depth and transmittance of a view at any sub-pixel positions, and their gradients.
+"""Isosurface depth and transmittance of a view at sub-pixel positions, and their gradients.
 
 The depth is that of the image, at positions instead of pixel centres (docs/method.md, section 2.9):
-the multi-view terms follow a surface point into a neighbouring view and ask for the depth where it
-lands. That place moves with the Gaussians too, so the answers are differentiable with respect to
-the positions as well.
+the multi-view terms project a surface point into a neighbouring view and query the depth there.
+This position moves with the Gaussians too, so the results are differentiable with respect to the
+positions as well.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from .fine_screen import project_finely
 from .query_spans import GEOMETRY
 
 _DEEPEST = 1e18
-"""Depths beyond this count as this; squares of it still fit a float32."""
+"""Depths are clamped to this, the square of which still fits a float32."""
 _POSITION_COST = 256
-"""What a position costs besides the Gaussians that it walks, in Gaussians."""
+"""Fixed cost of a position, in Gaussians that it evaluates."""
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits")
 
 
 @dataclass(frozen=True)
 class QueryView:
-    """A view that can be asked any number of times."""
+    """A projected view, for any number of queries."""
 
     gaussians: RawArrays
     camera: Camera
@@ -57,12 +57,12 @@ class QueryView:
 
 @dataclass(frozen=True)
 class QueryResult:
-    """Answers for m positions, and what their gradient needs."""
+    """Results at m positions, and what the backward pass needs."""
 
     values: np.ndarray
-    """(m,) float32: depth in scene units, or transmittance; 0 where there is no answer."""
+    """(m,) float32: depth in scene units, or transmittance; 0 where there is none."""
     positions: SortedPositions
-    at: np.ndarray  # (k,) float32 depth of the isosurface, or the depth asked for; sorted
+    at: np.ndarray  # (k,) float32 depth of the isosurface, or the requested one; sorted
     found: np.ndarray  # (k,) float32 the values, sorted
     slopes: np.ndarray  # (k,) float32 -d(log T)/dt there, floored where it is a depth's
     stops: np.ndarray  # (k,) int32
@@ -70,7 +70,7 @@ class QueryResult:
 
 
 def query_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> QueryView:
-    """Project Gaussians for queries only, also those that lie between pixel centres.
+    """Project Gaussians for queries only, including those between pixel centres.
 
     Parameters
     ----------
@@ -79,15 +79,15 @@ def query_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> 
     camera : Camera
         In the scene frame.
     options : RenderOptions
-        ``near_z``, ``depth_valid_transmittance`` and ``threads`` are read.
+        ``near_z``, ``depth_valid_transmittance`` and ``threads`` are used.
 
     Raises
     ------
     ResourceError
-        If the tile lists grow beyond what can be addressed.
+        If the tile lists are too long to be indexed.
     """
     threads = options.threads or default_threads()
-    # Colours do not matter here.
+    # Colours are not needed.
     lean = dataclasses.replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, :1]))
     screen = project_finely(lean, camera, options)
     lists = list_areas(screen, camera.width, camera.height, threads)
@@ -95,24 +95,23 @@ def query_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> 
 
 
 def query_view_of(view: ScreenView) -> QueryView:
-    """Return a view for queries that shares the projection of a view that is rendered.
+    """Return a view for queries that shares the projection of a rendered view.
 
-    Gradients on its ``screen.params`` add to those of
-    :func:`~..raster.blend.blend_backward`. It holds
-    only the Gaussians whose box holds a pixel centre: of those that pass between pixel centres
-    the image knows nothing, and neither do queries of this view.
+    Gradients on its ``screen.params`` add to those of :func:`~..raster.blend.blend_backward`. It
+    contains only the Gaussians whose box contains a pixel centre: those that pass between pixel
+    centres affect neither the image nor queries of this view.
     """
     lists = list_areas(view.screen, view.camera.width, view.camera.height, view.threads)
     return QueryView(view.gaussians, view.camera, view.options, view.screen, lists, view.threads)
 
 
 def solve_depths(view: QueryView, positions: np.ndarray) -> QueryResult:
-    """Find the 0.5-isosurface at positions of a view.
+    """Solve the depth of the 0.5-isosurface at positions of a view.
 
     The definition is that of :func:`~..reference.reference.render_reference`: contributors have
     ``alpha >= 1/255`` and a transmittance of at least 1e-4 before them; there is no depth where
-    the final transmittance exceeds ``depth_valid_transmittance`` or where less than half of the
-    light reaches depth 0.
+    the final transmittance exceeds ``depth_valid_transmittance`` or where the transmittance at
+    depth 0 is below one half.
 
     Parameters
     ----------
@@ -123,22 +122,22 @@ def solve_depths(view: QueryView, positions: np.ndarray) -> QueryResult:
     Returns
     -------
     QueryResult
-        z-depths; 0 where there is none, off ``[0, width] x [0, height]`` and for NaN.
+        z-depths; 0 where there is none, outside ``[0, width] x [0, height]`` and for NaN.
     """
     sorted_positions = _sorted(view, positions)
     return _query(view, sorted_positions, np.zeros(len(sorted_positions.order), np.float32), True)
 
 
 def solve_transmittances(view: QueryView, positions: np.ndarray, depths: np.ndarray) -> QueryResult:
-    """Evaluate what the contributors at positions let through up to z-depths.
+    """Evaluate the transmittance of the contributors at positions up to z-depths.
 
     ``T(t) = prod_i (1 - G_i(t))``, over the same contributors and with the same cap of 0.99 as the
     isosurface, so that T is 0.5 at the depth of :func:`solve_depths`. The vacancy of
     :class:`~.vacancy.VacancyField` is the largest T of several cameras, with two
-    differences: it counts all Gaussians with ``alpha >= 1/255`` and calls a product below 1e-4
-    zero, where this leaves out what lies behind 1e-4 and can be slightly above 0; and it does not
+    differences: it includes all Gaussians with ``alpha >= 1/255`` and sets a product below 1e-4 to
+    zero, whereas this omits what lies behind 1e-4 and can be slightly above 0; and it does not
     cap G, so this is larger by up to 1 % of T per Gaussian whose G exceeds 0.99. Around the
-    surface, where no G exceeds 0.5, they are the same up to rounding.
+    surface, where no G exceeds 0.5, they are equal up to rounding.
 
     Parameters
     ----------
@@ -146,18 +145,18 @@ def solve_transmittances(view: QueryView, positions: np.ndarray, depths: np.ndar
     positions : (m, 2) array
         Pixels; rounded to float32.
     depths : (m,) array
-        z-depths, scene units; negative ones count as 0.
+        z-depths, scene units; negative ones are clamped to 0.
 
     Returns
     -------
     QueryResult
-        In [0, 1]; 0 off the image and where a position or depth is NaN.
+        In [0, 1]; 0 outside the image and where a position or depth is NaN.
     """
     requested = np.asarray(depths, np.float64)
     if requested.shape != (len(positions),):
         raise UsageError(
             f"{len(positions)} positions came with depths of shape {requested.shape}.",
-            "Give one depth a position.",
+            "Give one depth per position.",
         )
     known = ~np.isnan(requested)
     coordinates = np.where(known[:, None], np.asarray(positions), np.nan)
@@ -177,18 +176,18 @@ def add_query_gradients(
     Parameters
     ----------
     view : QueryView
-        What ``result`` was asked of.
+        The view of the query.
     result : QueryResult
     grads : (m,) array
-        On ``result.values``; those of positions without an answer are ignored.
+        On ``result.values``; ignored for positions without a result.
     grad_params : (n, 24) float32
-        Accumulated into; columns from 13 on are not touched.
+        Accumulated into; columns from 13 on are unchanged.
 
     Returns
     -------
     grad_positions : (m, 2) float32
     grad_depths : (m,) float32
-        On the depths that a transmittance was asked for; 0 for depths.
+        On the depths of a transmittance query; 0 for a depth query.
     """
     positions, lists = result.positions, view.lists
     incoming = np.asarray(grads)[positions.order].astype(np.float32)  # (k,)
@@ -231,10 +230,10 @@ def query_depth(
     positions_px: Tensor,
     options: RenderOptions | None = None,
 ) -> Tensor:
-    """Return the isosurface depth at any positions; see :func:`solve_depths`.
+    """Return the isosurface depth at sub-pixel positions; see :func:`solve_depths`.
 
-    Differentiable with respect to means, log_scales, quats, opacity_logits and positions. It does
-    not depend on harmonics and orientation.
+    Differentiable with respect to means, log_scales, quats, opacity_logits and positions;
+    independent of harmonics and orientation.
 
     Parameters
     ----------
@@ -249,7 +248,7 @@ def query_depth(
     Returns
     -------
     (m,) float32 tensor
-        z-depth in scene units; 0 where there is none, off the image and for NaN.
+        z-depth in scene units; 0 where there is none, outside the image and for NaN.
 
     Raises
     ------
@@ -280,7 +279,7 @@ def query_transmittance(
     Returns
     -------
     (m,) float32 tensor
-        In [0, 1]; 0 off the image and for NaN.
+        In [0, 1]; 0 outside the image and for NaN.
 
     Raises
     ------
@@ -316,8 +315,8 @@ class _Query(torch.autograd.Function):
             result = solve_transmittances(view, coordinates, depths.detach().cpu().numpy())
         ctx.view, ctx.result = view, result
         ctx.types = positions.dtype, depths.dtype if depths is not None else None
-        # The backward pass reads their memory; saved, so that autograd refuses to run it after
-        # one of them was changed in place.
+        # The backward pass reads their memory; saved so that autograd refuses to run after one of
+        # them was modified in place.
         ctx.save_for_backward(means, log_scales, quats, opacity_logits)
         return torch.from_numpy(result.values)
 
@@ -357,7 +356,7 @@ def _sorted(view: QueryView, positions: np.ndarray) -> SortedPositions:
 
 
 def _tile_costs(view: QueryView, positions: SortedPositions) -> np.ndarray:
-    """(tiles,) about what the positions of each tile cost."""
+    """(tiles,) approximate cost of the positions of each tile."""
     lengths = np.diff(view.lists.start)
     counts = np.diff(positions.start[:: 1 << (2 * positions.shift)])
     walked = lengths >> (2 * positions.shift)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled gradients of ``log T`` at depths and positions: per pair of tile and Gaussian, summed.
+"""Compiled gradients of ``log T`` at depths and positions, summed per tile intersection.
 
 A depth's gradient is one of these over the slope of ``log T`` (docs/method.md, section 2.5).
 """
@@ -44,7 +44,7 @@ from .query_spans import (
     longest_list,
 )
 
-# Columns of a span behind the Gaussians': the gradients on them.
+# Columns of a span after those of the Gaussians: the gradients on them.
 _G = GEOMETRY * SPAN
 _COLUMNS = 2 * GEOMETRY
 _INDEX = np.arange(SPAN, dtype=np.float32)
@@ -52,7 +52,7 @@ _INDEX = np.arange(SPAN, dtype=np.float32)
 
 @inline
 def _span_gradient(span: Any, x: Any, y: Any, t: Any, weight: Any, stop: Any) -> Any:
-    """Add the gradient of ``weight log T(t)`` on a span; return that on the position."""
+    """Add the gradient of ``weight log T(t)`` to a span's; return that on the position."""
     sum_x, sum_y = ZERO, ZERO
     for j in range(SPAN):
         qa, qb, qc = span[QA + j], span[QB + j], span[QC + j]
@@ -128,8 +128,8 @@ def query_gradient_range(
     depths, weights : (k,) float32
     stops : (k,) int32
         As :func:`~.depth_query_kernels.query_kernel` wrote them.
-    intersection_grads : (pairs, 13) float32
-        Zero; each pair adds up at its slot, cell after cell.
+    intersection_grads : (intersections, 13) float32
+        Zero on entry; each intersection accumulates at its slot, cell by cell.
     grad_coordinates : (k, 2) float32
     """
     longest = longest_list(first_tile, end_tile, start, shift, cell_start)
@@ -192,7 +192,7 @@ def add_intersection_gradients(
     intersection_offsets: np.ndarray,
     grad_params: np.ndarray,
 ) -> None:
-    """Add the pairs of the Gaussians ``first .. end``, in the order of their slots."""
+    """Add the gradients of the Gaussians ``first .. end`` over their slots, in order."""
     total = np.zeros(GEOMETRY, np.float32)
     for i in range(first, end):
         if intersection_offsets[i] == intersection_offsets[i + 1]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled answers at positions of a view: the depth of the isosurface, or the transmittance."""
+"""Compiled query at positions of a view: the depth of the isosurface, or the transmittance."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from .query_spans import (
 )
 from .ray_solver import NEGLIGIBLE, TINY, evaluate_ray, solve_ray
 
-# Columns of a span behind the Gaussians': what they are on the ray of the position at hand.
+# Columns of a span after those of the Gaussians: their values on the ray of the current position.
 _RAW, _PEAK, _SHARPNESS = 13 * SPAN, 14 * SPAN, 15 * SPAN
 _COLUMNS = 16
 
@@ -70,12 +70,12 @@ def _evaluate_span(span: Any, x: Any, y: Any) -> None:
 
 @functools.cache
 def query_kernel(solve: bool) -> Any:
-    """Return the kernel that answers positions, compiled on first call.
+    """Return the query kernel, compiled on first call.
 
     Parameters
     ----------
     solve : bool
-        Find the depth of the isosurface; otherwise evaluate the transmittance at given depths.
+        Solve the depth of the isosurface; otherwise evaluate the transmittance at given depths.
     """
 
     @kernel(fast=True)
@@ -97,10 +97,10 @@ def query_kernel(solve: bool) -> Any:
         slopes: np.ndarray,
         stops: np.ndarray,
     ) -> None:
-        """Answer the positions of tiles: write ``values`` and ``slopes``, read ``depths``.
+        """Query the positions of tiles: write ``values`` and ``slopes``, read ``depths``.
 
-        ``depths (k,)`` is what is written where the depth is solved. ``stops (k,) int32`` receives
-        the number of Gaussians of the cell's list that come before the light is used up.
+        If the depth is solved, ``depths (k,)`` is the array that is written. ``stops (k,) int32``
+        receives the number of Gaussians of the cell's list up to the one that makes the ray opaque.
         """
         longest = longest_list(first_tile, end_tile, start, shift, cell_start)
         room = (longest + SPAN - 1) // SPAN
@@ -195,11 +195,11 @@ def query_kernel(solve: bool) -> Any:
                         sharpest = max(sharpest, sharpness)
                         kept += 1
                 if nearest_depths[0] <= ZERO:
-                    # Some Gaussian may reach the camera: light must pass at depth 0.
+                    # Some Gaussian may reach the camera: a crossing needs T > 0.5 at depth 0.
                     product, _ = evaluate_ray(False, kept, ZERO, alphas, peaks, sharpnesses)
                     if product <= ISO_LEVEL:
                         continue
-                # Alone, the Gaussian at the crossing lets 0.5 through where its fall-off is ratio.
+                # The Gaussian at the crossing alone reaches T = 0.5 where its fall-off is ratio.
                 weight = min(alphas[crossing], ALPHA_MAX) * before_crossing
                 ratio = min(max((before_crossing - ISO_LEVEL) / max(weight, TINY), ZERO), ONE)
                 log_ratio = math.log(max(ratio, TINY))

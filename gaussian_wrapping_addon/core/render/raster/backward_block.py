@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vector code of the gradient: one Gaussian against one block of pixels, and its sums."""
+"""Vector code of the backward pass: one Gaussian and one block of pixels, with its sums."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from ..simd.raster_math import FEATURES, STRIDE
 from ..simd.simd import Block, State, Vector
 from ..simd.simd_math import RayEvaluation, evaluate_rays, exp_wide, first_pixel, peak_depth
 
-# Planes of the tile's scratch array: loss gradients of the features, then the pixel's state.
+# Planes of the tile's scratch array: loss gradients on the features, then the pixels' state.
 G0 = 0
 TRANSMITTANCE, REMAINING = FEATURES, FEATURES + 1
 DEPTH, LOG_T_GRADIENT = FEATURES + 2, FEATURES + 3
-"""The isosurface depth, and the loss gradient on it over the slope of log T there."""
+"""The isosurface depth, and the loss gradient on it divided by the slope of log T there."""
 BACKWARD_PLANES = LOG_T_GRADIENT + 1
 
-# Sums of one pair: moments (1, x, y, xx, xy, yy) of the gradient on num and on den, the gradient
-# on the squared distance, that on the features; then those of the depth; then absolute values.
+# Sums of one intersection: moments (1, x, y, xx, xy, yy) of the gradients on num and on den, the
+# gradients on the squared distance and on the features; then those of the depth; then sums of
+# absolute values.
 NUM, DEN, DISTANCE, FEATURE = 0, 6, 12, 13
 LIN, ALONG = FEATURE + FEATURES, FEATURE + FEATURES + 3
 """Moments (1, x, y) of the gradient on ``1 + p.d``, and the gradient on a0 over den."""
@@ -32,7 +33,7 @@ DEPTH_SUMS = ALONG + 1
 
 
 def sum_count(depth: bool, absolute: bool) -> int:
-    """Return the number of sums a pair has."""
+    """Return the number of sums per intersection."""
     return (DEPTH_SUMS if depth else BASE_SUMS) + (2 if absolute else 0)
 
 
@@ -65,7 +66,7 @@ def _gradient_intrinsic(lanes: int, depth: bool, absolute: bool) -> Any:
 def _sums_of_block(
     block: Block, state: Any, at: Any, rays: RayEvaluation, depth: bool, absolute: bool
 ) -> Iterator[tuple[int, Vector]]:
-    """Advance the pixels of a block past one Gaussian; yield what to add to which of its sums."""
+    """Advance the pixels of a block past one Gaussian; yield (index, term) of its sums."""
     row, dx, dy = rays.row, rays.dx, rays.dy
 
     def plane(number: int) -> Any:
@@ -91,13 +92,13 @@ def _sums_of_block(
     if depth:
         peak = peak_depth(rays)
         ahead = (peak - block.load(state, plane(DEPTH))).max(0.0)
-        # At most FINITE_PULL on any lane, so that 0 stays 0 in what follows; the exponential's
-        # argument may overflow where nothing counts.
+        # At most FINITE_PULL on any lane, so that products with 0 stay 0; the exponential's
+        # argument may overflow where nothing contributes.
         fall = rays.den * row[12] * ahead
         density = rays.raw * exp_wide(fall * ahead, 0.5)
         uncapped = contributes & (density < float(constants.ALPHA_MAX))
         density = density.min(float(constants.ALPHA_MAX))
-        # On log G, through log(1 - G).
+        # Gradient on log G, through log(1 - G).
         g_log = block.load(state, plane(LOG_T_GRADIENT)) * density / (density - 1.0)
         g_log = uncapped.select(g_log, 0.0)
         g_distance = g_distance - g_log * 0.5
@@ -149,13 +150,13 @@ def sum_intersection_gradient(
     lanes: Any, depth: Any, absolute: Any, m: Any, bits: Any, params: Any, i: Any, x: Any, y: Any,
     sums: Any,
 ) -> None:  # fmt: skip
-    """Take the blocks whose ``bits`` are set past Gaussian ``i``; write its sums to ``m[sums]``.
+    """Advance the blocks with ``bits`` set past Gaussian ``i``; write its sums to ``m[sums]``.
 
     Parameters
     ----------
     lanes : int
     depth, absolute : bool
-        Also the gradient of the depth; also sums of absolute values.
+        Include the gradient of the depth; include sums of absolute values.
     x, y : float32
         Centre of the tile's first pixel, pixels.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blending the tiles of a view, forward and backward: the raster kernels over threads."""
+"""Blend the tiles of a view, forward and backward: multithreaded raster kernels."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from .raster_backward import BACKWARD_SCRATCH, backward_kernel, sum_intersection
 from .raster_forward import FORWARD_SCRATCH, forward_kernel
 
 _MOST_BLOCKS = 32
-"""Blocks of a tile where they have eight pixels."""
+"""Blocks of a tile if a block has eight pixels."""
 
 
 def _take(pool: list[np.ndarray], count: int, make: Callable[[int], np.ndarray]) -> np.ndarray:
-    """Return an array of at least ``count`` values from a pool, or a new one with some to spare."""
+    """Return an array of at least ``count`` values from a pool, or a new, larger one."""
     try:
         kept = pool.pop()
     except IndexError:
@@ -36,10 +36,10 @@ def _take(pool: list[np.ndarray], count: int, make: Callable[[int], np.ndarray])
 
 @dataclass
 class RenderBuffers:
-    """Large scratch arrays kept from call to call.
+    """Pools of large scratch arrays, kept between calls.
 
-    Taken and given back with the atomic ``list.pop`` and ``list.append``, so renderings in several
-    threads never share one.
+    Taken and returned with the atomic ``list.pop`` and ``list.append``, so that concurrent
+    renderings never share one.
     """
 
     scratch: list[np.ndarray] = field(default_factory=list)
@@ -50,9 +50,9 @@ class RenderBuffers:
     """Idle :class:`~..view_renderer.ViewRenderer` with their memory."""
 
     def reserve(self, threads: int, longest: int, *, depth: bool) -> None:
-        """Have memory for every thread, so that it is not a matter of timing who allocates it.
+        """Allocate memory for every thread, so that allocation does not depend on timing.
 
-        ``longest`` is the number of pairs of the fullest tile; only the depth needs lists.
+        ``longest`` is the largest number of intersections of a tile; only depth needs lists.
         """
         spare = [
             (self.scratch, self.take_scratch()),
@@ -67,20 +67,20 @@ class RenderBuffers:
                 )
 
     def take_scratch(self) -> np.ndarray:
-        """Return the state of one thread's tile, with any content."""
+        """Return the uninitialised state of one thread's tile."""
         return _take(self.scratch, max(FORWARD_SCRATCH, BACKWARD_SCRATCH), aligned_zeros)
 
     def take_lists(self, longest: int) -> np.ndarray:
-        """Return room for the list of a block of a tile of ``longest`` pairs, with any content."""
+        """Return an uninitialised depth list for a block of a tile of ``longest`` intersections."""
         return _take(self.lists, longest * LIST_VALUES * TILE, aligned_zeros)
 
     def take_contributors(self, longest: int) -> np.ndarray:
-        """Return room for the pairs that reach each block of such a tile, with any content."""
+        """Return uninitialised contributor lists for all blocks of such a tile."""
         count = _MOST_BLOCKS * (longest + CONTRIBUTORS_PADDING)
         return _take(self.contributors, count, lambda size: np.zeros(size, np.int32))
 
     def take_intersections(self, count: int) -> np.ndarray:
-        """Return at least ``count`` rows of pair gradients with any content."""
+        """Return at least ``count`` uninitialised rows of intersection gradients."""
         try:
             kept = self.intersections.pop()
         except IndexError:
@@ -92,7 +92,7 @@ class RenderBuffers:
 
 @dataclass(frozen=True)
 class ScreenView:
-    """One view, or a part of its tiles, between projection and gradient."""
+    """One view, or a band of its tiles: state between projection and backward pass."""
 
     gaussians: RawArrays
     camera: Camera
@@ -100,12 +100,12 @@ class ScreenView:
     screen: ScreenGaussians
     lists: TileLists
     lanes: int
-    masks: np.ndarray  # (pairs,) uint32: blocks of the tile that the ellipse reaches
+    masks: np.ndarray  # (intersections,) uint32: blocks of the tile that the ellipse reaches
     bounds: np.ndarray  # tiles of about equal cost
     threads: int
 
     def arguments(self) -> tuple[np.ndarray | int, ...]:
-        """Return what the raster kernels read of a view, in their order."""
+        """Return the view's arguments of the raster kernels, in order."""
         lists, camera = self.lists, self.camera
         return (
             self.screen.params, lists.start, lists.gaussian_ids, lists.intersection_slots,
@@ -115,7 +115,7 @@ class ScreenView:
 
 @dataclass(frozen=True)
 class Images:
-    """What the forward kernel writes, image layout, float32."""
+    """Images that the forward kernel writes, float32."""
 
     color: np.ndarray  # (h, w, 3)
     normal: np.ndarray  # (h, w, 3)
@@ -132,10 +132,10 @@ class Images:
         options: RenderOptions,
         take: Callable[[str, tuple[int, ...], Any], np.ndarray] | None = None,
     ) -> Images:
-        """Return images of the camera's size, all 0.
+        """Return zero images of the camera's size.
 
-        With ``take(name, shape, dtype)`` they lie in the memory it returns, with any content where
-        :func:`blend` writes every pixel.
+        With ``take(name, shape, dtype)`` they use the memory it returns; images of which
+        :func:`blend` writes every pixel are not cleared then.
         """
         if take is None:
 
@@ -159,7 +159,7 @@ class Images:
         return images
 
     def arguments(self) -> tuple[np.ndarray, ...]:
-        """Return the images that the gradient reads too, in the raster kernels' order."""
+        """Return the images that both passes use, in the order of the raster kernels."""
         return self.color, self.normal, self.geometric, self.alpha, self.depth, self.slope
 
 
@@ -169,17 +169,18 @@ def blend(
     buffers: RenderBuffers,
     intersection_weights: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Blend the tiles of a view into ``images`` and solve their isosurface depth.
+    """Blend the tiles of a view into ``images`` and solve the isosurface depth.
 
     Parameters
     ----------
-    intersection_weights : (pairs, 2) float32, optional
-        Where the weights are written; by default a new array.
+    intersection_weights : (intersections, 2) float32, optional
+        Receives the weights; by default a new array.
 
     Returns
     -------
-    (pairs, 2) float32
-        Sum and maximum of the blending weight of each pair, by slot; (0, 2) without statistics.
+    (intersections, 2) float32
+        Sum and maximum of the blending weight of each intersection, by slot; (0, 2) without
+        statistics.
     """
     options, lists = view.options, view.lists
     depth, weights = options.depth, options.statistics
@@ -226,10 +227,10 @@ def write_intersection_gradients(
     depth: bool,
     absolute: bool,
 ) -> None:
-    """Write the gradients of all pairs of a view's tiles at their slots of ``pairs (p, 24)``.
+    """Write the gradients of a view's tile intersections to their slots.
 
-    ``depth`` tells that the gradient of the depth is not all 0, ``absolute`` that the sums of
-    absolute values are wanted.
+    ``intersections (p, 24)`` receives them. Set ``depth`` if the gradient of the depth is not all
+    0, ``absolute`` to include the sums of absolute values.
     """
     backward = backward_kernel(view.lanes, view.options.depth and depth, absolute)
 
@@ -257,7 +258,7 @@ def blend_backward(
     *,
     absolute: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the gradient on params (n, 24), and its length on (u, v) plain and absolute (n,)."""
+    """Return the gradient on params (n, 24), and its signed and absolute norms on (u, v), (n,)."""
     lists, count = view.lists, len(view.screen)
     intersections = buffers.take_intersections(len(lists.gaussian_ids))
     depth = bool(grads[4].any())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which pairs reach each block of a tile, and which blocks still let light through."""
+"""Contributor lists of the blocks of a tile, and which blocks are not yet opaque."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from ..simd.vector_runs import lowest_bit
 
 _GROUP = TILE
 CONTRIBUTORS_PADDING = _GROUP
-"""Values behind the end of a list that may be overwritten."""
+"""Values past the end of a list that may be overwritten."""
 _WORD, _INDEX = ir.IntType(32), ir.IntType(64)
 
 
 @intrinsic
 def _pack_groups(typingctx, masks, begin, groups, block, contributors, at):  # type: ignore[no-untyped-def]
-    """Write to ``contributors[at ..]`` which of ``16 groups`` pairs reach a block; return how many.
+    """Write the intersections that reach a block to ``contributors[at ..]``; return their number.
 
-    Sixteen pairs are one vector, of which those that count are moved to the front.
+    ``16 groups`` intersections are tested, sixteen per vector, which is compressed.
     """
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -67,17 +67,17 @@ def _pack_groups(typingctx, masks, begin, groups, block, contributors, at):  # t
 def list_contributors(
     lanes: Any, masks: Any, begin: Any, count: Any, capacity: Any, contributors: Any, counts: Any
 ) -> None:
-    """List the pairs ``begin .. begin + count`` of a tile by the blocks that they reach.
+    """List, for each block, which intersections ``begin .. begin + count`` of a tile reach it.
 
     Parameters
     ----------
     lanes : int
         8 or 16.
-    masks : (pairs,) uint32
+    masks : (intersections,) uint32
     capacity : int
-        Values of ``contributors`` for one block, at least ``count + CONTRIBUTORS_PADDING``.
+        Values of ``contributors`` per block, at least ``count + CONTRIBUTORS_PADDING``.
     contributors : (blocks * capacity,) int32
-        Receives the numbers of the pairs of block b from ``b * capacity`` on, increasing.
+        Receives the intersections of block b, increasing, from ``b * capacity`` on.
     counts : (blocks,) int64
         Receives the length of each list.
     """
@@ -92,7 +92,7 @@ def list_contributors(
                 n += np.int64((masks[k] >> np.uint32(block)) & np.uint32(1))
             counts[block] = n - at
     else:
-        # Without instructions that pack vectors, elsewhere bit by bit.
+        # Bit by bit, where no instruction compresses vectors.
         for block in range(blocks):
             counts[block] = 0
         for k in range(begin, begin + count):
@@ -126,5 +126,5 @@ _active_16, _active_8 = _active_intrinsic(16), _active_intrinsic(8)
 
 @inline
 def active_blocks(lanes: Any, m: Any, plane: Any) -> Any:
-    """Return as bits the blocks with a pixel whose transmittance, at ``m[plane ..]``, counts."""
+    """Return as bits the blocks with a pixel that is not opaque; T is at ``m[plane ..]``."""
     return _active_16(m, plane) if lanes == 16 else _active_8(m, plane)

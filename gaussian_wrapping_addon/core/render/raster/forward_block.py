@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vector code that blends all Gaussians of a block of pixels, with the block's state in registers.
+"""Vector code of the forward pass: blends all Gaussians of a block of pixels in registers.
 
-For the depth, each Gaussian that can matter leaves an entry in the block's list: one that any pixel
-meets before its transmittance has crossed 0.5, or whose front reaches back before the deepest peak
-in front of that crossing.
+For the depth, each Gaussian that can affect it is appended to the block's list: those met before
+the transmittance of some pixel has crossed 0.5, and those whose density reaches back in front of
+the deepest peak before that crossing.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ _COLOR_COLUMN, _SHARPNESS_COLUMN = 13, 12
 
 
 class _DepthRecord:
-    """What blending keeps for the depth: the list of entries and where 0.5 was crossed."""
+    """State that blending keeps for the depth solver: the list of entries and the 0.5 crossing."""
 
     def __init__(self, block: Block, lists: Any) -> None:
         self.block, self.lists = block, lists
         self.count = cgutils.alloca_once_value(block.builder, block.index(0))
         self.high, self.sharpest = State(block, 0.0), State(block, 0.0)
-        # Transmittance before, then the entry, of the Gaussian at the crossing.
+        # Of the Gaussian at the crossing: the transmittance in front of it, then its entry.
         self.crossing = [State(block, 0.0) for _ in range(1 + LIST_VALUES)]
 
     def sharpen(self, rays: RayEvaluation, contributes: Mask) -> Vector:
-        """Note and return a Gaussian's sharpness along the rays."""
+        """Return a Gaussian's sharpness along the rays; update the maximum."""
         sharpness = rays.den * rays.row[_SHARPNESS_COLUMN]
         known = self.sharpest.get()
         self.sharpest.set((contributes & (sharpness > known)).select(sharpness, known))
@@ -60,7 +60,7 @@ class _DepthRecord:
     def add_before(
         self, rays: RayEvaluation, contributes: Mask, before: Vector, after: Vector
     ) -> None:
-        """Note a Gaussian while some pixel has not crossed 0.5."""
+        """Record a Gaussian while some pixel has not crossed 0.5."""
         peak, sharpness = peak_depth(rays), self.sharpen(rays, contributes)
         above = before > constants.ISO_LEVEL
         high = self.high.get()
@@ -72,7 +72,7 @@ class _DepthRecord:
         self._append(values, contributes)
 
     def add_behind(self, rays: RayEvaluation, contributes: Mask) -> None:
-        """Note a Gaussian behind all crossings, if its front reaches back to the brackets."""
+        """Record a Gaussian behind all crossings if its density reaches back to the brackets."""
         peak, sharpness = peak_depth(rays), self.sharpen(rays, contributes)
         behind = (peak - self.high.get()).max(0.0)
         matters = contributes & (sharpness * behind * behind < NEGLIGIBLE)
@@ -89,7 +89,7 @@ class _DepthRecord:
 
 @dataclass(frozen=True)
 class _Weights:
-    """Where blending gathers weights: per pair, and the strongest Gaussian of each pixel."""
+    """Blending weights per intersection, and the strongest Gaussian of each pixel."""
 
     intersection_weights: Any
     intersection_slots: Any
@@ -98,7 +98,7 @@ class _Weights:
     best_at: State
 
     def add(self, block: Block, weight: Vector, intersection: Any) -> None:
-        """Note the weights of one pair in one block."""
+        """Add the weights of one intersection in one block."""
         builder = block.builder
         best = self.best.get()
         stronger = weight > best
@@ -152,7 +152,7 @@ def _blend_intrinsic(lanes: int, depth: bool, weights: bool) -> Any:
             )
 
             def blend_one(n: Any) -> tuple[RayEvaluation, Mask, Vector, Vector]:
-                """Blend one Gaussian; return also the light before and behind it."""
+                """Blend one Gaussian; return also the transmittance before and behind it."""
                 intersection = contributor_at(n)
                 which = builder.load(builder.gep(ids, [intersection], inbounds=True))
                 rays = evaluate_rays(
@@ -187,7 +187,7 @@ def _blend_intrinsic(lanes: int, depth: bool, weights: bool) -> Any:
                     return always
 
                 block.walk(cursor, count_, cross, lambda n: always)
-                # No front of the pairs that come reaches back to the last bracket: record no more.
+                # Stop recording once no later intersection reaches back to the last bracket.
                 deepest = record.high.get().largest()
 
                 def reaches_back(n: Any) -> Any:
@@ -216,7 +216,7 @@ def _blend_intrinsic(lanes: int, depth: bool, weights: bool) -> Any:
             )
             nearest = builder.load(nearest_data)
             opened = start_solver(block, m_data, crossing, record.sharpest.get(), nearest, limit_)
-            # Nobody open, nothing to solve: no entries.
+            # Without a pixel to solve there are no entries.
             none_open = builder.icmp_unsigned("==", opened, block.index(0))
             return builder.select(none_open, block.index(0), builder.load(record.count))
 
@@ -252,18 +252,18 @@ def blend_block(
     ----------
     lanes : int
     depth, weights : bool
-        Write the list and begin to solve it; gather blending weights.
+        Write the list and initialise the solver; collect blending weights.
     m : (n,) float32
         The tile's scratch.
     block : int
     begin : int
-        First pair of the tile; places of the strongest Gaussians count from it.
+        First intersection of the tile; indices of the strongest Gaussians are relative to it.
     x, y : float32
         Centre of the tile's first pixel, pixels.
     lists : (n,) float32
         Receives the entries.
     nearest_depths : (n,) float32
-        For each pair of the tile, the nearest z-depth that it or a later one reaches back to.
+        For each intersection of the tile, the nearest z-depth that it or a later one reaches.
     limit : float32
         Largest final transmittance of a pixel that has a depth.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled sums of what the pairs of one band hold, added to the rows of the seen Gaussians."""
+"""Compiled reduction of per-intersection values of one band to the visible Gaussians."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def add_intersection_gradients(
     fresh: bool,
     grad_params: np.ndarray,
 ) -> None:
-    """Add the pair gradients of the Gaussians ``ids[begin .. end]`` to ``grad_params (n, 24)``.
+    """Add the intersection gradients of the Gaussians ``ids[begin .. end]`` to ``grad_params``.
 
-    With ``fresh`` the rows start at 0, whatever they hold. The last two columns receive sums of
-    absolute values. Slots are added one after the other, so the order is that of the tiles.
+    With ``fresh`` the rows of ``grad_params (n, 24)`` start at 0, whatever their content. The last
+    two columns receive sums of absolute values. Slots are added in order, which is that of tiles.
     """
     total = np.zeros(ROW_VALUES, np.float32)
     for k in range(begin, end):
@@ -51,10 +51,10 @@ def write_screen_gradients(
     grad_px: np.ndarray,
     grad_abs_px: np.ndarray,
 ) -> None:
-    """Write the lengths of the gradient on (u, v) and of its sum of absolute values.
+    """Write the norms of the gradient on (u, v) and of its sum of absolute values.
 
-    The columns that held the absolute values become 0: params have none there. So does a row that
-    float32 could not hold.
+    The columns of the absolute values are then set to 0, as params have none there, and so are rows
+    that overflow float32.
     """
     for k in range(begin, end):
         i = ids[k]
@@ -82,7 +82,7 @@ def add_intersection_weights(
     weight_sum: np.ndarray,
     weight_max: np.ndarray,
 ) -> None:
-    """Combine the blending weights of the pairs of the Gaussians ``ids[begin .. end]``."""
+    """Reduce the blending weights of the Gaussians ``ids[begin .. end]`` over intersections."""
     for k in range(begin, end):
         i = ids[k]
         total, largest = weight_sum[i], weight_max[i]
@@ -101,7 +101,7 @@ def mark_visible(
     visible: np.ndarray,
     radii_px: np.ndarray,
 ) -> None:
-    """Mark the Gaussians ``ids[begin .. end]``; write half of the longer side of their boxes."""
+    """Mark the Gaussians ``ids[begin .. end]`` visible; write half their boxes' longer side."""
     for k in range(begin, end):
         i = ids[k]
         visible[i] = True

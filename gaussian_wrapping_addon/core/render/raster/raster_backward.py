@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled gradient of the blending and of the isosurface depth, front to back.
+"""Compiled backward pass of blending and isosurface depth, front to back.
 
 One scalar per pixel replaces the list of contributors: with ``q_i`` the loss gradient along
 Gaussian i's features, ``remaining = sum_{j > i} w_j q_j + ...`` starts from the images and is
-used up on the way. The depth's gradient is that of the implicit function: each
-contributor adds ``g / a dlog(1 - G_i(t))`` (docs/method.md, section 2.5). Per Gaussian and tile
-only moments of the gradient on ``num``, ``den`` and ``1 + p.d`` are summed over pixels; the
-gradient on the row of params follows from them. Each pair writes its own slot, so the sum per
-Gaussian has a fixed order. Blocks are visited as in the forward pass, a chunk of pairs at a time.
+reduced on the way. The depth's gradient is that of the implicit function: each contributor adds
+``g / a dlog(1 - G_i(t))`` (docs/method.md, section 2.5). Per Gaussian and tile only moments of the
+gradient on ``num``, ``den`` and ``1 + p.d`` are summed over pixels; the gradient on the row of
+params follows from them. Each intersection writes its own slot, so the sum per Gaussian has a fixed
+order. Blocks are processed as in the forward pass, a chunk of intersections at a time.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from .contributors import active_blocks
 from .tile_io import read_row
 
 ABS_U, ABS_V = 22, 23
-"""Columns of the pair gradients that hold sums of absolute values, not gradients of params."""
+"""Columns of the intersection gradients with sums of absolute values instead of gradients."""
 
 _SUMS = BACKWARD_PLANES * STRIDE
 BACKWARD_SCRATCH = _SUMS + 2 * TILE
@@ -60,7 +60,7 @@ BACKWARD_SCRATCH = _SUMS + 2 * TILE
 def _write_intersection(
     depth: Any, absolute: Any, m: Any, s: Any, params: Any, i: Any, out: Any, slot: Any
 ) -> None:  # fmt: skip
-    """Turn a pair's totals at ``m[s]`` into the gradient on its row of params."""
+    """Turn an intersection's totals at ``m[s]`` into the gradient on its row of params."""
     qa, qb, qc = params[i, 2], params[i, 3], params[i, 4]
     px, py, qr, qs, qt = params[i, 5], params[i, 6], params[i, 7], params[i, 8], params[i, 9]
     den, den_x, den_y = m[s + DEN], m[s + DEN + 1], m[s + DEN + 2]
@@ -96,7 +96,7 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
     lanes : int
         8 or 16.
     depth : bool
-        Also the gradient of the depth image.
+        Include the gradient of the depth image.
     absolute : bool
         Also sum the absolute gradients on (u, v) per pixel (AbsGS).
     """
@@ -128,7 +128,7 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
         m: np.ndarray,
         intersections: np.ndarray,
     ) -> None:
-        """Write the gradients of all pairs of the tiles at their slots of ``pairs (p, 24)``."""
+        """Write the gradients of the tiles' intersections to their slots, (p, 24)."""
         images = (color, normal, geometric, alpha_image, depth_image, slope_image)
         grads = (g_color, g_normal, g_geometric, g_alpha, g_depth)
         for tile in range(first_tile, end_tile):
@@ -177,10 +177,10 @@ def sum_intersections(
     grad_px: np.ndarray,
     grad_abs_px: np.ndarray,
 ) -> None:
-    """Sum the pair gradients of the Gaussians ``first .. end`` into ``grad_params (n, 24)``.
+    """Sum the intersection gradients of the Gaussians ``first .. end`` into ``grad_params``.
 
-    Columns 22 and 23 become 0; ``grad_px (n,)`` and ``grad_abs_px (n,)`` receive the lengths of
-    the gradient on (u, v) and of its sum of absolute values.
+    Columns 22 and 23 of ``grad_params (n, 24)`` become 0; ``grad_px (n,)`` and ``grad_abs_px (n,)``
+    receive the norms of the gradient on (u, v) and of its sum of absolute values.
     """
     total = np.zeros(ROW_VALUES, np.float32)
     for i in range(first, end):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled blending of tiles, front to back: nine feature channels, transmittance, depth.
+"""Compiled forward pass of tiles, front to back: nine feature channels, transmittance, depth.
 
 The Gaussians of a tile are first listed for each block of pixels that their ellipses reach; each
 block is then blended with its state in registers, and its isosurface is solved from the entries
-that blending left, without evaluating any Gaussian again.
+that blending recorded, without evaluating any Gaussian again.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
     depth : bool
         Also solve the isosurface.
     weights : bool
-        Also gather the blending weights per pair and the strongest Gaussian per pixel.
+        Also collect the blending weights per intersection and the strongest Gaussian per pixel.
     """
     blocks = PLANE // lanes
     block_height = lanes // BLOCK_WIDTH
@@ -102,7 +102,7 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
             origin_x = np.float32(tile_x) + HALF
             live_rows = min(height - tile_y, TILE)
             live_columns = min(width - tile_x, TILE)
-            # Everything else of the scratch is written before it is read.
+            # The rest of the scratch array is written before it is read.
             for p in range(PLANE):
                 m[TRANSMITTANCE * STRIDE + p] = ONE
             if live_rows < TILE or live_columns < TILE:
@@ -123,7 +123,7 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
             coming: Any = np.int64(start[min(tile + 2, end_tile)]) - begin - count
             list_contributors(lanes, masks, begin, count, capacity, contributors, counts)
             if depth:
-                # From behind: the nearest point that a pair or any after it reaches back to.
+                # Back to front: the nearest depth that an intersection or any later one reaches.
                 nearest: Any = FAR
                 nearest_depths[0] = FAR
                 for k in range(count - 1, -1, -1):
@@ -131,7 +131,7 @@ def forward_kernel(lanes: int, depth: bool, weights: bool) -> Any:
                     nearest = min(nearest, params[i, 10] - FRONT_SIGMAS * params[i, 22])
                     nearest_depths[k] = nearest
             for block in range(blocks):
-                # The rows of the next tile arrive while this one is blended.
+                # Prefetch the rows of the next tile while this one is blended.
                 next_k = begin + count + block * coming // blocks
                 for k in range(next_k, begin + count + (block + 1) * coming // blocks):
                     prefetch_row_early(params, np.int64(gaussian_ids[k]))

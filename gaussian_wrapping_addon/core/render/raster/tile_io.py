@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rows of a tile between its planes, ordered by blocks, and the images, ordered by pixels.
+"""Copy rows of a tile between its planes, ordered by blocks, and the images, ordered by pixels.
 
-A row of a tile is 16 pixels: in a plane four runs of four values, one a block; in an image of three
-channels 48 values, interleaved. Both are moved as vectors and reordered in registers. Rows that the
-image's edge cuts take the same path with masked loads and stores, so that their values are the
-same; masks are kept from whole rows because some processors are slow at them.
+A row of a tile is 16 pixels: in a plane four runs of four values, one per block; in an image of
+three channels 48 interleaved values. Both are moved as vectors and reordered in registers. Rows
+that the image's edge cuts take the same path with masked loads and stores, so that their values are
+the same; whole rows use no masks because these are slow on some processors.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _WORD = ir.IntType(32)
 
 
 class _Rows:
-    """Moves rows of one tile; ``live`` is the number of columns in the image, None for all."""
+    """Copies rows of one tile; ``live`` is the number of columns in the image, None for all."""
 
     def __init__(
         self, lanes: int, context: Any, builder: Any, offset: Any, at: Any, live: Any | None
@@ -69,7 +69,7 @@ class _Rows:
         self._store(value, image, self.at, 0, 1)
 
     def load_one(self, image: Any) -> Vector:
-        """Return the row of an image of one channel, 0 outside of it."""
+        """Return the row of an image of one channel, 0 outside it."""
         return self._load(image, self.at, 0, 1)
 
     def store_three(self, channels: Sequence[Vector], image: Any) -> None:
@@ -84,7 +84,7 @@ class _Rows:
             self._store(Vector(self.block, value), image, first, part, _CHANNELS)
 
     def load_three(self, image: Any) -> list[Vector]:
-        """Return the channels of the row of an image, 0 outside of it."""
+        """Return the channels of the row of an image, 0 outside it."""
         first = self._first_value()
         a, b, c = (self._load(image, first, part, _CHANNELS).value for part in range(_CHANNELS))
         channels = []
@@ -97,7 +97,7 @@ class _Rows:
         return channels
 
     def inside(self, value: Vector) -> Vector:
-        """Return ``value`` in the image, 0 outside."""
+        """Return ``value`` inside the image, 0 outside."""
         if self._live is None:
             return value
         zeros = self.block.vector(0.0).value
@@ -155,7 +155,7 @@ class _Rows:
 def _require_contiguous(*arrays: Any) -> None:
     for array in arrays:
         if not isinstance(array, types.Array) or array.layout != "C":
-            raise errors.TypingError(f"Rows of tiles are moved in C-contiguous arrays, not {array}")
+            raise errors.TypingError(f"Rows of tiles need C-contiguous arrays, not {array}")
 
 
 def _images(block: Block, kinds: Any, values: Any) -> list[Any]:
@@ -213,7 +213,7 @@ def _read_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
             state = block.data(sig.args[0], args[0])
             *three, alpha, depth_image, slope_image = _images(block, sig.args[3], args[3])
             *g_three, g_alpha, g_depth = _images(block, sig.args[4], args[4])
-            # The colour holds the background, so its part of the final T is included.
+            # The colour includes the background, and with it the final transmittance.
             grad = rows.load_one(g_alpha)
             remaining = _multiply_add(grad, rows.load_one(alpha), -grad)
             values = [rows.load_three(image) for image in three]
@@ -230,7 +230,7 @@ def _read_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
                 found, grad = rows.load_one(depth_image), rows.load_one(g_depth)
                 has_gradient = (found > 0.0) & ((grad < 0.0) | (grad > 0.0))
                 slope = rows.load_one(slope_image)
-                # Divided exactly: fast arithmetic would allow vectors an approximation, and numba
+                # Exact division: fast math would allow an approximation for vectors, and numba
                 # makes every operation without a flag of its own fast.
                 log_t_gradient = Vector(
                     block, builder.fdiv(grad.value, slope.value, flags=("nsz",))
@@ -272,11 +272,11 @@ def write_row(
     lanes : int
         8 or 16.
     depth : bool
-        Also depth and slope.
+        Include depth and slope.
     m : (n,) float32
         The tile's scratch.
     offset : int
-        Where the row begins in each plane.
+        Start of the row in each plane.
     live : int
         Columns of the tile in the image.
     background : (3,) float32
@@ -315,8 +315,8 @@ def read_row(
 ) -> None:
     """Read one row of images and loss gradients into a tile's planes of the backward pass.
 
-    Pixels outside the image become opaque ones without gradient; ``live`` may be 0. Other
-    parameters as in :func:`write_row`; ``grads`` are those on the images but the slope.
+    Pixels outside the image become opaque and have no gradient; ``live`` may be 0. Other parameters
+    as in :func:`write_row`; ``grads`` are those on all images but the slope.
     """
     if lanes == 16:
         if depth:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The renderer's definition in plain torch: every pixel against every Gaussian.
+"""Reference renderer in plain torch: every pixel against every Gaussian.
 
 Any float type, gradients by autograd. Only for small scenes: the cost is pixels x Gaussians.
 """
@@ -25,7 +25,7 @@ _ELEMENTS_PER_CHUNK = 1_000_000
 
 @dataclass(frozen=True)
 class _RayEvaluation:
-    """What p pixels see of n Gaussians in blending order; rows are pixels."""
+    """n Gaussians, in blending order, evaluated on the rays of p pixels; rows are pixels."""
 
     log_alpha: Tensor  # (p, n) log of the opacity on the ray, before the cap
     weight: Tensor  # (p, n) alpha T, 0 where the Gaussian does not contribute
@@ -55,15 +55,15 @@ def render_reference(
     camera : Camera
         In the scene frame.
     options : RenderOptions
-        ``threads`` is not used.
+        ``threads`` is ignored.
 
     Raises
     ------
     UsageError
-        If statistics are asked for; only the fast renderer gathers them.
+        If statistics are requested; only the fast renderer collects them.
     """
     if options.statistics:
-        raise UsageError("The reference renderer gathers no statistics.", "Use render() for them.")
+        raise UsageError("The reference renderer collects no statistics.", "Use render() for them.")
     screen = reference_projection(gaussians, camera, options)
     chosen = torch.nonzero(screen.usable)[:, 0]
     order = chosen[torch.argsort(screen.depths[chosen].float(), stable=True)]
@@ -112,7 +112,7 @@ def reference_transmittance_at(
     depths: Tensor,
     options: RenderOptions,
 ) -> Tensor:
-    """Return what the contributors of :func:`render_reference` let through up to z-depths.
+    """Return the transmittance of the contributors of :func:`render_reference` up to z-depths.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def reference_transmittance_at(
 def _evaluate_rays_at(
     gaussians: OrientedGaussians, camera: Camera, positions: Tensor, options: RenderOptions
 ) -> tuple[_RayEvaluation, Tensor]:
-    """Return the hits of the positions on the image, and the indices of these positions."""
+    """Evaluate the rays of the positions on the image; return also these positions' indices."""
     screen = reference_projection(gaussians, camera, options)
     chosen = torch.nonzero(screen.usable)[:, 0]
     order = chosen[torch.argsort(screen.depths[chosen].float(), stable=True)]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lists of the Gaussians that reach anywhere into a tile, and of the positions inside each cell.
+"""Tile lists by area, and query positions sorted into cells.
 
-The lists of :mod:`.tiles` hold what reaches a pixel *centre* of a tile; a Gaussian that passes
-between centres is rightly missing there. Positions between the centres need these lists.
+The lists of :mod:`.tiles` hold the Gaussians that reach a pixel *centre* of a tile; one that passes
+between the centres is rightly missing there. Queries at sub-pixel positions need these lists.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from .depth_order import radix_order
 
 TILE = tolerances.TILE_PX
 _MAX_INTERSECTIONS = 2**31 - 1
-# Rounding of the float32 boxes and skews: pixels, share of a half side.
+# Margin for the rounding of float32 boxes and skews: in pixels, and relative to a half side.
 PIXEL_MARGIN = 0.02
 SHARE_MARGIN = 1e-6
 _MAX_SHIFT = 2
 _POSITIONS_PER_CELL = 14
-"""Cells shrink while they still hold this many positions: each costs one walk of its tile's list,
-and shortens the list that its positions walk."""
+"""Cells are subdivided while they hold this many positions on average: each costs one pass over its
+tile's list, and shortens the list that its positions pass over."""
 
 
 @dataclass(frozen=True)
 class AreaLists:
     """For each tile, the Gaussians whose ellipse ``alpha >= 1/255`` reaches its area.
 
-    Nearest first, ties by index. Tiles are numbered row by row. *Slots* number the pairs (tile,
-    Gaussian) so that those of one Gaussian are contiguous.
+    Nearest first, ties by index. Tiles are numbered row by row. *Slots* number the tile
+    intersections so that those of one Gaussian are contiguous.
     """
 
-    start: np.ndarray  # (tiles + 1,) int64: the pairs of tile t are start[t] .. start[t + 1]
-    gaussian_ids: np.ndarray  # (pairs,) int32
-    intersection_slots: np.ndarray  # (pairs,) int32
+    start: np.ndarray  # (tiles + 1,) int64: tile t has the intersections start[t] .. start[t + 1]
+    gaussian_ids: np.ndarray  # (intersections,) int32
+    intersection_slots: np.ndarray  # (intersections,) int32
     intersection_offsets: np.ndarray  # (n + 1,) int64: the slots of Gaussian i
     tiles_x: int
     tiles_y: int
@@ -51,33 +51,33 @@ class SortedPositions:
     """Positions inside the image, by cell; cells divide each tile ``2^shift`` times per axis."""
 
     coordinates: np.ndarray  # (k, 2) float32, pixels, sorted
-    order: np.ndarray  # (k,) int32: index of each among the positions that were given
+    order: np.ndarray  # (k,) int32: index of each in the input
     start: np.ndarray  # (cells + 1,) int64; cells are numbered tile by tile
     shift: int
     input_count: int
-    """Number of positions that were given."""
+    """Number of positions in the input."""
 
 
 def list_areas(screen: ScreenGaussians, width: int, height: int, threads: int) -> AreaLists:
-    """List the visible Gaussians by the tiles whose area they reach.
+    """List, for each tile, the visible Gaussians that reach its area.
 
     Parameters
     ----------
     screen : ScreenGaussians
         Boxes in pixels of an image of ``width`` x ``height``.
     threads : int
-        The result does not depend on it.
+        Does not affect the result.
 
     Raises
     ------
     ResourceError
-        If the lists would hold more than 2^31 - 1 pairs.
+        If the lists would hold more than 2^31 - 1 intersections.
     """
     count = len(screen)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     order = radix_order(screen.depths, screen.visible)
     intersection_offsets = np.zeros(count + 1, np.int64)
-    # Runs of the order are counted apart, so that each knows where it writes in every tile.
+    # Each run of the order is counted separately, so that it knows its write offset in every tile.
     bounds = even_bounds(len(order), threads, 1)
     heads = np.zeros((max(len(bounds) - 1, 1), tiles_x * tiles_y), np.int64)
     run_of = {int(begin): run for run, begin in enumerate(bounds[:-1])}
@@ -94,7 +94,7 @@ def list_areas(screen: ScreenGaussians, width: int, height: int, threads: int) -
     intersections = int(intersection_offsets[-1])
     if intersections > _MAX_INTERSECTIONS:
         raise ResourceError(
-            f"{intersections} pairs of Gaussian and tile do not fit.", "Query a smaller image."
+            f"{intersections} tile intersections do not fit.", "Query a smaller image."
         )
     start = np.zeros(tiles_x * tiles_y + 1, np.int64)
     np.cumsum(heads.sum(0), out=start[1:])
@@ -114,12 +114,12 @@ def list_areas(screen: ScreenGaussians, width: int, height: int, threads: int) -
 
 
 def sort_positions(positions: np.ndarray, width: int, height: int) -> SortedPositions:
-    """Sort positions by cell, in each cell as given; leave out what is not on the image.
+    """Sort positions by cell, stable within a cell; drop those outside the image.
 
     Parameters
     ----------
     positions : (m, 2) array
-        Pixels. The image is ``0 <= x <= width``, ``0 <= y <= height``; NaN lies outside.
+        Pixels. The image is ``0 <= x <= width``, ``0 <= y <= height``; NaN counts as outside.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     shift = 0
@@ -140,11 +140,11 @@ def sort_positions(positions: np.ndarray, width: int, height: int) -> SortedPosi
 
 @part(fast=False)
 def strip_span(x0: float, y0: float, x1: float, y1: float, skew: float, top: float, bottom: float):  # type: ignore[no-untyped-def]  # numba infers the pair of floats
-    """Return the extent in x of an ellipse's part between two heights; (1, 0) where it has none.
+    """Return the x extent of an ellipse within a horizontal strip; (1, 0) where they are disjoint.
 
-    The ellipse is given by its box and the x offset ``skew`` of its lowest point. Its part is
-    convex: the extent ends at the ellipse's own extreme point where the strip holds it, else on
-    the edge of the strip nearer to it.
+    The ellipse is given by its box and the x offset ``skew`` of its lowest point. The intersection
+    is convex: its extent ends at the ellipse's own extreme point if the strip contains it, else on
+    the nearer edge of the strip.
     """
     half_x, half_y = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
     if math.isinf(skew) or not (half_x > 0.0 and half_y > 0.0):
@@ -179,9 +179,9 @@ def scan_areas(
     gaussian_ids: np.ndarray,
     intersection_slots: np.ndarray,
 ) -> None:
-    """Count or, where ``gaussian_ids`` has room, write the pairs of ``order[begin .. end]``.
+    """Count the intersections of ``order[begin .. end]``; write them if ``gaussian_ids`` has room.
 
-    Counting adds to ``heads (tiles,)`` and writes the number of pairs of Gaussian i to
+    Counting adds to ``heads (tiles,)`` and writes the number of intersections of Gaussian i to
     ``intersection_offsets[i + 1]``; writing advances ``heads``.
     """
     write = len(gaussian_ids) > 0
@@ -202,7 +202,7 @@ def scan_areas(
                 )
             if left > right:
                 continue
-            # Both ends are clamped before the conversion, which they could overflow.
+            # Clamped before the conversion, which could overflow.
             first = int(min(max(left / TILE, 0.0), tiles_x - 1.0))
             last = int(min(max(right / TILE, 0.0), tiles_x - 1.0))
             for column in range(first, last + 1):
@@ -228,7 +228,7 @@ def find_cells(
     cells: np.ndarray,
     start: np.ndarray,
 ) -> None:
-    """Write the cell of each position, or -1, and count those of cell c in ``start[c + 1]``."""
+    """Write the cell of each position, or -1; count the positions of cell c in ``start[c + 1]``."""
     mask = (1 << shift) - 1
     cell_px = np.float32(TILE >> shift)
     for p in range(len(coordinates)):
@@ -247,7 +247,7 @@ def find_cells(
 
 @kernel(fast=False)
 def sort_into_cells(cells: np.ndarray, heads: np.ndarray, order: np.ndarray) -> None:
-    """Write the indices of the positions of each cell, from its ``heads`` on."""
+    """Write the indices of each cell's positions, starting at its ``heads``."""
     for p in range(len(cells)):
         if cells[p] >= 0:
             order[heads[cells[p]]] = p

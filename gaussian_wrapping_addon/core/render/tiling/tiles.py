@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lists of the Gaussians that touch each tile of 16 x 16 pixels, in blending order."""
+"""Tile lists: the Gaussians that reach each tile of 16 x 16 pixels, in blending order."""
 
 from __future__ import annotations
 
@@ -33,28 +33,28 @@ _CHUNKS_PER_THREAD = 2
 class TileLists:
     """For each tile, the Gaussians whose ellipse ``alpha >= 1/255`` reaches it, nearest first.
 
-    Tiles are numbered row by row. A *pair* is one (tile, Gaussian); *slots* number the pairs so
-    that those of one Gaussian are contiguous, which is where per-pair gradients are written. The
-    lists may be those of a band of tiles; all others are empty then.
+    Tiles are numbered row by row. An *intersection* is one (tile, Gaussian); *slots* number the
+    intersections so that those of one Gaussian are contiguous: their gradients are written there.
+    The lists may be those of a band of tiles; all other lists are empty then.
     """
 
     start: np.ndarray
-    """(tiles + 1,) int64: the pairs of tile t are ``start[t] .. start[t + 1]``."""
+    """(tiles + 1,) int64: tile t has the intersections ``start[t] .. start[t + 1]``."""
     gaussian_ids: np.ndarray
-    """(pairs,) int32, by increasing distance within a tile, ties by index."""
+    """(intersections,) int32, by increasing distance within a tile, ties by index."""
     intersection_slots: np.ndarray
-    """(pairs,) int32: slot of each pair."""
+    """(intersections,) int32: slot of each intersection."""
     intersection_offsets: np.ndarray
     """(n + 1,) int64: the slots of Gaussian i are ``[offsets[i], offsets[i + 1])``."""
     pixel_ranges: np.ndarray
-    """(n, 4) int32: first and last row, first and last column of pixels whose centre lies in the
-    box, inside the image; empty (first > last) where not visible."""
+    """(n, 4) int32: first and last row, first and last column of the pixels of the image whose
+    centres lie in the box; empty (first > last) where not visible."""
     tiles_x: int
     tiles_y: int
 
 
 class TileBinning:
-    """Which tiles each Gaussian of a view reaches, from which the lists of any band are made.
+    """The tiles that each Gaussian of a view reaches; yields the lists of any band of tiles.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class TileBinning:
     def __init__(
         self, screen: ScreenGaussians, width: int, height: int, threads: int, store: ArrayStore
     ) -> None:
-        """Find tiles and order; the arrays live in ``store`` until its next binning.
+        """Find tiles and depth order; the arrays are valid until the next binning with ``store``.
 
         Raises
         ------
@@ -90,7 +90,7 @@ class TileBinning:
         self._gaussians = _bounds(count, threads)  # runs of Gaussians, one a chunk
         chunks = len(self._gaussians) - 1
         self.pixel_ranges = store.take("pixel ranges", (count, 4), np.int32)
-        found = np.zeros((chunks + 1, 2), np.int64)  # visible, rows of tiles they reach
+        found = np.zeros((chunks + 1, 2), np.int64)  # visible, tile rows they reach
 
         def ranges(first: int, end: int) -> None:
             for chunk in range(first, end):
@@ -109,7 +109,7 @@ class TileBinning:
         self._records = store.take("records", (int(starts[-1, 0]), RECORD_VALUES), np.int32)
         keys = store.take("keys", int(starts[-1, 0]), np.uint32)
         changes = store.take("changes", (chunks, self.tiles_y, self.tiles_x + 1), np.int32)
-        results = np.zeros((chunks, 4), np.int64)  # end record, pairs, lowest and highest key
+        results = np.zeros((chunks, 4), np.int64)  # end record, count, lowest and highest key
 
         def spans(first: int, end: int) -> None:
             for chunk in range(first, end):
@@ -130,9 +130,9 @@ class TileBinning:
                 )
 
         run_chunks(spans, np.arange(chunks + 1), threads)
-        # Gaussians that turned out to reach no tile leave gaps at the ends of the runs.
+        # Gaussians that turn out to reach no tile leave gaps at the ends of the runs.
         self._runs = np.stack([starts[:-1, 0], results[:, 0]], 1)  # (chunks, 2) runs of records
-        # The records hold numbers of pairs of the whole image until slots take their place.
+        # Until slots replace them, the records hold the intersection counts of the whole image.
         self._image_intersections: np.ndarray | None = results[:, 1]
         seen = int((self._runs[:, 1] - self._runs[:, 0]).sum())
         self.ids = store.take("ids", seen, np.int32)
@@ -148,12 +148,12 @@ class TileBinning:
         self._order = order_by_keys(keys, self._runs, extent, threads, store)
 
     def bands(self, max_intersections: int) -> list[tuple[int, int]]:
-        """Cut the tiles into runs of at most ``max_intersections`` pairs, or of a single tile.
+        """Split the tiles into runs of at most ``max_intersections``, or of a single tile.
 
         Returns
         -------
         list of (first, end)
-            At least one band, even where nothing is visible.
+            At least one band, even if nothing is visible.
         """
         below = np.concatenate([[0], np.cumsum(self.tile_counts)])
         tiles = len(self.tile_counts)
@@ -168,19 +168,19 @@ class TileBinning:
         return bands
 
     def lists(self, first: int, end: int, max_intersections: int | None = None) -> TileLists:
-        """Return the lists of the tiles ``first .. end``; those made before are overwritten.
+        """Return the lists of the tiles ``first .. end``, overwriting those of the last call.
 
         Parameters
         ----------
         first, end : int
             Any run of tiles.
         max_intersections : int, optional
-            No memory is reserved for more pairs than these, beyond what the band needs.
+            Largest number of intersections to reserve memory for ahead of need.
 
         Raises
         ------
         ResourceError
-            If they would hold more than 2^31 - 1 pairs.
+            If the lists would hold more than 2^31 - 1 intersections.
         """
         store, threads = self._store, self.threads
         tiles = len(self.tile_counts)
@@ -190,7 +190,7 @@ class TileBinning:
         start[end:] = intersections = int(start[end])
         if intersections > _MAX_INTERSECTIONS:
             raise ResourceError(
-                f"{intersections} pairs of Gaussian and tile do not fit.",
+                f"{intersections} tile intersections do not fit.",
                 "Render a smaller image or with a smaller budget.",
             )
         intersection_offsets = self._offsets(first, end)
@@ -221,7 +221,7 @@ class TileBinning:
                 intersection_slots,
             )
 
-        # Each thread walks the whole order and keeps what falls into its tiles.
+        # Each thread passes over the whole order and keeps what falls into its tiles.
         bounds = first + balanced_bounds(self.tile_counts[first:end], threads)
         run_chunks(scatter, bounds, threads)
         return TileLists(
@@ -276,9 +276,9 @@ def bin_gaussians(
 ) -> TileLists:
     """Sort the visible Gaussians by distance and scatter them into tile lists.
 
-    One radix sort of the distances and one counting sort into tiles; the order within each tile
-    is that of a stable sort, whatever the number of threads. In tiles at the corners of a box that
-    the ellipse itself does not reach, the Gaussian is left out.
+    One radix sort of the distances and one counting sort into tiles; within each tile the order is
+    that of a stable sort, for any number of threads. Tiles at the corners of a box that the ellipse
+    itself does not reach leave the Gaussian out.
 
     Parameters
     ----------
@@ -287,12 +287,12 @@ def bin_gaussians(
     threads : int
         0 uses every core.
     store : ArrayStore, optional
-        Where the lists live, until they are made again there; by default they are new.
+        Owns the lists, which are valid until its next binning; by default a new one.
 
     Raises
     ------
     ResourceError
-        If the lists would hold more than 2^31 - 1 pairs.
+        If the lists would hold more than 2^31 - 1 intersections.
     """
     store = ArrayStore() if store is None else store
     binning = TileBinning(screen, width, height, threads or default_threads(), store)
@@ -300,5 +300,5 @@ def bin_gaussians(
 
 
 def _bounds(count: int, threads: int) -> np.ndarray:
-    """Split the Gaussians: one run for one thread, else a few a thread."""
+    """Split the Gaussians: one run for a single thread, else a few per thread."""
     return even_bounds(count, threads, _CHUNKS_PER_THREAD if threads > 1 else 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lists hold for each block the pairs whose masks name it; lit blocks let light through."""
+"""Contributor lists contain the intersections whose masks include a block; active blocks."""
 
 from __future__ import annotations
 

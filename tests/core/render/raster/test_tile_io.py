@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rows that the image's edge cuts hold, bit for bit, what whole rows hold."""
+"""Rows cut by the image's edge are bitwise equal to whole rows."""
 
 from __future__ import annotations
 

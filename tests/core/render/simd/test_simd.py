@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Explicit vectors do what their operators say, at both widths."""
+"""Operators of explicit vectors against numpy, at both widths."""
 
 from __future__ import annotations
 
