@@ -19,9 +19,9 @@ import trimesh
 
 from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.field.isosurface_residual import level_errors
+from gaussian_wrapping_addon.core.field.isosurface_residual import isosurface_residuals
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
-from gaussian_wrapping_addon.core.files import finite, read_json, write_json
+from gaussian_wrapping_addon.core.files import finite_json, read_json, write_json
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
 from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
@@ -114,14 +114,14 @@ def judge(
     field = VacancyField(trained.gaussians.arrays(), trained.scene.cameras, threads=threads)
     points = mesh.vertices[inner(trained.region, mesh.vertices)]
     values: dict[str, Any] = {
-        "level": level_errors(field, points),
+        "level": isosurface_residuals(field, points),
         "distance": distances(mesh, reference, trained.region),
         "reference_vertices": len(reference.vertices),
         **solidity(mesh),
     }
     if (scene_folder / "truth.npz").is_file():
         values["truth"] = against_truth(mesh, trained, scene_folder, threads)
-    return dict(finite(values))
+    return dict(finite_json(values))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

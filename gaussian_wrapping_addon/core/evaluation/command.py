@@ -32,7 +32,7 @@ ALIGNMENTS = ("none", "cameras", "icp")
 SHARES = (0.0025, 0.005, 0.01)
 """Thresholds as shares of the truth's diagonal, where none are given."""
 SAMPLES = 200_000
-ELSEWHERE_SHARE = 0.01
+FRAME_MISMATCH_SHARE = 0.01
 """Cameras further than this share of their spread from the true ones stand in another frame, where
 an alignment brings them nearer: the largest of :data:`SHARES`."""
 ICP_REACH = (0.05, 0.01)
@@ -443,7 +443,7 @@ def _pose_lines(result: dict[str, Any], align: str) -> list[str]:
         f"{poses['cameras']}, after their own best alignment)"
     )
     lines = [text]
-    if align == "none" and given > max(ELSEWHERE_SHARE, 2.0 * aligned):
+    if align == "none" and given > max(FRAME_MISMATCH_SHARE, 2.0 * aligned):
         lines.append(
             f"poses     the cameras lie elsewhere (scale {poses['transform']['scale']:.4g}, shift "
             f"{given * poses['spread']:.4g} in the truth's units): try --align cameras"

@@ -14,8 +14,8 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import MeshingError
-from ..field.depth_samples import Sightings
-from ..field.isosurface_residual import level_errors
+from ..field.depth_samples import DepthSamples
+from ..field.isosurface_residual import isosurface_residuals
 from ..gaussians.model import GaussianArrays
 from ..mesh.components import compacted, without_floaters
 from ..mesh.surface_mesh import SurfaceMesh
@@ -54,7 +54,7 @@ def mesh_by_pivots(
     progress: Progress,
     *,
     seed: int,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> SurfaceMesh:
     """Mesh the surface ``vacancy = 0.5`` inside a region at the resolution of the Gaussians.
 
@@ -75,8 +75,8 @@ def mesh_by_pivots(
     settings : MeshingSettings
         ``pivots`` (per Gaussian) and ``min_component_share`` are used. An edge length or a number
         of points does not apply; the provenance notes that.
-    sightings : Sightings, optional
-        Where the cameras see the isosurface in the region (:mod:`.depth_samples`).
+    depth_samples : DepthSamples, optional
+        Depth-map samples of the isosurface in the region (:mod:`.depth_samples`).
 
     Returns
     -------
@@ -91,7 +91,7 @@ def mesh_by_pivots(
     if len(cameras) == 0:
         raise MeshingError("The scene has no cameras.", "Check the scene.")
     cloud = pivot_cloud(
-        arrays, region, vacancy.is_empty, seed, sightings, pivots_of=PIVOTS[settings.pivots]
+        arrays, region, vacancy.is_empty, seed, depth_samples, pivots_of=PIVOTS[settings.pivots]
     )
     points = np.concatenate([cloud.points, bounding_points(cloud.points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
@@ -118,7 +118,7 @@ def mesh_by_pivots(
         "pivots_each": settings.pivots,
         "gaussians_in_region": cloud.gaussians,
         "pivots": len(cloud.points),
-        "sightings": 0 if sightings is None else len(sightings),
+        "sightings": 0 if depth_samples is None else len(depth_samples),
         "tetrahedra": len(cut.tetrahedra),
         "notes": _notes(settings, cloud.gaussians, cloud.chosen),
         "seed": seed,
@@ -129,7 +129,7 @@ def mesh_by_pivots(
         "degenerate_faces_left": degenerate,
         "vertices_on_surface": int((~capped).sum()),
         "vertices_on_region_boundary": int(capped.sum()),
-        **level_errors(vacancy, vertices[~capped]),
+        **isosurface_residuals(vacancy, vertices[~capped]),
     }
     progress.update(1.0, f"{len(kept)} faces")
     _logger.info("Meshed region %s by pivots: %d faces", region.name, len(kept))

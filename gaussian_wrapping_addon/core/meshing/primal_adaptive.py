@@ -14,8 +14,8 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import MeshingError
-from ..field.depth_samples import Sightings
-from ..field.isosurface_residual import level_errors
+from ..field.depth_samples import DepthSamples
+from ..field.isosurface_residual import isosurface_residuals
 from ..gaussians.model import GaussianArrays
 from ..mesh.components import compacted, without_floaters
 from ..mesh.simplification.edge_flips import flip_edges
@@ -60,7 +60,7 @@ def mesh_region(
     seed: int,
     threads: int,
     edge_length_scene: float = 0.0,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> SurfaceMesh:
     """Mesh the surface ``vacancy = 0.5`` inside a region, closed by caps on the region's boundary.
 
@@ -89,8 +89,8 @@ def mesh_region(
     edge_length_scene : float
         Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices.
         0 means that ``settings.points`` applies.
-    sightings : Sightings, optional
-        Where the cameras see the isosurface in the region (:mod:`.depth_samples`).
+    depth_samples : DepthSamples, optional
+        Depth-map samples of the isosurface in the region (:mod:`.depth_samples`).
 
     Returns
     -------
@@ -111,7 +111,7 @@ def mesh_region(
     rng = np.random.default_rng(seed)
     surface = candidate_surface(
         arrays, region, vacancy.is_empty, 0.5 * request.edge_length, seed, progress.span(0.0, 0.3),
-        sightings,
+        depth_samples,
     )  # fmt: skip
     adaptive = settings.spacing == "adaptive"
     sampler = SurfaceSampler(
@@ -132,7 +132,7 @@ def mesh_region(
         "edge_length_scene": nominal_edge(request, sampler.area, region),
         "gaussians_in_region": surface.gaussians,
         "pivots": surface.pivots,
-        "sightings": 0 if sightings is None else len(sightings),
+        "sightings": 0 if depth_samples is None else len(depth_samples),
         "candidate_area": sampler.area,
         "spacing": settings.spacing,
         "notes": [note.to_json() for note in (*dense.request.notes, *cloud.notes)],
@@ -292,4 +292,4 @@ def vertex_counts(kind: np.ndarray) -> dict[str, int]:
 
 def residuals_on_surface(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:
     """Measure ``|v - 0.5|`` at the vertices that should lie on the isosurface."""
-    return level_errors(vacancy, vertices[kind == KIND_SURFACE])
+    return isosurface_residuals(vacancy, vertices[kind == KIND_SURFACE])

@@ -79,9 +79,9 @@ def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> Po
     distances = np.linalg.norm(transform.points(centers) - true_centers, axis=1)
     given = np.linalg.norm(centers - true_centers, axis=1)
     moved = np.array([solved[name].rotation @ transform.rotation.T for name in names])
-    apart = moved - np.array([true[name].rotation for name in names])  # (n, 3, 3)
+    difference = moved - np.array([true[name].rotation for name in names])  # (n, 3, 3)
     # ||A - B||_F = 2 sqrt(2) sin(angle / 2): exact for tiny angles, where the trace is not.
-    sines = np.linalg.norm(apart, axis=(1, 2)) / np.sqrt(8.0)
+    sines = np.linalg.norm(difference, axis=(1, 2)) / np.sqrt(8.0)
     angles = np.degrees(2.0 * np.arcsin(np.minimum(sines, 1.0)))
     missing = tuple(name for name in true if name not in solved)
     return PoseErrors(

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError
-from ..surface.samples import thin_points
+from ..surface.samples import voxel_downsample_points
 
 COLLINEAR_SHARE = 1e-6
 """Second over first extent below which points count as collinear: the rotation about their line
@@ -381,9 +381,9 @@ def refine_as_tanks(
         if voxels:
             # Voxels are of the target's frame, so that both sets are equally dense.
             moving = transform.inverse().points(
-                thin_points(transform.points(moving), voxels * threshold)
+                voxel_downsample_points(transform.points(moving), voxels * threshold)
             )
-            aim = thin_points(aim, voxels * threshold)
+            aim = voxel_downsample_points(aim, voxels * threshold)
         else:
             moving, aim = _every_kth(moving), _every_kth(aim)
         stages.append(

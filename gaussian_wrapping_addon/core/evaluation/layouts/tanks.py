@@ -28,7 +28,7 @@ from ..surface.samples import (
     sample_legacy,
     sample_uniformly,
     scan_virtually,
-    thin_points,
+    voxel_downsample_points,
 )
 from ..surface.scores import score_clouds
 from .mesh_input import read_cloud
@@ -415,10 +415,10 @@ def _scan(
         progress.check()
         seen = start.points(scan_virtually(vertices, faces, [camera], threads=threads).points)
         near = ((seen >= low - margin) & (seen <= high + margin)).all(1)
-        kept.append(thin_points(seen[near], voxel))
+        kept.append(voxel_downsample_points(seen[near], voxel))
         count += len(kept[-1])
         if count > SCAN_KEPT_POINTS:
-            kept = [thin_points(np.concatenate(kept), voxel)]
+            kept = [voxel_downsample_points(np.concatenate(kept), voxel)]
             # What is left is as thin as it gets: the next thinning waits for as much again.
             count = 0
-    return back.points(thin_points(np.concatenate(kept), voxel))
+    return back.points(voxel_downsample_points(np.concatenate(kept), voxel))

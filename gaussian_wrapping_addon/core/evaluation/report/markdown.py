@@ -15,13 +15,14 @@ from .estimate_section import estimate_lines
 from .figures import figure_rows
 from .region_section import Picture, note_lines, region_lines, region_summary
 from .report_warnings import FEW_HELD_OUT, collect_warnings, warning_lines
-from .selection_section import needs_lines
+from .selection_section import selection_lines
 from .text import (
     NOT_MEASURED,
     bar,
     bytes_text,
     duration,
     escaped,
+    escaped_or,
     items,
     measured,
     number,
@@ -29,7 +30,6 @@ from .text import (
     percent,
     plural,
     table,
-    words,
 )
 
 CURVE = "learning-curve.svg"
@@ -75,7 +75,7 @@ def report_markdown(report: dict[str, Any], result: Path, earlier: Path | None =
     """
     picture = _pictures_of(result, earlier)
     lines = [
-        f"# Report: {words(report.get('source'), 'job')}",
+        f"# Report: {escaped_or(report.get('source'), 'job')}",
         "",
         *picture("preview.png", "Left: part of a photo. Right: the textured mesh."),
         *_summary(report),
@@ -92,7 +92,7 @@ def report_markdown(report: dict[str, Any], result: Path, earlier: Path | None =
         "",
         *_training(part(report, "training"), picture),
         "",
-        *needs_lines(part(report, "training")),
+        *selection_lines(part(report, "training")),
     ]
     for name, region in part(report, "regions").items():
         lines += ["", f"## Region {escaped(name)}", "", *region_lines(name, region, picture)]
@@ -107,10 +107,10 @@ def report_markdown(report: dict[str, Any], result: Path, earlier: Path | None =
         "",
         "</details>",
     ]
-    return "\n".join(_without_gaps(lines)) + "\n"
+    return "\n".join(_collapse_blank_lines(lines)) + "\n"
 
 
-def _without_gaps(lines: list[str]) -> list[str]:
+def _collapse_blank_lines(lines: list[str]) -> list[str]:
     """Drop empty lines that follow an empty line."""
     return [t for i, t in enumerate(lines) if t or i == 0 or lines[i - 1]]
 
@@ -130,15 +130,17 @@ def _pictures_of(result: Path, earlier: Path | None) -> Picture:
 def _summary(report: dict[str, Any]) -> list[str]:
     cameras, training = part(report, "cameras"), part(report, "training")
     preset = part(report, "settings").get("preset")
-    made = f"Photos used: {number(cameras.get('views'))}. "
-    made += f"Gaussians trained on them: {number(training.get('gaussians'))}"
+    text = f"Photos used: {number(cameras.get('views'))}. "
+    text += f"Gaussians trained on them: {number(training.get('gaussians'))}"
     if preset:
-        made += f" (preset {escaped(preset)})"
-    lines = ["## Summary", "", f"- **What was made.** {made}."]
+        text += f" (preset {escaped(preset)})"
+    lines = ["## Summary", "", f"- **What was made.** {text}."]
     lines[-1] += "".join(" " + region_summary(n, r) for n, r in part(report, "regions").items())
-    lines.append(f"- **How long.** {_how_long(report)}")
-    lines.append(f"- **How exact.** {_how_exact(training)}{_mesh_exact(report)}")
-    lines.append(f"- **How well seen.** {_how_seen(report)}")
+    lines.append(f"- **How long.** {_duration_sentence(report)}")
+    lines.append(
+        f"- **How exact.** {_accuracy_sentence(training)}{_mesh_accuracy_sentence(report)}"
+    )
+    lines.append(f"- **How well seen.** {_coverage_sentence(report)}")
     warnings = collect_warnings(report)
     if warnings:
         lines.append(f"- **Be careful about** ({plural(len(warnings), 'warning')}):")
@@ -148,7 +150,7 @@ def _summary(report: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _how_long(report: dict[str, Any]) -> str:
+def _duration_sentence(report: dict[str, Any]) -> str:
     stages = [(s, measured(s.get("seconds"))) for s in map(part, items(report.get("stages")))]
     known = [(s, seconds) for s, seconds in stages if seconds is not None]
     total = sum(seconds for _, seconds in known)
@@ -165,7 +167,7 @@ def _how_long(report: dict[str, Any]) -> str:
     return text
 
 
-def _how_exact(training: dict[str, Any]) -> str:
+def _accuracy_sentence(training: dict[str, Any]) -> str:
     held_out = items(training.get("held_out"))
     psnr = measured(training.get("held_out_psnr"))
     if not held_out or psnr is None:
@@ -182,7 +184,7 @@ def _how_exact(training: dict[str, Any]) -> str:
     return text
 
 
-def _mesh_exact(report: dict[str, Any]) -> str:
+def _mesh_accuracy_sentence(report: dict[str, Any]) -> str:
     text = ""
     for name, region in part(report, "regions").items():
         rendering = part(region, "mesh_rendering")
@@ -202,7 +204,7 @@ def _mesh_exact(report: dict[str, Any]) -> str:
     return text
 
 
-def _how_seen(report: dict[str, Any]) -> str:
+def _coverage_sentence(report: dict[str, Any]) -> str:
     parts = []
     for name, region in part(report, "regions").items():
         texture = part(region, "texture")
@@ -266,7 +268,7 @@ def _cameras(cameras: dict[str, Any]) -> list[str]:
             text = number(value, unit)
         else:
             listed = ", ".join(str(v) for v in value if v) if isinstance(value, list) else value
-            text = f"{words(listed)} {unit}".strip()
+            text = f"{escaped_or(listed)} {unit}".strip()
         rows.append((name, text))
     lines = table(("photos and cameras", "figure"), rows, "lr")
     if facts.get("kind") == "photos":
@@ -303,7 +305,7 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
         "",
     ]
     perceptual = any(measured(figure.get("lpips")) is not None for figure in held_out)
-    rows = [_held_out_row(words(f.get("name")), f, perceptual) for f in held_out]
+    rows = [_held_out_row(escaped_or(f.get("name")), f, perceptual) for f in held_out]
     mean = {key: training.get(f"held_out_{key}") for key in ("psnr", "ssim", "lpips")}
     rows.append(_held_out_row("**mean**", mean, perceptual))
     header = ["photo held out", "PSNR", "typical error", "SSIM (1 is equal)"]
@@ -344,11 +346,11 @@ def _machine(report: dict[str, Any]) -> list[str]:
     if started is not None:
         date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(started))
     packages = part(machine, "packages")
-    versions = ", ".join(f"{escaped(k)} {words(v)}" for k, v in packages.items())
+    versions = ", ".join(f"{escaped(k)} {escaped_or(v)}" for k, v in packages.items())
     threads = f"{number(machine.get('threads'), 'threads')} used"
-    system, python = words(machine.get("system")), words(machine.get("python"))
-    preset, seed = words(settings.get("preset")), words(settings.get("seed"))
-    processor, cores = words(machine.get("processor")), number(machine.get("cores"), "cores")
+    system, python = escaped_or(machine.get("system")), escaped_or(machine.get("python"))
+    preset, seed = escaped_or(settings.get("preset")), escaped_or(settings.get("seed"))
+    processor, cores = escaped_or(machine.get("processor")), number(machine.get("cores"), "cores")
     return [
         f"- Started: {date}",
         f"- Processor: {processor}, {cores}, {threads}",

@@ -41,11 +41,11 @@ _INK = (232, 232, 232)
 _HEAT = np.array([(0, 0, 0), (74, 20, 120), (196, 42, 80), (250, 150, 30), (255, 250, 210)])
 
 
-def heat(values: np.ndarray) -> np.ndarray:
+def heat_colors(values: np.ndarray) -> np.ndarray:
     """Return (h, w, 3) uint8 colours of values from 0 (black) to 1 (ivory); beyond is clipped."""
-    places = np.linspace(0.0, 1.0, len(_HEAT))
+    stops = np.linspace(0.0, 1.0, len(_HEAT))
     clipped = np.clip(values, 0.0, 1.0)
-    channels = [np.interp(clipped, places, _HEAT[:, c]) for c in range(3)]
+    channels = [np.interp(clipped, stops, _HEAT[:, c]) for c in range(3)]
     return np.rint(np.stack(channels, -1)).astype(np.uint8)
 
 
@@ -65,7 +65,7 @@ def error_map(
     error = np.abs(np.clip(rendering, 0.0, 1.0) - photo / 255.0).mean(-1)  # (h, w)
     if mask is not None:
         error = np.where(mask, error, 0.0)
-    return heat(ERROR_GAIN * error)
+    return heat_colors(ERROR_GAIN * error)
 
 
 def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX) -> bytes:

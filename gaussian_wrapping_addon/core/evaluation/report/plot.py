@@ -56,8 +56,8 @@ class _Axis:
     ticks: tuple[float, ...]
 
     def share(self, value: float) -> float:
-        place = math.log10(value) if self.log else value
-        return (place - self.low) / (self.high - self.low)
+        attributes = math.log10(value) if self.log else value
+        return (attributes - self.low) / (self.high - self.low)
 
 
 def _axis(values: Sequence[float], log: bool) -> _Axis:
@@ -90,9 +90,9 @@ def _fits(panel: Panel, point: tuple[float, float]) -> bool:
     return finite and (not panel.x_log or point[0] > 0) and (not panel.y_log or point[1] > 0)
 
 
-def _text(x: float, y: float, words: str, anchor: str = "middle", extra: str = "") -> str:
-    place = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{extra}'
-    return f"<text {place}>{html.escape(words)}</text>"
+def _text(x: float, y: float, content: str, anchor: str = "middle", extra: str = "") -> str:
+    attributes = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{extra}'
+    return f"<text {attributes}>{html.escape(content)}</text>"
 
 
 def _dot(x: float, y: float, color: str) -> str:
@@ -130,20 +130,20 @@ def _panel(panel: Panel, left: int, top: int) -> list[str]:
     for number, series in enumerate(panel.series):
         color = _COLORS[number % len(_COLORS)]
         kept = [i for i, p in enumerate(series.points) if _fits(panel, p)]
-        places = [at(series.points[i]) for i in kept]
-        if series.line and len(places) > 1:
-            path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+        positions = [at(series.points[i]) for i in kept]
+        if series.line and len(positions) > 1:
+            path = " ".join(f"{x:.1f},{y:.1f}" for x, y in positions)
             parts.append(
                 f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="1.5"/>'
             )
         if series.dots:
             parts += [
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{color}"/>' for x, y in places
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{color}"/>' for x, y in positions
             ]
         if series.labels:
             parts += [
                 _text(x + 5, y - 5, series.labels[i], "start", f' fill="{color}"')
-                for i, (x, y) in zip(kept, places, strict=True)
+                for i, (x, y) in zip(kept, positions, strict=True)
             ]
         y = y0 + 14 + 15 * number
         if panel.legend_low:

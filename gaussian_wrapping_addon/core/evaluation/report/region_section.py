@@ -10,6 +10,7 @@ from .text import (
     NOT_MEASURED,
     duration,
     escaped,
+    escaped_or,
     items,
     measured,
     number,
@@ -17,7 +18,6 @@ from .text import (
     percent,
     plural,
     table,
-    words,
 )
 
 Picture = Callable[[str, str], list[str]]
@@ -96,10 +96,10 @@ def _mesh(region: dict[str, Any]) -> list[str]:
         ("Faces", number(statistics.get("faces"), "faces")),
         ("Vertices", number(statistics.get("vertices"), "vertices")),
         ("Closed", topology),
-        ("Check of closedness and manifold", _checked(part(region, "check"))),
+        ("Check of closedness and manifold", _check_text(part(region, "check"))),
         ("Separate parts", plural(statistics.get("components"), "part")),
-        *_removed(provenance),
-        *_made(provenance),
+        *_removal_rows(provenance),
+        *_tile_rows(provenance),
         ("Size (x, y, z)", extent),
         ("Surface area", number(world.get("area"), "square world units")),
         ("Edge length, mean", number(world.get("edge_mean"), "world units")),
@@ -108,9 +108,9 @@ def _mesh(region: dict[str, Any]) -> list[str]:
         ("Residual, mean", _residual(provenance, "mean")),
         ("Residual, 99 % of vertices below", _residual(provenance, "p99")),
         ("Residual, largest", _residual(provenance, "max")),
-        *_cleaned(provenance),
+        *_simplification_rows(provenance),
         ("Time", duration(seconds.get("mesh"))),
-        *_expected(part(region, "estimate")),
+        *_estimate_rows(part(region, "estimate")),
     ]
     lines = table(("mesh", "figure"), rows, "lr")
     vertices = measured(statistics.get("vertices"))
@@ -136,20 +136,20 @@ def _mesh(region: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _checked(check: dict[str, Any]) -> str:
+def _check_text(check: dict[str, Any]) -> str:
     defects = check.get("defects")
     if not isinstance(defects, list):
         return NOT_MEASURED
-    return "; ".join(words(defect) for defect in defects) or "no defect"
+    return "; ".join(escaped_or(defect) for defect in defects) or "no defect"
 
 
-def _removed(provenance: dict[str, Any]) -> list[tuple[str, str]]:
+def _removal_rows(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     solids = measured(provenance.get("removed_solids"))
     cavities = measured(provenance.get("removed_cavities"))
     if solids is None or cavities is None:
         return []
-    hollows = plural(int(cavities), "small cavity", "small cavities")
-    text = f"{plural(int(solids), 'floater')}, {hollows}"
+    cavity_count = plural(int(cavities), "small cavity", "small cavities")
+    text = f"{plural(int(solids), 'floater')}, {cavity_count}"
     if solids or cavities:
         text += f": {percent(provenance.get('removed_area_share'))} of the area"
     rows = [("Removed for their size", text)]
@@ -162,7 +162,7 @@ def _removed(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _cleaned(provenance: dict[str, Any]) -> list[tuple[str, str]]:
+def _simplification_rows(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     before = measured(provenance.get("faces_before_clean_up"))
     if before is None:
         return []
@@ -175,7 +175,7 @@ def _cleaned(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _made(provenance: dict[str, Any]) -> list[tuple[str, str]]:
+def _tile_rows(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     """Return in how many tiles the mesh was made, and how much of the space nobody has seen."""
     rows = []
     if tiles := measured(provenance.get("tiles")):
@@ -183,17 +183,17 @@ def _made(provenance: dict[str, Any]) -> list[tuple[str, str]]:
         if processes := measured(provenance.get("tile_processes")):
             text += f", by {plural(int(processes), 'process', 'processes')}"
         rows.append(("Made in", text))
-    asked = measured(provenance.get("field_evaluations"))
+    evaluated = measured(provenance.get("field_evaluations"))
     unseen = measured(provenance.get("unseen_evaluations"))
-    if asked and unseen is not None:
-        text = f"{percent(unseen / asked)} of the points asked for"
+    if evaluated and unseen is not None:
+        text = f"{percent(unseen / evaluated)} of the points asked for"
         if provenance.get("unseen") in ("empty", "occupied"):
             text += f", taken as {provenance['unseen']}"
         rows.append(("Seen by no camera", text))
     return rows
 
 
-def _expected(estimate: dict[str, Any]) -> list[tuple[str, str]]:
+def _estimate_rows(estimate: dict[str, Any]) -> list[tuple[str, str]]:
     """Return what was said before the mesh was made; nothing of reports that had no estimate."""
     few, many = (measured(estimate.get(f"points_{end}")) for end in ("low", "high"))
     soon, late = (measured(estimate.get(f"seconds_{end}")) for end in ("low", "high"))
@@ -252,7 +252,7 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
         "mask": "Counted are the pixels inside of the photos' masks.",
         "covered": "Counted are only the pixels that the mesh covers.",
     }.get(str(rendering.get("pixels")), "")
-    rows = [_view_row(words(view.get("name")), view, perceptual) for view in views]
+    rows = [_view_row(escaped_or(view.get("name")), view, perceptual) for view in views]
     rows.append(_view_row("**mean**", rendering, perceptual))
     header = ["photo", "PSNR", "SSIM (1 is equal)", "of the photo covered"]
     trained = {

@@ -20,7 +20,7 @@ LOW_COVERAGE = 0.5
 GAP_DB = 20.0 * math.log10(2.0)
 """Photos never seen in training with more than twice the error of those seen."""
 
-HALF_WAY = 0.25
+MAX_RESIDUAL = 0.25
 """``|v - 0.5|`` at which a vertex is nearer to "empty" or "solid" than to the surface."""
 
 REPROJECTION_PX = 2.0
@@ -56,10 +56,10 @@ def collect_warnings(report: dict[str, Any]) -> list[StageWarning]:
     found = _of_stage(
         "cameras",
         read_warnings(cameras.get("warnings")),
-        _judge_cameras(part(cameras, "facts")),
+        _camera_warnings(part(cameras, "facts")),
     )
     found += _of_stage(
-        "training", read_warnings(training.get("warnings")), _judge_training(training)
+        "training", read_warnings(training.get("warnings")), _training_warnings(training)
     )
     for name, region in part(report, "regions").items():
         provenance, texture = part(region, "provenance"), part(region, "texture")
@@ -67,14 +67,14 @@ def collect_warnings(report: dict[str, Any]) -> list[StageWarning]:
             f"mesh {name}",
             read_warnings(provenance.get("warnings")),
             read_warnings(provenance.get("notes")),
-            _judge_mesh(part(region, "statistics"), provenance),
-            _judge_check(part(region, "check")),
+            _mesh_warnings(part(region, "statistics"), provenance),
+            _check_warnings(part(region, "check")),
         )
         found += _of_stage(
             f"texture {name}",
             read_warnings(texture.get("warnings")),
             read_warnings(part(region).get("warnings")),
-            _judge_texture(texture),
+            _texture_warnings(texture),
         )
     return list(dict.fromkeys(found))
 
@@ -92,7 +92,7 @@ def _of_stage(stage: str, *lists: Iterable[ReportWarning]) -> list[StageWarning]
     return [StageWarning(stage, w.code, w.text, w.hint) for each in lists for w in each]
 
 
-def _judge_cameras(facts: dict[str, Any]) -> list[ReportWarning]:
+def _camera_warnings(facts: dict[str, Any]) -> list[ReportWarning]:
     error_px = measured(facts.get("mean_reprojection_error_px"))
     if error_px is None or error_px <= REPROJECTION_PX:
         return []
@@ -107,7 +107,7 @@ def _judge_cameras(facts: dict[str, Any]) -> list[ReportWarning]:
     ]
 
 
-def _judge_training(training: dict[str, Any]) -> list[ReportWarning]:
+def _training_warnings(training: dict[str, Any]) -> list[ReportWarning]:
     if not isinstance(training.get("held_out"), list):
         return []
     count = len(training["held_out"])
@@ -135,18 +135,18 @@ def _judge_training(training: dict[str, Any]) -> list[ReportWarning]:
     return found
 
 
-def _judge_mesh(statistics: dict[str, Any], provenance: dict[str, Any]) -> list[ReportWarning]:
+def _mesh_warnings(statistics: dict[str, Any], provenance: dict[str, Any]) -> list[ReportWarning]:
     found = []
-    by_request = provenance.get("boundary") == "open"
-    if statistics.get("closed") is False and not by_request:
+    is_open_by_request = provenance.get("boundary") == "open"
+    if statistics.get("closed") is False and not is_open_by_request:
         edges = plural(statistics.get("boundary_edges"), "open edge")
         text = f"The mesh is not closed ({edges}); volumes and 3D prints need a closed one."
         step = "Fill the holes in Blender; send the job folder's log.txt with a bug report."
         found.append(ReportWarning("not-closed", text, step))
-    wide = measured(provenance.get("level_error_p99"))
+    residual_p99 = measured(provenance.get("level_error_p99"))
     # Smoothing and decimation move vertices off the surface on request.
     moved = "faces_before_clean_up" in provenance or measured(provenance.get("smooth_steps"))
-    if wide is not None and wide > HALF_WAY and not moved:
+    if residual_p99 is not None and residual_p99 > MAX_RESIDUAL and not moved:
         text = "At one vertex in a hundred the mesh is not on the surface the photos describe."
         found.append(
             ReportWarning("off-the-surface", text, "Mesh with more points or a smaller region.")
@@ -162,8 +162,8 @@ def _judge_mesh(statistics: dict[str, Any], provenance: dict[str, Any]) -> list[
     return found
 
 
-def _judge_check(check: dict[str, Any]) -> list[ReportWarning]:
-    defects = [words for words in items(check.get("defects")) if isinstance(words, str)]
+def _check_warnings(check: dict[str, Any]) -> list[ReportWarning]:
+    defects = [defect for defect in items(check.get("defects")) if isinstance(defect, str)]
     if not defects:
         return []
     text = f"The check of the finished mesh found defects ({'; '.join(defects)})."
@@ -171,7 +171,7 @@ def _judge_check(check: dict[str, Any]) -> list[ReportWarning]:
     return [ReportWarning("mesh-defects", text, step)]
 
 
-def _judge_texture(texture: dict[str, Any]) -> list[ReportWarning]:
+def _texture_warnings(texture: dict[str, Any]) -> list[ReportWarning]:
     found = []
     coverage = measured(texture.get("coverage"))
     if coverage == 0.0:

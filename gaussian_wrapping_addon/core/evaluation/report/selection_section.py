@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .text import escaped, items, part, table, words
+from .text import escaped, escaped_or, items, part, table
 
 _TITLES = {
     "harmonics": "Colours that change with the viewing direction (gloss)",
@@ -28,24 +28,26 @@ _EFFECTS = {
     "growth": '"on" lets the number grow up to `max_gaussians`; "off" adds none',
 }
 
-_WHO = {"auto": "the photos", "on": "you (on)", "off": "you (off)"}
+_DECIDED_BY = {"auto": "the photos", "on": "you (on)", "off": "you (off)"}
 
 
-def needs_lines(training: dict[str, Any]) -> list[str]:
+def selection_lines(training: dict[str, Any]) -> list[str]:
     """Return the Markdown lines of the section, with its heading; none where nothing was decided.
 
     Parameters
     ----------
     training : dict
         The report's training figures; its entry ``decisions`` holds what
-        :meth:`~.model_selection.Needs.to_json` wrote. Entries of newer versions are shown as they
-        are.
+        :meth:`~.model_selection.ModelSelection.to_json` wrote. Entries of newer versions are shown
+        as they are.
     """
     decisions = [part(entry) for entry in items(training.get("decisions"))]
     decisions = [entry for entry in decisions if entry.get("name")]
     if not decisions:
         return []
-    rows = [(_title(entry), words(entry.get("chosen")), _who(entry)) for entry in decisions]
+    rows = [
+        (_title(entry), escaped_or(entry.get("chosen")), _decided_by(entry)) for entry in decisions
+    ]
     lines = [
         "## What this scene needed",
         "",
@@ -58,7 +60,7 @@ def needs_lines(training: dict[str, Any]) -> list[str]:
         "",
     ]
     for entry in decisions:
-        lines += [f"- **{_title(entry)}: {words(entry.get('chosen'))}.** {_evidence(entry)}"]
+        lines += [f"- **{_title(entry)}: {escaped_or(entry.get('chosen'))}.** {_evidence(entry)}"]
         lines += [f"    - *To decide otherwise:* {_override(entry)}."]
     return lines
 
@@ -67,12 +69,12 @@ def _title(entry: dict[str, Any]) -> str:
     return _TITLES.get(str(entry["name"]), escaped(entry["name"]))
 
 
-def _who(entry: dict[str, Any]) -> str:
-    return _WHO.get(str(entry.get("setting")), words(entry.get("setting")))
+def _decided_by(entry: dict[str, Any]) -> str:
+    return _DECIDED_BY.get(str(entry.get("setting")), escaped_or(entry.get("setting")))
 
 
 def _evidence(entry: dict[str, Any]) -> str:
-    evidence = words(entry.get("evidence"), "No evidence was recorded.")
+    evidence = escaped_or(entry.get("evidence"), "No evidence was recorded.")
     measured = entry.get("measured") is not False  # version 0.1.0 did not tell
     if entry.get("setting") in ("on", "off") and measured:
         return f"You decided this. What the photos say: {evidence}"

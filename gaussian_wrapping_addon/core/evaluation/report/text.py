@@ -111,9 +111,9 @@ def escaped(text: Any) -> str:
     return " ".join(str(text).split()).translate(_MARKUP)
 
 
-def words(value: Any, instead: str = "unknown") -> str:
+def escaped_or(value: Any, default: str = "unknown") -> str:
     """Return text from outside, escaped, or other words where there is none."""
-    return instead if value is None or value == "" else escaped(value)
+    return default if value is None or value == "" else escaped(value)
 
 
 def bar(share: float) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import MeshingError, ResourceError, UsageError
-from ...files import finite
+from ...files import finite_json
 from ...limits import MAX_POINTS
 from ...mesh.distance import distances_to_cloud
 from ...mesh.surface_sampling import thin
@@ -48,7 +48,7 @@ class ObservationMask:
     """Distance between voxel centres."""
 
     def __post_init__(self) -> None:
-        sound = (
+        is_valid = (
             self.volume.ndim == 3
             and self.volume.dtype == np.bool_
             and np.shape(self.low) == (3,)
@@ -58,7 +58,7 @@ class ObservationMask:
             and math.isfinite(self.resolution)
             and self.resolution > 0
         )
-        if not sound:
+        if not is_valid:
             raise UsageError(
                 "The observation mask is not a bool volume with a box and a resolution > 0.",
                 "Read it from the data set's ObsMask file again.",
@@ -71,10 +71,10 @@ class ObservationMask:
     def observed(self, points: np.ndarray) -> np.ndarray:
         """Tell which of (n, 3) points lie in an observed voxel, (n,) bool."""
         # Clipped before the cast: far points would not fit an integer.
-        place = np.clip(
+        along_row = np.clip(
             np.floor((points - self.low) / self.resolution + 0.5), -1.0, self.volume.shape
         )
-        index = place.astype(np.int64)  # (n, 3)
+        index = along_row.astype(np.int64)  # (n, 3)
         inside = ((index >= 0) & (index < self.volume.shape)).all(1)
         result = np.zeros(len(points), np.bool_)
         i, j, k = index[inside].T
@@ -101,7 +101,7 @@ class DtuScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return dict(finite(dataclasses.asdict(self)))
+        return dict(finite_json(dataclasses.asdict(self)))
 
 
 def dtu_chamfer(
@@ -250,9 +250,9 @@ def resample_mesh(vertices: np.ndarray, faces: np.ndarray, density: float) -> np
     line, step = _counted(steps + 1)
     if len(line) > MAX_POINTS:
         raise ResourceError(f"The mesh would need {len(line)} points.", _MORE)
-    place = step / np.maximum(steps[line], 1)  # (n,), along the row
+    along_row = step / np.maximum(steps[line], 1)  # (n,), along the row
     lift, owner = share[line], face[line]
-    weights = np.stack([(1 - lift) * (1 - place), (1 - lift) * place, lift], 1)  # (n, 3)
+    weights = np.stack([(1 - lift) * (1 - along_row), (1 - lift) * along_row, lift], 1)  # (n, 3)
     result = weights[:, :1] * a[owner]
     result += weights[:, 1:2] * b[owner]
     result += weights[:, 2:] * c[owner]

@@ -152,13 +152,13 @@ def vacancy_errors(
     outer, inner = vacancy[:, :-1], vacancy[:, 1:]  # (n, k - 1)
     crosses = (outer > 0.5) & (inner <= 0.5)
     share = np.where(crosses, (outer - 0.5) / np.where(crosses, outer - inner, 1.0), 0.0)
-    place = offsets[:-1] + share * (offsets[1:] - offsets[:-1])  # (n, k - 1)
-    distance = np.where(crosses, np.abs(place), np.inf)
+    crossing = offsets[:-1] + share * (offsets[1:] - offsets[:-1])  # (n, k - 1)
+    distance = np.where(crosses, np.abs(crossing), np.inf)
     nearest = distance.argmin(1)
     rows = np.arange(count)
     least = distance[rows, nearest]
     found = np.isfinite(least)
-    signed = place[rows, nearest][found]
+    signed = crossing[rows, nearest][found]
     return VacancyErrors(
         count,
         float(found.mean()),

@@ -42,7 +42,7 @@ class SurfaceSamples:
         return SurfaceSamples(self.points[mask], self.normals[mask])
 
     @classmethod
-    def none(cls) -> SurfaceSamples:
+    def empty(cls) -> SurfaceSamples:
         """Return zero samples: what an empty mesh has."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3)))
 
@@ -213,7 +213,7 @@ def _weights_on_faces(corners: np.ndarray, rays: np.ndarray) -> np.ndarray:
     return np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1.0 / 3.0)
 
 
-def thin_out(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
+def voxel_downsample(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
     """Replace the samples in each cell of a grid by their mean, as point-cloud tools do.
 
     The grid begins half a cell before the smallest coordinates. Mean normals are made unit again;
@@ -245,16 +245,16 @@ def thin_out(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
     return SurfaceSamples(_means(samples.points - low, group, members) + low, normals)
 
 
-def thin_points(points: np.ndarray, voxel: float) -> np.ndarray:
-    """Thin out (n, 3) points that have no normals; see :func:`thin_out`."""
-    return thin_out(SurfaceSamples(points, np.zeros_like(points)), voxel).points
+def voxel_downsample_points(points: np.ndarray, voxel: float) -> np.ndarray:
+    """Thin out (n, 3) points that have no normals; see :func:`voxel_downsample`."""
+    return voxel_downsample(SurfaceSamples(points, np.zeros_like(points)), voxel).points
 
 
 def choose_per_cell(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
     """Keep in each cell of a grid the sample nearest to the mean of those there.
 
-    As even as :func:`thin_out`, whose means leave a curved surface: these samples stay on it.
-    Same grid, order and errors; ties go to the earlier sample.
+    As even as :func:`voxel_downsample`, whose means leave a curved surface: these samples stay on
+    it. Same grid, order and errors; ties go to the earlier sample.
     """
     group, members = _cells(samples.points, voxel)
     if len(samples) == 0:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...dataset.camera import Camera
 from ...errors import UsageError
-from ...files import finite
+from ...files import finite_json
 from ...kernels.parallel import default_threads
 from ...mesh.distance import distances_to_cloud, distances_to_mesh
 from .samples import (
@@ -26,7 +26,7 @@ from .samples import (
     sample_legacy,
     sample_uniformly,
     scan_virtually,
-    thin_points,
+    voxel_downsample_points,
 )
 from .truth import MIN_CAMERAS, Truth
 
@@ -77,7 +77,7 @@ class SurfaceScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return dict(finite(dataclasses.asdict(self)))
+        return dict(finite_json(dataclasses.asdict(self)))
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class CloudScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return dict(finite(dataclasses.asdict(self)))
+        return dict(finite_json(dataclasses.asdict(self)))
 
 
 def score_surface(
@@ -188,8 +188,8 @@ def score_surface(
         completeness_median=medians[1],
         chamfer_mean=(means[0] + means[1]) / 2,
         chamfer_median=(medians[0] + medians[1]) / 2,
-        normal_consistency=_both_ways([np.abs(values) for values in pairs]),
-        normal_agreement=_both_ways([(values > 0).astype(np.float64) for values in pairs]),
+        normal_consistency=_symmetric_mean([np.abs(values) for values in pairs]),
+        normal_agreement=_symmetric_mean([(values > 0).astype(np.float64) for values in pairs]),
         predicted_count=len(shown),
         truth_count=len(true),
         visible_count=int(visible.sum()) if knows_seen else 0,
@@ -273,13 +273,13 @@ def score_protocols(
                     f"No true sample is seen by {min_cameras} cameras.", "Ask for fewer cameras."
                 )
             judged = truth.kept(visible)
-            predicted = SurfaceSamples.none()
+            predicted = SurfaceSamples.empty()
             if len(faces):
                 step = _scan_step(cameras) if step_px is None else step_px
                 reached = scan_virtually(vertices, faces, cameras, threads=threads, step_px=step)
                 predicted = choose_per_cell(reached, min(limits) / 2)
         elif protocol == "legacy":
-            predicted = sample_legacy(vertices, faces) if len(faces) else SurfaceSamples.none()
+            predicted = sample_legacy(vertices, faces) if len(faces) else SurfaceSamples.empty()
         else:
             raise UsageError(f"Protocol {protocol!r} is unknown.", f"Use {', '.join(PROTOCOLS)}.")
         # An area that lies on nothing but degenerate faces is as empty as no faces.
@@ -327,7 +327,7 @@ def score_clouds(
         if not np.isfinite(points).all():
             raise UsageError(f"The {name} cloud has a point that is not finite.", "Remove it.")
         if voxel is not None:
-            points = thin_points(points, voxel)
+            points = voxel_downsample_points(points, voxel)
         clouds.append(points)
     predicted, truth = clouds
     if len(truth) == 0:
@@ -350,7 +350,7 @@ def _uniform(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> 
     if len(faces) == 0 or (
         np.isfinite(vertices[np.unique(faces)]).all() and not face_normals(vertices, faces)[1].any()
     ):
-        return SurfaceSamples.none()
+        return SurfaceSamples.empty()
     return sample_uniformly(vertices, faces, count, seed=seed)
 
 
@@ -400,7 +400,7 @@ def _median(distances: np.ndarray) -> float:
     return float(np.median(distances)) if len(distances) else math.inf
 
 
-def _both_ways(pairs: list[np.ndarray]) -> float:
+def _symmetric_mean(pairs: list[np.ndarray]) -> float:
     """Mean of the two directions' means; of one where the other has no pair; 0 without any."""
     means = [float(values.mean()) for values in pairs if len(values)]
     return sum(means) / len(means) if means else 0.0

@@ -23,7 +23,7 @@ from ...texture.unwrap.unwrap import Unwrap
 MIN_SIZE_PX = 256
 
 
-class _Subset:
+class _PhotoSubset:
     """Some photos of a store, numbered anew."""
 
     def __init__(self, photos: PhotoSource, indices: list[int]) -> None:
@@ -40,7 +40,7 @@ class _Subset:
         return self._photos.mask(self._indices[index], divisor)
 
 
-def texture_without(
+def bake_held_out_texture(
     textured: TexturedMesh,
     scene: Scene,
     photos: PhotoSource,
@@ -88,6 +88,6 @@ def texture_without(
     )
     part = dataclasses.replace(scene, views=tuple(scene.views[i] for i in kept))
     return texture_mesh(
-        mesh, part, _Subset(photos, kept), settings, work_folder, progress,
+        mesh, part, _PhotoSubset(photos, kept), settings, work_folder, progress,
         threads=threads, unwrapped=unwrapped,
     )  # fmt: skip

@@ -17,7 +17,7 @@ from ...imaging.lpips import lpips_if_ready
 from ...kernels.parallel import default_threads
 from ...mesh.textured_mesh import TexturedMesh
 from ...progress import Progress
-from .held_out_texture import texture_without
+from .held_out_texture import bake_held_out_texture
 from .mesh_rendering import render_views
 from .side_by_side import write_side_by_side
 
@@ -25,9 +25,11 @@ MAX_PHOTOS = 8
 LONG_SIDE_PX = 800
 MAX_PICTURES = 3
 PICTURE_WIDTH_PX = 1200
-INCLUDED = "the texture was baked from all photos, these included"
-WITHOUT = "the texture compared was baked again without the held-out photos; the files have all"
-FROM_GAUSSIANS = "the texture is of the Gaussians, which no held-out photo has trained"
+NOTE_ALL_PHOTOS = "the texture was baked from all photos, these included"
+NOTE_HELD_OUT = (
+    "the texture compared was baked again without the held-out photos; the files have all"
+)
+NOTE_GAUSSIANS = "the texture is of the Gaussians, which no held-out photo has trained"
 
 
 def compare_with_photos(
@@ -78,7 +80,7 @@ def compare_with_photos(
     """
     names = [view.camera.name for view in scene.views]
     wanted = [index for index, name in enumerate(names) if name in held_out]
-    chosen = _evenly(wanted or list(range(len(names))), MAX_PHOTOS)
+    chosen = _evenly_spaced(wanted or list(range(len(names))), MAX_PHOTOS)
     cameras, images, counted = [], [], []
     reduction = 0
     for index in chosen:
@@ -90,15 +92,17 @@ def compare_with_photos(
         cameras.append(photos.camera(index, divisor))
         images.append(photos.photo(index, divisor))
         counted.append(photos.mask(index, divisor))
-    told: dict[str, Any] = {"note": FROM_GAUSSIANS if from_gaussians and wanted else INCLUDED}
+    description: dict[str, Any] = {
+        "note": NOTE_GAUSSIANS if from_gaussians and wanted else NOTE_ALL_PHOTOS
+    }
     if wanted and len(wanted) < len(names) and not from_gaussians:
         begun_s = time.monotonic()
-        textured = texture_without(
+        textured = bake_held_out_texture(
             textured, scene, photos, held_out, reduction, folder, progress,
             threads=threads or default_threads(),
         )  # fmt: skip
-        told = {
-            "note": WITHOUT,
+        description = {
+            "note": NOTE_HELD_OUT,
             "texture_size_px": len(textured.albedo),
             "bake_s": round(time.monotonic() - begun_s, 1),
         }
@@ -112,15 +116,15 @@ def compare_with_photos(
     if reason:
         values["lpips_note"] = reason
     values["pictures"] = []
-    for number, index in enumerate(_evenly(list(range(len(shown))), MAX_PICTURES), start=1):
+    for number, index in enumerate(_evenly_spaced(list(range(len(shown))), MAX_PICTURES), start=1):
         name = f"comparison-{number}.jpg"
         write_side_by_side(folder / name, *shown[index], max_width_px=PICTURE_WIDTH_PX)
         values["views"][index]["picture"] = name
         values["pictures"].append(name)
-    return {**values, "held_out": bool(wanted), **told}
+    return {**values, "held_out": bool(wanted), **description}
 
 
-def _evenly(items: list[int], count: int) -> list[int]:
+def _evenly_spaced(items: list[int], count: int) -> list[int]:
     """Return ``count`` of the items (or all), from the first to the last."""
-    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
-    return [items[place] for place in places.tolist()]
+    positions = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[position] for position in positions.tolist()]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...field.isosurface_residual import level_errors
+from ...field.isosurface_residual import isosurface_residuals
 from ...mesh.simplification.decimation import decimate
 from ...mesh.surface_mesh import SurfaceMesh
 from ...progress import Progress
@@ -82,7 +82,7 @@ def clean_up(
         "smooth_steps": settings.smooth_steps,
         "target_faces": settings.target_faces,
         "faces_before_clean_up": len(mesh.faces),
-        **level_errors(vacancy, vertices[~capped]),
+        **isosurface_residuals(vacancy, vertices[~capped]),
         "vertices_on_surface": int((~capped).sum()),
         "vertices_on_region_boundary": int(capped.sum()),
         "vertices_at_end_of_sight": 0,

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ...errors import ResourceError
-from ...field.depth_samples import MAX_SIGHTINGS
+from ...field.depth_samples import MAX_DEPTH_SAMPLES
 from ...gaussians.model import GaussianArrays
 from ...regions.convex_region import Region
 from ..points.candidate_surface import pivots_and_probes
@@ -100,7 +100,7 @@ def _span(seconds: float) -> str:
 
 
 def estimate_pivot_mesh(
-    arrays: GaussianArrays, region: Region, pivots: int, sightings: int, *,
+    arrays: GaussianArrays, region: Region, pivots: int, depth_samples: int, *,
     evaluation_s: float = 0.0, seed: int = 0,
 ) -> PivotEstimate:  # fmt: skip
     """Estimate the cost of :func:`~..pivot_meshing.mesh_by_pivots`.
@@ -111,7 +111,7 @@ def estimate_pivot_mesh(
         Same frame.
     pivots : int
         Number of pivots per Gaussian.
-    sightings : int
+    depth_samples : int
         Number of depth samples in the region.
     evaluation_s : float
         Time of one evaluation of vacancy, from :func:`~.mesh_estimate.evaluation_seconds`.
@@ -122,8 +122,8 @@ def estimate_pivot_mesh(
         No Gaussian reaches the region.
     """
     own = pivots_and_probes(arrays, region, seed, PIVOTS[pivots])
-    pairs_low = PAIRED_LOW * min(sightings, MAX_SIGHTINGS)
-    pairs_high = min(PAIRED_HIGH * sightings, 2.0 * MAX_SIGHTINGS)
+    pairs_low = PAIRED_LOW * min(depth_samples, MAX_DEPTH_SAMPLES)
+    pairs_high = min(PAIRED_HIGH * depth_samples, 2.0 * MAX_DEPTH_SAMPLES)
     low, high = len(own.points) + pairs_low, len(own.points) + pairs_high
     few = FACES_LOW * len(own.points) + PAIR_FACES_LOW * pairs_low
     many = FACES_HIGH * len(own.points) + PAIR_FACES_HIGH * pairs_high

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...errors import MeshingError
-from ...field.depth_samples import Sightings, bracket_pairs
+from ...field.depth_samples import DepthSamples, bracket_pairs
 from ...gaussians.model import GaussianArrays
 from ...progress import Progress
 from ...regions.convex_region import Region
@@ -59,16 +59,16 @@ def candidate_surface(
     tolerance: float,
     seed: int,
     progress: Progress,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> CandidateSurface:
-    """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and sighting.
+    """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and depth sample.
 
     Parameters
     ----------
     tolerance : float
         Length of the bracket on crossing edges; 0 stands for :data:`BRACKET_SHARE`.
-    sightings : Sightings, optional
-        Of the cameras in the region: parts about as thin as a pixel are found by these alone.
+    depth_samples : DepthSamples, optional
+        Of the region: parts about as thin as a pixel are found only by these.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def candidate_surface(
     """
     margin = MARGIN_SHARE * region.diagonal
     is_empty = _within_halo(is_empty, region)
-    cloud = pivot_cloud(arrays, region, is_empty, seed, sightings)
+    cloud = pivot_cloud(arrays, region, is_empty, seed, depth_samples)
     pivots = cloud.points
     points = np.concatenate([pivots, bounding_points(pivots, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
@@ -114,7 +114,7 @@ def pivot_cloud(
     region: Region,
     is_empty: IsEmpty,
     seed: int,
-    sightings: Sightings | None,
+    depth_samples: DepthSamples | None,
     *,
     pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray] = two_pivots,
 ) -> PivotCloud:
@@ -126,9 +126,9 @@ def pivot_cloud(
         No Gaussian reaches the region.
     """
     own = pivots_and_probes(arrays, region, seed, pivots_of)
-    if sightings is None:
+    if depth_samples is None:
         return own
-    points = np.concatenate(bracket_pairs(sightings, is_empty))
+    points = np.concatenate(bracket_pairs(depth_samples, is_empty))
     return replace(own, points=np.concatenate([own.points, _in_halo(points, region)]))
 
 

@@ -67,7 +67,7 @@ class TilePlan:
     target: int
     share: float
     """Vertices to keep, as for :func:`.primal_adaptive.simplified`: 0 and 1 keep all."""
-    sightings: int = 0
+    depth_samples: int = 0
 
     @property
     def radius(self) -> float:
@@ -103,7 +103,7 @@ def make_plan(
     seed: int,
     cameras: Sequence[Camera],
     adaptive: bool,
-    sightings: int,
+    depth_samples: int,
 ) -> TilePlan:
     """Compute the data that tiles share.
 
@@ -152,5 +152,5 @@ def make_plan(
     return TilePlan(
         region, surface, sampler.area, spacing, tiling, steiner.points, steiner.ball_radius, caps,
         seed, (*dense.request.notes, *notes), nominal_edge(request, sampler.area, region),
-        dense.target, dense.share, sightings,
+        dense.target, dense.share, depth_samples,
     )  # fmt: skip

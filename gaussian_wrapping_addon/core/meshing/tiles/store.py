@@ -72,7 +72,7 @@ def save_plan(folder: Path, plan: TilePlan, origin: dict[str, Any]) -> None:
             "edge_length": plan.edge_length,
             "target": plan.target,
             "share": plan.share,
-            "sightings": plan.sightings,
+            "sightings": plan.depth_samples,
             "ball": plan.ball_radius,
             "area": plan.area,
             "gaussians": plan.surface.gaussians,

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...dataset.camera import Camera
 from ...errors import MeshingError
-from ...field.depth_samples import Sightings
+from ...field.depth_samples import DepthSamples
 from ...gaussians.model import GaussianArrays
 from ...mesh.surface_mesh import SurfaceMesh
 from ...progress import Progress
@@ -44,7 +44,7 @@ def plan_tiles(
     tiles: int,
     seed: int,
     edge_length_scene: float = 0.0,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> TilePlan:
     """Extract the region's candidate surface and split it into tiles.
 
@@ -63,12 +63,12 @@ def plan_tiles(
     request = checked_request(edge_length_scene, settings.points, region)
     surface = candidate_surface(
         arrays, region, field.vacancy.is_empty, 0.5 * request.edge_length, seed,
-        progress.span(0.0, 0.6), sightings,
+        progress.span(0.0, 0.6), depth_samples,
     )  # fmt: skip
     plan = make_plan(
         field, region, surface, request, progress.span(0.6, 1.0), tiles=tiles, seed=seed,
         cameras=cameras, adaptive=settings.spacing == "adaptive",
-        sightings=0 if sightings is None else len(sightings),
+        depth_samples=0 if depth_samples is None else len(depth_samples),
     )  # fmt: skip
     _logger.info("Region %s is meshed in %d tiles", region.name, len(plan.tiling))
     return plan
@@ -116,7 +116,7 @@ def join_tiles(
         "edge_length_scene": plan.edge_length,
         "gaussians_in_region": plan.surface.gaussians,
         "pivots": plan.surface.pivots,
-        "sightings": plan.sightings,
+        "sightings": plan.depth_samples,
         "candidate_area": plan.area,
         "spacing": settings.spacing,
         "notes": [note.to_json() for note in plan.notes],
@@ -145,7 +145,7 @@ def mesh_in_tiles(
     seed: int,
     threads: int,
     edge_length_scene: float = 0.0,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> SurfaceMesh:
     """Mesh a region tile by tile in this process; see :func:`~.primal_adaptive.mesh_region`.
 
@@ -156,7 +156,7 @@ def mesh_in_tiles(
     field = Field(vacancy, vectors, threads)
     plan = plan_tiles(
         field, arrays, cameras, region, settings, progress.span(0.0, 0.3), tiles=tiles, seed=seed,
-        edge_length_scene=edge_length_scene, sightings=sightings,
+        edge_length_scene=edge_length_scene, depth_samples=depth_samples,
     )  # fmt: skip
     count = len(plan.tiling)
     sampling, labelling = progress.span(0.3, 0.6), progress.span(0.6, 0.9)

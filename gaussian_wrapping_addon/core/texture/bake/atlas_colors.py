@@ -13,15 +13,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from .atlas_points import AtlasPoints, blocks_of
-from .bake import Baked
-from .fill import RING_TEXELS, Continuation, fill_background, grow, surface_positions
+from .bake import BakedColors
+from .fill import BLEND_TEXELS, HarmonicFill, dilate, fill_background, surface_positions
 from .photo_samples import SurfaceArrays
 
-CONTINUED_POINTS = 1_000_000
+MAX_FILL_SOURCES = 1_000_000
 """As many seen texels are enough for the cells from which colours are continued."""
-OUTLINE_TEXELS = 8
+SILHOUETTE_TEXELS = 8
 """Texels seen only at silhouettes take their neighbours' colour within this distance."""
-UNSURE_LEVELS = 15.0
+UNRELIABLE_LEVELS = 15.0
 """What only grazing or half hidden views show is taken while it is this near to what lies around,
 and not at all at twice this: on trained meshes such views are often of something before it."""
 
@@ -40,9 +40,9 @@ class AtlasColors:
     """
 
     def __init__(
-        self, atlas: AtlasPoints, baked: Baked, known_points: int, surface: SurfaceArrays
+        self, atlas: AtlasPoints, baked: BakedColors, known_points: int, surface: SurfaceArrays
     ) -> None:
-        texels, seen = atlas.texels, baked.sure
+        texels, seen = atlas.texels, baked.reliable
         size_px = len(atlas.chart)
         self.image = np.zeros((size_px, size_px, 3), np.uint8)
         pixels = self.image.reshape(-1, 3)
@@ -52,7 +52,7 @@ class AtlasColors:
         for rows in blocks_of(len(texels)):
             pixels[texels[rows]] = baked.colors[rows]
             flat_ring[texels[rows][seen[rows] & baked.clear[rows]]] = 0
-        grow(self.image, ring, atlas.chart, OUTLINE_TEXELS, inside=True)
+        dilate(self.image, ring, atlas.chart, SILHOUETTE_TEXELS, inside=True)
         trusted = seen.copy()
         for rows in blocks_of(len(texels)):
             trusted[rows] &= flat_ring[texels[rows]] >= 0
@@ -60,7 +60,7 @@ class AtlasColors:
         known = np.flatnonzero(trusted if trusted.any() else seen)
         known = known[:: max(1, len(known) // known_points)]
         if not seen.all():
-            grow(self.image, ring, atlas.chart, RING_TEXELS, inside=True)
+            dilate(self.image, ring, atlas.chart, BLEND_TEXELS, inside=True)
         self.known = surface_positions(atlas.points.part(known), surface)
         """(n, 3) float64 where seen texels lie,"""
         self.known_colors = pixels[texels[known]]
@@ -69,9 +69,9 @@ class AtlasColors:
         self._unseen = texels[unseen]
         self._unseen_points = atlas.points.part(unseen)
         self._unseen_ring = flat_ring[self._unseen]
-        unsure = np.flatnonzero((baked.views > 0) & ~seen)
-        self._unsure, self._unsure_colors = texels[unsure], baked.colors[unsure]
-        self._unsure_ring = flat_ring[self._unsure]
+        unreliable = np.flatnonzero((baked.views > 0) & ~seen)
+        self._unreliable, self._unreliable_colors = texels[unreliable], baked.colors[unreliable]
+        self._unreliable_ring = flat_ring[self._unreliable]
         self._owned = atlas.chart >= 0
 
     def unseen(self, surface: SurfaceArrays) -> Iterator[np.ndarray]:
@@ -79,48 +79,48 @@ class AtlasColors:
         for rows in blocks_of(len(self._unseen)):
             yield surface_positions(self._unseen_points.part(rows), surface)
 
-    def finish(
-        self, continuation: Continuation, surface: SurfaceArrays, gutter_px: int
-    ) -> np.ndarray:
+    def finish(self, fill: HarmonicFill, surface: SurfaceArrays, gutter_px: int) -> np.ndarray:
         """Fill what no photo saw, gutters and the rest; return the (h, w, 3) uint8 image."""
         pixels = self.image.reshape(-1, 3)
         for rows, positions in zip(blocks_of(len(self._unseen)), self.unseen(surface), strict=True):
-            far = continuation.at(positions)
+            far = fill.at(positions)
             near = pixels[self._unseen[rows]]
-            share = _away(self._unseen_ring[rows])
+            share = _fill_weight(self._unseen_ring[rows])
             pixels[self._unseen[rows]] = np.rint(near + share * (far - near)).astype(np.uint8)
-        for rows in blocks_of(len(self._unsure)):
-            around = pixels[self._unsure[rows]].astype(np.float32)
-            shown = self._unsure_colors[rows]
+        for rows in blocks_of(len(self._unreliable)):
+            around = pixels[self._unreliable[rows]].astype(np.float32)
+            shown = self._unreliable_colors[rows]
             off = np.abs(shown - around).max(axis=1, initial=0.0)
-            near_enough = (2.0 - off / UNSURE_LEVELS).clip(0.0, 1.0)[:, None]
-            share = _away(self._unsure_ring[rows]) * near_enough  # no step at the sure ones
+            near_enough = (2.0 - off / UNRELIABLE_LEVELS).clip(0.0, 1.0)[:, None]
+            share = (
+                _fill_weight(self._unreliable_ring[rows]) * near_enough
+            )  # no step at the sure ones
             mixed = np.rint(around + share * (shown - around))
-            pixels[self._unsure[rows]] = mixed.astype(np.uint8)
+            pixels[self._unreliable[rows]] = mixed.astype(np.uint8)
         ring = np.where(self._owned, np.int16(0), np.int16(-1))
         chart = np.where(self._owned, np.int32(0), np.int32(-1))
-        grow(self.image, ring, chart, gutter_px, inside=False)
+        dilate(self.image, ring, chart, gutter_px, inside=False)
         del chart
         fill_background(self.image, ring >= 0)
         return self.image
 
 
-def _away(ring: np.ndarray) -> np.ndarray:
+def _fill_weight(ring: np.ndarray) -> np.ndarray:
     """(n, 1) float32 from 0 at seen texels to 1 where the rings around them end."""
     number = ring.astype(np.float32)
-    share = np.where(number < 0, np.float32(1.0), number / np.float32(RING_TEXELS + 1.0))
+    share = np.where(number < 0, np.float32(1.0), number / np.float32(BLEND_TEXELS + 1.0))
     return share[:, None]
 
 
-def continue_colors(atlases: list[AtlasColors], surface: SurfaceArrays) -> Continuation:
+def fill_harmonically(atlases: list[AtlasColors], surface: SurfaceArrays) -> HarmonicFill:
     """Continue what photos show over the surface of all atlases."""
 
-    def wanted() -> Iterator[np.ndarray]:
+    def queries() -> Iterator[np.ndarray]:
         for atlas in atlases:
             yield from atlas.unseen(surface)
 
-    return Continuation(
+    return HarmonicFill(
         np.concatenate([a.known for a in atlases]),
         np.concatenate([a.known_colors for a in atlases]),
-        wanted,
+        queries,
     )

@@ -21,8 +21,8 @@ from ...kernels.compiled import kernel
 from .photo_samples import SurfaceArrays, SurfacePoints
 
 CELLS_PER_SIDE = 96
-RING_TEXELS = 16
-NEAREST_PULL = 1e-4
+BLEND_TEXELS = 16
+NEAREST_WEIGHT = 1e-4
 """Weight of the nearest seen cell against one neighbour: decides for pieces that touch none."""
 UNKNOWN_GREY = 128
 CELL_BITS = 10
@@ -38,7 +38,7 @@ def surface_positions(points: SurfacePoints, surface: SurfaceArrays) -> np.ndarr
     return np.einsum("nc,ncx->nx", weights, corners)
 
 
-class Continuation:
+class HarmonicFill:
     """The harmonic continuation of some points' colours over the surface.
 
     Parameters
@@ -55,26 +55,26 @@ class Continuation:
         self,
         known: np.ndarray,
         colors: np.ndarray,
-        wanted: Callable[[], Iterable[np.ndarray]],
+        queries: Callable[[], Iterable[np.ndarray]],
     ) -> None:
         self._keys = np.empty(0, np.int64)
         if len(known) == 0:
             return
         low, high = known.min(axis=0), known.max(axis=0)
-        for block in wanted():
+        for block in queries():
             low, high = np.minimum(low, block.min(axis=0)), np.maximum(high, block.max(axis=0))
         self._low = low
         self._cell = max(float((high - low).max()), 1e-12) / CELLS_PER_SIDE
         key_known = self._cells(known)
         keys = np.unique(key_known)
-        for block in wanted():
+        for block in queries():
             keys = np.union1d(keys, self._cells(block))
-        place = np.searchsorted(keys, key_known)
-        count = np.bincount(place, minlength=len(keys))
+        index = np.searchsorted(keys, key_known)
+        count = np.bincount(index, minlength=len(keys))
         has = count > 0
         values = np.empty((len(keys), 3))
         for channel in range(3):
-            total = np.bincount(place, colors[:, channel], len(keys))
+            total = np.bincount(index, colors[:, channel], len(keys))
             values[:, channel] = total / np.maximum(count, 1)
         centres = np.stack([keys >> (2 * CELL_BITS), (keys >> CELL_BITS), keys], axis=1)
         centres = centres & ((1 << CELL_BITS) - 1)  # (cells, 3)
@@ -96,10 +96,10 @@ def _key(coordinates: np.ndarray) -> np.ndarray:
     return (x << (2 * CELL_BITS)) | (y << CELL_BITS) | z
 
 
-def _find(keys: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _find(keys: np.ndarray, queries: np.ndarray) -> np.ndarray:
     """Return the place of each wanted key, or -1."""
-    place = np.searchsorted(keys, wanted).clip(0, len(keys) - 1)
-    return np.where(keys[place] == wanted, place, -1)
+    index = np.searchsorted(keys, queries).clip(0, len(keys) - 1)
+    return np.where(keys[index] == queries, index, -1)
 
 
 def _harmonic(
@@ -113,8 +113,8 @@ def _harmonic(
     number_known = np.full(len(keys), -1)
     number_known[known] = np.arange(int(known.sum()))
     nearest = cKDTree(centres[known]).query(centres[unknown])[1]
-    right = NEAREST_PULL * values[nearest]
-    degree = np.full(len(unknown), NEAREST_PULL)
+    right = NEAREST_WEIGHT * values[nearest]
+    degree = np.full(len(unknown), NEAREST_WEIGHT)
     rows, columns = [], []
     limit = (1 << CELL_BITS) - 1
     for offset in np.ndindex(3, 3, 3):
@@ -134,17 +134,17 @@ def _harmonic(
         columns.append(number[there[row[~fixed]]])
     row, column = np.concatenate(rows), np.concatenate(columns)
     size = (len(unknown), len(unknown))
-    links = coo_matrix((np.ones(len(row)), (row, column)), shape=size)
-    matrix = identity(len(unknown)).multiply(degree[:, None]) - links
+    adjacency = coo_matrix((np.ones(len(row)), (row, column)), shape=size)
+    matrix = identity(len(unknown)).multiply(degree[:, None]) - adjacency
     return splu(matrix.tocsc()).solve(right)
 
 
-def _interpolate(keys: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:
+def _interpolate(keys: np.ndarray, values: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Trilinear look-up among the cells that exist; a point's own cell always does."""
-    base = np.floor(places - 0.5).astype(np.int64)
-    share = places - 0.5 - base
-    total = np.zeros((len(places), 3))
-    weight_sum = np.full(len(places), 1e-12)
+    base = np.floor(positions - 0.5).astype(np.int64)
+    share = positions - 0.5 - base
+    total = np.zeros((len(positions), 3))
+    weight_sum = np.full(len(positions), 1e-12)
     for offset in np.ndindex(2, 2, 2):
         target = base + offset
         weight = np.prod(np.where(np.array(offset) == 1, share, 1.0 - share), axis=1)
@@ -155,7 +155,9 @@ def _interpolate(keys: np.ndarray, values: np.ndarray, places: np.ndarray) -> np
     return (total / weight_sum[:, None]).astype(np.float32)
 
 
-def grow(image: np.ndarray, ring: np.ndarray, chart: np.ndarray, rings: int, inside: bool) -> None:
+def dilate(
+    image: np.ndarray, ring: np.ndarray, chart: np.ndarray, rings: int, inside: bool
+) -> None:
     """Grow filled texels ring by ring, each the mean of its neighbours of the ring before.
 
     Parameters
@@ -171,16 +173,16 @@ def grow(image: np.ndarray, ring: np.ndarray, chart: np.ndarray, rings: int, ins
     inside : bool
         Grow within each chart only; otherwise only between charts.
     """
-    frontier = np.empty(_with_open_neighbour(ring, chart, inside, np.empty(0, np.int64)), np.int64)
-    _with_open_neighbour(ring, chart, inside, frontier)
+    frontier = np.empty(_border_texels(ring, chart, inside, np.empty(0, np.int64)), np.int64)
+    _border_texels(ring, chart, inside, frontier)
     for number in range(1, rings + 1):
         if len(frontier) == 0:
             return
-        frontier = _grow_ring(frontier, number, image, ring, chart, inside)
+        frontier = _dilate_ring(frontier, number, image, ring, chart, inside)
 
 
 @kernel(fast=False)
-def _with_open_neighbour(ring: Any, chart: Any, inside: bool, out: Any) -> int:
+def _border_texels(ring: Any, chart: Any, inside: bool, out: Any) -> int:
     """Count the filled texels beside some that are not; write as many as fit."""
     height, width = ring.shape
     count = 0
@@ -191,8 +193,8 @@ def _with_open_neighbour(ring: Any, chart: Any, inside: bool, out: Any) -> int:
             is_open = False
             for v in range(max(y - 1, 0), min(y + 2, height)):
                 for u in range(max(x - 1, 0), min(x + 2, width)):
-                    wanted = chart[v, u] == chart[y, x] if inside else chart[v, u] < 0
-                    is_open = is_open or (ring[v, u] < 0 and wanted)
+                    queries = chart[v, u] == chart[y, x] if inside else chart[v, u] < 0
+                    is_open = is_open or (ring[v, u] < 0 and queries)
             if is_open:
                 if count < len(out):
                     out[count] = y * width + x
@@ -201,7 +203,7 @@ def _with_open_neighbour(ring: Any, chart: Any, inside: bool, out: Any) -> int:
 
 
 @kernel(fast=False)
-def _grow_ring(
+def _dilate_ring(
     frontier: Any, number: int, image: Any, ring: Any, chart: Any, inside: bool
 ) -> np.ndarray:
     height, width = ring.shape
@@ -211,8 +213,8 @@ def _grow_ring(
         y, x = texel // width, texel % width
         for v in range(max(y - 1, 0), min(y + 2, height)):
             for u in range(max(x - 1, 0), min(x + 2, width)):
-                wanted = chart[v, u] == chart[y, x] if inside else chart[v, u] < 0
-                if ring[v, u] < 0 and wanted:
+                queries = chart[v, u] == chart[y, x] if inside else chart[v, u] < 0
+                if ring[v, u] < 0 and queries:
                     ring[v, u] = number
                     found[count] = v * width + u
                     count += 1

@@ -17,21 +17,21 @@ from .photo_gains import BRIGHTEST, DARKEST, ROBUST_LOG
 
 GRID = (9, 12)
 """Rows and columns of nodes over a photo: a twelfth of it is low band, less may be detail."""
-MAX_LOG_FIELD = 0.4
+MAX_LOG_CORRECTION = 0.4
 """A factor of 1.5 either way; more is another thing, not brightness."""
 SMOOTHNESS = 20.0
 """As much weight as this many points pulls neighbouring nodes together."""
 PRIOR_POINTS = 2.0
 """As much weight as this many points holds a node at one."""
-MIN_FIELD_SPREAD = 0.008
+MIN_CORRECTION_SPREAD = 0.008
 """Fields whose logarithms spread less are noise of the samples: none are applied. Exact photos of a
 checker gave 0.002, samples with noise of 10 % 0.004, dark corners and gradients of 8 % 0.025."""
 ROUNDS = 12
 MIN_VIEWS = 2
 
 
-def solve_fields(
-    colors: np.ndarray, valid: np.ndarray, places: np.ndarray, gains: np.ndarray
+def solve_low_frequency_correction(
+    colors: np.ndarray, valid: np.ndarray, image_positions: np.ndarray, gains: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Find smooth factors within each photo that bring the photos' colours of points together.
 
@@ -59,11 +59,11 @@ def solve_fields(
     """
     photos = valid.shape[1]
     shared = np.flatnonzero(valid.sum(axis=1) >= MIN_VIEWS)
-    even = np.ones((photos, 1, 1, 3))
+    ones = np.ones((photos, 1, 1, 3))
     if len(shared) == 0:
-        return even, 0.0
+        return ones, 0.0
     seen = [np.flatnonzero(valid[shared, p]) for p in range(photos)]
-    bases = [_basis(places[shared[rows], p]) for p, rows in enumerate(seen)]
+    bases = [_basis(image_positions[shared[rows], p]) for p, rows in enumerate(seen)]
     stiffness = _stiffness()
     logs = np.zeros((photos, GRID[0] * GRID[1], 3))
     variances = []
@@ -75,25 +75,27 @@ def solve_fields(
         logs[:, :, channel], variance = _solve(target, usable, seen, bases, stiffness)
         variances.append(variance)
     spread = float(np.sqrt(np.mean(variances)))
-    if spread < MIN_FIELD_SPREAD:
-        return even, spread
-    fields = np.exp(np.clip(logs, -MAX_LOG_FIELD, MAX_LOG_FIELD))
-    return fields.reshape(photos, *GRID, 3), spread
+    if spread < MIN_CORRECTION_SPREAD:
+        return ones, spread
+    corrections = np.exp(np.clip(logs, -MAX_LOG_CORRECTION, MAX_LOG_CORRECTION))
+    return corrections.reshape(photos, *GRID, 3), spread
 
 
-def _basis(places: np.ndarray) -> csr_matrix:
+def _basis(image_positions: np.ndarray) -> csr_matrix:
     """Return the (n, nodes) bilinear weights of places in [0, 1]."""
     rows, columns = GRID
-    x = places[:, 0].clip(0.0, 1.0) * (columns - 1)
-    y = places[:, 1].clip(0.0, 1.0) * (rows - 1)
+    x = image_positions[:, 0].clip(0.0, 1.0) * (columns - 1)
+    y = image_positions[:, 1].clip(0.0, 1.0) * (rows - 1)
     ix = np.minimum(x.astype(np.int64), columns - 2)
     iy = np.minimum(y.astype(np.int64), rows - 2)
     tx, ty = x - ix, y - iy
     first = iy * columns + ix
     nodes = np.stack([first, first + 1, first + columns, first + columns + 1], axis=1)
     weights = np.stack([(1 - tx) * (1 - ty), tx * (1 - ty), (1 - tx) * ty, tx * ty], axis=1)
-    begins = np.arange(len(places) + 1) * 4
-    return csr_matrix((weights.ravel(), nodes.ravel(), begins), (len(places), rows * columns))
+    begins = np.arange(len(image_positions) + 1) * 4
+    return csr_matrix(
+        (weights.ravel(), nodes.ravel(), begins), (len(image_positions), rows * columns)
+    )
 
 
 def _stiffness() -> np.ndarray:
@@ -123,12 +125,12 @@ def _solve(
     stiffness: np.ndarray,
 ) -> tuple[np.ndarray, float]:
     """Return (photos, nodes) log fields and their mean square at the points."""
-    field = np.zeros_like(values)  # (n, photos)
+    correction = np.zeros_like(values)  # (n, photos)
     weight = usable.astype(np.float32)
     nodes = np.zeros((values.shape[1], len(stiffness)))
     for _ in range(ROUNDS):
         total = np.maximum(weight.sum(axis=1), 1e-9)
-        level = (weight * (values + field)).sum(axis=1) / total
+        level = (weight * (values + correction)).sum(axis=1) / total
         for photo, (rows, basis) in enumerate(zip(seen, bases, strict=True)):
             if len(rows) == 0:
                 continue
@@ -136,8 +138,8 @@ def _solve(
             offset = level[rows] - values[rows, photo]
             normal = (basis.multiply(own[:, None]).T @ basis).toarray()
             nodes[photo] = np.linalg.solve(normal + stiffness, basis.T @ (own * offset))
-            field[rows, photo] = basis @ nodes[photo]
-        residual = np.abs(level[:, None] - values - field)
+            correction[rows, photo] = basis @ nodes[photo]
+        residual = np.abs(level[:, None] - values - correction)
         weight = usable * np.minimum(1.0, ROBUST_LOG / np.maximum(residual, 1e-6))
     points = max(int(usable.sum()), 1)
-    return nodes, float((np.where(usable, field, 0.0) ** 2).sum(dtype=np.float64)) / points
+    return nodes, float((np.where(usable, correction, 0.0) ** 2).sum(dtype=np.float64)) / points

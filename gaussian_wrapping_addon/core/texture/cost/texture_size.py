@@ -28,7 +28,7 @@ ENOUGH = 0.8
 """A texture of this share of the photos' resolution is enough: the next size costs four times."""
 
 
-def wanted_side(
+def required_side(
     graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0, seed: int = 0
 ) -> float:
     """Return the side in pixels of one texture that shows about what the photos do; no limits.
@@ -63,8 +63,8 @@ def wanted_side(
 def automatic_size(
     graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0, seed: int = 0
 ) -> int:
-    """Return the side in pixels, a power of two from 256 to 4096, that :func:`wanted_side` asks."""
-    return _power_of_two(wanted_side(graph, photos, count, detail_points, seed))
+    """Return the side in pixels, a power of two from 256 to 4096, of :func:`required_side`."""
+    return _power_of_two(required_side(graph, photos, count, detail_points, seed))
 
 
 def _power_of_two(wanted: float) -> int:
@@ -79,7 +79,7 @@ def plan_textures(wanted: float, size_px: int, max_atlases: int) -> tuple[int, i
     Parameters
     ----------
     wanted : float
-        Side of the one texture that would do (:func:`wanted_side`).
+        Side of the one texture that would do (:func:`required_side`).
     size_px : int
         What was asked for; 0 chooses a power of two from 256 to 4096.
     max_atlases : int

@@ -11,7 +11,7 @@ from ...mesh.face_graph import face_graph, uv_charts
 from ...mesh.textured_mesh import TexturedMesh
 from ..atlas.atlas_raster import raster_atlas
 
-ENOUGH = 0.25
+MIN_WEIGHT = 0.25
 """A look-up takes a level where this share of its four texels, by weight, is of the chart."""
 
 
@@ -26,7 +26,7 @@ class ChartPyramid:
     charts: list[np.ndarray]
     """(h, w) int32 of each level: the chart whose texels were averaged, -1 for none."""
 
-    def looked_up(self, uv: np.ndarray, face: np.ndarray, level: int) -> np.ndarray:
+    def sample_level(self, uv: np.ndarray, face: np.ndarray, level: int) -> np.ndarray:
         """Return (n, 3) uint8 colours.
 
         Bilinear among texels of the face's own chart; where a level has hardly any there, as in
@@ -46,7 +46,7 @@ class ChartPyramid:
         left = np.arange(len(uv))
         for number in range(min(level, len(self.colors) - 1), -1, -1):
             color, weight = self._bilinear(uv[left], charts[left], number)
-            good = weight >= ENOUGH if number else np.ones(len(left), np.bool_)
+            good = weight >= MIN_WEIGHT if number else np.ones(len(left), np.bool_)
             result[left[good]] = np.rint(color[good])
             left = left[~good]
             if len(left) == 0:
@@ -112,15 +112,15 @@ def _halved(
     owner = np.pad(owner, odd, constant_values=-1)
     weight = np.pad(weight, odd)
     image = np.pad(image, (*odd, (0, 0)))
-    places = [np.s_[dy::2, dx::2] for dy in (0, 1) for dx in (0, 1)]
-    best = np.full(owner[places[0]].shape, -1, np.int32)
+    offsets = [np.s_[dy::2, dx::2] for dy in (0, 1) for dx in (0, 1)]
+    best = np.full(owner[offsets[0]].shape, -1, np.int32)
     most = np.zeros(best.shape, np.float32)
-    for place in places:
-        support = sum(weight[p] * (owner[p] == owner[place]) for p in places)
+    for offset in offsets:
+        support = sum(weight[p] * (owner[p] == owner[offset]) for p in offsets)
         better = support > most
-        best[better], most[better] = owner[place][better], support[better]
+        best[better], most[better] = owner[offset][better], support[better]
     color = np.zeros((*best.shape, 3), np.float32)
-    for place in places:
-        color += (weight[place] * (owner[place] == best))[..., None] * image[place]
+    for offset in offsets:
+        color += (weight[offset] * (owner[offset] == best))[..., None] * image[offset]
     color /= np.maximum(most, 1.0)[..., None]
     return color, best, most

@@ -26,24 +26,24 @@ CAGE_FACTOR = 1.5
 """Detail between the samples may reach further than they do."""
 MIN_CAGE_SHARE = 1e-4
 """Of the mesh's diagonal: the least reach of a ray, far above rounding."""
-SLIP_SHARE = 1e-7
+RETRY_OFFSET_SHARE = 1e-7
 """Of the mesh's diagonal: a ray that found nothing is shot again from this far beside, as rays in
 the very plane of an edge can slip between its two faces."""
-SLIP_WAY = np.array([0.5345, 0.2673, 0.8018])
+RETRY_DIRECTION = np.array([0.5345, 0.2673, 0.8018])
 """Of unit length, along no axis that a mesh is likely to have."""
 NO_HIT, BY_RAY, BY_NEAREST = 0, 1, 2
 """How a point was found on the dense mesh."""
 
 
 @dataclass(frozen=True)
-class Places:
+class SurfaceCorrespondences:
     """Points on the dense mesh."""
 
     face: np.ndarray
     """(n,) int64, -1 where there is none."""
     weights: np.ndarray
     """(n, 3) float64 of the face's corners."""
-    how: np.ndarray
+    method: np.ndarray
     """(n,) uint8: ``NO_HIT``, ``BY_RAY`` or ``BY_NEAREST``."""
 
 
@@ -69,20 +69,22 @@ class DenseSurface:
         self._tree = igl.AABB()
         self._tree.init(self._local, self.faces)
 
-    def normals(self, places: Places) -> np.ndarray:
+    def normals(self, matches: SurfaceCorrespondences) -> np.ndarray:
         """Return (n, 3) float64 interpolated unit normals; that of the face where they cancel."""
-        corners = self.vertex_normals[self.faces[places.face]]  # (n, 3, 3)
-        normals = np.einsum("nc,ncx->nx", places.weights, corners)
+        corners = self.vertex_normals[self.faces[matches.face]]  # (n, 3, 3)
+        normals = np.einsum("nc,ncx->nx", matches.weights, corners)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        flat = self.face_normals[places.face]
+        flat = self.face_normals[matches.face]
         flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
         return np.where(length > 1e-6, normals / np.maximum(length, 1e-6), flat)
 
-    def points(self, places: Places) -> np.ndarray:
+    def points(self, matches: SurfaceCorrespondences) -> np.ndarray:
         """Return (n, 3) float64 positions."""
-        return np.einsum("nc,ncx->nx", places.weights, self.vertices[self.faces[places.face]])
+        return np.einsum("nc,ncx->nx", matches.weights, self.vertices[self.faces[matches.face]])
 
-    def first_hits(self, points: np.ndarray, directions: np.ndarray, reach: float) -> Places:
+    def first_hits(
+        self, points: np.ndarray, directions: np.ndarray, reach: float
+    ) -> SurfaceCorrespondences:
         """Shoot rays; the first hit of each within ``reach``, from whichever side.
 
         Parameters
@@ -95,42 +97,46 @@ class DenseSurface:
         face = np.full(count, -1, np.int64)
         weights = np.zeros((count, 3))
         for begin, end in _blocks(count):
-            index, _, pair = self._shoot(points[begin:end], directions[begin:end], reach)
+            index, _, pair = self._cast(points[begin:end], directions[begin:end], reach)
             face[begin:end] = index
             weights[begin:end, 1:] = np.where(index[:, None] >= 0, pair, 0.0)
         weights[:, 0] = 1.0 - weights[:, 1] - weights[:, 2]
-        return Places(face, weights, np.where(face >= 0, BY_RAY, NO_HIT).astype(np.uint8))
+        return SurfaceCorrespondences(
+            face, weights, np.where(face >= 0, BY_RAY, NO_HIT).astype(np.uint8)
+        )
 
     def is_hit(self, points: np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
         """Shoot rays; (n,) bool whether each meets the mesh within ``reach``."""
         hit = np.zeros(len(points), np.bool_)
         for begin, end in _blocks(len(points)):
-            hit[begin:end] = self._shoot(points[begin:end], directions[begin:end], reach)[0] >= 0
+            hit[begin:end] = self._cast(points[begin:end], directions[begin:end], reach)[0] >= 0
         return hit
 
-    def _shoot(
+    def _cast(
         self, points: np.ndarray, directions: np.ndarray, reach: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         local = np.ascontiguousarray((points - self._centre) / self.size)
-        ways = np.ascontiguousarray(directions, np.float64)
+        rays = np.ascontiguousarray(directions, np.float64)
         return self._tree.intersect_ray_first(
-            self._local, self.faces, local, ways, reach / self.size
+            self._local, self.faces, local, rays, reach / self.size
         )
 
-    def nearest(self, points: np.ndarray) -> tuple[Places, np.ndarray]:
+    def nearest(self, points: np.ndarray) -> tuple[SurfaceCorrespondences, np.ndarray]:
         """Return the nearest point of the mesh to each, and the (n,) float64 distances."""
         count = len(points)
         face, distance = np.zeros(count, np.int64), np.zeros(count)
         weights = np.zeros((count, 3))
         for begin, end in _blocks(count):
             local = np.ascontiguousarray((points[begin:end] - self._centre) / self.size)
-            square, index, place = self._tree.squared_distance(self._local, self.faces, local)
+            square, index, closest = self._tree.squared_distance(self._local, self.faces, local)
             face[begin:end] = index
             distance[begin:end] = np.sqrt(np.maximum(square, 0.0)) * self.size
-            weights[begin:end] = _barycentric(place, self._local[self.faces[index]])
-        return Places(face, weights, np.full(count, BY_NEAREST, np.uint8)), distance
+            weights[begin:end] = _barycentric(closest, self._local[self.faces[index]])
+        return SurfaceCorrespondences(face, weights, np.full(count, BY_NEAREST, np.uint8)), distance
 
-    def corresponding(self, points: np.ndarray, normals: np.ndarray, reach: float) -> Places:
+    def correspondences(
+        self, points: np.ndarray, normals: np.ndarray, reach: float
+    ) -> SurfaceCorrespondences:
         """Find what of this mesh a point of a lighter one stands for.
 
         Rays go both ways along the normal. One that leaves the solid, or enters it, at its first
@@ -147,18 +153,18 @@ class DenseSurface:
         """
         face = np.full(len(points), -1, np.int64)
         weights = np.zeros((len(points), 3))
-        for shift in (0.0, SLIP_SHARE * self.size):
+        for shift in (0.0, RETRY_OFFSET_SHARE * self.size):
             left = np.flatnonzero(face < 0)
-            self._by_rays(points + shift * SLIP_WAY, normals, reach, left, face, weights)
-        how = np.where(face >= 0, BY_RAY, NO_HIT).astype(np.uint8)
+            self._by_rays(points + shift * RETRY_DIRECTION, normals, reach, left, face, weights)
+        method = np.where(face >= 0, BY_RAY, NO_HIT).astype(np.uint8)
         left = np.flatnonzero(face < 0)
         if len(left):
-            places, _ = self.nearest(points[left])
-            agrees = (self.face_normals[places.face] * normals[left]).sum(axis=1) > 0.0
+            matches, _ = self.nearest(points[left])
+            agrees = (self.face_normals[matches.face] * normals[left]).sum(axis=1) > 0.0
             rows = left[agrees]
-            face[rows], weights[rows] = places.face[agrees], places.weights[agrees]
-            how[rows] = BY_NEAREST
-        return Places(face, weights, how)
+            face[rows], weights[rows] = matches.face[agrees], matches.weights[agrees]
+            method[rows] = BY_NEAREST
+        return SurfaceCorrespondences(face, weights, method)
 
     def _by_rays(
         self,
@@ -175,7 +181,7 @@ class DenseSurface:
             hits = self.first_hits(points[wanted], sign * normals[wanted], reach)
             hit = hits.face >= 0
             rows = wanted[hit]
-            part = Places(hits.face[hit], hits.weights[hit], hits.how[hit])
+            part = SurfaceCorrespondences(hits.face[hit], hits.weights[hit], hits.method[hit])
             away = np.linalg.norm(self.points(part) - points[rows], axis=1)
             agrees = (self.face_normals[part.face] * normals[rows]).sum(axis=1) > 0.0
             better = agrees & (away < best[rows])

@@ -21,7 +21,7 @@ from .occlusion import MAX_SIDE_PX, bake_occlusion
 
 
 @dataclass(frozen=True)
-class Detail:
+class DetailMaps:
     """Maps beside the colours; ``None`` where not asked for."""
 
     normal_map: np.ndarray | None = None
@@ -46,7 +46,7 @@ def bake_detail(
     *,
     threads: int,
     atlas: int = 0,
-) -> Detail:
+) -> DetailMaps:
     """Bake the maps that the settings ask for.
 
     Parameters
@@ -67,7 +67,7 @@ def bake_detail(
     with_normals = wants_normal_map(settings, is_decimated=dense is not None)
     with_occlusion = settings.ambient_occlusion == "on"
     if not (with_normals or with_occlusion):
-        return Detail()
+        return DetailMaps()
     surface = DenseSurface(mesh if dense is None else dense)
     size_px = raster.face.shape[0]
     normal_map = occlusion = None
@@ -84,10 +84,10 @@ def bake_detail(
         span = progress.span(0.5 if with_normals else 0.0, 1.0)
         open_sky = bake_occlusion(mesh, coarse, surface, gutter_px, span)
         occlusion, statistics["ambient_occlusion"] = open_sky.image, open_sky.statistics
-    return Detail(normal_map, occlusion, statistics)
+    return DetailMaps(normal_map, occlusion, statistics)
 
 
-def merged_statistics(details: Sequence[Detail]) -> dict[str, Any]:
+def merged_statistics(details: Sequence[DetailMaps]) -> dict[str, Any]:
     """Return the statistics of the atlases of one mesh as one: shares are their means."""
     merged: dict[str, Any] = {}
     for name, first in details[0].statistics.items():

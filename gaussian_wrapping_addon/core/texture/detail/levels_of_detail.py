@@ -26,7 +26,7 @@ from ...report_warning import ReportWarning
 from ...settings import TextureSettings
 from ..atlas.atlas_raster import AtlasRaster
 from ..atlas.texel_points import texel_points
-from ..bake.fill import fill_background, grow
+from ..bake.fill import dilate, fill_background
 from ..cost.texture_size import gutter_for
 from ..unwrap.unwrap import unwrap
 from .chart_pyramid import ChartPyramid, chart_pyramid
@@ -42,7 +42,7 @@ FLOOR_FACES = 100
 MIN_SIDE_PX = 128
 
 
-class Colors(NamedTuple):
+class ColorSource(NamedTuple):
     """Where a level looks up its colours."""
 
     textured: TexturedMesh
@@ -92,23 +92,23 @@ def levels_of_detail(
         chart_pyramid(textured, settings.lods, threads, number)
         for number in range(len(textured.atlases))
     ]
-    colors = Colors(textured, DenseSurface(textured.mesh), pyramids)
+    colors = ColorSource(textured, DenseSurface(textured.mesh), pyramids)
     current, size_px = textured.mesh, textured.albedo.shape[0]
     for number in range(1, settings.lods + 1):
         span = progress.span((number - 1) / settings.lods, number / settings.lods)
         target = len(current.faces) // FACES_DIVISOR
         if target < FLOOR_FACES:
-            _ended(textured, settings, number, f"it would have {target} faces")
+            _warn_fewer_levels(textured, settings, number, f"it would have {target} faces")
             break
         try:
             fewer = decimate(
                 current.vertices, current.faces, target, span.span(0.0, 0.2), region=region
             )
         except MeshingError as error:
-            _ended(textured, settings, number, error.message.rstrip("."))
+            _warn_fewer_levels(textured, settings, number, error.message.rstrip("."))
             break
         if 2 * len(fewer.faces) > len(current.faces):
-            _ended(textured, settings, number, "fewer faces would tear the mesh")
+            _warn_fewer_levels(textured, settings, number, "fewer faces would tear the mesh")
             break
         current = SurfaceMesh(fewer.vertices, fewer.faces.astype(np.int32))
         size_px = max(size_px // 2, min(size_px, MIN_SIDE_PX))
@@ -119,7 +119,9 @@ def levels_of_detail(
     return levels
 
 
-def _ended(textured: TexturedMesh, settings: TextureSettings, number: int, reason: str) -> None:
+def _warn_fewer_levels(
+    textured: TexturedMesh, settings: TextureSettings, number: int, reason: str
+) -> None:
     """Say, in the log and for the report, why there is no further level."""
     text = f"{number - 1} of {settings.lods} levels of detail were made, no further one: {reason}."
     _logger.warning("%s", text)
@@ -130,7 +132,7 @@ def _ended(textured: TexturedMesh, settings: TextureSettings, number: int, reaso
 
 def _level(
     mesh: SurfaceMesh,
-    colors: Colors,
+    colors: ColorSource,
     source: SurfaceMesh,
     size_px: int,
     settings: TextureSettings,
@@ -149,7 +151,7 @@ def _level(
         span = progress.span(low, high)
         raster = unwrapped.raster(size_px, threads, number)
         overlaps += raster.overlaps
-        albedo = transferred(mesh, raster, colors, gutter_px, span.span(0.0, 0.4))
+        albedo = transfer_colors(mesh, raster, colors, gutter_px, span.span(0.0, 0.4))
         detail = bake_detail(
             mesh, unwrapped, raster, source, settings, span.span(0.4, 1.0),
             threads=threads, atlas=number,
@@ -167,8 +169,8 @@ def _level(
     return TexturedMesh.of(mesh, unwrapped.corner_uvs, unwrapped.face_atlas, maps, statistics)
 
 
-def transferred(
-    mesh: SurfaceMesh, raster: AtlasRaster, colors: Colors, gutter_px: int, progress: Progress
+def transfer_colors(
+    mesh: SurfaceMesh, raster: AtlasRaster, colors: ColorSource, gutter_px: int, progress: Progress
 ) -> np.ndarray:
     """Return the (h, w, 3) uint8 texture of a mesh, looked up on another textured one.
 
@@ -191,21 +193,21 @@ def transferred(
         progress.update(start / len(texels), "level of detail: colours")
         part = texels[start : start + BLOCK]
         at = texel_points(mesh, raster, part, normals)
-        places = colors.surface.corresponding(at.points, at.normals, cage)
-        lost = np.flatnonzero(places.how == NO_HIT)
+        matches = colors.surface.correspondences(at.points, at.normals, cage)
+        lost = np.flatnonzero(matches.method == NO_HIT)
         if len(lost):
             near, _ = colors.surface.nearest(at.points[lost])
-            places.face[lost], places.weights[lost] = near.face, near.weights
-        uvs = np.asarray(colors.textured.corner_uvs, np.float64)[places.face]  # (n, 3, 2)
-        uv = np.einsum("nc,ncx->nx", places.weights, uvs)
-        owner = atlas_of_faces[places.face]
+            matches.face[lost], matches.weights[lost] = near.face, near.weights
+        uvs = np.asarray(colors.textured.corner_uvs, np.float64)[matches.face]  # (n, 3, 2)
+        uv = np.einsum("nc,ncx->nx", matches.weights, uvs)
+        owner = atlas_of_faces[matches.face]
         for number, pyramid in enumerate(colors.pyramids):
             mine = owner == number
-            found = pyramid.looked_up(uv[mine], places.face[mine], level)
+            found = pyramid.sample_level(uv[mine], matches.face[mine], level)
             image.reshape(-1, 3)[part[mine]] = found
     owned = raster.face >= 0
     ring, chart = np.where(owned, 0, -1).astype(np.int16), np.where(owned, 0, -1).astype(np.int32)
-    grow(image, ring, chart, gutter_px, inside=False)
+    dilate(image, ring, chart, gutter_px, inside=False)
     fill_background(image, ring >= 0)
     progress.update(1.0, "level of detail: colours")
     return image

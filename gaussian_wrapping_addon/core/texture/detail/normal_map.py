@@ -13,8 +13,16 @@ from ...mesh.tangent_frame import TangentFrames, tangent_frames
 from ...progress import Progress
 from ..atlas.atlas_raster import AtlasRaster
 from ..atlas.texel_points import texel_points
-from ..bake.fill import grow
-from .dense_surface import BLOCK, BY_NEAREST, BY_RAY, NO_HIT, DenseSurface, Places, cage_distance
+from ..bake.fill import dilate
+from .dense_surface import (
+    BLOCK,
+    BY_NEAREST,
+    BY_RAY,
+    NO_HIT,
+    DenseSurface,
+    SurfaceCorrespondences,
+    cage_distance,
+)
 
 FLAT = (128, 128, 255)
 """The colour of the light mesh's own normal: what is between charts."""
@@ -73,16 +81,20 @@ def bake_normal_map(
         progress.update(begin / len(texels), "normal map: rays between the meshes")
         part = texels[begin : begin + BLOCK]
         at = texel_points(light, raster, part, frames.normals)
-        places = dense.corresponding(at.points, at.normals, cage)
-        counts += np.bincount(places.how, minlength=3)
-        found = places.how != NO_HIT
+        matches = dense.correspondences(at.points, at.normals, cage)
+        counts += np.bincount(matches.method, minlength=3)
+        found = matches.method != NO_HIT
         wanted = at.normals.copy()
-        rows = Places(places.face[found], places.weights[found], places.how[found])
+        rows = SurfaceCorrespondences(
+            matches.face[found], matches.weights[found], matches.method[found]
+        )
         wanted[found] = dense.normals(rows)
-        pixels[part] = encode(in_frame(wanted, at.raw_normals, at.weights, at.face, frames))
+        pixels[part] = encode_normals(
+            to_tangent_space(wanted, at.raw_normals, at.weights, at.face, frames)
+        )
     ring = np.where(raster.face >= 0, 0, -1).astype(np.int16)
     chart = np.where(raster.face >= 0, 0, -1).astype(np.int32)
-    grow(image, ring, chart, gutter_px, inside=False)
+    dilate(image, ring, chart, gutter_px, inside=False)
     progress.update(1.0, "normal map: finished")
     total = max(len(texels), 1)
     statistics = {
@@ -96,7 +108,7 @@ def bake_normal_map(
     return NormalMap(image, statistics)
 
 
-def in_frame(
+def to_tangent_space(
     wanted: np.ndarray,
     normal: np.ndarray,
     weights: np.ndarray,
@@ -122,13 +134,15 @@ def in_frame(
     bitangent = frames.signs[face][:, None] * np.cross(normal, tangent)
     axes = (np.cross(bitangent, normal), np.cross(normal, tangent), np.cross(tangent, bitangent))
     volume = (tangent * axes[0]).sum(axis=1)
-    told = np.stack([(wanted * axis).sum(axis=1) for axis in axes], axis=1)  # times the volume
-    told *= np.sign(volume)[:, None]
-    told[:, 2] = np.maximum(told[:, 2], 0.0)
-    length = np.linalg.norm(told, axis=1, keepdims=True)
-    return np.where(length > 0.0, told / np.where(length > 0.0, length, 1.0), (0.0, 0.0, 1.0))
+    components = np.stack(
+        [(wanted * axis).sum(axis=1) for axis in axes], axis=1
+    )  # times the volume
+    components *= np.sign(volume)[:, None]
+    components[:, 2] = np.maximum(components[:, 2], 0.0)
+    length = np.linalg.norm(components, axis=1, keepdims=True)
+    return np.where(length > 0.0, components / np.where(length > 0.0, length, 1.0), (0.0, 0.0, 1.0))
 
 
-def encode(vectors: np.ndarray) -> np.ndarray:
+def encode_normals(vectors: np.ndarray) -> np.ndarray:
     """Turn (n, 3) unit vectors into (n, 3) uint8, -1 to 1 over 0 to 255."""
     return np.rint((0.5 * vectors + 0.5) * 255.0).clip(0, 255).astype(np.uint8)

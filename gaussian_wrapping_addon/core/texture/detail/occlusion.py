@@ -13,8 +13,8 @@ from ...mesh.tangent_frame import shading_normals
 from ...progress import Progress
 from ..atlas.atlas_raster import AtlasRaster
 from ..atlas.texel_points import texel_points
-from ..bake.fill import grow
-from .dense_surface import BLOCK, NO_HIT, DenseSurface, Places, cage_distance
+from ..bake.fill import dilate
+from .dense_surface import BLOCK, NO_HIT, DenseSurface, SurfaceCorrespondences, cage_distance
 
 MAX_SIDE_PX = 1024
 """Occlusion varies slowly, and each texel costs :data:`RAYS` rays."""
@@ -69,23 +69,25 @@ def bake_occlusion(
         progress.update(begin / len(texels), "ambient occlusion: looking around")
         part = texels[begin : begin + block]
         at = texel_points(light, raster, part, normals)
-        places = dense.corresponding(at.points, at.normals, cage)
-        found = places.how != NO_HIT
-        rows = Places(places.face[found], places.weights[found], places.how[found])
-        seen = openness(dense, rows, reach, part[found])
+        matches = dense.correspondences(at.points, at.normals, cage)
+        found = matches.method != NO_HIT
+        rows = SurfaceCorrespondences(
+            matches.face[found], matches.weights[found], matches.method[found]
+        )
+        seen = sky_visibility(dense, rows, reach, part[found])
         values.ravel()[part[found]] = np.rint(255.0 * seen).astype(np.uint8)
     image = np.repeat(values[..., None], 3, axis=2)
     owned = raster.face >= 0
     ring, chart = np.where(owned, 0, -1).astype(np.int16), np.where(owned, 0, -1).astype(np.int32)
-    grow(image, ring, chart, gutter_px, inside=False)
+    dilate(image, ring, chart, gutter_px, inside=False)
     progress.update(1.0, "ambient occlusion: finished")
     mean = float(values.ravel()[texels].mean() / 255.0) if len(texels) else 1.0
     statistics = {"size_px": size, "rays": RAYS, "reach_scene": reach, "open_share": mean}
     return OcclusionMap(np.ascontiguousarray(image[..., 0]), statistics)
 
 
-def openness(
-    surface: DenseSurface, places: Places, reach: float, numbers: np.ndarray
+def sky_visibility(
+    surface: DenseSurface, matches: SurfaceCorrespondences, reach: float, numbers: np.ndarray
 ) -> np.ndarray:
     """Return which share of the light of an even sky reaches points of a mesh.
 
@@ -103,7 +105,7 @@ def openness(
     (n,) float64
         1 where nothing is in the way, weighted by the cosine to the face's normal.
     """
-    normals = surface.face_normals[places.face]
+    normals = surface.face_normals[matches.face]
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     sign = np.where(normals[:, 2] < 0.0, -1.0, 1.0)
     # Two axes beside each normal, without a special case (Duff and others, 2017).
@@ -119,12 +121,12 @@ def openness(
     # Even on the disc below is cosine-weighted on the half sphere above.
     radius, angle = np.sqrt(share[..., 0]), 2.0 * np.pi * share[..., 1]
     height = np.sqrt(1.0 - share[..., 0])
-    ways = (
+    directions = (
         (radius * np.cos(angle))[..., None] * one[:, None]
         + (radius * np.sin(angle))[..., None] * other[:, None]
         + height[..., None] * normals[:, None]
     )  # (n, rays, 3)
-    origins = surface.points(places) + LIFT_SHARE * surface.size * normals
+    origins = surface.points(matches) + LIFT_SHARE * surface.size * normals
     origins = np.repeat(origins, RAYS, axis=0)
-    hit = surface.is_hit(origins, ways.reshape(-1, 3), reach)
+    hit = surface.is_hit(origins, directions.reshape(-1, 3), reach)
     return 1.0 - hit.reshape(-1, RAYS).mean(axis=1)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import MeshingError, cannot_be_written
+from ...errors import MeshingError, unwritable_error
 from ...limits import MAX_ATLASES
 
 SINGLE_MAX = float(np.finfo(np.float32).max)
@@ -32,7 +32,7 @@ def atlas_file(name: str, atlas: int) -> str:
     return f"{name}-{atlas + 1}.png" if atlas else f"{name}.png"
 
 
-def check_face_atlas(face_atlas: np.ndarray, faces: int) -> np.ndarray:
+def validate_face_atlas(face_atlas: np.ndarray, faces: int) -> np.ndarray:
     """Return (f,) uint8 atlases of faces as a file holds them.
 
     Raises
@@ -47,7 +47,7 @@ def check_face_atlas(face_atlas: np.ndarray, faces: int) -> np.ndarray:
     return face_atlas.astype(np.uint8)
 
 
-def check_mesh(
+def validate_for_export(
     vertices: np.ndarray,
     faces: np.ndarray,
     corner_uvs: np.ndarray | None = None,
@@ -92,9 +92,9 @@ def check_mesh(
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
+def write_errors(path: Path) -> Iterator[None]:
     """Turn what the system says of a path into our error."""
     try:
         yield
     except OSError as error:
-        raise cannot_be_written(path, error) from error
+        raise unwritable_error(path, error) from error

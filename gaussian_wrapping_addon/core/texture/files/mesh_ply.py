@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...files import write_bytes
-from .file_checks import check_mesh, writing
+from .file_checks import validate_for_export, write_errors
 
 
 def write_mesh_ply(
@@ -34,7 +34,7 @@ def write_mesh_ply(
         The file cannot be written.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
-    check_mesh(vertices, faces)
+    validate_for_export(vertices, faces)
     fields = [(axis, "<f8") for axis in "xyz"]
     names = ["property double x", "property double y", "property double z"]
     if colors is not None:
@@ -60,7 +60,7 @@ def write_mesh_ply(
         "",
     ]
     data = "\n".join(header).encode() + rows.tobytes() + triangles.tobytes()
-    with writing(path):
+    with write_errors(path):
         write_bytes(path, data)
 
 

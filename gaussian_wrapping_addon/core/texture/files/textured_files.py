@@ -27,7 +27,7 @@ from ...export_formats import RESULT_FORMATS
 from ...files import write_bytes, write_json
 from ...mesh.tangent_frame import shading_normals
 from ...mesh.textured_mesh import TexturedMesh
-from .file_checks import atlas_file, check_mesh, writing
+from .file_checks import atlas_file, validate_for_export, write_errors
 from .glb import glb_bytes
 from .mesh_ply import vertex_colors, write_mesh_ply
 from .shading import OBJ_SHININESS, SPECULAR_LEVEL
@@ -57,7 +57,7 @@ def write_obj(
     face_atlas : (f,) int, optional
         Where there are several atlases; each has a material of its own.
     """
-    check_mesh(vertices, faces, corner_uvs)
+    validate_for_export(vertices, faces, corner_uvs)
     names = [image_name] if isinstance(image_name, str) else list(image_name)
     bumps = [normal_name] if isinstance(normal_name, str) else list(normal_name or ())
     for name in names:
@@ -84,7 +84,7 @@ def write_obj(
         material += f"Ni 1.5\nd 1\nillum 2\nmap_Kd {name}\n"
         if bumps:
             material += f"map_Bump -bm 1 {bumps[number]}\n"
-    with writing(path):
+    with write_errors(path):
         write_bytes(path.with_suffix(".mtl"), material.encode())
         write_bytes(path, text.getvalue().encode())
 
@@ -103,8 +103,8 @@ def write_glb(
     face_atlas: np.ndarray | None = None,
 ) -> None:
     """Write a binary glTF with the images inside; see :func:`.glb.glb_bytes`."""
-    check_mesh(vertices, faces, corner_uvs)
-    with writing(path):
+    validate_for_export(vertices, faces, corner_uvs)
+    with write_errors(path):
         data = glb_bytes(
             vertices, faces, corner_uvs, png, offset,
             normal_png=normal_png, occlusion_png=occlusion_png, shading=shading,
@@ -154,7 +154,7 @@ def write_textured(
             f"There is no export {unknown[0]!r} here.", f"Use {', '.join(RESULT_FORMATS)}."
         )
     mesh = textured.mesh
-    check_mesh(mesh.vertices, mesh.faces, textured.corner_uvs)
+    validate_for_export(mesh.vertices, mesh.faces, textured.corner_uvs)
     world = world_from_scene.points(mesh.vertices)
     offset = file_offset(world) if offset is None else offset
     atlases, face_atlas = textured.atlases, textured.face_atlas
@@ -165,7 +165,7 @@ def write_textured(
     }
     pngs = {name: [png_bytes(image) for image in several] for name, several in images.items()}
     arrays = {} if face_atlas is None else {"face_atlas": np.asarray(face_atlas, np.uint8)}
-    with writing(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         stream = io.BytesIO()
         np.savez(

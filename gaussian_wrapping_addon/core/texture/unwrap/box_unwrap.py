@@ -8,7 +8,7 @@ import numpy as np
 from ...mesh.face_graph import FaceGraph, components
 from ...mesh.surface_mesh import SurfaceMesh
 from ...progress import Progress
-from .chart_boxes import cut_wide_charts
+from .chart_boxes import split_wide_charts
 from .chart_overlaps import split_overlaps
 
 SMOOTHING_ROUNDS = 8
@@ -51,7 +51,7 @@ def box_unwrap(
     charts = split_overlaps(flat - corners.mean(axis=(0, 1))[plane][:, None, :], charts, graph)
     progress.update(0.6, "box projection: packing")
     if atlases > 1:
-        charts = cut_wide_charts(flat, charts, atlases)
+        charts = split_wide_charts(flat, charts, atlases)
     return _pack(flat, charts, size_px, gutter_px, atlases)
 
 
@@ -89,18 +89,18 @@ def _pack(
     lying = np.where(turned[:, None], extent[:, ::-1], extent)
     gutter = float(gutter_px)
     while True:
-        scale, places = _largest_scale(lying, size_px, gutter, atlases)
-        if places is not None or gutter < 0.01:
+        scale, positions = _largest_scale(lying, size_px, gutter, atlases)
+        if positions is not None or gutter < 0.01:
             break
         gutter *= 0.7
-    assert places is not None
+    assert positions is not None
     local = (flat - low[charts][:, None, :]) * scale  # (f, 3, 2)
     width = extent[charts, 0][:, None] * scale
     # A quarter turn keeps the orientation: (x, y) -> (y, width - x).
     quarter = np.stack([local[..., 1], width - local[..., 0]], axis=-1)
     local = np.where(turned[charts][:, None, None], quarter, local)
-    corner_uvs = (local + places[charts][:, None, :2]) / size_px
-    face_atlas = places[charts, 2].astype(np.uint8)
+    corner_uvs = (local + positions[charts][:, None, :2]) / size_px
+    face_atlas = positions[charts, 2].astype(np.uint8)
     return np.clip(corner_uvs, 0.0, 1.0).astype(np.float32), face_atlas, gutter
 
 
@@ -109,9 +109,9 @@ def _largest_scale(
 ) -> tuple[float, np.ndarray | None]:
     high = size_px / max(float(extent.max()), 1e-300)
     low = 0.0
-    places = _shelves(extent * high, size_px, gutter, atlases)
-    if places is not None:
-        return high, places
+    positions = _shelves(extent * high, size_px, gutter, atlases)
+    if positions is not None:
+        return high, positions
     best: np.ndarray | None = None
     # Charts of under a hundredth of the largest scale would hold no texels.
     low = 0.01 * high
@@ -123,11 +123,11 @@ def _largest_scale(
         best = np.zeros((len(extent), 3))
     for _ in range(SCALE_STEPS):
         middle = 0.5 * (low + high)
-        places = _shelves(extent * middle, size_px, gutter, atlases)
-        if places is None:
+        positions = _shelves(extent * middle, size_px, gutter, atlases)
+        if positions is None:
             high = middle
         else:
-            low, best = middle, places
+            low, best = middle, positions
     return low, best
 
 
@@ -138,7 +138,7 @@ def _shelves(extent_px: np.ndarray, size_px: int, gutter: float, atlases: int) -
     if float(np.prod(extent_px + gutter, axis=1).sum()) > atlases * float(size_px) ** 2:
         return None
     order = np.argsort(-extent_px[:, 1], kind="stable")
-    places = np.empty((len(extent_px), 3))
+    positions = np.empty((len(extent_px), 3))
     atlas = 0
     x, y, shelf = 0.5 * gutter, 0.5 * gutter, 0.0
     for index in order.tolist():
@@ -151,7 +151,7 @@ def _shelves(extent_px: np.ndarray, size_px: int, gutter: float, atlases: int) -
             x, y, shelf = 0.5 * gutter, 0.5 * gutter, 0.0
         if x + width + 0.5 * gutter > size_px or y + height + 0.5 * gutter > size_px:
             return None
-        places[index] = x, y, atlas
+        positions[index] = x, y, atlas
         x += width + gutter
         shelf = max(shelf, height)
-    return places
+    return positions

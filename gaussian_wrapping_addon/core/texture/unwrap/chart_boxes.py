@@ -51,7 +51,7 @@ def chart_extents(points: np.ndarray, corners: np.ndarray, charts: np.ndarray) -
     return high - low
 
 
-def scale_that_fits(extents: np.ndarray, side_px: int, padding_px: int, squares: int = 1) -> float:
+def packing_scale(extents: np.ndarray, side_px: int, padding_px: int, squares: int = 1) -> float:
     """Return the texels for a unit at which boxes with their padding fill most of the squares."""
     low, high = 0.0, side_px / max(float(extents.max()), 1e-30)
     largest = high
@@ -62,7 +62,7 @@ def scale_that_fits(extents: np.ndarray, side_px: int, padding_px: int, squares:
     return max(low, MIN_SCALE_SHARE * largest)
 
 
-def cut_wide_charts(corner_uvs: np.ndarray, charts: np.ndarray, squares: int) -> np.ndarray:
+def split_wide_charts(corner_uvs: np.ndarray, charts: np.ndarray, squares: int) -> np.ndarray:
     """Halve charts that are too wide to be spread over several squares.
 
     One chart cannot be larger than a square: where it holds most of the surface, several squares

@@ -23,7 +23,7 @@ def signed_areas(flat: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
 
 
-def conflicts(corner_uvs: np.ndarray, charts: np.ndarray) -> np.ndarray:
+def find_overlaps(corner_uvs: np.ndarray, charts: np.ndarray) -> np.ndarray:
     """Find the pairs of faces of the same chart that overlap.
 
     Returns
@@ -134,7 +134,7 @@ def split_overlaps(corner_uvs: np.ndarray, charts: np.ndarray, graph: FaceGraph)
     (f,) int32
         New labels from 0.
     """
-    pairs = conflicts(corner_uvs, charts)
+    pairs = find_overlaps(corner_uvs, charts)
     areas = signed_areas(np.asarray(corner_uvs, np.float64))
     count = int(charts.max()) + 1
     up = np.bincount(charts, areas > 0, count)
@@ -164,7 +164,7 @@ def split_overlaps(corner_uvs: np.ndarray, charts: np.ndarray, graph: FaceGraph)
 
 
 @inline
-def _apart(a: Any, b: Any, ccw: float) -> float:
+def _separation(a: Any, b: Any, ccw: float) -> float:
     """Return the widest gap between two triangles over the directions of the first one's edges."""
     widest = -np.inf
     for k in range(3):
@@ -182,7 +182,7 @@ def _apart(a: Any, b: Any, ccw: float) -> float:
 
 
 @inline
-def _turn(a: Any) -> float:
+def _orientation(a: Any) -> float:
     double = (a[1, 0] - a[0, 0]) * (a[2, 1] - a[0, 1]) - (a[2, 0] - a[0, 0]) * (a[1, 1] - a[0, 1])
     return 1.0 if double > 0.0 else (-1.0 if double < 0.0 else 0.0)
 
@@ -209,8 +209,8 @@ def _overlapping(
     left = low[:, 0]
     for i in range(len(uvs)):
         one = uvs[i]
-        turn = _turn(one)
-        if turn == 0.0:
+        orientation = _orientation(one)
+        if orientation == 0.0:
             continue
         for c in range(classes_begin[i], classes_end[i]):
             same_height = class_height[c] == height[i]
@@ -227,10 +227,10 @@ def _overlapping(
                     apart = high[j, 0] < low[i, 0] + depth or high[j, 1] < low[i, 1] + depth
                     if not apart and low[j, 1] <= high[i, 1] - depth:
                         other = uvs[j]
-                        turn_other = _turn(other)
-                        if turn_other != 0.0 and (
-                            _apart(one, other, turn) <= -depth
-                            and _apart(other, one, turn_other) <= -depth
+                        orientation_other = _orientation(other)
+                        if orientation_other != 0.0 and (
+                            _separation(one, other, orientation) <= -depth
+                            and _separation(other, one, orientation_other) <= -depth
                         ):
                             if count < len(found):
                                 found[count, 0] = i
@@ -243,7 +243,7 @@ def _overlapping(
 
 @kernel(fast=False)
 def _grow_pieces(
-    charts: Any, faces: Any, neighbours: Any, turn: Any, starts: Any, others: Any, label: int
+    charts: Any, faces: Any, neighbours: Any, orientation: Any, starts: Any, others: Any, label: int
 ) -> np.ndarray:
     """Give the faces listed (by chart, from the middle outwards) labels of pieces."""
     piece = charts.copy()
@@ -265,7 +265,7 @@ def _grow_pieces(
                 other = neighbours[face, k]
                 if other < 0 or not waiting[other] or charts[other] != charts[seed]:
                     continue
-                if turn[other] * turn[seed] < 0.0:
+                if orientation[other] * orientation[seed] < 0.0:
                     continue
                 free = True
                 for at in range(starts[other], starts[other + 1]):

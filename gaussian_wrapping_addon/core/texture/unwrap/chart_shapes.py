@@ -8,7 +8,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
 from ...mesh.topology import area_vectors, half_edges
-from .chart_overlaps import conflicts, signed_areas
+from .chart_overlaps import find_overlaps, signed_areas
 
 SMOOTHING_STEPS = 2
 """More bring more charts again (the copy shrinks into folds), one leaves noise of 0.3 edges."""
@@ -22,11 +22,11 @@ MAX_ROUNDS_BACK = 30
 """A point put back may spoil its neighbours, so all are looked at again."""
 MIN_HEIGHT_SHARE = 0.02
 """Needles are given this height by their longest edge, so that their weights stay bounded."""
-HOLD = 1e-6
+ANCHOR_WEIGHT = 1e-6
 """Weight that keeps a chart in its place, by the mean weight of a vertex."""
 
 
-def smoothed_copy(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def smooth_vertices(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Move vertices toward the mean of their neighbours, by half an edge at most.
 
     xatlas splits charts wherever faces are noisy or badly shaped; on the copy both are milder.
@@ -44,18 +44,18 @@ def smoothed_copy(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     degree = np.maximum(np.bincount(rows, minlength=count), 1)
     length = np.linalg.norm(start[rows] - start[columns], axis=1)
     limit = MAX_MOVE_SHARE * np.bincount(rows, length, count) / degree
-    links = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    lonely = np.bincount(rows, minlength=count) == 0
+    adjacency = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    isolated = np.bincount(rows, minlength=count) == 0
     points = start.copy()
     for _ in range(SMOOTHING_STEPS):
-        move = (links @ points) / degree[:, None] - start
-        move[lonely] = 0.0
+        move = (adjacency @ points) / degree[:, None] - start
+        move[isolated] = 0.0
         far = np.linalg.norm(move, axis=1)
         points = start + move * np.minimum(1.0, limit / np.maximum(far, 1e-300))[:, None]
-    return np.asarray(_without_crushed_faces(points, start, faces) + centre)
+    return np.asarray(_restore_crushed_faces(points, start, faces) + centre)
 
 
-def _without_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _restore_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Put points back to their start where a face lost most of its area: wires keep their tubes."""
     before = np.linalg.norm(area_vectors(start, faces), axis=1)
     points = points.copy()
@@ -93,13 +93,13 @@ def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray
     return corners.reshape(-1, 3), order[fresh]
 
 
-def even_density(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+def equalise_density(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.ndarray:
     """Scale each chart so that its area is that of its faces, and put its corner at the origin.
 
     Parameters
     ----------
     shapes : (f, 3, 2) float64
-        True shape of each face, see :func:`flat_faces`.
+        True shape of each face, see :func:`flatten_faces`.
     """
     count = int(charts.max()) + 1
     uvs = np.asarray(corner_uvs, np.float64)
@@ -117,7 +117,7 @@ def even_density(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray)
     return np.asarray((uvs - low[charts][:, None, :]) * scale[charts][:, None, None])
 
 
-def flat_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def flatten_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Lay each face into the plane: (f, 3, 2) float64, counter-clockwise, first corner at 0."""
     corners = np.asarray(vertices, np.float64)[faces]
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -151,7 +151,7 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
     start = np.asarray(corner_uvs, np.float64)
     corners, first = chart_points(corner_uvs.astype(np.float32), charts)
     points = start.reshape(-1, 2)[first]
-    shapes = _without_needles(shapes)
+    shapes = _widen_needles(shapes)
     weights = _cotangents(shapes)  # (f, 3) of the edge from corner k to k + 1
     size = len(points)
     begin, end = half_edges(corners)
@@ -159,8 +159,8 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
     off = coo_matrix((-weight, (begin, end)), shape=(size, size)).tocsr()
     off = off + off.T
     total = -np.asarray(off.sum(axis=1)).ravel()
-    hold = HOLD * float(np.mean(np.abs(total)))
-    solve = splu((off + diags(total + hold)).tocsc(), permc_spec="MMD_AT_PLUS_A").solve
+    anchor = ANCHOR_WEIGHT * float(np.mean(np.abs(total)))
+    solve = splu((off + diags(total + anchor)).tocsc(), permc_spec="MMD_AT_PLUS_A").solve
     edges = shapes - np.roll(shapes, -1, axis=1)  # (f, 3, 2)
     for _ in range(RELAXATIONS):
         now = points[corners]
@@ -177,18 +177,18 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
             ],
             axis=2,
         )
-        pull = (weights[..., None] * turned).reshape(-1, 2)
-        target = hold * points
+        edge_targets = (weights[..., None] * turned).reshape(-1, 2)
+        right_side = anchor * points
         for axis in range(2):
-            target[:, axis] += np.bincount(begin, pull[:, axis], size)
-            target[:, axis] -= np.bincount(end, pull[:, axis], size)
-        points = np.asarray(solve(target))
+            right_side[:, axis] += np.bincount(begin, edge_targets[:, axis], size)
+            right_side[:, axis] -= np.bincount(end, edge_targets[:, axis], size)
+        points = np.asarray(solve(right_side))
     if not np.isfinite(points).all():
         return start
-    return _without_new_folds(points, start.reshape(-1, 2)[first], corners, charts)
+    return _restore_folded_faces(points, start.reshape(-1, 2)[first], corners, charts)
 
 
-def _without_new_folds(
+def _restore_folded_faces(
     points: np.ndarray, start: np.ndarray, corners: np.ndarray, charts: np.ndarray
 ) -> np.ndarray:
     """Put points back to their start where faces turned over or came to lie upon each other.
@@ -200,11 +200,11 @@ def _without_new_folds(
     count = int(charts.max()) + 1
     before = start[corners]
     was_up = signed_areas(before) > 0.0
-    folded = np.bincount(charts[conflicts(before, charts)[:, 0]], minlength=count)
+    folded = np.bincount(charts[find_overlaps(before, charts)[:, 0]], minlength=count)
     points = points.copy()
     for _ in range(MAX_ROUNDS_BACK):
         now = points[corners]
-        pairs = conflicts(now, charts)
+        pairs = find_overlaps(now, charts)
         pairs = pairs[folded[charts[pairs[:, 0]]] == 0]  # those that folded before are split later
         bad = was_up & (signed_areas(now) <= 0.0)
         bad[pairs] = True
@@ -213,11 +213,11 @@ def _without_new_folds(
         if len(back) == 0:
             return now
         points[back] = start[back]
-    spoilt = np.bincount(charts, bad, count) > 0
-    return np.where(spoilt[charts][:, None, None], before, points[corners])
+    still_folded = np.bincount(charts, bad, count) > 0
+    return np.where(still_folded[charts][:, None, None], before, points[corners])
 
 
-def _without_needles(shapes: np.ndarray) -> np.ndarray:
+def _widen_needles(shapes: np.ndarray) -> np.ndarray:
     longest = np.linalg.norm(shapes - np.roll(shapes, -1, axis=1), axis=2).max(axis=1)
     longest = np.maximum(longest, 1e-300)
     double = 2.0 * np.abs(signed_areas(shapes))

@@ -14,9 +14,9 @@ from ...errors import DatasetError, ResourceError, WorkerError
 from ...mesh.face_graph import face_graph, uv_charts
 from ...processes.helper_process import run_helper
 from ...progress import Progress
-from .chart_boxes import chart_extents, cut_wide_charts, packing_square, scale_that_fits
+from .chart_boxes import chart_extents, packing_scale, packing_square, split_wide_charts
 from .chart_overlaps import signed_areas, split_overlaps
-from .chart_shapes import chart_points, even_density, flat_faces, relax, smoothed_copy
+from .chart_shapes import chart_points, equalise_density, flatten_faces, relax, smooth_vertices
 from .chunks import split_into_chunks
 from .stretch import Stretch, texture_stretch
 
@@ -30,7 +30,7 @@ DEADLINE_PER_FACE_S = 1e-3
 """Noisy meshes take about 1e-4 s a face and packing; ten times that is a hang."""
 MAX_MEAN_STRETCH = 1.1
 """Charts found on the smoothed copy that stay worse than this are found on the mesh itself too."""
-WORTH_SHATTERING = 1.2
+MIN_DENSITY_GAIN = 1.2
 """Texels for an edge by which the charts of the mesh itself must be better: there are many more,
 with a seam around each, and boxes flatter small charts."""
 MAX_LOST_SHARE = 1e-3
@@ -54,7 +54,7 @@ class Charts:
         corners = np.arange(self.corner_uvs.size // 2).reshape(-1, 3)
         extents = chart_extents(self.corner_uvs.reshape(-1, 2), corners, self.labels)
         side_px, padding_px = packing_square(size_px, gutter_px)
-        scale = scale_that_fits(extents, side_px, padding_px, atlases) * size_px / side_px
+        scale = packing_scale(extents, side_px, padding_px, atlases) * size_px / side_px
         return scale / max(self.stretch.p95, 1.0)
 
 
@@ -93,21 +93,23 @@ def find_charts(
     WorkerError, DatasetError, ResourceError
         xatlas crashed, answered nonsense or took too long.
     """
-    copy = smoothed_copy(vertices, faces)
+    copy = smooth_vertices(vertices, faces)
     try:
         first = _charts(vertices, copy, faces, folder, progress.span(0.0, 0.6))
     except (WorkerError, ResourceError, DatasetError) as error:
         _logger.info("xatlas failed on the smoothed copy: %s", error.message)
         return _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0))
-    poor = first.stretch.mean > MAX_MEAN_STRETCH or first.stretch.collapsed_share > MAX_LOST_SHARE
-    if not poor and len(first.faces) == len(faces):
+    too_stretched = (
+        first.stretch.mean > MAX_MEAN_STRETCH or first.stretch.collapsed_share > MAX_LOST_SHARE
+    )
+    if not too_stretched and len(first.faces) == len(faces):
         return first
     second = _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0))
     density = [one.density(size_px, gutter_px, atlases) for one in (first, second)]
     _logger.debug("texels for an edge: %.2f, without smoothing %.2f", *density)
     lost = first.stretch.collapsed_share - second.stretch.collapsed_share
     lost += (len(second.faces) - len(first.faces)) / len(faces)
-    return second if lost > MAX_LOST_SHARE or density[1] > WORTH_SHATTERING * density[0] else first
+    return second if lost > MAX_LOST_SHARE or density[1] > MIN_DENSITY_GAIN * density[0] else first
 
 
 def _charts(
@@ -122,12 +124,12 @@ def _charts(
     graph = face_graph(vertices, faces)
     progress.update(0.75, "fitting charts to the surface")
     labels = uv_charts(graph, faces, corner_uvs)
-    shapes = flat_faces(vertices, faces)
-    flat = even_density(_counter_clockwise(corner_uvs, labels), labels, shapes)
+    shapes = flatten_faces(vertices, faces)
+    flat = equalise_density(_counter_clockwise(corner_uvs, labels), labels, shapes)
     flat = relax(flat, labels, shapes)
     progress.update(0.9, "splitting charts that fold")
     labels = split_overlaps(flat, labels, graph)
-    flat = even_density(flat, labels, shapes)
+    flat = equalise_density(flat, labels, shapes)
     side = max(float(np.abs(flat).max()), 1e-300)
     stretch = texture_stretch(vertices, faces, flat / side)
     return Charts(kept, flat, labels, stretch)
@@ -161,11 +163,11 @@ def _run_xatlas(
         vertex_bounds=np.array(vertex_bounds),
         face_bounds=face_bounds,
     )
-    answer = _run(CHARTS_HELPER, folder, len(faces), progress.span(0.1, 1.0))["corner_uvs"]
-    if answer.shape != (len(faces), 3, 2):
+    result = _run(CHARTS_HELPER, folder, len(faces), progress.span(0.1, 1.0))["corner_uvs"]
+    if result.shape != (len(faces), 3, 2):
         raise WorkerError("xatlas left UVs of another mesh.")
     corner_uvs = np.empty((len(faces), 3, 2), np.float32)
-    corner_uvs[order] = answer
+    corner_uvs[order] = result
     return corner_uvs
 
 
@@ -211,7 +213,7 @@ def pack_charts(
     flat = (charts.corner_uvs * [1.0, -1.0]).astype(np.float32)
     labels = charts.labels
     if atlases > 1:
-        labels = cut_wide_charts(charts.corner_uvs, labels, atlases)
+        labels = split_wide_charts(charts.corner_uvs, labels, atlases)
     corners, first = chart_points(flat, labels)
     np.savez(
         folder / "input.npz",

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...errors import DatasetError
 from ...processes.helper_process import emit
-from .chart_boxes import chart_extents, packing_square, scale_that_fits
+from .chart_boxes import chart_extents, packing_scale, packing_square
 
 GROWTH = 1.1
 MAX_GROWTHS = 8
@@ -57,7 +57,7 @@ def main(folder: Path) -> None:
 def _largest(task: dict[str, np.ndarray], side_px: int, padding_px: int) -> _Packed | None:
     """Pack at the largest scale that fits into the squares; ``None`` when none was found."""
     extents = chart_extents(task["points"], task["corners"], task["charts"])
-    scale = scale_that_fits(extents, side_px, padding_px, int(task["atlases"]))
+    scale = packing_scale(extents, side_px, padding_px, int(task["atlases"]))
     packed = _pack(task, scale, side_px, padding_px)
     too_large = 0.0
     for factor in SHRINKING if packed is None else ():

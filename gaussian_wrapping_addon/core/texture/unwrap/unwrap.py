@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import NO_ROOM, DatasetError, ResourceError, WorkerError, cannot_be_written
+from ...errors import DISK_FULL_ERRNOS, DatasetError, ResourceError, WorkerError, unwritable_error
 from ...mesh.face_graph import FaceGraph, face_graph, uv_charts
 from ...mesh.surface_mesh import SurfaceMesh
 from ...mesh.topology import edge_lengths
@@ -103,9 +103,9 @@ def unwrap(
             mesh, graph, size_px, gutter_px, progress.span(0.0, 0.9), atlases
         )
         method = "box"
-        problem = _problem(corner_uvs, face_atlas, size_px, threads)
-        if problem:
-            _logger.warning("the box projection is not perfect: %s", problem)
+        defect = _find_defect(corner_uvs, face_atlas, size_px, threads)
+        if defect:
+            _logger.warning("the box projection is not perfect: %s", defect)
     if gutter_left_px < gutter_px:
         _logger.warning(
             "the texture is too small for %d texels between charts: %.1f are kept",
@@ -119,11 +119,11 @@ def unwrap(
     progress.update(1.0, f"unwrapped with {method}")
     return Unwrap(
         corner_uvs, charts, method, float(gutter_left_px), reason,
-        _numbered(face_atlas) if face_atlas.any() else None,
+        _renumber(face_atlas) if face_atlas.any() else None,
     )  # fmt: skip
 
 
-def _numbered(face_atlas: np.ndarray) -> np.ndarray:
+def _renumber(face_atlas: np.ndarray) -> np.ndarray:
     """Number the atlases that are used from 0, without gaps."""
     return np.unique(face_atlas, return_inverse=True)[1].ravel().astype(np.uint8)
 
@@ -159,8 +159,8 @@ def _xatlas(
             charts, size_px, gutter_px, folder, progress.span(0.7, 0.9), atlases
         )
     except (OSError, ValueError, KeyError) as error:
-        if isinstance(error, OSError) and error.errno in NO_ROOM:
-            raise cannot_be_written(error.filename or folder, error) from error
+        if isinstance(error, OSError) and error.errno in DISK_FULL_ERRNOS:
+            raise unwritable_error(error.filename or folder, error) from error
         raise WorkerError(f"xatlas left no usable result ({error}).") from None
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -170,9 +170,9 @@ def _xatlas(
     face_atlas = np.zeros(len(mesh.faces), np.uint8)
     face_atlas[solid[charts.faces]] = chart_atlas
     _collapse_ignored(corner_uvs, face_atlas, mesh.faces, graph)
-    problem = _problem(corner_uvs, face_atlas, size_px, threads)
-    if problem:
-        raise DatasetError(f"The UVs that xatlas made cannot be used: {problem}.")
+    defect = _find_defect(corner_uvs, face_atlas, size_px, threads)
+    if defect:
+        raise DatasetError(f"The UVs that xatlas made cannot be used: {defect}.")
     return corner_uvs, face_atlas, gutter_left_px
 
 
@@ -198,7 +198,7 @@ def _collapse_ignored(
     face_atlas[missing] = face_atlas[chosen // 3]
 
 
-def _problem(corner_uvs: np.ndarray, face_atlas: np.ndarray, size_px: int, threads: int) -> str:
+def _find_defect(corner_uvs: np.ndarray, face_atlas: np.ndarray, size_px: int, threads: int) -> str:
     """Say what is wrong with the UVs; empty when nothing is."""
     if not np.isfinite(corner_uvs).all():
         return "some are not finite"
