@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Mesh files: read back by independent readers, exact where promised, refused where bad."""
+"""Mesh files: read back by independent readers, lossless where specified; bad meshes refused."""
 
 from __future__ import annotations
 
