@@ -10,7 +10,7 @@ from .text import escaped, escaped_or, items, part, table
 _TITLES = {
     "harmonics": "View-dependent colour (gloss)",
     "exposure": "Brightness and tint of each photo",
-    "multi_view": "Multi-view consistency between neighbouring photos",
+    "multi_view": "Comparison of neighbouring photos",
     "wrapping": "Thin parts (two-sided surfaces)",
     "growth": "Number of Gaussians",
     "full_size": "Size of the training images",

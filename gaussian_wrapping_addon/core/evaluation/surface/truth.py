@@ -96,7 +96,7 @@ class Truth:
         return self.crop.inside(self.samples.points)
 
     def visible(self, min_cameras: int = MIN_CAMERAS) -> np.ndarray:
-        """Return whether ``min_cameras`` cameras see each sample, (n,) bool; true if unknown."""
+        """Return whether at least ``min_cameras`` see each sample, (n,) bool; true if unknown."""
         if self.seen is None:
             return np.ones(len(self.samples), np.bool_)
         return self.seen if self.seen.dtype == np.bool_ else self.seen >= min_cameras

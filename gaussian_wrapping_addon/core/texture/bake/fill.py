@@ -158,7 +158,7 @@ def _interpolate(keys: np.ndarray, values: np.ndarray, positions: np.ndarray) ->
 def dilate(
     image: np.ndarray, ring: np.ndarray, chart: np.ndarray, rings: int, inside: bool
 ) -> None:
-    """Dilate filled texels ring by ring; each new texel is the mean of its filled neighbours.
+    """Dilate filled texels ring by ring; each texel is the mean of its neighbours in earlier rings.
 
     Parameters
     ----------

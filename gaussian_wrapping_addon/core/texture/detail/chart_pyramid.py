@@ -107,7 +107,7 @@ def chart_pyramid(
 def _halved(
     image: np.ndarray, owner: np.ndarray, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Average those of 2 x 2 texels that belong to the chart with the largest weight among them."""
+    """Average those of 2 x 2 texels in the chart that has most texels of the finest level there."""
     odd = ((0, owner.shape[0] % 2), (0, owner.shape[1] % 2))
     owner = np.pad(owner, odd, constant_values=-1)
     weight = np.pad(weight, odd)

@@ -19,7 +19,7 @@ MIN_AREA_SHARE = 0.03
 RELAXATIONS = 6
 """After six rounds, the stretch of charts changes by less than 0.1 %."""
 MAX_ROUNDS_BACK = 30
-"""Rounds: restoring a point may fold its neighbours, so all are tested again."""
+"""Maximum number of rounds: restoring a point may fold its neighbours, so all are tested again."""
 MIN_HEIGHT_SHARE = 0.02
 """Minimum height of needles relative to their longest edge, so that their weights stay bounded."""
 ANCHOR_WEIGHT = 1e-6
