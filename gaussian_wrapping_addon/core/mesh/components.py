@@ -45,7 +45,7 @@ def volumes_and_areas(
 
 
 @dataclass(frozen=True)
-class Floaters:
+class FloaterRemoval:
     """What :func:`without_floaters` did."""
 
     faces: np.ndarray
@@ -78,7 +78,7 @@ def extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: in
     return np.asarray(np.linalg.norm(np.maximum(high - low, 0.0), axis=1))
 
 
-def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> Floaters:
+def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> FloaterRemoval:
     """Remove parts that are small: in area and in length.
 
     The area is below ``min_share`` of the largest part's, and the length below
@@ -93,7 +93,7 @@ def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) 
     long = length >= LONG_FACTOR * min_share * length.max(initial=0.0)
     keep |= long & (np.bincount(part, minlength=count) >= LONG_FACES)
     removed = float(area[~keep].sum() / max(area.sum(), 1e-300))
-    return Floaters(
+    return FloaterRemoval(
         faces[keep[part]],
         int(keep.sum()),
         int((~keep & (volume >= 0)).sum()),

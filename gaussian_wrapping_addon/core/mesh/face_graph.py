@@ -62,8 +62,8 @@ def components(graph: FaceGraph, joined: np.ndarray) -> np.ndarray:
     count = len(graph.opposite)
     face, corner = np.nonzero(joined & (graph.opposite >= 0))
     other = graph.opposite[face, corner] // 3
-    links = coo_matrix((np.ones(len(face), np.int8), (face, other)), shape=(count, count))
-    labels = connected_components(links, directed=False)[1]
+    adjacency = coo_matrix((np.ones(len(face), np.int8), (face, other)), shape=(count, count))
+    labels = connected_components(adjacency, directed=False)[1]
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int32)
     rank[np.argsort(first, kind="stable")] = np.arange(len(first), dtype=np.int32)

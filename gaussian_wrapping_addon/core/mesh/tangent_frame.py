@@ -108,8 +108,8 @@ def _groups(faces: np.ndarray, uvs: np.ndarray, signs: np.ndarray) -> np.ndarray
     same = np.flatnonzero(edge[order[1:]] == edge[order[:-1]])
     one, other = order[same], order[same + 1]
     rows, columns = np.r_[low[one], high[one]], np.r_[low[other], high[other]]
-    links = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (faces.size, faces.size))
-    return connected_components(links, directed=False)[1].astype(np.int64)
+    adjacency = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (faces.size, faces.size))
+    return connected_components(adjacency, directed=False)[1].astype(np.int64)
 
 
 def _flattened(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:

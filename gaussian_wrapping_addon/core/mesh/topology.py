@@ -56,7 +56,7 @@ def faces_per_edge(faces: np.ndarray, vertex_count: int) -> np.ndarray:
     return count[index]
 
 
-def ends_of(chosen: np.ndarray, faces: np.ndarray, vertex_count: int) -> np.ndarray:
+def vertices_of_half_edges(chosen: np.ndarray, faces: np.ndarray, vertex_count: int) -> np.ndarray:
     """Return (v,) bool: the vertices at the half-edges chosen, (3f,) bool."""
     begin, end = half_edges(faces)
     result = np.zeros(vertex_count, np.bool_)

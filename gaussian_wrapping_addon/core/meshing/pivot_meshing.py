@@ -14,8 +14,8 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import MeshingError
-from ..field.depth_samples import Sightings
-from ..field.isosurface_residual import level_errors
+from ..field.depth_samples import DepthSamples
+from ..field.isosurface_residual import isosurface_residuals
 from ..gaussians.model import GaussianArrays
 from ..mesh.components import compacted, without_floaters
 from ..mesh.surface_mesh import SurfaceMesh
@@ -26,11 +26,11 @@ from ..regions.convex_region import Region
 from ..report_warning import ReportWarning
 from ..settings import MeshingSettings
 from .cleanup.degenerate import remove_degenerate
-from .points.candidate_surface import no_surface, pivot_cloud
+from .points.candidate_surface import no_surface_error, pivot_cloud
 from .points.pivots import PIVOTS
 from .points.spacing import footprints
 from .tetrahedra.boundary_faces import tetrahedron_neighbours
-from .tetrahedra.delaunay import delaunay, far_points
+from .tetrahedra.delaunay import bounding_points, delaunay
 from .tetrahedra.marching_tetrahedra import bisect, marching_closed
 from .tetrahedra.tetrahedron_cut import cut_to_region
 
@@ -54,7 +54,7 @@ def mesh_by_pivots(
     progress: Progress,
     *,
     seed: int,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> SurfaceMesh:
     """Mesh the surface ``vacancy = 0.5`` inside a region, as finely as the Gaussians lie.
 
@@ -75,7 +75,7 @@ def mesh_by_pivots(
     settings : MeshingSettings
         ``pivots``, the number for each Gaussian, and ``min_component_share`` are read. An edge
         length or a number of points does not apply; the provenance says so.
-    sightings : Sightings, optional
+    depth_samples : DepthSamples, optional
         Where the cameras see the isosurface in the region (:mod:`.depth_samples`).
 
     Returns
@@ -91,16 +91,16 @@ def mesh_by_pivots(
     if len(cameras) == 0:
         raise MeshingError("There are no cameras to look from.", "Check the scene.")
     cloud = pivot_cloud(
-        arrays, region, vacancy.is_empty, seed, sightings, pivots_of=PIVOTS[settings.pivots]
+        arrays, region, vacancy.is_empty, seed, depth_samples, pivots_of=PIVOTS[settings.pivots]
     )
-    points = np.concatenate([cloud.points, far_points(cloud.points, seed)])
+    points = np.concatenate([cloud.points, bounding_points(cloud.points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
     cut = cut_to_region(points, tetrahedra, region)
     inside = _inside(vacancy, cut.points, cut.tetrahedra, progress.span(0.3, 0.5))
-    pairs, faces = marching_closed(cut.tetrahedra, tetrahedron_neighbours(cut.tetrahedra), inside)
+    edges, faces = marching_closed(cut.tetrahedra, tetrahedron_neighbours(cut.tetrahedra), inside)
     if len(faces) == 0:
-        raise no_surface(region)
-    begin, end = cut.points[pairs[:, 0]], cut.points[pairs[:, 1]]
+        raise no_surface_error(region)
+    begin, end = cut.points[edges[:, 0]], cut.points[edges[:, 1]]
     pixel = footprints((begin + end) / 2, cameras)  # (e,)
     limit = np.linalg.norm(end - begin, axis=1)
     limit = np.where(pixel > 0.0, np.minimum(limit, pixel), limit)
@@ -118,7 +118,7 @@ def mesh_by_pivots(
         "pivots_each": settings.pivots,
         "gaussians_in_region": cloud.gaussians,
         "pivots": len(cloud.points),
-        "sightings": 0 if sightings is None else len(sightings),
+        "sightings": 0 if depth_samples is None else len(depth_samples),
         "tetrahedra": len(cut.tetrahedra),
         "notes": _notes(settings, cloud.gaussians, cloud.chosen),
         "seed": seed,
@@ -129,7 +129,7 @@ def mesh_by_pivots(
         "degenerate_faces_left": degenerate,
         "vertices_on_surface": int((~capped).sum()),
         "vertices_on_region_boundary": int(capped.sum()),
-        **level_errors(vacancy, vertices[~capped]),
+        **isosurface_residuals(vacancy, vertices[~capped]),
     }
     progress.update(1.0, f"{len(kept)} faces")
     _logger.info("Meshed region %s by pivots: %d faces", region.name, len(kept))

@@ -14,8 +14,8 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import MeshingError
-from ..field.depth_samples import Sightings
-from ..field.isosurface_residual import level_errors
+from ..field.depth_samples import DepthSamples
+from ..field.isosurface_residual import isosurface_residuals
 from ..gaussians.model import GaussianArrays
 from ..mesh.components import compacted, without_floaters
 from ..mesh.simplification.edge_flips import flip_edges
@@ -29,11 +29,11 @@ from .cleanup.degenerate import remove_degenerate
 from .cleanup.repair import split_nonmanifold
 from .cleanup.small_handles import without_small_handles
 from .points.candidate_surface import candidate_surface
-from .points.resolution import Dense, checked_request, dense_request, nominal_edge
+from .points.resolution import DenseRequest, checked_request, dense_request, nominal_edge
 from .points.surface_points import KIND_CAP, KIND_JUMP, KIND_SURFACE, SurfacePoints, SurfaceSampler
 from .tetrahedra.boundary_faces import boundary_faces, tetrahedron_neighbours
 from .tetrahedra.classification import classify, on_one_sheet
-from .tetrahedra.delaunay import delaunay, far_points
+from .tetrahedra.delaunay import bounding_points, delaunay
 
 _logger = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ def mesh_region(
     seed: int,
     threads: int,
     edge_length_scene: float = 0.0,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> SurfaceMesh:
     """Mesh the surface ``vacancy = 0.5`` inside a region; the boundary closes the solid.
 
@@ -89,7 +89,7 @@ def mesh_region(
     edge_length_scene : float
         Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices
         as that one. 0 leaves it to ``settings.points``.
-    sightings : Sightings, optional
+    depth_samples : DepthSamples, optional
         Where the cameras see the isosurface in the region (:mod:`.depth_samples`).
 
     Returns
@@ -111,33 +111,35 @@ def mesh_region(
     rng = np.random.default_rng(seed)
     surface = candidate_surface(
         arrays, region, vacancy.is_empty, 0.5 * request.edge_length, seed, progress.span(0.0, 0.3),
-        sightings,
+        depth_samples,
     )  # fmt: skip
     adaptive = settings.spacing == "adaptive"
     sampler = SurfaceSampler(
         vacancy, vectors, region, surface, threads, cameras=cameras if adaptive else ()
     )
-    wanted = dense_request(request, sampler.area, region) if adaptive else Dense(request, 0, 1.0)
-    cloud = sampler.sample(wanted.request, rng, progress.span(0.3, 0.6))
+    dense = (
+        dense_request(request, sampler.area, region) if adaptive else DenseRequest(request, 0, 1.0)
+    )
+    cloud = sampler.sample(dense.request, rng, progress.span(0.3, 0.6))
     vertices, faces, kind, figures = _connect(cloud, vacancy, region, settings, seed, rng, progress)
     figures["dense_vertices"] = len(vertices)
-    vertices, faces, kind = selected(vertices, faces, kind, wanted.target, wanted.share, region)
-    vertices, faces, kind, handles = tidied(vertices, faces, kind)
-    figures |= handles | counts(kind)
+    vertices, faces, kind = simplified(vertices, faces, kind, dense.target, dense.share, region)
+    vertices, faces, kind, handles = small_handles_closed(vertices, faces, kind)
+    figures |= handles | vertex_counts(kind)
     provenance = {
         "method": "primal adaptive meshing",
         "region": region.name,
         "edge_length_scene": nominal_edge(request, sampler.area, region),
         "gaussians_in_region": surface.gaussians,
         "pivots": surface.pivots,
-        "sightings": 0 if sightings is None else len(sightings),
+        "sightings": 0 if depth_samples is None else len(depth_samples),
         "candidate_area": sampler.area,
         "spacing": settings.spacing,
-        "notes": [note.to_json() for note in (*wanted.request.notes, *cloud.notes)],
+        "notes": [note.to_json() for note in (*dense.request.notes, *cloud.notes)],
         "seed": seed,
         **cloud.figures,
         **figures,
-        **distance_to_level(vacancy, vertices, kind),
+        **residuals_on_surface(vacancy, vertices, kind),
     }
     progress.update(1.0, f"{len(faces)} faces")
     _logger.info("Meshed region %s: %d faces", region.name, len(faces))
@@ -157,7 +159,7 @@ def _connect(
     hint = "Draw the region around something that was photographed."
     if len(cloud.points) < 4:
         raise MeshingError(f"Region {region.name!r} holds no surface.", hint)
-    points = np.concatenate([cloud.points, far_points(cloud.points, seed)])
+    points = np.concatenate([cloud.points, bounding_points(cloud.points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.6, 0.65))
     neighbours = tetrahedron_neighbours(tetrahedra)
     # Points lie in a convex body: only tetrahedra with a far corner reach beyond it.
@@ -179,11 +181,11 @@ def _connect(
         "undecided_tetrahedra": labels.undecided,
         "relabelled_tetrahedra": labels.flipped,
     }
-    vertices, faces, kind, repairs = finished(points, faces, cloud, region, settings, progress)
+    vertices, faces, kind, repairs = made_manifold(points, faces, cloud, region, settings, progress)
     return vertices, faces, kind, {**figures, **repairs}
 
 
-def finished(
+def made_manifold(
     points: np.ndarray,
     faces: np.ndarray,
     cloud: SurfacePoints,
@@ -238,7 +240,7 @@ def finished(
     return vertices, kept, kind, figures
 
 
-def selected(
+def simplified(
     vertices: np.ndarray,
     faces: np.ndarray,
     kind: np.ndarray,
@@ -266,7 +268,7 @@ def selected(
     return kept, flip_edges(kept, coarse, vertices, faces, longest), kind[chosen]
 
 
-def tidied(
+def small_handles_closed(
     vertices: np.ndarray, faces: np.ndarray, kind: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, int]]:
     """Close handles that are smaller than the edges of the mesh resolve, of a closed 2-manifold."""
@@ -277,7 +279,7 @@ def tidied(
     return vertices, faces, kind[chosen], figures
 
 
-def counts(kind: np.ndarray) -> dict[str, int]:
+def vertex_counts(kind: np.ndarray) -> dict[str, int]:
     """Return how many vertices there are of each kind, for the report."""
     return {
         "vertices_on_surface": int((kind == KIND_SURFACE).sum()),
@@ -287,6 +289,6 @@ def counts(kind: np.ndarray) -> dict[str, int]:
     }
 
 
-def distance_to_level(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:
+def residuals_on_surface(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:
     """Measure ``|v - 0.5|`` at the vertices that should lie on the isosurface."""
-    return level_errors(vacancy, vertices[kind == KIND_SURFACE])
+    return isosurface_residuals(vacancy, vertices[kind == KIND_SURFACE])

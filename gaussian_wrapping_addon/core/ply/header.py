@@ -84,25 +84,25 @@ def read_ply_header(path: Path, hint: str) -> PlyHeader:
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
     for number, raw in enumerate(head[: end.start()].splitlines()[1:], start=2):
         words = raw.decode("ascii", "replace").split()
-        place = f"line {number}"
+        location = f"line {number}"
         if not words or words[0] == "obj_info":
             continue
         if words[0] == "comment":
             comments.append(" ".join(words[1:]))
         elif words[0] == "format":
             if len(words) < 2 or words[1] not in _ENCODINGS:
-                raise ParseError(path, place, f"format {' '.join(words[1:])!r}.", hint)
+                raise ParseError(path, location, f"format {' '.join(words[1:])!r}.", hint)
             encoding = _ENCODINGS[words[1]]
         elif words[0] == "element":
             if len(words) != 3 or not re.fullmatch(r"\d{1,18}", words[2]):
-                raise ParseError(path, place, "an element without a count.", hint)
+                raise ParseError(path, location, "an element without a count.", hint)
             elements.append((words[1], int(words[2]), []))
         elif words[0] == "property":
             if not elements:
-                raise ParseError(path, place, "a property before any element.", hint)
-            elements[-1][2].append(_property(path, place, words, elements[-1][2], hint))
+                raise ParseError(path, location, "a property before any element.", hint)
+            elements[-1][2].append(_property(path, location, words, elements[-1][2], hint))
         else:
-            raise ParseError(path, place, f"unknown header line {words[0][:40]!r}.", hint)
+            raise ParseError(path, location, f"unknown header line {words[0][:40]!r}.", hint)
     if not encoding:
         raise ParseError(path, "header", "the format line is missing.", hint)
     found = tuple(PlyElement(name, count, tuple(kinds)) for name, count, kinds in elements)
@@ -110,7 +110,7 @@ def read_ply_header(path: Path, hint: str) -> PlyHeader:
 
 
 def _property(
-    path: Path, place: str, words: list[str], before: list[tuple[str, str]], hint: str
+    path: Path, location: str, words: list[str], before: list[tuple[str, str]], hint: str
 ) -> tuple[str, str]:
     """Return (name, type) of a property line."""
     is_list = len(words) == 5 and words[1] == "list"
@@ -119,7 +119,7 @@ def _property(
     elif len(words) == 3 and words[1] in _TYPES:
         name, kind = words[2], _TYPES[words[1]]
     else:
-        raise ParseError(path, place, f"property {' '.join(words[1:])[:60]!r}.", hint)
+        raise ParseError(path, location, f"property {' '.join(words[1:])[:60]!r}.", hint)
     if name in dict(before):
-        raise ParseError(path, place, f"property {name} comes twice.", hint)
+        raise ParseError(path, location, f"property {name} comes twice.", hint)
     return name, kind

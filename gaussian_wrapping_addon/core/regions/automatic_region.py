@@ -75,10 +75,10 @@ def automatic_region(scene: Scene) -> Region:
     points = scene.points[np.isfinite(scene.points).all(1)] if len(scene.points) else scene.points
     if len(points) >= MIN_POINTS:
         seen = _views_of(points, cameras) / len(cameras)  # (n,) share of views
-        steady = _ramp(seen / max(seen.max(), 1e-12)) * _thinned(points, VOXEL_SHARE * frame_size)
+        support = _ramp(seen / max(seen.max(), 1e-12)) * _thinned(points, VOXEL_SHARE * frame_size)
         for _ in range(3):
             offset = np.linalg.norm(points - focus, axis=1) / frame_size  # (n,)
-            weight = np.exp(-2.0 * offset**2) * steady
+            weight = np.exp(-2.0 * offset**2) * support
             if (weight > WEIGHT_THAT_COUNTS).sum() < MIN_POINTS:
                 break
             focus = _weighted_quantiles(points, weight, np.array([0.5]))[0]
@@ -149,9 +149,9 @@ def _focus(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, f
     for _ in range(20):
         miss = np.linalg.norm(np.einsum("cij,cj->ci", across, focus - centers), axis=1)  # (c,)
         weight = 1.0 / np.maximum(miss, 1e-3 * np.median(depth))
-        pull = 0.01 * weight
-        matrix = np.einsum("c,cij->ij", weight, across) + np.eye(3) * pull.sum()
-        right = np.einsum("c,cij,cj->i", weight, across, centers) + pull @ prior
+        prior_weight = 0.01 * weight
+        matrix = np.einsum("c,cij->ij", weight, across) + np.eye(3) * prior_weight.sum()
+        right = np.einsum("c,cij,cj->i", weight, across, centers) + prior_weight @ prior
         focus = np.linalg.solve(matrix, right)
     in_front = ((focus - centers) * forwards).sum(1) > 0
     if in_front.mean() < 0.5:  # cameras that look outwards: take what lies before them
@@ -213,8 +213,8 @@ def _weighted_quantiles(values: np.ndarray, weight: np.ndarray, shares: np.ndarr
     for column in range(values.shape[1]):
         order = np.argsort(values[:, column], kind="stable")
         total = np.cumsum(weight[order])
-        place = np.searchsorted(total, shares * total[-1])
-        result[:, column] = values[order[np.minimum(place, len(order) - 1)], column]
+        position = np.searchsorted(total, shares * total[-1])
+        result[:, column] = values[order[np.minimum(position, len(order) - 1)], column]
     return result
 
 

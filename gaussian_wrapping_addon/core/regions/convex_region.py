@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from ..dataset.similarity import Similarity
-from .volume import check_volume, flat_region
+from .volume import check_volume, flat_region_error
 
 COPLANAR_COSINE = 1.0 - 1e-9
 """Hull triangles whose normals agree this well are one face."""
@@ -40,7 +40,7 @@ class Region:
         vertices.setflags(write=False)
         object.__setattr__(self, "vertices", vertices)
         if not self._has_hull():
-            raise flat_region(self.name)
+            raise flat_region_error(self.name)
 
     def _has_hull(self) -> bool:
         try:

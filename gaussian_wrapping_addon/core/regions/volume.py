@@ -39,10 +39,10 @@ def check_volume(vertices: np.ndarray, name: str) -> None:
     if not np.isfinite(vertices).all():
         raise MeshingError(f"Region {name!r} has a corner that is not finite.", "Draw it again.")
     if not _is_thick(vertices):
-        raise flat_region(name)
+        raise flat_region_error(name)
 
 
-def flat_region(name: str) -> MeshingError:
+def flat_region_error(name: str) -> MeshingError:
     """Return the error of a region without a volume."""
     return MeshingError(f"Region {name!r} is flat: it encloses no volume.", "Give it some height.")
 

@@ -72,7 +72,7 @@ def test_broken_headers_name_their_line(old: str, new: str, place: str, tmp_path
     path = written(tmp_path / "a.ply", HEADER.replace(old, new, 1))
     with pytest.raises(ParseError) as caught:
         read_ply_header(path, "Again.")
-    assert (caught.value.place, caught.value.hint) == (place, "Again.")
+    assert (caught.value.location, caught.value.hint) == (place, "Again.")
     with pytest.raises(ParseError):
         is_cloud(path)
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ...files import finite, write_bytes, write_json
+from ...files import finite_json, write_bytes, write_json
 from .markdown import report_markdown
 from .region_section import closedness
 from .report_warnings import collect_warnings
@@ -33,7 +33,7 @@ def write_report(
     earlier : Path or None
         Result folder into which this one will be merged; it has the pictures of other regions.
     """
-    report = finite({"version": 1, **summary, "regions": regions})
+    report = finite_json({"version": 1, **summary, "regions": regions})
     report["warnings"] = [warning.to_json() for warning in collect_warnings(report)]
     write_json(result / "report.json", report)
     # File and region names may contain characters that cannot be encoded (lone surrogates).

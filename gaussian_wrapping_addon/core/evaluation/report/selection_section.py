@@ -36,8 +36,8 @@ def selection_lines(training: dict[str, Any]) -> list[str]:
     ----------
     training : dict
         The report's training figures; its entry ``decisions`` holds what
-        :meth:`~.model_selection.Needs.to_json` wrote. Unknown entries of newer versions are shown
-        unchanged.
+        :meth:`~.model_selection.ModelSelection.to_json` wrote. Unknown entries of newer versions
+        are shown unchanged.
     """
     decisions = [part(entry) for entry in items(training.get("decisions"))]
     decisions = [entry for entry in decisions if entry.get("name")]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import MeshingError, ResourceError, UsageError
-from ...files import finite
+from ...files import finite_json
 from ...limits import MAX_POINTS
 from ...mesh.distance import distances_to_cloud
 from ...mesh.surface_sampling import thin
@@ -101,7 +101,7 @@ class DtuScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return dict(finite(dataclasses.asdict(self)))
+        return dict(finite_json(dataclasses.asdict(self)))
 
 
 def dtu_chamfer(

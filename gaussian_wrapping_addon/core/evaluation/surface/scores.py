@@ -16,7 +16,7 @@ import numpy as np
 
 from ...dataset.camera import Camera
 from ...errors import UsageError
-from ...files import finite
+from ...files import finite_json
 from ...kernels.parallel import default_threads
 from ...mesh.distance import distances_to_cloud, distances_to_mesh
 from .samples import (
@@ -77,7 +77,7 @@ class SurfaceScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return dict(finite(dataclasses.asdict(self)))
+        return dict(finite_json(dataclasses.asdict(self)))
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class CloudScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return dict(finite(dataclasses.asdict(self)))
+        return dict(finite_json(dataclasses.asdict(self)))
 
 
 def score_surface(

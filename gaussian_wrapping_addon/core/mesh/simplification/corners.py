@@ -2,7 +2,7 @@
 """Faces around vertices while edges collapse: linked corners, and the merging of two vertices.
 
 The corners (3 face + k) of a vertex are linked: ``head[v]`` is its first, ``following[corner]`` the
-next, -1 ends. Dead faces have -1 as first corner and stay linked until :func:`drop_dead`.
+next, -1 ends. Dead faces have -1 as first corner and stay linked until :func:`unlink_dead_faces`.
 
 ``mesh`` is the tuple of points (v, 3) float64, faces (f, 3) int64, head (v,) int64, following (3f,)
 int64, quadrics (v, 11) float64, stamps (v,) int64 (how often a vertex has changed) and marks (v,)
@@ -29,7 +29,7 @@ def link_corners(faces, head, following):
 
 
 @part(fast=False)
-def drop_dead(v, faces, head, following):
+def unlink_dead_faces(v, faces, head, following):
     """Take dead faces out of the links of ``v``; return the last corner."""
     last, corner = -1, head[v]
     while corner >= 0:
@@ -46,7 +46,7 @@ def drop_dead(v, faces, head, following):
 
 
 @part(fast=False)
-def merge(u, v, mesh, counts):
+def merge_vertices(u, v, mesh, counts):
     """Let ``v`` become ``u`` where the link condition allows it; dead faces must be dropped."""
     _, faces, head, following, quadrics, stamps, _ = mesh
     corner = head[v]
@@ -59,13 +59,13 @@ def merge(u, v, mesh, counts):
             faces[f, k] = u
         corner = following[corner]
     counts[VERTICES_LEFT] -= 1
-    last = drop_dead(u, faces, head, following)
+    last = unlink_dead_faces(u, faces, head, following)
     if last < 0:
         head[u] = head[v]
     else:
         following[last] = head[v]
     head[v] = -1
-    drop_dead(u, faces, head, following)
+    unlink_dead_faces(u, faces, head, following)
     quadrics[u] += quadrics[v]
     stamps[u] += 1
     stamps[v] += 1

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-HEAP_SIZE, SEQUENCE, FACES_LEFT, VERTICES_LEFT, TICK = 0, 1, 2, 3, 4
+HEAP_SIZE, SEQUENCE, FACES_LEFT, VERTICES_LEFT, LAST_MARK = 0, 1, 2, 3, 4
 """Places in ``counts``, (5,) int64: entries of the heap in use, number of the next entry, faces and
 used vertices that are left, last mark given (see :mod:`.link_condition`)."""
 

@@ -16,14 +16,14 @@ from ...progress import Progress
 from ...regions.cap_planes import CapPlanes, cap_planes
 from ...regions.convex_region import Region
 from ..components import compacted
-from ..topology import ends_of, half_edges
+from ..topology import half_edges, vertices_of_half_edges
 from .engine import Heap, Simplification
 from .optimal_collapse import HEAP_COLUMNS, POINT_WEIGHT, Limits, collapse_edges, push_edges
 
 MIN_TARGET = 4
 """Faces of a tetrahedron: no closed surface has fewer."""
 
-LOOKS_PER_CALL = 100_000
+EDGES_PER_CALL = 100_000
 """Edges looked at between two moments at which the work can be cancelled: about 0.2 s."""
 
 
@@ -34,7 +34,7 @@ plates need long narrow faces; the bound still lies far above what counts as deg
 
 
 @dataclass(frozen=True)
-class Decimated:
+class DecimationResult:
     """A mesh with fewer faces."""
 
     vertices: np.ndarray
@@ -54,7 +54,7 @@ def decimate(
     progress: Progress,
     *,
     region: Region | None = None,
-) -> Decimated:
+) -> DecimationResult:
     """Collapse edges until ``target`` faces are left, or one more.
 
     A closed oriented 2-manifold stays one, every part with its genus; so do open ones, whose
@@ -85,7 +85,7 @@ def decimate(
     faces = np.array(faces, np.int64).reshape(-1, 3)
     vertices = np.asarray(vertices, np.float64)
     if len(faces) <= target:
-        return Decimated(vertices, faces, np.arange(len(vertices)), True)
+        return DecimationResult(vertices, faces, np.arange(len(vertices)), True)
     caps = cap_planes(vertices, region)
     # In units of the mesh's own size: neither metres nor UTM coordinates change a decision.
     low, high = vertices[faces].min((0, 1)), vertices[faces].max((0, 1))
@@ -99,7 +99,7 @@ def decimate(
     while True:
         before = run.faces_left
         share = (first - before) / (first - target)
-        run.work(target, progress.span(min(share, 1.0), 1.0), first)
+        run.collapse_pass(target, progress.span(min(share, 1.0), 1.0), first)
         # What was refused may be allowed now that its surroundings have changed.
         if run.faces_left <= target or run.faces_left == before:
             break
@@ -107,7 +107,7 @@ def decimate(
     result = np.where(moved[:, None], run.points * size + center, vertices)
     result, kept, source = compacted(result, run.faces())
     progress.update(1.0, f"{len(kept)} faces left")
-    return Decimated(result, kept, source, len(kept) <= target)
+    return DecimationResult(result, kept, source, len(kept) <= target)
 
 
 class _Decimation(Simplification):
@@ -128,7 +128,7 @@ class _Decimation(Simplification):
         self._caps = (caps.planes, locked, np.ascontiguousarray(caps.normals), offsets)
         self._scratch = np.zeros((8, 3))
 
-    def work(self, target: int, progress: Progress, first: int) -> None:
+    def collapse_pass(self, target: int, progress: Progress, first: int) -> None:
         """Look at every edge once, and at those that change again, until nothing is left to do."""
         heap = self.empty_heap(3 * self.faces_left, HEAP_COLUMNS)
         push_edges(self.mesh, self._caps, heap, self.counts, self._scratch)
@@ -137,7 +137,7 @@ class _Decimation(Simplification):
         def collapse(heap: Heap) -> int:
             return collapse_edges(
                 self.mesh, self._caps, heap, self.counts, tuple(LIMITS), self._scratch, target,
-                LOOKS_PER_CALL,
+                EDGES_PER_CALL,
             )  # fmt: skip
 
         def report() -> None:
@@ -152,10 +152,10 @@ def _on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
     """(v,) bool: vertices at an edge with one face; refuses what is no oriented manifold."""
     begin, end = half_edges(faces)
     forward, backward = np.sort(begin * count + end), end * count + begin
-    place = np.minimum(np.searchsorted(forward, backward), len(forward) - 1)
+    position = np.minimum(np.searchsorted(forward, backward), len(forward) - 1)
     if (forward[1:] == forward[:-1]).any() or (begin == end).any():
         raise MeshingError(
             "Only an oriented manifold can be decimated.",
             "Send the job folder's log.txt with a bug report.",
         )
-    return ends_of(forward[place] != backward, faces, count)
+    return vertices_of_half_edges(forward[position] != backward, faces, count)

@@ -59,7 +59,7 @@ def flip_edges(
     low, high = dense_vertices.min(0), dense_vertices.max(0)
     # Measured near the origin: nearest points far from it would be rounded.
     points = vertices - (low + high) / 2
-    surface = _Heights(points, dense_vertices - (low + high) / 2, dense_faces)
+    surface = _SurfaceHeights(points, dense_vertices - (low + high) / 2, dense_faces)
     for _ in range(PASSES):
         chosen = _one_pass(points, faces, surface, longest)
         if chosen == 0:
@@ -67,7 +67,7 @@ def flip_edges(
     return faces
 
 
-class _Heights:
+class _SurfaceHeights:
     """Height of the surface over the middles of edges, each measured once."""
 
     def __init__(self, points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -101,7 +101,9 @@ class _Heights:
         return self._heights[at], self._up[at]
 
 
-def _one_pass(points: np.ndarray, faces: np.ndarray, surface: _Heights, longest: float) -> int:
+def _one_pass(
+    points: np.ndarray, faces: np.ndarray, surface: _SurfaceHeights, longest: float
+) -> int:
     """Flip the best edges, none of which share a face, in place; return their number."""
     # Half-edge 3 f + k runs from corner k of face f to the next one, opposite the one after.
     start, end, tip = (np.roll(faces, -k, 1).ravel() for k in range(3))
@@ -120,15 +122,15 @@ def _one_pass(points: np.ndarray, faces: np.ndarray, surface: _Heights, longest:
     up = normal_1 * area_1[:, None] + normal_2 * area_2[:, None]
     up /= np.maximum(np.linalg.norm(up, axis=1), 1e-300)[:, None]
     least = np.minimum(LEAST_ROUNDNESS, np.minimum(round_1, round_2))
-    may = np.minimum(round_3, round_4) >= least
+    allowed = np.minimum(round_3, round_4) >= least
     for normal in (normal_3, normal_4):
-        may &= (normal * up).sum(1) > LEAST_COSINE
-    may &= (normal_3 * normal_4).sum(1) > 0.0
-    may &= np.linalg.norm(points[c] - points[d], axis=1) <= longest
+        allowed &= (normal * up).sum(1) > LEAST_COSINE
+    allowed &= (normal_3 * normal_4).sum(1) > 0.0
+    allowed &= np.linalg.norm(points[c] - points[d], axis=1) <= longest
     edges = surface.key(a, b)
-    may &= ~np.isin(surface.key(c, d), edges)
+    allowed &= ~np.isin(surface.key(c, d), edges)
 
-    rows = np.flatnonzero(may)
+    rows = np.flatnonzero(allowed)
     one, other, a, b, c, d = (x[rows] for x in (one, other, a, b, c, d))
     across, there = surface.over(c, d)
     along, bc, ca = surface.over(a, b)[0], surface.over(b, c)[0], surface.over(c, a)[0]

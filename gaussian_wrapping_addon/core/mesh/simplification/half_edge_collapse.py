@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...kernels.compiled import kernel, part
-from .corners import drop_dead, merge
+from .corners import merge_vertices, unlink_dead_faces
 from .counters import DONE, EMPTY, FULL, HEAP_ROOM, HEAP_SIZE, PAUSED, VERTICES_LEFT
-from .heap import drop_first, take_in_last
+from .heap import pop_first, sift_up_last
 from .link_condition import link_allows, mark_ring
 from .quadrics import WEIGHT, area_vector, error_of_one
 
@@ -92,7 +92,7 @@ def _cheapest(vertex, mesh, counts, bounds, ring):
     points, faces, head, following, quadrics = mesh[0], mesh[1], mesh[2], mesh[3], mesh[4]
     shape_weight = bounds[1]
     best, lowest = -1, np.inf
-    drop_dead(vertex, faces, head, following)
+    unlink_dead_faces(vertex, faces, head, following)
     around, mark = mark_ring(vertex, mesh, counts, ring)
     if around > MAX_RING:
         return best, lowest
@@ -108,7 +108,7 @@ def _cheapest(vertex, mesh, counts, bounds, ring):
         price = error + shape_weight * quadrics[vertex, WEIGHT] * square
         if price > lowest or (price == lowest and stays > best):
             continue
-        drop_dead(stays, faces, head, following)
+        unlink_dead_faces(stays, faces, head, following)
         if not link_allows(vertex, stays, around, mark, limit, mesh, counts):
             continue
         if _shapes_allow(vertex, stays, mesh, bounds):
@@ -120,7 +120,7 @@ def _cheapest(vertex, mesh, counts, bounds, ring):
 def _push(vertex, price, stamp, heap, counts):
     slot = counts[HEAP_SIZE]
     heap[0][slot], heap[1][slot], heap[2][slot] = price, vertex, stamp
-    take_in_last(heap, counts)
+    sift_up_last(heap, counts)
 
 
 @kernel(fast=False)
@@ -159,7 +159,7 @@ def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
         if counts[HEAP_SIZE] > room:
             return FULL
         price, gone, stamp = heap[0][0], heap[1][0], heap[2][0]
-        drop_first(heap, counts)
+        pop_first(heap, counts)
         if stamps[gone] != stamp:
             continue
         stays, now = _cheapest(gone, mesh, counts, bounds, ring)
@@ -169,7 +169,7 @@ def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
             stamps[gone] += 1
             _push(gone, now, stamps[gone], heap, counts)
             continue
-        merge(stays, gone, mesh, counts)
+        merge_vertices(stays, gone, mesh, counts)
         around, _ = mark_ring(stays, mesh, counts, changed)
         changed[around] = stays
         for slot in range(around + 1):

@@ -30,7 +30,7 @@ def _swap(heap, a, b):
 
 
 @part(fast=False)
-def take_in_last(heap, counts):
+def sift_up_last(heap, counts):
     """Add the entry that was written behind the last one."""
     slot = counts[HEAP_SIZE]
     counts[HEAP_SIZE] += 1
@@ -47,7 +47,7 @@ def _copy(heap, source, target):
 
 
 @part(fast=False)
-def drop_first(heap, counts):
+def pop_first(heap, counts):
     """Remove the cheapest entry."""
     last = counts[HEAP_SIZE] - 1
     counts[HEAP_SIZE] = last

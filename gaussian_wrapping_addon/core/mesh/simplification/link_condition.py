@@ -9,7 +9,7 @@ ring are marked with numbers that only grow, so that no mark has to be erased.
 from __future__ import annotations
 
 from ...kernels.compiled import part
-from .counters import TICK
+from .counters import LAST_MARK
 
 
 @part(fast=False)
@@ -21,8 +21,8 @@ def mark_ring(u, mesh, counts, ring):
     closed, that is each neighbour once.
     """
     faces, head, following, marks = mesh[1], mesh[2], mesh[3], mesh[6]
-    counts[TICK] += 1
-    mark = counts[TICK]
+    counts[LAST_MARK] += 1
+    mark = counts[LAST_MARK]
     around = 0
     corner = head[u]
     while corner >= 0:
@@ -48,8 +48,8 @@ def link_allows(u, v, around_u, mark, max_ring, mesh, counts):
         Faces around the merged vertex at most.
     """
     faces, head, following, marks = mesh[1], mesh[2], mesh[3], mesh[6]
-    counts[TICK] += 1
-    seen = counts[TICK]
+    counts[LAST_MARK] += 1
+    seen = counts[LAST_MARK]
     around_v, shared, common = 0, 0, 0
     corner = head[v]
     while corner >= 0:

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ...kernels.compiled import kernel, part
-from .corners import drop_dead, merge
+from .corners import merge_vertices, unlink_dead_faces
 from .counters import DONE, EMPTY, FACES_LEFT, FULL, HEAP_ROOM, HEAP_SIZE, PAUSED, SEQUENCE
-from .heap import drop_first, take_in_last
+from .heap import pop_first, sift_up_last
 from .link_condition import link_allows, mark_ring
-from .optimal_placement import BEST, FIRST, SECOND, place_merged, within
+from .optimal_placement import FIRST, OPTIMAL, SECOND, on_planes_of, place_merged
 from .quadrics import area_vector
 
 POINT_WEIGHT = 1e-7
@@ -43,19 +43,19 @@ class Limits(NamedTuple):
 
 
 @part(fast=False)
-def _push(u, v, first_kind, mesh, caps, heap, counts, work):
+def _push(u, v, first_kind, mesh, caps, heap, counts, scratch):
     """Put an edge into the heap, where the merged vertex can go anywhere."""
     cost, kind = np.inf, first_kind
-    if first_kind == BEST:
-        cost = place_merged(u, v, BEST, mesh, caps, work)
+    if first_kind == OPTIMAL:
+        cost = place_merged(u, v, OPTIMAL, mesh, caps, scratch)
     if not cost < np.inf and first_kind != SECOND:
-        cost, kind = place_merged(u, v, FIRST, mesh, caps, work), FIRST
-        other = place_merged(u, v, SECOND, mesh, caps, work)
+        cost, kind = place_merged(u, v, FIRST, mesh, caps, scratch), FIRST
+        other = place_merged(u, v, SECOND, mesh, caps, scratch)
         if other < cost:
             # Ends exchanged, so that the cheaper one is always tried first.
             u, v, cost = v, u, other
     elif first_kind == SECOND:
-        cost = place_merged(u, v, SECOND, mesh, caps, work)
+        cost = place_merged(u, v, SECOND, mesh, caps, scratch)
     if not cost < np.inf:
         return
     stamps, slot = mesh[5], counts[HEAP_SIZE]
@@ -63,11 +63,11 @@ def _push(u, v, first_kind, mesh, caps, heap, counts, work):
     heap[2][slot] = stamps[u] + stamps[v]
     heap[3][slot], heap[4][slot], heap[5][slot] = u, v, kind
     counts[SEQUENCE] += 1
-    take_in_last(heap, counts)
+    sift_up_last(heap, counts)
 
 
 @part(fast=False)
-def _across(b, c, mesh, skip_u, skip_v):
+def _opposite_face(b, c, mesh, skip_u, skip_v):
     """Return the face on the other side of the half-edge b -> c that holds neither end, or -1."""
     faces, head, following = mesh[1], mesh[2], mesh[3]
     corner = head[b]
@@ -91,8 +91,8 @@ def _shapes_allow(u, v, mesh, limits, place, ring, ring_normals):
     turn_cos, fold_cos, min_shape = limits
     x, y, z = place[0], place[1], place[2]
     size = 0
-    for turn in range(2):
-        centre, other = (u, v) if turn == 0 else (v, u)
+    for side in range(2):
+        centre, other = (u, v) if side == 0 else (v, u)
         corner = head[centre]
         while corner >= 0:
             f, k = corner // 3, corner % 3
@@ -125,7 +125,7 @@ def _shapes_allow(u, v, mesh, limits, place, ring, ring_normals):
             ring[size, 0], ring[size, 1] = b, c
             ring_normals[size, 0], ring_normals[size, 1] = nx / new, ny / new
             ring_normals[size, 2] = nz / new
-            beyond = _across(b, c, mesh, u, v)
+            beyond = _opposite_face(b, c, mesh, u, v)
             if beyond >= 0:
                 a = faces[beyond, 0]
                 mx, my, mz = area_vector(
@@ -153,15 +153,15 @@ def _shapes_allow(u, v, mesh, limits, place, ring, ring_normals):
 def _merge(u, v, mesh, caps, counts, place):
     """Let ``v`` become ``u``, at ``place``, on the planes of both."""
     points, planes, locked = mesh[0], caps[0], caps[1]
-    merge(u, v, mesh, counts)
-    if not within(planes, v, u):
+    merge_vertices(u, v, mesh, counts)
+    if not on_planes_of(planes, v, u):
         planes[u] = planes[v]
     points[u] = place
     locked[u] = locked[u] or locked[v]
 
 
 @kernel(fast=False)
-def push_edges(mesh, caps, heap, counts, work):
+def push_edges(mesh, caps, heap, counts, scratch):
     """Put every edge into the empty heap, which must have room for half of all corners."""
     faces = mesh[1]
     for f in range(len(faces)):
@@ -169,11 +169,11 @@ def push_edges(mesh, caps, heap, counts, work):
             for k in range(3):
                 u, v = faces[f, k], faces[f, (k + 1) % 3]
                 if u < v:
-                    _push(u, v, BEST, mesh, caps, heap, counts, work)
+                    _push(u, v, OPTIMAL, mesh, caps, heap, counts, scratch)
 
 
 @kernel(fast=False)
-def collapse_edges(mesh, caps, heap, counts, limits, work, target, budget):
+def collapse_edges(mesh, caps, heap, counts, limits, scratch, target, budget):
     """Collapse the cheapest edges until ``target`` faces are left.
 
     Parameters
@@ -191,7 +191,7 @@ def collapse_edges(mesh, caps, heap, counts, limits, work, target, budget):
     unused = np.empty(0, np.int64)
     ring = np.empty((MAX_RING + 4, 2), np.int64)
     ring_normals = np.empty((MAX_RING + 4, 3), np.float64)
-    place = work[0]
+    place = scratch[0]
     room = len(heap[0]) - HEAP_ROOM
     for _ in range(budget):
         if counts[FACES_LEFT] <= target:
@@ -202,21 +202,21 @@ def collapse_edges(mesh, caps, heap, counts, limits, work, target, budget):
             return FULL
         u, v, kind = heap[3][0], heap[4][0], heap[5][0]
         current = stamps[u] + stamps[v] == heap[2][0]
-        drop_first(heap, counts)
+        pop_first(heap, counts)
         if not current or head[u] < 0 or head[v] < 0:
             continue
-        drop_dead(u, faces, head, following)
-        drop_dead(v, faces, head, following)
+        unlink_dead_faces(u, faces, head, following)
+        unlink_dead_faces(v, faces, head, following)
         around, mark = mark_ring(u, mesh, counts, unused)
         if not link_allows(u, v, around, mark, MAX_RING, mesh, counts):
             continue
-        place_merged(u, v, kind, mesh, caps, work)
+        place_merged(u, v, kind, mesh, caps, scratch)
         size = _shapes_allow(u, v, mesh, limits, place, ring, ring_normals)
         if size < 0:
             if kind != SECOND:
-                _push(u, v, kind + 1, mesh, caps, heap, counts, work)
+                _push(u, v, kind + 1, mesh, caps, heap, counts, scratch)
             continue
         _merge(u, v, mesh, caps, counts, place)
         for i in range(size):
-            _push(u, ring[i, 0], BEST, mesh, caps, heap, counts, work)
+            _push(u, ring[i, 0], OPTIMAL, mesh, caps, heap, counts, scratch)
     return PAUSED

@@ -13,12 +13,12 @@ import numpy as np
 from ...kernels.compiled import part
 from .quadrics import error_of_both
 
-BEST, FIRST, SECOND = 0, 1, 2
+OPTIMAL, FIRST, SECOND = 0, 1, 2
 """Kinds of collapses: the merged vertex goes where the error is least, or to one of the ends."""
 
 
 @part(fast=False)
-def within(planes, u, v):
+def on_planes_of(planes, u, v):
     """Tell whether ``v`` lies on every plane that ``u`` lies on."""
     for i in range(3):
         if planes[u, i] >= 0:
@@ -90,19 +90,19 @@ def _solve(matrix, right, size):
 
 
 @part(fast=False)
-def place_merged(u, v, kind, mesh, caps, work):
+def place_merged(u, v, kind, mesh, caps, scratch):
     """Put the merged vertex into ``work[0]``; return its error, infinite where it may not go."""
     points, quadrics = mesh[0], mesh[4]
     planes, locked, normals, offsets = caps
-    place, basis, matrix = work[0], work[1:4], work[4:7]
-    right = work[7]
-    u_in_v = not locked[u] and within(planes, u, v)
-    v_in_u = not locked[v] and within(planes, v, u)
-    if kind == FIRST or (kind == BEST and locked[u]):
+    place, basis, matrix = scratch[0], scratch[1:4], scratch[4:7]
+    right = scratch[7]
+    u_in_v = not locked[u] and on_planes_of(planes, u, v)
+    v_in_u = not locked[v] and on_planes_of(planes, v, u)
+    if kind == FIRST or (kind == OPTIMAL and locked[u]):
         if not v_in_u:
             return np.inf
         place[:] = points[u]
-    elif kind == SECOND or (kind == BEST and locked[v]):
+    elif kind == SECOND or (kind == OPTIMAL and locked[v]):
         if not u_in_v:
             return np.inf
         place[:] = points[v]

@@ -56,7 +56,7 @@ def mesh_statistics(mesh: SurfaceMesh) -> MeshStatistics:
     keys = edge_keys(begin, end, max(len(vertices), 1))
     edges, index, count = np.unique(keys, return_inverse=True, return_counts=True)
     forward = np.bincount(index, weights=begin < end, minlength=len(edges))
-    boundary, crowded = int((count == 1).sum()), int((count > 2).sum())
+    boundary, nonmanifold = int((count == 1).sum()), int((count > 2).sum())
     inconsistent = int(((count == 2) & (forward != 1)).sum())
     used = len(np.unique(faces))
     parts, part = face_components(len(vertices), faces)
@@ -64,14 +64,14 @@ def mesh_statistics(mesh: SurfaceMesh) -> MeshStatistics:
     _, areas = normals_and_areas(vertices, faces)
     repeated = (faces == faces[:, [1, 2, 0]]).any(1)
     fans = _fans(faces, keys)
-    closed = len(faces) > 0 and boundary == 0 and crowded == 0 and inconsistent == 0
+    closed = len(faces) > 0 and boundary == 0 and nonmanifold == 0 and inconsistent == 0
     euler = used - len(edges) + len(faces)
     manifold = closed and fans == used
     return MeshStatistics(
         vertices=len(vertices),
         faces=len(faces),
         boundary_edges=boundary,
-        nonmanifold_edges=crowded,
+        nonmanifold_edges=nonmanifold,
         nonmanifold_vertices=fans - used,
         inconsistent_edges=inconsistent,
         degenerate_faces=int((repeated | (areas <= 0)).sum()),

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...field.isosurface_residual import level_errors
+from ...field.isosurface_residual import isosurface_residuals
 from ...mesh.simplification.decimation import decimate
 from ...mesh.surface_mesh import SurfaceMesh
 from ...progress import Progress
@@ -22,7 +22,7 @@ from .smoothing import smooth
 _logger = logging.getLogger(__name__)
 
 
-class CleanedUp(NamedTuple):
+class CleanUpResult(NamedTuple):
     """A mesh as asked for, and the one with all its faces where some were taken away."""
 
     mesh: SurfaceMesh
@@ -35,7 +35,7 @@ def clean_up(
     settings: MeshingSettings,
     vacancy: Any,
     progress: Progress,
-) -> CleanedUp:
+) -> CleanUpResult:
     """Smooth, then decimate, as the settings ask; without a request the mesh stays as it is.
 
     Both keep a closed 2-manifold closed and manifold, with its parts and their genus. Vertices then
@@ -52,7 +52,7 @@ def clean_up(
         Or anything with ``vacancy(points)``.
     """
     if settings.smooth_steps == 0 and not 0 < settings.target_faces < len(mesh.faces):
-        return CleanedUp(_with_request(mesh, settings), None)
+        return CleanUpResult(_with_request(mesh, settings), None)
     vertices, faces, colors = mesh.vertices, np.asarray(mesh.faces, np.int64), mesh.colors
     if settings.smooth_steps > 0:
         vertices = smooth(
@@ -82,7 +82,7 @@ def clean_up(
         "smooth_steps": settings.smooth_steps,
         "target_faces": settings.target_faces,
         "faces_before_clean_up": len(mesh.faces),
-        **level_errors(vacancy, vertices[~capped]),
+        **isosurface_residuals(vacancy, vertices[~capped]),
         "vertices_on_surface": int((~capped).sum()),
         "vertices_on_region_boundary": int(capped.sum()),
         "vertices_at_end_of_sight": 0,
@@ -90,7 +90,7 @@ def clean_up(
     }
     progress.update(1.0, f"{len(faces)} faces")
     cleaned = SurfaceMesh(vertices, faces.astype(np.int32), colors, provenance)
-    return CleanedUp(cleaned, dense if len(faces) < len(mesh.faces) else None)
+    return CleanUpResult(cleaned, dense if len(faces) < len(mesh.faces) else None)
 
 
 def _with_request(mesh: SurfaceMesh, settings: MeshingSettings) -> SurfaceMesh:

@@ -59,11 +59,11 @@ def remove_degenerate(
         longer = 2.0 ** max(0, done - PATIENT_PASSES)
         short = height * min(SHORT_HEIGHTS * longer, MAX_SHORT_HEIGHTS)
         near, frozen = _surroundings(len(vertices), faces, narrow)
-        mesh = _Editable(faces[near], frozen)
+        mesh = _HalfEdgeMesh(faces[near], frozen)
         changed = False
         for face in np.searchsorted(near, narrow).tolist():
             if mesh.faces[face] is not None:
-                changed |= _improve(mesh, vertices, face, short, planes)
+                changed |= _remove_face(mesh, vertices, face, short, planes)
         if not changed:
             if short >= height * MAX_SHORT_HEIGHTS:
                 break
@@ -113,7 +113,7 @@ def _surroundings(count: int, faces: np.ndarray, chosen: np.ndarray) -> tuple[np
     return chosen, set(here[beyond[here]].tolist())
 
 
-class _Editable:
+class _HalfEdgeMesh:
     """Faces by half-edge, for a few local changes."""
 
     def __init__(self, faces: np.ndarray, frozen: set[int]) -> None:
@@ -188,8 +188,8 @@ class _Editable:
         return next(v for v in face if v not in (begin, end))
 
 
-def _improve(
-    mesh: _Editable,
+def _remove_face(
+    mesh: _HalfEdgeMesh,
     vertices: np.ndarray,
     face: int,
     short: float,

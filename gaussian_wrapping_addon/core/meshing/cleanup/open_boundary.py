@@ -15,16 +15,18 @@ from ...mesh.surface_mesh import SurfaceMesh
 from ...mesh.topology import edge_keys, half_edges, next_half_edges, normals_and_areas
 from ...regions.cap_planes import ON_PLANE_SHARE, cap_planes
 from ...regions.convex_region import Region
-from .repair import APART_SHARE
+from .repair import SEPARATION_SHARE
 
-MOVED_SHARE = 1.5 * APART_SHARE
+MOVED_SHARE = 1.5 * SEPARATION_SHARE
 """A vertex that repair moved may be off its plane by this share of its face's longest edge."""
 
 ALONG_COSINE = 0.9
 """With such a vertex a face belongs to a cap only if it still faces out of the region."""
 
 
-def opened(mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0) -> SurfaceMesh:
+def without_caps(
+    mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0
+) -> SurfaceMesh:
     """Return the mesh without the faces that close it at the region's boundary.
 
     What stays is consistently oriented and manifold, with boundary edges on the region's planes
@@ -147,5 +149,5 @@ def split_fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     columns = np.concatenate([following[second], second])
     graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(faces.size,) * 2)
     _, label = connected_components(graph, directed=False)
-    _, place, number = np.unique(label, return_index=True, return_inverse=True)
-    return number.reshape(-1, 3), faces.reshape(-1)[place]
+    _, first_corner, number = np.unique(label, return_index=True, return_inverse=True)
+    return number.reshape(-1, 3), faces.reshape(-1)[first_corner]

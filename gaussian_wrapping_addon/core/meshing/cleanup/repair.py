@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from ...errors import MeshingError
 from ...mesh.topology import faces_per_edge, half_edges, next_half_edges
 
-APART_SHARE = 0.005
+SEPARATION_SHARE = 0.005
 """Copies of a vertex move this share of the way to the middle of their own faces, so that the
 parts do not touch and programs that merge equal points do not join them again. With four times as
 much, coarse meshes of thin things left the isosurface: 99 % of a room's vertices were within 0.05
@@ -24,7 +24,7 @@ _DEFECT = "Send the job folder's log.txt with a bug report."
 
 
 @dataclass(frozen=True)
-class Repaired:
+class RepairResult:
     """A closed 2-manifold."""
 
     vertices: np.ndarray
@@ -39,7 +39,7 @@ class Repaired:
     """Edges that needed a vertex in their middle."""
 
 
-def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> Repaired:
+def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> RepairResult:
     """Split edges with more than two faces, and vertices with more than one fan of faces.
 
     Around an edge, faces that bound the same wedge of the solid stay together. Where both copies
@@ -66,10 +66,10 @@ def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> Repaired:
         partner = _partners(vertices, faces)
         new_faces, source = _fans(faces, partner)
         vertices, origin = vertices[source], origin[source]
-        bad = _crowded(new_faces)
+        bad = _nonmanifold_half_edges(new_faces)
         if not bad.any():
             break
-        pairs = _one_per_face(bad, partner)
+        pairs = _independent_pairs(bad, partner)
         middles = (vertices[new_faces.reshape(-1)[pairs]] + vertices[_ends(new_faces)[pairs]]) / 2
         new_faces = _split_at_middles(new_faces, pairs, partner, len(vertices))
         vertices = np.concatenate([vertices, middles])
@@ -81,8 +81,8 @@ def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> Repaired:
             "The surface could not be made manifold.",
             _DEFECT,
         )
-    moved = _apart(vertices, new_faces, origin)
-    return Repaired(moved, new_faces, origin, len(moved) - before - split_edges, split_edges)
+    moved = _separate_copies(vertices, new_faces, origin)
+    return RepairResult(moved, new_faces, origin, len(moved) - before - split_edges, split_edges)
 
 
 def _ends(faces: np.ndarray) -> np.ndarray:
@@ -173,12 +173,12 @@ def _fans(faces: np.ndarray, partner: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return rank[label].reshape(-1, 3), old[order]
 
 
-def _crowded(faces: np.ndarray) -> np.ndarray:
+def _nonmanifold_half_edges(faces: np.ndarray) -> np.ndarray:
     """(3f,) bool: half-edges whose edge still has more than two faces."""
     return faces_per_edge(faces, int(faces.max()) + 1) > 2
 
 
-def _one_per_face(bad: np.ndarray, partner: np.ndarray) -> np.ndarray:
+def _independent_pairs(bad: np.ndarray, partner: np.ndarray) -> np.ndarray:
     """Choose pairs (by their first half-edge) so that no face is split twice in one pass."""
     chosen: list[int] = []
     busy: set[int] = set()
@@ -204,7 +204,7 @@ def _split_at_middles(
     return np.concatenate([result, np.array(added, np.int64).reshape(-1, 3)])
 
 
-def _apart(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray) -> np.ndarray:
+def _separate_copies(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """Move copies of vertices a little towards their own faces."""
     copies = np.bincount(origin[origin >= 0], minlength=int(origin.max(initial=0)) + 1)
     moving = np.where(origin >= 0, copies[origin] > 1, True)
@@ -217,5 +217,5 @@ def _apart(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray) -> np.nd
         np.add.at(count, faces[:, k], 1.0)
     target = total / np.maximum(count, 1.0)[:, None]
     result = vertices.copy()
-    result[moving] += APART_SHARE * (target - vertices)[moving]
+    result[moving] += SEPARATION_SHARE * (target - vertices)[moving]
     return result

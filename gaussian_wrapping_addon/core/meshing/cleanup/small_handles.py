@@ -24,7 +24,7 @@ MAX_MOVE_EDGES = 2.25
 """A vertex that goes lies at most so many edge lengths from the disc that takes the patch's place,
 half of the largest box: more is a thing of its own, not noise of the surface."""
 
-MAX_LOOP = 60
+MAX_LOOP_EDGES = 60
 """A patch with more edges around it is left alone: its cover would not follow the surface."""
 
 THIN = 1e-6
@@ -35,7 +35,7 @@ MAX_PASSES = 8
 
 
 @dataclass(frozen=True)
-class Closed:
+class HandleClosure:
     """What :func:`without_small_handles` did."""
 
     faces: np.ndarray
@@ -59,7 +59,9 @@ class _Patches:
     """(p,) int64 closed curves around each."""
 
 
-def without_small_handles(vertices: np.ndarray, faces: np.ndarray, edge_length: float) -> Closed:
+def without_small_handles(
+    vertices: np.ndarray, faces: np.ndarray, edge_length: float
+) -> HandleClosure:
     """Replace patches with handles in small boxes by discs with the same outline.
 
     A handle that small is below what the mesh resolves: noise of the isosurface, or of the labels
@@ -76,13 +78,13 @@ def without_small_handles(vertices: np.ndarray, faces: np.ndarray, edge_length: 
     """
     faces = np.asarray(faces, np.int64)
     if _genus(len(vertices), faces) == 0:
-        return Closed(faces, 0, 0)
+        return HandleClosure(faces, 0, 0)
     closed = 0
     for share in BOX_EDGES:
         for _ in range(MAX_PASSES):
             found = 0
             for shift in product((0.0, 0.5), repeat=3):
-                faces, count = _one_grid(vertices, faces, share, edge_length, np.array(shift))
+                faces, count = _close_in_grid(vertices, faces, share, edge_length, np.array(shift))
                 found += count
             closed += found
             if found == 0:
@@ -91,7 +93,7 @@ def without_small_handles(vertices: np.ndarray, faces: np.ndarray, edge_length: 
     for shift in product((0.0, 0.5), repeat=3):
         patches = _patches(vertices, faces, BOX_EDGES[-1] * edge_length, np.array(shift))
         left = max(left, int(patches.handles.sum()))
-    return Closed(faces, closed, left)
+    return HandleClosure(faces, closed, left)
 
 
 def _genus(vertex_count: int, faces: np.ndarray) -> int:
@@ -101,7 +103,7 @@ def _genus(vertex_count: int, faces: np.ndarray) -> int:
     return (2 * parts - euler) // 2
 
 
-def _one_grid(
+def _close_in_grid(
     vertices: np.ndarray, faces: np.ndarray, share: float, edge_length: float, shift: np.ndarray
 ) -> tuple[np.ndarray, int]:
     """Close the handles in the boxes of one grid; return the faces and the number of handles."""
@@ -119,14 +121,16 @@ def _one_grid(
     closed = 0
     for label, (first, last) in zip(chosen.tolist(), bounds.tolist(), strict=True):
         rows = order[first:last]
-        loop = _outline(faces[rows])
-        if loop is None or len(loop) > MAX_LOOP:
+        loop = _boundary_loop(faces[rows])
+        if loop is None or len(loop) > MAX_LOOP_EDGES:
             continue
         pairs = edge_keys(loop[:, None], loop[None, :], count)  # (n, n)
-        taken = keys[np.minimum(np.searchsorted(keys, pairs), len(keys) - 1)] == pairs
-        taken &= ~np.isin(pairs, _edge_keys(faces[rows], count))
-        taken |= np.array([key in covered for key in pairs.ravel().tolist()]).reshape(pairs.shape)
-        cover = _cover(vertices[loop], loop, taken)
+        forbidden = keys[np.minimum(np.searchsorted(keys, pairs), len(keys) - 1)] == pairs
+        forbidden &= ~np.isin(pairs, _edge_keys(faces[rows], count))
+        forbidden |= np.array([key in covered for key in pairs.ravel().tolist()]).reshape(
+            pairs.shape
+        )
+        cover = _least_area_triangles(vertices[loop], loop, forbidden)
         if cover is None:
             continue
         gone = np.setdiff1d(faces[rows], loop)
@@ -180,11 +184,13 @@ def _patches(vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.nda
     )
     nodes, index, degree = np.unique(ends, return_inverse=True, return_counts=True)
     half = len(outline_patch)
-    rings = coo_matrix((np.ones(half, np.int8), (index[:half], index[half:])), (len(nodes),) * 2)
-    ring_number, ring = connected_components(rings, directed=False)
-    ring_patch = np.zeros(ring_number, np.int64)
-    ring_patch[ring] = nodes // count
-    loops = np.bincount(ring_patch, minlength=number)
+    loop_graph = coo_matrix(
+        (np.ones(half, np.int8), (index[:half], index[half:])), (len(nodes),) * 2
+    )
+    loop_count, loop_label = connected_components(loop_graph, directed=False)
+    loop_patch = np.zeros(loop_count, np.int64)
+    loop_patch[loop_label] = nodes // count
+    loops = np.bincount(loop_patch, minlength=number)
     touching = np.bincount(nodes[degree != 2] // count, minlength=number) > 0
     # A patch without an outline is a whole small part: its handles are small too, but it has no
     # disc to become.
@@ -197,7 +203,7 @@ def _edge_keys(faces: np.ndarray, count: int) -> np.ndarray:
     return edge_keys(*half_edges(faces), count)
 
 
-def _outline(faces: np.ndarray) -> np.ndarray | None:
+def _boundary_loop(faces: np.ndarray) -> np.ndarray | None:
     """Return the vertices around a patch in the order of its half-edges, (n,) int64."""
     half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()
     pairs = {(a, b) for a, b in half}
@@ -211,7 +217,9 @@ def _outline(faces: np.ndarray) -> np.ndarray | None:
     return np.array(loop, np.int64) if len(loop) == len(following) else None
 
 
-def _cover(points: np.ndarray, loop: np.ndarray, taken: np.ndarray) -> np.ndarray | None:
+def _least_area_triangles(
+    points: np.ndarray, loop: np.ndarray, forbidden: np.ndarray
+) -> np.ndarray | None:
     """Return the triangles of least area that span a loop, (n - 2, 3), or None.
 
     Parameters
@@ -231,7 +239,7 @@ def _cover(points: np.ndarray, loop: np.ndarray, taken: np.ndarray) -> np.ndarra
     for gap in range(2, count):
         for i in range(count - gap):
             j = i + gap
-            if gap < count - 1 and taken[i, j]:
+            if gap < count - 1 and forbidden[i, j]:
                 continue
             middle = np.arange(i + 1, j)
             arms = np.cross(points[middle] - points[i], points[j] - points[i])

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from ...mesh.components import face_components, volumes_and_areas
-from ...mesh.topology import area_vectors, ends_of, faces_per_edge, half_edges
+from ...mesh.topology import area_vectors, faces_per_edge, half_edges, vertices_of_half_edges
 from ...progress import Progress
 from ...regions.cap_planes import CapPlanes, cap_planes
 from ...regions.convex_region import Region
@@ -107,7 +107,7 @@ def _neighbour_weights(points: np.ndarray, faces: np.ndarray) -> csr_matrix:
 
 
 def _at_open_edges(faces: np.ndarray, count: int) -> np.ndarray:
-    return ends_of(faces_per_edge(faces, count) == 1, faces, count)
+    return vertices_of_half_edges(faces_per_edge(faces, count) == 1, faces, count)
 
 
 def _safe_move(

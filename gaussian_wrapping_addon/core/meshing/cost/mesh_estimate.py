@@ -19,9 +19,9 @@ from ..points.resolution import (
     AUTOMATIC_POINTS,
     MIN_VERTICES,
     VERTICES_PER_UNIFORM,
-    Request,
+    ResolutionRequest,
     dense_points,
-    stay_of_dense,
+    kept_from_dense,
 )
 from ..points.spacing import LONGEST_SHARE
 from ..tiles.plan import TILE_POINTS, WHOLE_POINTS
@@ -99,7 +99,7 @@ class MeshEstimate:
         gigabytes = [f"{size / 2**30:.1f}" for size in sizes]
         unit, share = ("s", 1.0) if high < 90 else ("min", 60.0)
         return [
-            f"triangles: {rounded(2 * self.points_low)} to {rounded(2 * self.points_high)}",
+            f"triangles: {two_digits(2 * self.points_low)} to {two_digits(2 * self.points_high)}",
             f"time: {max(1, round(low / share))} to {max(1, round(high / share))} {unit}",
             f"memory: {gigabytes[0]} to {gigabytes[1]} GB whole, from {gigabytes[2]} GB in tiles",
         ]
@@ -118,8 +118,8 @@ class MeshEstimate:
         """
         if self.by_edge and self.dense_low > limits.MAX_MESH_POINTS:
             raise ResourceError(
-                f"This mesh needs at least {rounded(self.dense_low)} points; "
-                f"{rounded(limits.MAX_MESH_POINTS)} is the most.",
+                f"This mesh needs at least {two_digits(self.dense_low)} points; "
+                f"{two_digits(limits.MAX_MESH_POINTS)} is the most.",
                 f"{self._coarser(limits.MAX_MESH_POINTS)}, or a smaller region.",
             )
         needed = self.tiled_memory_bytes if tiled else self.memory_low_bytes
@@ -142,10 +142,10 @@ class MeshEstimate:
 
     def _coarser(self, dense: float) -> str:
         """Return what to ask for so that the mesh made first has so many points."""
-        stay = stay_of_dense(dense) if self.adaptive else dense
-        before = stay_of_dense(self.dense_low) if self.adaptive else float(self.dense_low)
+        stay = kept_from_dense(dense) if self.adaptive else dense
+        before = kept_from_dense(self.dense_low) if self.adaptive else float(self.dense_low)
         factor = math.ceil(105.0 * math.sqrt(before / max(stay, 1.0))) / 100.0
-        return f"Use edges {factor:.2f} times longer (about {rounded(int(stay))} points)"
+        return f"Use edges {factor:.2f} times longer (about {two_digits(int(stay))} points)"
 
 
 def _tile_bytes(points: float) -> float:
@@ -153,13 +153,13 @@ def _tile_bytes(points: float) -> float:
     return SURROUNDINGS * points * POINT_BYTES
 
 
-def rounded(number: int) -> str:
+def two_digits(number: int) -> str:
     """Return a number with two digits that count."""
     digits = max(0, len(str(max(number, 1))) - 2)
     return f"{round(number, -digits):_}".replace("_", " ")
 
 
-def area_of(points: np.ndarray) -> float:
+def box_counting_area(points: np.ndarray) -> float:
     """Return about the area of the surface that (n, 3) points lie on, by counting boxes.
 
     Thinner things than a box count once, not twice: the count is low for those.
@@ -181,7 +181,7 @@ def area_of(points: np.ndarray) -> float:
         side /= 1.25
 
 
-def occupied_boundary(region: Region, is_empty: Any) -> float:
+def occupied_boundary_area(region: Region, is_empty: Any) -> float:
     """Return about the area of the region's boundary that lies in the solid."""
     corners = np.concatenate(region.faces()).reshape(-1, 3)
     triangles = np.arange(len(corners)).reshape(-1, 3)
@@ -203,7 +203,7 @@ def evaluation_seconds(vacancy: Any, points: np.ndarray) -> float:
 def estimate_mesh(
     area: float,
     cap_area: float,
-    request: Request,
+    request: ResolutionRequest,
     *,
     adaptive: bool,
     evaluation_s: float = 0.0,
@@ -214,7 +214,7 @@ def estimate_mesh(
     Parameters
     ----------
     area, cap_area : float
-        From :func:`area_of` and :func:`occupied_boundary`.
+        From :func:`box_counting_area` and :func:`occupied_boundary_area`.
     evaluation_s : float
         From :func:`evaluation_seconds`.
     resolved : (n,) float64, optional

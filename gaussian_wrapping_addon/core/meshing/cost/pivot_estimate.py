@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What meshing a region by pivots will take, from the Gaussians and sightings in it.
+"""What meshing a region by pivots will take, from the Gaussians and depth_samples in it.
 
 The resolution is that of the Gaussians, so the points are counted, not asked for; each point has
 about six tetrahedra, as in any Delaunay triangulation of points near surfaces.
@@ -11,12 +11,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ...errors import ResourceError
-from ...field.depth_samples import MAX_SIGHTINGS
+from ...field.depth_samples import MAX_DEPTH_SAMPLES
 from ...gaussians.model import GaussianArrays
 from ...regions.convex_region import Region
-from ..points.candidate_surface import own_points
+from ..points.candidate_surface import pivots_and_probes
 from ..points.pivots import PIVOTS
-from .mesh_estimate import BASE_BYTES, FIXED_S, rounded
+from .mesh_estimate import BASE_BYTES, FIXED_S, two_digits
 
 TETRAHEDRA_LOW, TETRAHEDRA_HIGH = 5.0, 8.0
 """For each point, after the cut at the region (5.8 to 7.0 of spheres and tori)."""
@@ -25,7 +25,7 @@ FACES_LOW, FACES_HIGH = 0.5, 3.0
 """For each point of the Gaussians (1.2 with nine pivots, of which most lie off the surface, to 2.4
 with two; fewer where the region ends)."""
 PAIR_FACES_LOW, PAIR_FACES_HIGH = 3.0, 7.0
-"""For each point of the sightings, all next to the surface (5 to 6 on a trained scene)."""
+"""For each point of the depth_samples, all next to the surface (5 to 6 on a trained scene)."""
 
 POINT_LOW_BYTES, POINT_BYTES = 1_500, 6_500
 """Peak for each point (1 900 with nine pivots to 5 900 with three)."""
@@ -71,8 +71,8 @@ class PivotEstimate:
             f"{size / 2**30:.1f}" for size in (self.memory_low_bytes, self.memory_bytes)
         )
         return [
-            f"tetrahedra: {rounded(self.tetrahedra_low)} to {rounded(self.tetrahedra_high)}",
-            f"triangles: {rounded(2 * self.points_low)} to {rounded(2 * self.points_high)}",
+            f"tetrahedra: {two_digits(self.tetrahedra_low)} to {two_digits(self.tetrahedra_high)}",
+            f"triangles: {two_digits(2 * self.points_low)} to {two_digits(2 * self.points_high)}",
             f"time: {_span(self.seconds_low)} to {_span(self.seconds_high)}",
             f"memory: {low_gb} to {high_gb} GB",
         ]
@@ -88,7 +88,7 @@ class PivotEstimate:
         if memory_bytes <= 0 or self.memory_low_bytes <= memory_bytes:
             return
         raise ResourceError(
-            f"Meshing {rounded(self.gaussians)} Gaussians by pivots needs at least "
+            f"Meshing {two_digits(self.gaussians)} Gaussians by pivots needs at least "
             f"{self.memory_low_bytes / 2**30:.1f} GB of memory; {memory_bytes / 2**30:.1f} GB are "
             "free.",
             "Draw a smaller region, use fewer pivots, or mesh it by the method pam.",
@@ -99,8 +99,8 @@ def _span(seconds: float) -> str:
     return f"{max(1, round(seconds))} s" if seconds < 90 else f"{round(seconds / 60)} min"
 
 
-def estimate_pivots(
-    arrays: GaussianArrays, region: Region, pivots: int, sightings: int, *,
+def estimate_pivot_mesh(
+    arrays: GaussianArrays, region: Region, pivots: int, depth_samples: int, *,
     evaluation_s: float = 0.0, seed: int = 0,
 ) -> PivotEstimate:  # fmt: skip
     """Return what :func:`~..pivot_meshing.mesh_by_pivots` will take.
@@ -111,7 +111,7 @@ def estimate_pivots(
         Same frame.
     pivots : int
         Of each Gaussian.
-    sightings : int
+    depth_samples : int
         How many there are in the region.
     evaluation_s : float
         Time of one evaluation of vacancy, from :func:`~.mesh_estimate.evaluation_seconds`.
@@ -121,9 +121,9 @@ def estimate_pivots(
     MeshingError
         No Gaussian reaches the region.
     """
-    own = own_points(arrays, region, seed, PIVOTS[pivots])
-    pairs_low = PAIRED_LOW * min(sightings, MAX_SIGHTINGS)
-    pairs_high = min(PAIRED_HIGH * sightings, 2.0 * MAX_SIGHTINGS)
+    own = pivots_and_probes(arrays, region, seed, PIVOTS[pivots])
+    pairs_low = PAIRED_LOW * min(depth_samples, MAX_DEPTH_SAMPLES)
+    pairs_high = min(PAIRED_HIGH * depth_samples, 2.0 * MAX_DEPTH_SAMPLES)
     low, high = len(own.points) + pairs_low, len(own.points) + pairs_high
     few = FACES_LOW * len(own.points) + PAIR_FACES_LOW * pairs_low
     many = FACES_HIGH * len(own.points) + PAIR_FACES_HIGH * pairs_high

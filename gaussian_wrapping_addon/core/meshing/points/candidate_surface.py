@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...errors import MeshingError
-from ...field.depth_samples import Sightings, bracket_pairs
+from ...field.depth_samples import DepthSamples, bracket_pairs
 from ...gaussians.model import GaussianArrays
 from ...progress import Progress
 from ...regions.convex_region import Region
-from ..tetrahedra.delaunay import delaunay, far_points
+from ..tetrahedra.delaunay import bounding_points, delaunay
 from ..tetrahedra.marching_tetrahedra import IsEmpty, bisect, marching_tetrahedra
-from .pivots import MAX_PIVOT_GAUSSIANS, reaching, representative, two_pivots
+from .pivots import MAX_PIVOT_GAUSSIANS, gaussians_reaching, representative_gaussians, two_pivots
 
 PROBES = 4096
 """Points spread through the region besides the pivots: a Gaussian that is as large as the region
@@ -59,7 +59,7 @@ def candidate_surface(
     tolerance: float,
     seed: int,
     progress: Progress,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> CandidateSurface:
     """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and sighting.
 
@@ -67,7 +67,7 @@ def candidate_surface(
     ----------
     tolerance : float
         Length of the bracket on crossing edges; 0 takes :data:`BRACKET_SHARE`.
-    sightings : Sightings, optional
+    depth_samples : DepthSamples, optional
         Of the cameras in the region: parts about as thin as a pixel are found by these alone.
 
     Raises
@@ -77,23 +77,23 @@ def candidate_surface(
     """
     margin = MARGIN_SHARE * region.diagonal
     is_empty = _within_halo(is_empty, region)
-    cloud = pivot_cloud(arrays, region, is_empty, seed, sightings)
+    cloud = pivot_cloud(arrays, region, is_empty, seed, depth_samples)
     pivots = cloud.points
-    points = np.concatenate([pivots, far_points(pivots, seed)])
+    points = np.concatenate([pivots, bounding_points(pivots, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
     progress.update(0.3, f"evaluating {len(pivots)} pivots")
     inside = np.zeros(len(points), np.bool_)  # far points are empty by definition
     inside[: len(pivots)] = ~is_empty(pivots)
     edges, faces = marching_tetrahedra(_near(points, tetrahedra, region, margin), inside)
     if len(faces) == 0:
-        raise no_surface(region)
+        raise no_surface_error(region)
     tolerance = tolerance or BRACKET_SHARE * region.diagonal
     ends = bisect(points[edges[:, 0]], points[edges[:, 1]], is_empty, tolerance,
                   progress.span(0.6, 1.0))  # fmt: skip
     vertices = (ends[0] + ends[1]) / 2
     kept = region.distance(vertices[faces].mean(1)) <= margin
     if not kept.any():
-        raise no_surface(region)
+        raise no_surface_error(region)
     return CandidateSurface(vertices, faces[kept], cloud.gaussians, len(pivots))
 
 
@@ -114,7 +114,7 @@ def pivot_cloud(
     region: Region,
     is_empty: IsEmpty,
     seed: int,
-    sightings: Sightings | None,
+    depth_samples: DepthSamples | None,
     *,
     pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray] = two_pivots,
 ) -> PivotCloud:
@@ -125,14 +125,14 @@ def pivot_cloud(
     MeshingError
         No Gaussian reaches the region.
     """
-    own = own_points(arrays, region, seed, pivots_of)
-    if sightings is None:
+    own = pivots_and_probes(arrays, region, seed, pivots_of)
+    if depth_samples is None:
         return own
-    points = np.concatenate(bracket_pairs(sightings, is_empty))
+    points = np.concatenate(bracket_pairs(depth_samples, is_empty))
     return replace(own, points=np.concatenate([own.points, _in_halo(points, region)]))
 
 
-def own_points(
+def pivots_and_probes(
     arrays: GaussianArrays,
     region: Region,
     seed: int,
@@ -146,10 +146,10 @@ def own_points(
         No Gaussian reaches the region.
     """
     margin = MARGIN_SHARE * region.diagonal
-    index = reaching(arrays, region, margin)
+    index = gaussians_reaching(arrays, region, margin)
     if len(index) == 0:
         raise MeshingError(f"No Gaussian reaches region {region.name!r}.", NO_SURFACE_HINT)
-    chosen = representative(arrays, index, MAX_PIVOT_GAUSSIANS)
+    chosen = representative_gaussians(arrays, index, MAX_PIVOT_GAUSSIANS)
     pivots = pivots_of(arrays, chosen)
     near = pivots[region.distance(pivots) <= HALO_SHARE * region.diagonal]
     points = np.concatenate([near, _probes(region, margin, seed)])
@@ -181,7 +181,7 @@ def _within_halo(is_empty: IsEmpty, region: Region) -> IsEmpty:
     return inside_only
 
 
-def no_surface(region: Region) -> MeshingError:
+def no_surface_error(region: Region) -> MeshingError:
     """Return the error for a region without a surface."""
     return MeshingError(f"Region {region.name!r} holds no surface.", NO_SURFACE_HINT)
 

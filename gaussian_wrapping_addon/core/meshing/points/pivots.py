@@ -18,7 +18,7 @@ MAX_PIVOT_GAUSSIANS = 250_000
 """With more, one Gaussian a cell and direction stands for its neighbours (memory)."""
 
 
-def reaching(arrays: GaussianArrays, region: Region, margin: float) -> np.ndarray:
+def gaussians_reaching(arrays: GaussianArrays, region: Region, margin: float) -> np.ndarray:
     """Return indices of the Gaussians whose 3-sigma body comes within ``margin`` of the region.
 
     Gaussians that no kernel shows (opacity below 1/255), and those whose centre is farther away
@@ -105,7 +105,7 @@ PIVOTS: dict[int, Callable[[GaussianArrays, np.ndarray], np.ndarray]] = {
 """By their number."""
 
 
-def representative(arrays: GaussianArrays, index: np.ndarray, limit: int) -> np.ndarray:
+def representative_gaussians(arrays: GaussianArrays, index: np.ndarray, limit: int) -> np.ndarray:
     """Return at most about ``limit`` of the Gaussians ``index``, evenly over space and direction.
 
     In each cell the most opaque Gaussian of each octant of normals stays. Cells grow until the

@@ -39,7 +39,7 @@ FINEST_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
-class Request:
+class ResolutionRequest:
     """What was asked for: an edge length, a number of points, or neither (0 and 0)."""
 
     edge_length: float
@@ -49,7 +49,7 @@ class Request:
     """What was changed, for the report."""
 
 
-def checked_request(edge_length: float, points: int, region: Region) -> Request:
+def checked_request(edge_length: float, points: int, region: Region) -> ResolutionRequest:
     """Check a request before any work is done.
 
     Raises
@@ -80,11 +80,11 @@ def checked_request(edge_length: float, points: int, region: Region) -> Request:
     if edge_length > coarsest:
         share = f"1/{1 / COARSEST_SHARE:.0f} of the region's diagonal"
         text = f"The edge length was larger than {share} and was reduced to that."
-        return Request(coarsest, 0, (ReportWarning("edge-length-reduced", text),))
-    return Request(edge_length, points)
+        return ResolutionRequest(coarsest, 0, (ReportWarning("edge-length-reduced", text),))
+    return ResolutionRequest(edge_length, points)
 
 
-def thinning_radius(request: Request, area: float, region: Region) -> float:
+def thinning_radius(request: ResolutionRequest, area: float, region: Region) -> float:
     """Return the thinning radius that answers the request with the same spacing everywhere.
 
     Parameters
@@ -99,7 +99,7 @@ def thinning_radius(request: Request, area: float, region: Region) -> float:
     return min(radius, COARSEST_SHARE * region.diagonal)
 
 
-def check_expected(points: float, request: Request) -> None:
+def check_expected_points(points: float, request: ResolutionRequest) -> None:
     """Refuse an edge length that needs too many points.
 
     Raises
@@ -117,10 +117,10 @@ def check_expected(points: float, request: Request) -> None:
 
 
 @dataclass(frozen=True)
-class Dense:
+class DenseRequest:
     """The mesh from which the vertices of an adaptive one are selected."""
 
-    request: Request
+    request: ResolutionRequest
     target: int
     """Vertices that stay, for the surface alone."""
     share: float
@@ -132,12 +132,12 @@ def dense_points(stay: float) -> float:
     return max(min(DENSE_FACTOR * stay, DENSE_POINTS), LEAST_DENSE_FACTOR * stay)
 
 
-def stay_of_dense(points: float) -> float:
+def kept_from_dense(points: float) -> float:
     """Return how many stay, at most, of a mesh of so many points: the inverse of the above."""
     return points / (LEAST_DENSE_FACTOR if points >= DENSE_POINTS else DENSE_FACTOR)
 
 
-def dense_request(request: Request, area: float, region: Region) -> Dense:
+def dense_request(request: ResolutionRequest, area: float, region: Region) -> DenseRequest:
     """Tell how dense a mesh to make, and how many of its vertices to keep, for a request.
 
     Raises
@@ -157,12 +157,12 @@ def dense_request(request: Request, area: float, region: Region) -> Dense:
         target = MIN_VERTICES
     dense = dense_points(target)
     if request.edge_length > 0:
-        check_expected(dense, request)
+        check_expected_points(dense, request)
         edge = request.edge_length * math.sqrt(expected / dense)
-        return Dense(Request(edge, 0, notes), target, target / dense)
-    return Dense(Request(0.0, round(dense), notes), target, target / dense)
+        return DenseRequest(ResolutionRequest(edge, 0, notes), target, target / dense)
+    return DenseRequest(ResolutionRequest(0.0, round(dense), notes), target, target / dense)
 
 
-def nominal_edge(request: Request, area: float, region: Region) -> float:
+def nominal_edge(request: ResolutionRequest, area: float, region: Region) -> float:
     """Return the edge length of the uniform mesh that a request stands for."""
     return EDGE_PER_RADIUS * thinning_radius(request, area, region)

@@ -25,7 +25,7 @@ from ...report_warning import ReportWarning
 from ..tetrahedra.marching_tetrahedra import bisect
 from .candidate_surface import CandidateSurface
 from .region_caps import cap_points, no_caps
-from .resolution import Request, check_expected, thinning_radius
+from .resolution import ResolutionRequest, check_expected_points, thinning_radius
 from .spacing import Spacing, footprint_spacing
 
 KIND_SURFACE, KIND_CAP, KIND_JUMP = 0, 1, 2
@@ -42,9 +42,9 @@ FIRST_THINNING = 0.4
 even the points become (and sampling.POINTS_PER_SQUARE)."""
 MAX_BLOCK = 2_000_000
 """Candidates drawn at a time (memory)."""
-SCOUTS = 20_000
+FOOTPRINT_SAMPLES = 20_000
 """Even points on the candidate surface at which the photos' footprint is looked up."""
-NOTED_SHARE = 0.1
+REPORTED_SHARE = 0.1
 """Share of the surface from which on it is worth a note that the photos limit the edges."""
 
 MAX_PROJECTION_STEPS = 14
@@ -75,7 +75,7 @@ class SurfacePoints:
 
 
 @dataclass(frozen=True)
-class _Settled:
+class _ProjectedPoints:
     """Candidates that reached a surface."""
 
     points: np.ndarray
@@ -113,7 +113,7 @@ class SurfaceSampler:
         self._threads = threads
 
     def spacing(
-        self, request: Request, rng: np.random.Generator
+        self, request: ResolutionRequest, rng: np.random.Generator
     ) -> tuple[Spacing, tuple[ReportWarning, ...]]:
         """Return the local radii that answer to a request, and notes for the report.
 
@@ -123,7 +123,7 @@ class SurfaceSampler:
             The request needs more points than the cap.
         """
         spacing, notes = self._spacing(request, rng)
-        check_expected(self._expected(spacing)[1], request)
+        check_expected_points(self._expected(spacing)[1], request)
         return spacing, notes
 
     def _expected(self, spacing: Spacing) -> tuple[np.ndarray, float]:
@@ -135,7 +135,7 @@ class SurfaceSampler:
 
     def sample(
         self,
-        request: Request,
+        request: ResolutionRequest,
         rng: np.random.Generator,
         progress: Progress,
         *,
@@ -162,14 +162,14 @@ class SurfaceSampler:
             spacing, notes = self._spacing(request, rng)
         progress.update(0.0, "spreading points")
         share, expected = self._expected(spacing)
-        check_expected(expected, request)
+        check_expected_points(expected, request)
         points, face = self._candidates(
             spacing.nominal, share, int(OVERSAMPLING * expected) + 64, rng
         )
         progress.update(0.1, f"moving {len(points)} points onto the surface")
         radii = spacing.at(points, self._threads)
-        settled = self._settled(points, face, radii, progress.span(0.1, 0.8))
-        moved, normals, kind = settled.points, settled.normals, settled.kind
+        projected = self._project(points, face, radii, progress.span(0.1, 0.8))
+        moved, normals, kind = projected.points, projected.normals, projected.kind
         caps = no_caps()
         if owned is None:
             caps = cap_points(
@@ -181,10 +181,10 @@ class SurfaceSampler:
         radii = spacing.at(moved, self._threads)
         # Jumps last among surface points: where both are near, the isosurface is the better one.
         priority = PRIORITY_SURFACE + 0.5 * (rng.random(len(moved)) + (kind == KIND_JUMP))
-        everything = np.concatenate([caps.points, moved])
+        all_points = np.concatenate([caps.points, moved])
         normals = np.concatenate([caps.normals, normals])
         radii = np.concatenate([caps.radii, radii])
-        kept = thin(everything, normals, radii, np.concatenate([caps.priority, priority]))
+        kept = thin(all_points, normals, radii, np.concatenate([caps.priority, priority]))
         kinds = np.concatenate([np.full(len(caps.points), KIND_CAP, np.uint8), kind])[kept]
         figures = {
             "candidates": len(points),
@@ -192,34 +192,34 @@ class SurfaceSampler:
             "surface_points": int((kinds == KIND_SURFACE).sum()),
             "jump_points": int((kinds == KIND_JUMP).sum()),
             "cap_points": int((kinds == KIND_CAP).sum()),
-            "projection_evaluations": settled.evaluations,
+            "projection_evaluations": projected.evaluations,
             "shortest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].min(initial=np.inf)),
             "longest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].max(initial=0.0)),
             "limited_by_photos_share": spacing.limited,
         }
         return SurfacePoints(
-            everything[kept], normals[kept], kinds, radii[kept], spacing.nominal, notes, figures
+            all_points[kept], normals[kept], kinds, radii[kept], spacing.nominal, notes, figures
         )
 
     def _spacing(
-        self, request: Request, rng: np.random.Generator
+        self, request: ResolutionRequest, rng: np.random.Generator
     ) -> tuple[Spacing, tuple[ReportWarning, ...]]:
         """Choose the local radii, and tell where the photos limit them."""
         radius = thinning_radius(request, self.area, self._region)
         if len(self._cameras) == 0:
             return Spacing.uniform(radius), ()
-        points, _ = sample_triangles(self._vertices, self._faces, SCOUTS, rng)
+        points, _ = sample_triangles(self._vertices, self._faces, FOOTPRINT_SAMPLES, rng)
         spacing = footprint_spacing(points, self._cameras, radius)
         notes: tuple[ReportWarning, ...] = ()
-        if spacing.limited > NOTED_SHARE:
+        if spacing.limited > REPORTED_SHARE:
             share = f"On {spacing.limited:.0%} of the surface"
             text = f"{share} the photos resolve no finer edges; uniform spacing makes them."
             notes = (ReportWarning("photos-limit-edges", text),)
         return spacing, notes
 
-    def _settled(
+    def _project(
         self, points: np.ndarray, face: np.ndarray, radii: np.ndarray, progress: Progress
-    ) -> _Settled:
+    ) -> _ProjectedPoints:
         """Move points of the candidate surface onto the isosurface, or where vacancy jumps."""
         normals = self._normals_at(points, self._normals[face])
         found = project_to_isosurface(
@@ -232,7 +232,7 @@ class SurfaceSampler:
         kind = np.full(len(points), KIND_SURFACE, np.uint8)
         lost = np.flatnonzero(~found.on_surface)
         moved = found.points.copy()
-        searched, kind_of_lost = self._search(
+        searched, kind_of_lost = self._search_along_normals(
             points[lost], normals[lost], radii[lost], progress.span(0.8, 1.0)
         )
         moved[lost] = searched
@@ -241,7 +241,7 @@ class SurfaceSampler:
         kind[lost] = np.maximum(kind_of_lost, 0)
         good &= self._region.contains(moved, 0.0)
         normals = self._normals_at(moved[good], normals[good])
-        return _Settled(moved[good], normals, kind[good], int(found.vacancy_evaluations))
+        return _ProjectedPoints(moved[good], normals, kind[good], int(found.vacancy_evaluations))
 
     def _candidates(
         self, radius: float, share: np.ndarray, count: int, rng: np.random.Generator
@@ -285,7 +285,7 @@ class SurfaceSampler:
         agree = (outward * fallback).sum(1) > 0  # false for NaN
         return np.where(agree[:, None], outward, fallback)
 
-    def _search(
+    def _search_along_normals(
         self, points: np.ndarray, normals: np.ndarray, radii: np.ndarray, progress: Progress
     ) -> tuple[np.ndarray, np.ndarray]:
         """Look for a crossing along the normal where the projection found none.
@@ -302,14 +302,14 @@ class SurfaceSampler:
         if len(points) == 0:
             return moved, kind
         start = self._vacancy.is_empty(points)
-        other, open_rows = points.copy(), np.arange(len(points))
+        other, pending = points.copy(), np.arange(len(points))
         for share in SEARCH_SHARES:
-            step = share * radii[open_rows, None]
-            trial = points[open_rows] + step * normals[open_rows]
-            hit = self._vacancy.is_empty(trial) != start[open_rows]
-            other[open_rows[hit]] = trial[hit]
-            kind[open_rows[hit]] = KIND_JUMP
-            open_rows = open_rows[~hit]
+            step = share * radii[pending, None]
+            trial = points[pending] + step * normals[pending]
+            hit = self._vacancy.is_empty(trial) != start[pending]
+            other[pending[hit]] = trial[hit]
+            kind[pending[hit]] = KIND_JUMP
+            pending = pending[~hit]
         rows = np.flatnonzero(kind >= 0)
         empty = start[rows, None]
         inside, outside = bisect(

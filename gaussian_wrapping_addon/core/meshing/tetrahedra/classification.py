@@ -22,7 +22,7 @@ ROUNDS = (1, 3, 6)
 
 DECIDED_MARGIN = 0.3
 """A mean vacancy this far from 0.5 needs no further samples ..."""
-LONELY_NEIGHBOURS = 3
+DISAGREEING_NEIGHBOURS = 3
 """... unless so many neighbours carry the other label."""
 MIXED_DEVIATION = 0.1
 """Samples that agree this well, near 0.5, come from a sliver on the surface: more of them tell
@@ -104,13 +104,13 @@ def classify(
     flat[sheet.rows] = True
     total[sheet.rows], samples[sheet.rows] = 0.5 + 0.5 * sheet.side, 1
     rows = np.flatnonzero(~outer & ~flat)
-    for turn, extra in enumerate(ROUNDS):
-        span = progress.span(0.8 * turn / len(ROUNDS), 0.8 * (turn + 1) / len(ROUNDS))
+    for index, extra in enumerate(ROUNDS):
+        span = progress.span(0.8 * index / len(ROUNDS), 0.8 * (index + 1) / len(ROUNDS))
         size = max(1, POINTS_PER_CHUNK // extra)
         for begin in range(0, len(rows), size):
             span.update(begin / len(rows), f"classifying {len(rows)} tetrahedra")
             part = rows[begin : begin + size]
-            weights = _interior_weights((extra, len(part)), turn == 0, rng)
+            weights = _interior_weights((extra, len(part)), index == 0, rng)
             where = np.einsum("ekc,kcx->ekx", weights, points[tetrahedra[part]])
             # One call for all samples: it looks from every camera, however few the points.
             value = vacancy(where.reshape(-1, 3)).reshape(extra, -1).astype(np.float64)
@@ -120,9 +120,9 @@ def classify(
         mean = total / np.maximum(samples, 1)
         inside = (mean <= tolerances.ISO_LEVEL) & ~outer
         near = np.abs(mean - tolerances.ISO_LEVEL) < DECIDED_MARGIN
-        lonely = _disagreeing(inside, neighbours) >= LONELY_NEIGHBOURS
+        outvoted = _disagreeing(inside, neighbours) >= DISAGREEING_NEIGHBOURS
         mixed = squares > samples * (mean**2 + MIXED_DEVIATION**2)
-        rows = np.flatnonzero(((near & (mixed | (samples == 1))) | lonely) & ~outer & ~flat)
+        rows = np.flatnonzero(((near & (mixed | (samples == 1))) | outvoted) & ~outer & ~flat)
     progress.update(0.85, "smoothing labels")
     free = flat | (np.abs(mean - tolerances.ISO_LEVEL) < FIXED_MARGIN) & ~outer
     areas = face_areas(points, tetrahedra)
@@ -234,22 +234,22 @@ def regularised(
     own = np.full(len(free), -1, np.int32)
     own[nodes] = np.arange(len(nodes))
     # Only the difference of what pulls a tetrahedron to either side matters.
-    links = np.empty((len(nodes), 4), np.int32)
-    capacity, pull = np.empty((len(nodes), 4), np.int32), np.empty(len(nodes), np.int64)
+    arcs = np.empty((len(nodes), 4), np.int32)
+    capacity, unary = np.empty((len(nodes), 4), np.int32), np.empty(len(nodes), np.int64)
     confidence = DATA_WEIGHT * 2 * np.abs(vacancy[nodes] - tolerances.ISO_LEVEL)
     steps = CAPACITY_STEPS / max(float(np.median(areas[nodes])), 1e-300)
-    _cut_kernel(
-        nodes, own, inside, confidence, neighbours, areas, steps, float(LARGEST_CAPACITY), links,
-        capacity, pull,
+    _graph_kernel(
+        nodes, own, inside, confidence, neighbours, areas, steps, float(LARGEST_CAPACITY), arcs,
+        capacity, unary,
     )  # fmt: skip
     result = inside.copy()
-    result[nodes] = minimum_cut(links, capacity, pull, progress)
+    result[nodes] = minimum_cut(arcs, capacity, unary, progress)
     return result
 
 
 @kernel(fast=False)
-def _cut_kernel(  # type: ignore[no-untyped-def]
-    nodes, own, inside, confidence, neighbours, areas, steps, limit, links, capacity, pull
+def _graph_kernel(  # type: ignore[no-untyped-def]
+    nodes, own, inside, confidence, neighbours, areas, steps, limit, arcs, capacity, unary
 ):
     """Number the undecided, and round what links and pulls them to integers."""
     for row in range(len(nodes)):
@@ -257,11 +257,11 @@ def _cut_kernel(  # type: ignore[no-untyped-def]
         mean = 0.0
         for k in range(4):
             mean += areas[i, k] / 4.0
-        towards = confidence[row] * mean if inside[i] else -confidence[row] * mean
+        term = confidence[row] * mean if inside[i] else -confidence[row] * mean
         for k in range(4):
             j = neighbours[i, k]
-            links[row, k] = own[j] if j >= 0 else -1
+            arcs[row, k] = own[j] if j >= 0 else -1
             capacity[row, k] = np.int32(np.rint(min(areas[i, k] * steps, limit)))
-            if links[row, k] < 0:
-                towards += areas[i, k] if j >= 0 and inside[j] else -areas[i, k]
-        pull[row] = np.int64(np.rint(min(max(towards * steps, -4.0 * limit), 4.0 * limit)))
+            if arcs[row, k] < 0:
+                term += areas[i, k] if j >= 0 and inside[j] else -areas[i, k]
+        unary[row] = np.int64(np.rint(min(max(term * steps, -4.0 * limit), 4.0 * limit)))

@@ -25,12 +25,12 @@ HELPER_BYTES_PER_POINT = 8_000
 HELPER_BASE_BYTES = 4 << 30
 """Address space: Qhull holds about 2 kB a point; the libraries map much more than they use."""
 
-FAR_SHARE = 7.3
-FAR_SPREAD_SHARE = 0.1
+BOUNDING_SHARE = 7.3
+BOUNDING_SPREAD_SHARE = 0.1
 """Distance of the far box points and their irregularity, in half extents."""
 
 
-def far_points(points: np.ndarray, seed: int) -> np.ndarray:
+def bounding_points(points: np.ndarray, seed: int) -> np.ndarray:
     """Return 8 irregular points of a box far around ``points``, (8, 3) float64.
 
     With them every given point lies strictly inside the hull, and flat or collinear points have
@@ -40,7 +40,7 @@ def far_points(points: np.ndarray, seed: int) -> np.ndarray:
     extent = max(float((high - low).max()) / 2, np.finfo(np.float64).tiny * 1e6)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
     noise = np.random.default_rng(seed).normal(size=(8, 3))
-    return (low + high) / 2 + (corners * FAR_SHARE + noise * FAR_SPREAD_SHARE) * extent
+    return (low + high) / 2 + (corners * BOUNDING_SHARE + noise * BOUNDING_SPREAD_SHARE) * extent
 
 
 def delaunay(

@@ -141,8 +141,8 @@ _CAP_TRIANGLES = [_cap_triangles(code) for code in range(8)]
 
 def _indexed(pieces: list[np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
     """Number the different pairs of points of triangles (r, 3, 2); make faces of the numbers."""
-    pairs = np.concatenate(pieces).reshape(-1, 2)  # (3f, 2)
-    keys = pairs[:, 0] * np.int64(count) + pairs[:, 1]
+    edges = np.concatenate(pieces).reshape(-1, 2)  # (3f, 2)
+    keys = edges[:, 0] * np.int64(count) + edges[:, 1]
     unique, index = np.unique(keys, return_inverse=True)
     return np.stack([unique // count, unique % count], 1), index.reshape(-1, 3)
 

@@ -8,13 +8,13 @@ import numpy as np
 from ...kernels.compiled import kernel
 from ...progress import Progress
 
-WORK_PER_NODE = 6
+ARCS_PER_NODE = 6
 """Arcs looked at between two searches for the true heights, for each node. A search looks at four.
 The cut of trained scenes took as long with 2, and a quarter longer with 20."""
 
 
 def minimum_cut(
-    links: np.ndarray, capacity: np.ndarray, pull: np.ndarray, progress: Progress | None = None
+    arcs: np.ndarray, capacity: np.ndarray, unary: np.ndarray, progress: Progress | None = None
 ) -> np.ndarray:
     """Return which nodes lie inside in the cheapest labelling.
 
@@ -43,16 +43,16 @@ def minimum_cut(
     (k,) bool
     """
     progress = progress or Progress()
-    count = len(links)
-    links = np.ascontiguousarray(links, np.int32)
+    count = len(arcs)
+    arcs = np.ascontiguousarray(arcs, np.int32)
     residual = np.ascontiguousarray(capacity, np.int32).copy()
-    back = np.zeros((count, 4), np.int8)
-    _pair_kernel(links, residual, back)
-    excess = -np.asarray(pull, np.int64)
+    reverse = np.zeros((count, 4), np.int8)
+    _reverse_arc_kernel(arcs, residual, reverse)
+    excess = -np.asarray(unary, np.int64)
     height, queue = np.empty(count, np.int32), np.empty(count, np.int32)
     queued = np.empty(count, np.bool_)
     while True:
-        _height_kernel(links, residual, back, excess, height, queue)
+        _relabel_kernel(arcs, residual, reverse, excess, height, queue)
         progress.update(0.0, "smoothing labels")
         active = np.flatnonzero((excess > 0) & (height < count))
         if len(active) == 0:
@@ -61,30 +61,30 @@ def minimum_cut(
         queued[:] = False
         queued[active] = True
         _push_kernel(
-            links, residual, back, excess, height, queue, queued, len(active),
-            WORK_PER_NODE * count,
+            arcs, residual, reverse, excess, height, queue, queued, len(active),
+            ARCS_PER_NODE * count,
         )  # fmt: skip
 
 
 @kernel(fast=False)
-def _pair_kernel(links, residual, back):  # type: ignore[no-untyped-def]
+def _reverse_arc_kernel(arcs, residual, reverse):  # type: ignore[no-untyped-def]
     """Find each link in its neighbour's row; both directions get the smaller capacity."""
-    for i in range(len(links)):
+    for i in range(len(arcs)):
         for k in range(4):
-            j = links[i, k]
+            j = arcs[i, k]
             if j < 0:
                 continue
             for m in range(4):
-                if links[j, m] == i:
-                    back[i, k] = m
+                if arcs[j, m] == i:
+                    reverse[i, k] = m
                     residual[i, k] = min(residual[i, k], residual[j, m])
                     residual[j, m] = residual[i, k]
 
 
 @kernel(fast=False)
-def _height_kernel(links, residual, back, excess, height, queue):  # type: ignore[no-untyped-def]
+def _relabel_kernel(arcs, residual, reverse, excess, height, queue):  # type: ignore[no-untyped-def]
     """Links between each node and the nearest one that wants flow; the number of nodes if none."""
-    count = len(links)
+    count = len(arcs)
     end = 0
     for i in range(count):
         height[i] = count
@@ -97,8 +97,8 @@ def _height_kernel(links, residual, back, excess, height, queue):  # type: ignor
         j = queue[begin]
         begin += 1
         for k in range(4):
-            i = links[j, k]
-            if i >= 0 and height[i] == count and residual[i, back[j, k]] > 0:
+            i = arcs[j, k]
+            if i >= 0 and height[i] == count and residual[i, reverse[j, k]] > 0:
                 height[i] = height[j] + 1
                 queue[end] = i
                 end += 1
@@ -106,10 +106,10 @@ def _height_kernel(links, residual, back, excess, height, queue):  # type: ignor
 
 @kernel(fast=False)
 def _push_kernel(  # type: ignore[no-untyped-def]
-    links, residual, back, excess, height, queue, queued, waiting, budget
+    arcs, residual, reverse, excess, height, queue, queued, waiting, budget
 ):
     """Push flow down, first in first out, and lift nodes that are stuck, up to a budget of work."""
-    count = len(links)
+    count = len(arcs)
     begin = 0
     while waiting > 0 and budget > 0:
         i = queue[begin]
@@ -119,7 +119,7 @@ def _push_kernel(  # type: ignore[no-untyped-def]
         budget -= 4
         lowest = count
         for k in range(4):
-            j = links[i, k]
+            j = arcs[i, k]
             if j < 0 or residual[i, k] == 0:
                 continue
             if height[j] >= height[i]:
@@ -127,7 +127,7 @@ def _push_kernel(  # type: ignore[no-untyped-def]
                 continue
             flow = min(excess[i], np.int64(residual[i, k]))
             residual[i, k] -= flow
-            residual[j, back[i, k]] += flow
+            residual[j, reverse[i, k]] += flow
             excess[i] -= flow
             excess[j] += flow
             if excess[j] > 0 and not queued[j]:

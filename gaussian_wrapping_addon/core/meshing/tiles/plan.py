@@ -17,11 +17,11 @@ from ...regions.convex_region import Region
 from ...report_warning import ReportWarning
 from ..points.candidate_surface import CandidateSurface
 from ..points.region_caps import Caps, cap_points
-from ..points.resolution import Dense, Request, dense_request, nominal_edge
+from ..points.resolution import DenseRequest, ResolutionRequest, dense_request, nominal_edge
 from ..points.spacing import Spacing
 from ..points.surface_points import SurfaceSampler
-from .steiner_points import CLEAR_CAP_RADII, CLEAR_RADII, lattice, lattice_side
-from .tiling import Tiling, cut_evenly
+from .steiner_points import CLEARANCE_CAP_RADII, CLEARANCE_RADII, lattice_side, steiner_lattice
+from .tiling import Tiling, split_evenly
 
 TILE_POINTS = 75_000
 """Surface points of a tile, at most, where the number of tiles is automatic: memory stays small
@@ -55,9 +55,9 @@ class TilePlan:
     spacing: Spacing
     """Local thinning radii of the whole surface, of the denser mesh with adaptive spacing."""
     tiling: Tiling
-    fillers: np.ndarray
+    steiner_points: np.ndarray
     """(k, 3) float64, before any gives way."""
-    ball: float
+    ball_radius: float
     """Largest empty ball that touches the region."""
     caps: Caps
     seed: int
@@ -66,8 +66,8 @@ class TilePlan:
     """Of the uniform mesh that the request stands for."""
     target: int
     share: float
-    """Vertices that stay, as for :func:`.primal_adaptive.selected`: 0 and 1 keep all."""
-    sightings: int = 0
+    """Vertices that stay, as for :func:`.primal_adaptive.simplified`: 0 and 1 keep all."""
+    depth_samples: int = 0
 
     @property
     def radius(self) -> float:
@@ -78,13 +78,13 @@ class TilePlan:
     def halo(self) -> float:
         """Width of the surroundings from which a tile's tetrahedra are known exactly.
 
-        A tetrahedron with a corner in the tile lies in a ball of radius ``ball`` through that
-        corner; twice that much again for balls that might hold a point.
+        A tetrahedron with a corner in the tile lies in a ball of radius ``ball_radius`` through
+        that corner; twice that much again for balls that might hold a point.
         """
-        return 2.0 * self.ball + 2.0 * JITTER_SHARE * self.region.diagonal
+        return 2.0 * self.ball_radius + 2.0 * JITTER_SHARE * self.region.diagonal
 
 
-class _EvenCaps(Spacing):
+class _CapSpacing(Spacing):
     """Spacing that does not grow inside a cap: its points bound the empty balls there."""
 
     def at(self, where: np.ndarray, threads: int = 1) -> np.ndarray:
@@ -95,14 +95,14 @@ def make_plan(
     field: Field,
     region: Region,
     surface: CandidateSurface,
-    request: Request,
+    request: ResolutionRequest,
     progress: Progress,
     *,
     tiles: int,
     seed: int,
     cameras: Sequence[Camera],
     adaptive: bool,
-    sightings: int,
+    depth_samples: int,
 ) -> TilePlan:
     """Decide everything that tiles share.
 
@@ -121,8 +121,10 @@ def make_plan(
         field.vacancy, field.vectors, region, surface, field.threads,
         cameras=cameras if adaptive else (),
     )  # fmt: skip
-    wanted = dense_request(request, sampler.area, region) if adaptive else Dense(request, 0, 1.0)
-    spacing, notes = sampler.spacing(wanted.request, rng)
+    dense = (
+        dense_request(request, sampler.area, region) if adaptive else DenseRequest(request, 0, 1.0)
+    )
+    spacing, notes = sampler.spacing(dense.request, rng)
     corners = surface.vertices[surface.faces]  # (f, 3, 3)
     centers = corners.mean(1)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -134,18 +136,20 @@ def make_plan(
             return count >= tiles
         return heaviest <= TILE_POINTS or count >= limits.MAX_TILES
 
-    tiling = cut_evenly(centers, expected, region.bounds, enough)
+    tiling = split_evenly(centers, expected, region.bounds, enough)
     caps = cap_points(
         region, field.vacancy.is_empty,
-        _EvenCaps(spacing.points, spacing.radii, spacing.nominal, spacing.limited), rng,
+        _CapSpacing(spacing.points, spacing.radii, spacing.nominal, spacing.limited), rng,
         progress,
     )  # fmt: skip
     largest = float(spacing.radii.max())
-    clearance = max(CLEAR_RADII * largest, CLEAR_CAP_RADII * float(caps.radii.max(initial=0.0)))
+    clearance = max(
+        CLEARANCE_RADII * largest, CLEARANCE_CAP_RADII * float(caps.radii.max(initial=0.0))
+    )
     side = lattice_side(region, largest, sampler.area / len(tiling))
-    fillers = lattice(region, side, clearance, seed)
+    steiner = steiner_lattice(region, side, clearance, seed)
     return TilePlan(
-        region, surface, sampler.area, spacing, tiling, fillers.points, fillers.ball, caps, seed,
-        (*wanted.request.notes, *notes), nominal_edge(request, sampler.area, region), wanted.target,
-        wanted.share, sightings,
+        region, surface, sampler.area, spacing, tiling, steiner.points, steiner.ball_radius, caps,
+        seed, (*dense.request.notes, *notes), nominal_edge(request, sampler.area, region),
+        dense.target, dense.share, depth_samples,
     )  # fmt: skip

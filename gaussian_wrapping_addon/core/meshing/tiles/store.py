@@ -20,7 +20,7 @@ from ..points.spacing import Spacing
 from ..points.surface_points import SurfacePoints
 from .plan import TilePlan
 from .tile_faces import TileFaces
-from .tile_points import AllPoints
+from .tile_points import GatheredPoints
 from .tiling import Tiling
 
 LIST_NAME = "tiles.json"
@@ -53,7 +53,7 @@ def save_plan(folder: Path, plan: TilePlan, origin: dict[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     _save(
         folder / "plan.npz",
-        vertices=plan.surface.vertices, faces=plan.surface.faces, fillers=plan.fillers,
+        vertices=plan.surface.vertices, faces=plan.surface.faces, fillers=plan.steiner_points,
         region=plan.region.vertices, cap_points=plan.caps.points, cap_normals=plan.caps.normals,
         cap_radii=plan.caps.radii, cap_priority=plan.caps.priority,
         spacing_points=plan.spacing.points, spacing_radii=plan.spacing.radii,
@@ -72,8 +72,8 @@ def save_plan(folder: Path, plan: TilePlan, origin: dict[str, Any]) -> None:
             "edge_length": plan.edge_length,
             "target": plan.target,
             "share": plan.share,
-            "sightings": plan.sightings,
-            "ball": plan.ball,
+            "sightings": plan.depth_samples,
+            "ball": plan.ball_radius,
             "area": plan.area,
             "gaussians": plan.surface.gaussians,
             "pivots": plan.surface.pivots,
@@ -142,15 +142,15 @@ def load_points(path: Path) -> SurfacePoints:
         return _cloud_of(arrays)
 
 
-def save_gathered(path: Path, everything: AllPoints) -> None:
+def save_gathered(path: Path, gathered: GatheredPoints) -> None:
     """Write the points of all tiles."""
-    _save(path, shifted=everything.shifted, inner=everything.inner, **_of_cloud(everything.cloud))
+    _save(path, shifted=gathered.shifted, inner=gathered.inner, **_of_cloud(gathered.cloud))
 
 
-def load_gathered(path: Path) -> AllPoints:
+def load_gathered(path: Path) -> GatheredPoints:
     """Read the points of all tiles."""
     with np.load(path, allow_pickle=False) as arrays:
-        return AllPoints(_cloud_of(arrays), arrays["shifted"], arrays["inner"])
+        return GatheredPoints(_cloud_of(arrays), arrays["shifted"], arrays["inner"])
 
 
 def save_faces(path: Path, part: TileFaces) -> None:

@@ -18,9 +18,9 @@ from ...errors import MeshingError
 from ...progress import Progress
 from ..tetrahedra.boundary_faces import OUTWARD_FACES, tetrahedron_neighbours
 from ..tetrahedra.classification import classify, on_one_sheet
-from ..tetrahedra.delaunay import delaunay, far_points
+from ..tetrahedra.delaunay import bounding_points, delaunay
 from .plan import Field, TilePlan
-from .tile_points import AllPoints
+from .tile_points import GatheredPoints
 
 CONTEXT_RADII = 4.0
 """Tetrahedra of others this close are labelled as well, so that the own ones have neighbours."""
@@ -40,29 +40,29 @@ class TileFaces:
 
 
 def tile_faces(
-    field: Field, plan: TilePlan, everything: AllPoints, tile: int, progress: Progress
+    field: Field, plan: TilePlan, gathered: GatheredPoints, tile: int, progress: Progress
 ) -> TileFaces:
     """Connect the points in and around a tile, label its tetrahedra, return its faces."""
-    numbers = np.flatnonzero(plan.tiling.within(tile, everything.shifted, plan.halo))
-    own = plan.tiling.owner(everything.cloud.points[numbers]) == tile
-    if not (own & everything.inner[numbers]).any():
-        return _nothing()
+    numbers = np.flatnonzero(plan.tiling.within(tile, gathered.shifted, plan.halo))
+    own = plan.tiling.owner(gathered.cloud.points[numbers]) == tile
+    if not (own & gathered.inner[numbers]).any():
+        return _no_faces()
     seed = int(np.random.default_rng([plan.seed, tile, 2]).integers(2**31))
-    numbers, tetrahedra = local_tetrahedra(plan, everything, tile, seed, progress.span(0.0, 0.2))
+    numbers, tetrahedra = local_tetrahedra(plan, gathered, tile, seed, progress.span(0.0, 0.2))
     # Beyond the tile's surroundings they may be others than those of the whole.
     near = np.zeros(len(numbers) + 8, np.bool_)
     near[: len(numbers)] = plan.tiling.within(
-        tile, everything.cloud.points[numbers], CONTEXT_RADII * plan.radius
+        tile, gathered.cloud.points[numbers], CONTEXT_RADII * plan.radius
     )
     tetrahedra = tetrahedra[near[tetrahedra].any(1)]
     neighbours = tetrahedron_neighbours(tetrahedra)
-    inner = np.append(everything.inner[numbers], np.zeros(8, np.bool_))
+    inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
     outer = ~inner[tetrahedra].all(1)
     # Numbers of the region's points rise with the local ones.
     first = tetrahedra.min(1)
     owned = ~outer & np.append(own, np.zeros(8, np.bool_))[first]
     # Only outer tetrahedra have far corners, and nobody asks where those are.
-    points = np.concatenate([everything.cloud.points[numbers], np.zeros((8, 3))])
+    points = np.concatenate([gathered.cloud.points[numbers], np.zeros((8, 3))])
     labels = classify(
         points,
         tetrahedra,
@@ -71,9 +71,9 @@ def tile_faces(
         on_one_sheet(
             points,
             tetrahedra,
-            everything.cloud.normals[numbers],
+            gathered.cloud.normals[numbers],
             outer,
-            everything.cloud.radii[numbers],
+            gathered.cloud.radii[numbers],
         ),
         lambda where: field.vacancy.vacancy(where).filled,
         np.random.default_rng([plan.seed, tile, 3]),
@@ -96,7 +96,7 @@ def tile_faces(
 
 
 def local_tetrahedra(
-    plan: TilePlan, everything: AllPoints, tile: int, seed: int, progress: Progress
+    plan: TilePlan, gathered: GatheredPoints, tile: int, seed: int, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray]:
     """Connect the points in and around a tile.
 
@@ -109,9 +109,9 @@ def local_tetrahedra(
     tetrahedra : (m, 4) int64
         Indices into ``numbers``; n and more are points far away.
     """
-    numbers = np.flatnonzero(plan.tiling.within(tile, everything.shifted, plan.halo))
-    shifted = everything.shifted[numbers]
-    shifted = np.concatenate([shifted, far_points(shifted, seed)])
+    numbers = np.flatnonzero(plan.tiling.within(tile, gathered.shifted, plan.halo))
+    shifted = gathered.shifted[numbers]
+    shifted = np.concatenate([shifted, bounding_points(shifted, seed)])
     tetrahedra = delaunay(shifted, seed=seed, progress=progress, jitter_share=0.0)
     return numbers, tetrahedra
 
@@ -124,7 +124,7 @@ def circumradii(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(offsets, axis=1))
 
 
-def _nothing() -> TileFaces:
+def _no_faces() -> TileFaces:
     none = np.zeros((0, 3), np.int64)
     return TileFaces(none, none, np.zeros(0, np.bool_), {})
 

@@ -27,17 +27,17 @@ class Tiling:
     def owner(self, points: np.ndarray) -> np.ndarray:
         """Return the number of the tile of each of (n, 3) points, (n,) int64."""
         result = np.zeros(len(points), np.int64)
-        for new, (tile, axis, place) in enumerate(self.splits, 1):
-            result[(result == tile) & (points[:, axis] >= place)] = new
+        for new, (tile, axis, coordinate) in enumerate(self.splits, 1):
+            result[(result == tile) & (points[:, axis] >= coordinate)] = new
         return result
 
     def box(self, tile: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and highest corner of a tile, infinite where space is not cut."""
         low = np.full((len(self), 3), -np.inf)
         high = np.full((len(self), 3), np.inf)
-        for new, (cut, axis, place) in enumerate(self.splits, 1):
+        for new, (cut, axis, coordinate) in enumerate(self.splits, 1):
             low[new], high[new] = low[cut], high[cut]
-            high[cut, axis] = low[new, axis] = place
+            high[cut, axis] = low[new, axis] = coordinate
         return low[tile], high[tile]
 
     def within(self, tile: int, points: np.ndarray, reach: float) -> np.ndarray:
@@ -47,15 +47,17 @@ class Tiling:
 
     def to_json(self) -> list[list[float]]:
         """Return JSON values."""
-        return [[tile, axis, place] for tile, axis, place in self.splits]
+        return [[tile, axis, coordinate] for tile, axis, coordinate in self.splits]
 
     @classmethod
     def from_json(cls, values: Sequence[Sequence[float]]) -> Tiling:
         """Build from JSON values."""
-        return cls(tuple((int(tile), int(axis), float(place)) for tile, axis, place in values))
+        return cls(
+            tuple((int(tile), int(axis), float(coordinate)) for tile, axis, coordinate in values)
+        )
 
 
-def cut_evenly(
+def split_evenly(
     centers: np.ndarray,
     weights: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
@@ -76,29 +78,29 @@ def cut_evenly(
         Given the number of tiles and the heaviest weight, tells whether to stop.
     """
     owner = np.zeros(len(centers), np.int64)
-    heavy, splits = [float(weights.sum())], []
+    tile_weights, splits = [float(weights.sum())], []
     boxes = [(np.array(bounds[0], np.float64), np.array(bounds[1], np.float64))]
-    while not enough(len(heavy), max(heavy)):
-        tile, new = int(np.argmax(heavy)), len(heavy)
+    while not enough(len(tile_weights), max(tile_weights)):
+        tile, new = int(np.argmax(tile_weights)), len(tile_weights)
         rows = np.flatnonzero((owner == tile) & (weights > 0))
         low, high = boxes[tile]
         if len(rows) >= 2:
             held = centers[rows]
             axis = int(np.argmax(held.max(0) - held.min(0)))
             order = np.argsort(held[:, axis], kind="stable")
-            half = int(np.searchsorted(np.cumsum(weights[rows[order]]), heavy[tile] / 2))
+            half = int(np.searchsorted(np.cumsum(weights[rows[order]]), tile_weights[tile] / 2))
             half = min(half, len(rows) - 2)
-            place = float(held[order[half : half + 2], axis].mean())
+            coordinate = float(held[order[half : half + 2], axis].mean())
         else:
             axis = int(np.argmax(high - low))
-            place = float((low[axis] + high[axis]) / 2)
-        moved = (owner == tile) & (centers[:, axis] >= place)
+            coordinate = float((low[axis] + high[axis]) / 2)
+        moved = (owner == tile) & (centers[:, axis] >= coordinate)
         owner[moved] = new
         middle_high, middle_low = high.copy(), low.copy()
-        middle_high[axis] = middle_low[axis] = place
+        middle_high[axis] = middle_low[axis] = coordinate
         boxes[tile] = (low, middle_high)
         boxes.append((middle_low, high))
-        heavy.append(float(weights[moved].sum()))
-        heavy[tile] = float(weights[owner == tile].sum())
-        splits.append((tile, axis, place))
+        tile_weights.append(float(weights[moved].sum()))
+        tile_weights[tile] = float(weights[owner == tile].sum())
+        splits.append((tile, axis, coordinate))
     return Tiling(tuple(splits))

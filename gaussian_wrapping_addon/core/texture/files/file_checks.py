@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import MeshingError, cannot_be_written
+from ...errors import MeshingError, unwritable_error
 from ...limits import MAX_ATLASES
 
 SINGLE_MAX = float(np.finfo(np.float32).max)
@@ -97,4 +97,4 @@ def write_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise cannot_be_written(path, error) from error
+        raise unwritable_error(path, error) from error

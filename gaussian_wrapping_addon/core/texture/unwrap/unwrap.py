@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import NO_ROOM, DatasetError, ResourceError, WorkerError, cannot_be_written
+from ...errors import DISK_FULL_ERRNOS, DatasetError, ResourceError, WorkerError, unwritable_error
 from ...mesh.face_graph import FaceGraph, face_graph, uv_charts
 from ...mesh.surface_mesh import SurfaceMesh
 from ...mesh.topology import edge_lengths
@@ -159,8 +159,8 @@ def _xatlas(
             charts, size_px, gutter_px, folder, progress.span(0.7, 0.9), atlases
         )
     except (OSError, ValueError, KeyError) as error:
-        if isinstance(error, OSError) and error.errno in NO_ROOM:
-            raise cannot_be_written(error.filename or folder, error) from error
+        if isinstance(error, OSError) and error.errno in DISK_FULL_ERRNOS:
+            raise unwritable_error(error.filename or folder, error) from error
         raise WorkerError(f"xatlas returned no usable result ({error}).") from None
     finally:
         shutil.rmtree(folder, ignore_errors=True)

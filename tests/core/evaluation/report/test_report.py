@@ -29,7 +29,7 @@ from gaussian_wrapping_addon.core.evaluation.report.text import (
     percent,
     table,
 )
-from gaussian_wrapping_addon.core.files import finite
+from gaussian_wrapping_addon.core.files import finite_json
 from gaussian_wrapping_addon.core.report_warning import ReportWarning, read_warnings
 from gaussian_wrapping_addon.core.settings import JobSettings, to_json
 from tests.core.evaluation.report.report_examples import (
@@ -417,7 +417,7 @@ def test_one_bad_figure_never_breaks_a_report(tmp_path: Path, value: Any) -> Non
         place[path[-1]] = value
         if path[:2] == ("training", "pictures"):
             continue
-        values = finite(report)
+        values = finite_json(report)
         text = report_markdown(values, tmp_path)
         body = text[: text.index("<details>")].replace("none ran", "").replace("black is none", "")
         assert WRONG_NUMBER.search(body) is None, path

@@ -12,18 +12,26 @@ import pytest
 from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markdown
 from gaussian_wrapping_addon.core.evaluation.report.selection_section import selection_lines
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training.selection.model_selection import Decision, Needs, decide
+from gaussian_wrapping_addon.core.training.selection.model_selection import (
+    Decision,
+    ModelSelection,
+    decide,
+)
 from tests.core.evaluation.report.report_examples import full_summary
 
 NAMES = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size")
 
 
 def training() -> dict[str, Any]:
-    needs = Needs()
+    model_selection = ModelSelection()
     for name in NAMES:
-        needs = needs.with_decision(decide(name, "auto", True, f"Seen in {name} a|b."))
-    needs = needs.with_decision(decide("exposure", "off", True, "Photos differ by 20 %."))
-    return {"decisions": needs.to_json()}
+        model_selection = model_selection.with_decision(
+            decide(name, "auto", True, f"Seen in {name} a|b.")
+        )
+    model_selection = model_selection.with_decision(
+        decide("exposure", "off", True, "Photos differ by 20 %.")
+    )
+    return {"decisions": model_selection.to_json()}
 
 
 def test_every_decision_is_listed_with_its_evidence_and_setting() -> None:

@@ -85,7 +85,7 @@ def test_a_wrong_entry_is_named(tmp_path: Path, name: str, value: np.ndarray | N
     with pytest.raises(ParseError) as caught:
         read_truth(tmp_path)
     assert caught.value.path.name == "truth.npz"
-    assert name in f"{caught.value.place} {caught.value.message}" or "ground truth" in str(
+    assert name in f"{caught.value.location} {caught.value.message}" or "ground truth" in str(
         caught.value
     )
     assert caught.value.hint

@@ -13,7 +13,7 @@ from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.evaluation.report.report_warnings import collect_warnings
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
 from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
@@ -66,7 +66,7 @@ def test_each_level_is_closed_a_quarter_and_looks_alike(
     assert [level.albedo.shape[0] for level in levels] == [256, 128]
     assert list(tmp_path.iterdir()) == []
     for level in levels:
-        check = check_mesh(level.mesh.vertices, level.mesh.faces, None)
+        check = validate_manifold(level.mesh.vertices, level.mesh.faces, None)
         assert check.good
         texels, points = positions(level.mesh, level.corner_uvs, level.albedo.shape[0])
         # Rays along the normals lean: a colour is met beside the place where it is looked for.

@@ -24,12 +24,12 @@ ON_PLANE_SHARE = 1e-7
 """A vertex so near the plane of a region's face lies on it, in diagonals of the region: what
 float32 can tell apart."""
 
-PARTS_TOLD = 20
+MAX_LISTED_PARTS = 20
 """Parts that the report lists one by one, the largest."""
 
 
 @dataclass(frozen=True)
-class CheckedPart:
+class CheckedComponent:
     """One connected part (over shared vertices)."""
 
     faces: int
@@ -41,7 +41,7 @@ class CheckedPart:
 
 
 @dataclass(frozen=True)
-class MeshCheck:
+class ManifoldCheck:
     """What is wrong with a mesh; every count is 0 and ``volume`` positive where nothing is."""
 
     faces: int
@@ -61,7 +61,7 @@ class MeshCheck:
     """Faces with a repeated corner, or lower than :data:`MIN_HEIGHT_SHARE`."""
     euler: int
     volume: float
-    parts: tuple[CheckedPart, ...]
+    parts: tuple[CheckedComponent, ...]
     """From the largest number of faces to the smallest."""
     open_at_region: int | None = None
     """Of the open edges, those that lie on one plane of the region's boundary. ``None`` where the
@@ -97,7 +97,7 @@ class MeshCheck:
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values, with ``good``, ``defects`` and the number of parts."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        values["parts"] = [dataclasses.asdict(part) for part in self.parts[:PARTS_TOLD]]
+        values["parts"] = [dataclasses.asdict(part) for part in self.parts[:MAX_LISTED_PARTS]]
         for holder in (values, *values["parts"]):
             if not np.isfinite(holder["volume"]):
                 holder["volume"] = None
@@ -105,7 +105,9 @@ class MeshCheck:
         return {**values, **counts}
 
 
-def check_mesh(vertices: np.ndarray, faces: np.ndarray, open_at: Region | None = None) -> MeshCheck:
+def validate_manifold(
+    vertices: np.ndarray, faces: np.ndarray, open_at: Region | None = None
+) -> ManifoldCheck:
     """Check a triangle mesh; anything is accepted, an empty one too.
 
     Parameters
@@ -126,21 +128,21 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, open_at: Region | None =
     used[faces] = True
     edges = _Edges(faces, count)
     part = _parts(faces, count)
-    sound = edges.open + edges.crowded + edges.turned == 0 and not repeated.any()
-    rings = _rings(edges.twin, faces, count) if sound else None
+    sound = edges.open + edges.nonmanifold + edges.inconsistent == 0 and not repeated.any()
+    rings = _nonmanifold_vertices(edges.twin, faces, count) if sound else None
     corners = vertices[faces]  # (f, 3, 3)
     parts, volume = _measure_parts(corners, faces, part, edges, sound and rings == 0)
     allowed = None if open_at is None else _on_boundary(vertices, edges.open_pairs, open_at)
-    return MeshCheck(
+    return ManifoldCheck(
         faces=given,
         bad_indices=given - len(faces),
         not_finite_vertices=int((~finite).sum()),
         unused_vertices=int((~used).sum()),
         open_edges=edges.open,
-        nonmanifold_edges=edges.crowded,
-        inconsistent_edges=edges.turned,
-        nonmanifold_vertices=_slow_rings(faces) if rings is None else rings,
-        degenerate_faces=int((repeated | _flat(corners)).sum()),
+        nonmanifold_edges=edges.nonmanifold,
+        inconsistent_edges=edges.inconsistent,
+        nonmanifold_vertices=_nonmanifold_vertices_any(faces) if rings is None else rings,
+        degenerate_faces=int((repeated | _degenerate(corners)).sum()),
         euler=int(used.sum()) - edges.count + len(faces),
         volume=volume,
         parts=parts,
@@ -154,19 +156,19 @@ class _Edges:
     def __init__(self, faces: np.ndarray, vertex_count: int) -> None:
         begin, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
         forward, backward = begin * vertex_count + end, end * vertex_count + begin
-        lines, self.line, sizes = np.unique(
+        unique_edges, self.edge_index, sizes = np.unique(
             np.minimum(forward, backward), return_inverse=True, return_counts=True
         )
-        self.count = len(lines)
-        self.open, self.crowded = int((sizes == 1).sum()), int((sizes > 2).sum())
-        once = sizes[self.line] == 1
+        self.count = len(unique_edges)
+        self.open, self.nonmanifold = int((sizes == 1).sum()), int((sizes > 2).sum())
+        once = sizes[self.edge_index] == 1
         self.open_pairs = np.stack([begin[once], end[once]], 1)
         """(o, 2) ends of the edges with one face."""
-        balance = np.bincount(self.line, weights=np.where(begin < end, 1.0, -1.0))
-        self.turned = int(((sizes == 2) & (balance != 0)).sum()) if len(lines) else 0
+        balance = np.bincount(self.edge_index, weights=np.where(begin < end, 1.0, -1.0))
+        self.inconsistent = int(((sizes == 2) & (balance != 0)).sum()) if len(unique_edges) else 0
         order = np.argsort(forward, kind="stable")
-        place = np.searchsorted(forward[order], backward)
-        self.twin = order[np.minimum(place, max(len(order) - 1, 0))]
+        position = np.searchsorted(forward[order], backward)
+        self.twin = order[np.minimum(position, max(len(order) - 1, 0))]
         """The opposite half-edge; only where the mesh is closed and consistent."""
 
 
@@ -179,7 +181,7 @@ def _on_boundary(vertices: np.ndarray, pairs: np.ndarray, region: Region) -> int
     return int(found.sum())
 
 
-def _rings(twin: np.ndarray, faces: np.ndarray, vertex_count: int) -> int:
+def _nonmanifold_vertices(twin: np.ndarray, faces: np.ndarray, vertex_count: int) -> int:
     """Count vertices with more than one ring, on a closed and consistently oriented mesh.
 
     The half-edge before one in its face, seen from the other side, is the next one that leaves the
@@ -202,16 +204,16 @@ def _cycle_minima(step: np.ndarray) -> np.ndarray:
         lowest, ahead = better, ahead[ahead]
 
 
-def _slow_rings(faces: np.ndarray) -> int:
+def _nonmanifold_vertices_any(faces: np.ndarray) -> int:
     """Count vertices whose faces are more than one piece, on any mesh."""
     around: dict[int, list[tuple[int, int]]] = {}
     for a, b, c in faces.tolist():
         for v, first, second in ((a, b, c), (b, c, a), (c, a, b)):
             around.setdefault(v, []).append((first, second))
-    return sum(_pieces(links) > 1 for links in around.values())
+    return sum(_connected_pieces(edges) > 1 for edges in around.values())
 
 
-def _pieces(links: list[tuple[int, int]]) -> int:
+def _connected_pieces(edges: list[tuple[int, int]]) -> int:
     """Count the connected pieces of a few edges."""
     leader: dict[int, int] = {}
 
@@ -220,7 +222,7 @@ def _pieces(links: list[tuple[int, int]]) -> int:
             x = leader[x]
         return x
 
-    for first, second in links:
+    for first, second in edges:
         leader[find(first)] = find(second)
     return len({find(x) for x in leader})
 
@@ -240,7 +242,7 @@ def _parts(faces: np.ndarray, vertex_count: int) -> np.ndarray:
             return leader[faces[:, 0]]
 
 
-def _flat(corners: np.ndarray) -> np.ndarray:
+def _degenerate(corners: np.ndarray) -> np.ndarray:
     """(f,) bool: faces whose least height is below the tolerance; not finite ones count."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     sides = np.stack([b - a, c - b, a - c], 1)  # (f, 3, 3)
@@ -253,7 +255,7 @@ def _flat(corners: np.ndarray) -> np.ndarray:
 
 def _measure_parts(
     corners: np.ndarray, faces: np.ndarray, part: np.ndarray, edges: _Edges, manifold: bool
-) -> tuple[tuple[CheckedPart, ...], float]:
+) -> tuple[tuple[CheckedComponent, ...], float]:
     """Return the parts, the largest first, and the volume of all."""
     _, index, sizes = np.unique(part, return_inverse=True, return_counts=True)
     count = len(sizes)
@@ -264,14 +266,14 @@ def _measure_parts(
         a, b, c = (corners[:, k] - corners[0, 0] for k in range(3))
         each = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
     volumes = np.bincount(index, weights=each, minlength=count)
-    line_part = np.zeros(edges.count, np.int64)
-    line_part[edges.line] = np.repeat(index, 3)
+    edge_part = np.zeros(edges.count, np.int64)
+    edge_part[edges.edge_index] = np.repeat(index, 3)
     _, first = np.unique(faces, return_index=True)
     vertex_count = np.bincount(index[first // 3], minlength=count)
-    eulers = vertex_count - np.bincount(line_part, minlength=count) + sizes
+    eulers = vertex_count - np.bincount(edge_part, minlength=count) + sizes
     order = np.argsort(-sizes, kind="stable")
     parts = tuple(
-        CheckedPart(
+        CheckedComponent(
             int(sizes[i]),
             int(eulers[i]),
             1 - int(eulers[i]) // 2 if manifold else None,
