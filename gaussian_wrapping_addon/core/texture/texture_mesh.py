@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From a mesh and photos to a textured mesh: unwrap, bake, fill, count."""
+"""Texture a mesh from photos: unwrap, bake, fill unseen texels, coverage statistics."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def texture_mesh(
     mesh : SurfaceMesh
         In the scene frame.
     scene : Scene
-        Whose views the photos are.
+        Views of the photos.
     photos : PhotoStore
-        Anything with ``camera``, ``photo`` and ``mask`` by index and divisor.
+        Any object with ``camera``, ``photo`` and ``mask`` by index and divisor.
     settings : TextureSettings
-        ``size_px = 0`` chooses the size from the photos' footprint, and ``max_atlases = 0`` how
-        many textures.
+        ``size_px = 0`` chooses the size from the photos' footprint, ``max_atlases = 0`` the number
+        of textures.
     work_folder : Path
         For a temporary sub-folder of the unwrap.
     progress : Progress
@@ -68,11 +68,11 @@ def texture_mesh(
     threads : int
         Threads to use; the result does not depend on it.
     dense : SurfaceMesh, optional
-        What the mesh was decimated from: its detail goes into the normal map.
+        The mesh before decimation; its detail goes into the normal map.
     free_bytes : int
-        Memory that may be taken; 0 where it is not known, then nothing is judged.
+        Available memory; 0 if unknown, then memory is not checked.
     unwrapped : Unwrap, optional
-        UVs to keep; the size must be given.
+        Existing UVs to keep; requires a given size.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def texture_mesh(
     UsageError
         The size is out of range.
     ResourceError
-        A texture of the size asked for needs more memory than is free.
+        A texture of the requested size needs more memory than is available.
     """
     validate_for_texturing(mesh)
     if settings.size_px < 0 or settings.size_px > limits.MAX_TEXTURE_SIDE_PX:
@@ -129,7 +129,7 @@ def texture_mesh(
         views.append(shown)
         colors.append(AtlasColors(atlas, baked, MAX_FILL_SOURCES // atlases, surface))
         del atlas, baked
-    progress.update(0.9, "filling what no photo saw")
+    progress.update(0.9, "filling unseen texels")
     fill = fill_harmonically(colors, surface)
     images = []
     while colors:
@@ -161,7 +161,7 @@ def _plan(
     dense: SurfaceMesh | None,
     free_bytes: int,
 ) -> tuple[int, int, ReportWarning | None]:
-    """Return side and number of textures, and a warning where memory makes them fewer."""
+    """Return side and number of textures, and a warning if memory limits them."""
     detail_points = 0
     if dense is not None and wants_normal_map(settings, is_decimated=True):
         detail_points = len(dense.vertices)
@@ -183,9 +183,9 @@ def _sample_surface(
     photos: int,
     threads: int,
 ) -> tuple[SurfaceArrays, SurfacePoints, AtlasRaster | None]:
-    """Return the surface with its texel size, points all over it, and the raster if there is one.
+    """Return the surface with its texel size, evenly spread points, and the raster if only one.
 
-    Several rasters would take too much memory: they are made once more when they are needed.
+    Several rasters would take too much memory: they are computed again when needed.
     """
     wanted, inside = correction_sample_count(photos), 0
     samples, counts = [], []
@@ -214,7 +214,7 @@ def _sample_surface(
 
 
 def _even_texels(raster: AtlasRaster, used: int, wanted: int) -> SurfacePoints:
-    """Return texels that faces own, evenly in their order."""
+    """Return ``wanted`` of the ``used`` texels with a face, evenly spaced in their order."""
     rank = np.linspace(0, used - 1, wanted).astype(np.int64)
     ends = np.cumsum((raster.face >= 0).sum(axis=1))
     row = np.searchsorted(ends, rank, side="right")
@@ -227,13 +227,13 @@ def _even_texels(raster: AtlasRaster, used: int, wanted: int) -> SurfacePoints:
 
 
 def validate_for_texturing(mesh: SurfaceMesh) -> None:
-    """Refuse what cannot be unwrapped or written."""
+    """Raise ``MeshingError`` if a mesh cannot be unwrapped or written."""
     hint = "Mesh the region again, or send the job folder's log.txt with a bug report."
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if len(faces) == 0 or len(vertices) == 0:
         raise MeshingError("The mesh has no faces.", "Choose a region that holds a surface.")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshingError("A face of the mesh names a vertex that does not exist.", hint)
+        raise MeshingError("A face of the mesh refers to a vertex that does not exist.", hint)
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         first = int(np.flatnonzero(~finite)[0])

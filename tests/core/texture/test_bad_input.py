@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes, photos and places that have killed unwrapping, baking or exports: all are survived.
+"""Meshes, photos and coordinates that once crashed unwrapping, baking or export.
 
 Cases by their numbers; "handled" is finite UVs in 0 to 1 without overlaps, "refused" a typed error
 with a next step and nothing left behind.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The whole texture step on analytic scenes: right colours, no bleeding, filled, counted."""
+"""The texture step on analytic scenes: correct colours, no bleeding, fill, statistics."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A job's textured mesh beside some of the job's own photos: figures and pictures."""
+"""Compare a job's textured mesh with some of the job's photos: figures and pictures."""
 
 from __future__ import annotations
 
@@ -25,11 +25,13 @@ MAX_PHOTOS = 8
 LONG_SIDE_PX = 800
 MAX_PICTURES = 3
 PICTURE_WIDTH_PX = 1200
-NOTE_ALL_PHOTOS = "the texture was baked from all photos, these included"
+NOTE_ALL_PHOTOS = "the texture was baked from all photos, including those compared"
 NOTE_HELD_OUT = (
-    "the texture compared was baked again without the held-out photos; the files have all"
+    "the texture compared was baked without the held-out photos; the files use all photos"
 )
-NOTE_GAUSSIANS = "the texture is of the Gaussians, which no held-out photo has trained"
+NOTE_GAUSSIANS = (
+    "the texture is rendered from the Gaussians, which were not trained on the held-out photos"
+)
 
 
 def compare_with_photos(
@@ -43,25 +45,25 @@ def compare_with_photos(
     from_gaussians: bool = False,
     threads: int = 0,
 ) -> dict[str, Any]:
-    """Measure mesh-based rendering over covered pixels, and write some of the comparisons.
+    """Evaluate mesh-based rendering over covered pixels, and write some of the comparisons.
 
-    A photo that the texture was baked from proves little. Where photos were held out, a texture
-    baked without them is compared, as coarse as the pictures allow.
+    Comparison with a photo from which the texture was baked is biased. If photos were held out, a
+    texture baked without them is compared, at the coarsest size that the pictures allow.
 
     Parameters
     ----------
     textured : TexturedMesh
         Scene frame.
     scene : Scene
-        Whose views the photos are.
+        Views of the photos.
     photos : PhotoStore
     held_out : collection of str
-        Names of photos that no Gaussian was trained on. Up to :data:`MAX_PHOTOS` are taken evenly
-        from these, or from all photos where there are none.
+        Names of photos held out of training. Up to :data:`MAX_PHOTOS` evenly spaced ones of these
+        are compared, or of all photos if none were held out.
     folder : Path
-        Gets ``comparison-1.jpg`` and so on: photo left, rendering right.
+        Where ``comparison-1.jpg`` and so on are written: photo left, rendering right.
     from_gaussians : bool
-        The texture has no colours of photos, so that none need be left out.
+        The texture has no colours of photos, so no photo has to be left out.
     threads : int
         0 uses every core.
 
@@ -69,9 +71,9 @@ def compare_with_photos(
     -------
     dict
         What :meth:`~.mesh_rendering.MeshRenderingScore.to_json` returns, with ``pictures`` (file
-        names), ``held_out`` (whether the photos were held out of training), ``note``, and where a
-        texture was baked for it ``texture_size_px`` and ``bake_s``. A view that is pictured names
-        its ``picture``.
+        names), ``held_out`` (whether the photos were held out of training), ``note``, and, if a
+        texture was baked for it, ``texture_size_px`` and ``bake_s``. Views with a picture have the
+        key ``picture``.
 
     Raises
     ------
@@ -125,6 +127,6 @@ def compare_with_photos(
 
 
 def _evenly_spaced(items: list[int], count: int) -> list[int]:
-    """Return ``count`` of the items (or all), from the first to the last."""
+    """Return up to ``count`` evenly spaced items, including the first and the last."""
     positions = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
     return [items[position] for position in positions.tolist()]

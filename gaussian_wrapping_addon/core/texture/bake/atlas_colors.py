@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The image of one atlas: what photos show, then what lies around it, then the space between.
+"""Image of one atlas: baked colours, fill of unseen texels, gutters and background.
 
-An atlas is filled in two steps, because what no photo saw is continued from the seen texels of all
-atlases: :class:`AtlasColors` puts the baked colours in and keeps little else; its ``finish`` does
-the rest.
+An atlas is completed in two steps, because unseen texels are filled from the seen texels of all
+atlases: :class:`AtlasColors` holds the baked colours and little else; its ``finish`` does the
+rest.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from .fill import BLEND_TEXELS, HarmonicFill, dilate, fill_background, surface_p
 from .photo_samples import SurfaceArrays
 
 MAX_FILL_SOURCES = 1_000_000
-"""As many seen texels are enough for the cells from which colours are continued."""
+"""Maximum number of seen texels used as sources of the harmonic fill."""
 SILHOUETTE_TEXELS = 8
-"""Texels seen only at silhouettes take their neighbours' colour within this distance."""
+"""Texels seen only at silhouettes take their neighbours' colours within this distance."""
 UNRELIABLE_LEVELS = 15.0
-"""What only grazing or half hidden views show is taken while it is this near to what lies around,
-and not at all at twice this: on trained meshes such views are often of something before it."""
+"""Colours of grazing or partly occluded views are used if they are this close to their
+surroundings, and not at all at twice this: on trained meshes, such views often show an occluder."""
 
 
 class AtlasColors:
-    """Colours of one atlas, until all are known from which unseen surface is continued.
+    """Colours of one atlas, before the fill of unseen texels is known.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class AtlasColors:
     baked : Baked
         Colours of its points.
     known_points : int
-        As many seen texels are kept at most, for the continuation.
+        Maximum number of seen texels kept as sources of the fill.
     surface : SurfaceArrays
     """
 
@@ -48,7 +48,7 @@ class AtlasColors:
         pixels = self.image.reshape(-1, 3)
         ring = np.full((size_px, size_px), -1, np.int16)
         flat_ring = ring.reshape(-1)
-        # Seen at silhouettes only: the neighbours' colour is cleaner, where there are neighbours.
+        # Seen only at silhouettes: use the cleaner colours of neighbours, if there are any.
         for rows in blocks_of(len(texels)):
             pixels[texels[rows]] = baked.colors[rows]
             flat_ring[texels[rows][seen[rows] & baked.clear[rows]]] = 0
@@ -62,9 +62,9 @@ class AtlasColors:
         if not seen.all():
             dilate(self.image, ring, atlas.chart, BLEND_TEXELS, inside=True)
         self.known = surface_positions(atlas.points.part(known), surface)
-        """(n, 3) float64 where seen texels lie,"""
+        """(n, 3) float64 positions of seen texels."""
         self.known_colors = pixels[texels[known]]
-        """(n, 3) uint8 and their colours."""
+        """(n, 3) uint8 colours of these texels."""
         unseen = np.flatnonzero(~seen)
         self._unseen = texels[unseen]
         self._unseen_points = atlas.points.part(unseen)
@@ -75,12 +75,12 @@ class AtlasColors:
         self._owned = atlas.chart >= 0
 
     def unseen(self, surface: SurfaceArrays) -> Iterator[np.ndarray]:
-        """Yield (m, 3) float64 positions of what no photo saw."""
+        """Yield (m, 3) float64 positions of unseen texels, in blocks."""
         for rows in blocks_of(len(self._unseen)):
             yield surface_positions(self._unseen_points.part(rows), surface)
 
     def finish(self, fill: HarmonicFill, surface: SurfaceArrays, gutter_px: int) -> np.ndarray:
-        """Fill what no photo saw, gutters and the rest; return the (h, w, 3) uint8 image."""
+        """Fill unseen texels, gutters and background; return the (h, w, 3) uint8 image."""
         pixels = self.image.reshape(-1, 3)
         for rows, positions in zip(blocks_of(len(self._unseen)), self.unseen(surface), strict=True):
             far = fill.at(positions)
@@ -106,14 +106,14 @@ class AtlasColors:
 
 
 def _fill_weight(ring: np.ndarray) -> np.ndarray:
-    """(n, 1) float32 from 0 at seen texels to 1 where the rings around them end."""
+    """Return (n, 1) float32 weights of the fill, from 0 at seen texels to 1 beyond their rings."""
     number = ring.astype(np.float32)
     share = np.where(number < 0, np.float32(1.0), number / np.float32(BLEND_TEXELS + 1.0))
     return share[:, None]
 
 
 def fill_harmonically(atlases: list[AtlasColors], surface: SurfaceArrays) -> HarmonicFill:
-    """Continue what photos show over the surface of all atlases."""
+    """Return the harmonic fill from the seen texels of all atlases."""
 
     def queries() -> Iterator[np.ndarray]:
         for atlas in atlases:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Colours of surface points from the photos: best views, occlusion-tested, robustly blended."""
+"""Colours of surface points from photos: occlusion test, best views, robust blending."""
 
 from __future__ import annotations
 
@@ -22,57 +22,57 @@ from .photo_samples import LAST_RESORT_BELOW, PhotoView, SurfaceArrays, SurfaceP
 from .visibility import photo_visibility
 
 KEPT_VIEWS = 15
-"""An odd number, so that the median of the views is one of them. Of five, the median changed where
-one view took another's place: flakes along the rim of a pot whose photos differ in exposure."""
+"""Odd, so that the median of the views is one of them. With five, the median changed wherever one
+view replaced another: flakes along the rim of a pot whose photos differ in exposure."""
 SHARPNESS = 6.0
-"""Weights are raised to this power: the best view leads. On held-out photos of the banana set, 6
+"""Exponent of the weights, so that the best view dominates. On held-out photos of the banana set, 6
 costs 0.1 dB against 1 and keeps a tenth more of the gradients."""
 OUTLIER_FLOOR = 20.0
 """Views within this many of 255 levels of the median are never outliers."""
 OUTLIER_FACTOR = 2.5
 CLEAR_PX = 2
-"""Nearer to a silhouette, a pixel's colour is partly that of something else."""
+"""Closer to a silhouette, a pixel's colour is mixed with that of another surface."""
 MEDIAN_POWER = 0.25
-"""Weights of the median: so even that one leading view cannot outvote the others."""
+"""Exponent of the weights in the median: even enough that one view cannot outvote the others."""
 POINTS_PER_BLOCK = 6_000_000
-"""Points held with their views at once (105 bytes each)."""
+"""Points processed at once with their views (105 bytes each)."""
 CORRECTION_POINTS = 24_000
-"""Some fifty in each cell of a photo's brightness field where a fifth of them is in the photo."""
+"""About fifty per grid cell of a photo's low-frequency correction, with a fifth of them in view."""
 MAX_CORRECTION_SAMPLES = 8_000_000
-"""Bound on points x photos of the exposure step."""
+"""Bound on points x photos of the colour correction."""
 COARSE_LONG_SIDE_PX = 480
 
 
 @dataclass(frozen=True)
 class BakedColors:
-    """Colours of the points."""
+    """Blended colours of surface points."""
 
     colors: np.ndarray
-    """(n, 3) uint8; 0 where no photo sees the point."""
+    """(n, 3) uint8; 0 if no photo sees the point."""
     views: np.ndarray
-    """(n,) uint8 number of views blended, 0 where unseen."""
+    """(n,) uint8 number of views blended, 0 if unseen."""
     clear: np.ndarray
     """(n,) bool: some view sees the point away from silhouettes, where two surfaces mix."""
     reliable: np.ndarray
-    """(n,) bool: some view sees the point neither grazing nor half hidden."""
+    """(n,) bool: some view sees the point neither at a grazing angle nor partly occluded."""
     photos_used: int
-    """Photos that gave at least a depth sample of the mesh."""
+    """Number of photos with at least one depth sample of the mesh."""
     gain_spread: float
     """Standard deviation of the log gains between photos."""
     gains_applied: bool
     low_frequency_spread: float
-    """Standard deviation of the log brightness fields within photos."""
+    """Standard deviation of the log low-frequency corrections within photos."""
     low_frequency_applied: bool
     rejected: int
-    """Kept views that were outliers."""
+    """Number of kept views rejected as outliers."""
 
 
 @dataclass(frozen=True)
 class PhotoPreparation:
-    """What is known of the photos before colours are taken."""
+    """Photos that show the mesh, and their colour correction."""
 
     used_photos: list[_UsedPhoto]
-    """Of the photos that show the mesh."""
+    """Photos that show the mesh, and the level at which each is read."""
     correction: _ColorCorrection
 
 
@@ -85,7 +85,7 @@ class _UsedPhoto:
 @dataclass(frozen=True)
 class _ColorCorrection:
     factors: np.ndarray
-    """(photos, gh, gw, 3) float64 factors of each photo's brightness, on a grid over the photo."""
+    """(photos, gh, gw, 3) float64 colour factors of each photo, on a grid over the photo."""
     gain_spread: float
     gains_applied: bool
     low_frequency_spread: float
@@ -101,22 +101,22 @@ def bake(
     *,
     threads: int,
 ) -> BakedColors:
-    """Give each point the robust mean of its best views.
+    """Blend the best views of each point by a robust mean.
 
     Parameters
     ----------
     points : SurfacePoints
         Points in texture order.
     photos : PhotoSource
-        Read one at a time, at the level that the texel size needs.
-    survey : Survey
-        Of these photos, by :func:`prepare_photos`.
+        Read one at a time, at the level that matches the texel size.
+    preparation : PhotoPreparation
+        Result of :func:`prepare_photos` for these photos.
 
     Notes
     -----
-    A view's weight is (cosine x useful pixels per texel)^2, faded near silhouettes and the
-    image border. The best ``KEPT_VIEWS`` are kept; with three or more, those far from their
-    median are dropped (docs/method.md, section 8.2).
+    The weight of a view is (cosine x useful pixels per texel)^2, reduced near silhouettes and the
+    image border. The best ``KEPT_VIEWS`` are kept; with three or more, those far from their median
+    are rejected (docs/method.md, section 8.2).
     """
     used_photos, correction = preparation.used_photos, preparation.correction
     colors = np.zeros((len(points), 3), np.uint8)
@@ -179,7 +179,7 @@ def _view(
 
 
 def correction_sample_count(count: int) -> int:
-    """Return how many points :func:`prepare_photos` can do with for a number of photos."""
+    """Return the number of points that :func:`prepare_photos` needs for a number of photos."""
     return max(1, min(CORRECTION_POINTS, MAX_CORRECTION_SAMPLES // max(count, 1)))
 
 
@@ -192,12 +192,12 @@ def prepare_photos(
     *,
     threads: int,
 ) -> PhotoPreparation:
-    """Look at every photo coarsely: which see the mesh, at what level, with what exposure.
+    """Find the photos that show the mesh, their level, and their colour correction.
 
     Parameters
     ----------
     part : SurfacePoints
-        Evenly over the surface, :func:`correction_sample_count` of them.
+        Evenly spread over the surface, :func:`correction_sample_count` of them.
     count : int
         Number of photos.
     """
@@ -208,7 +208,7 @@ def prepare_photos(
     positions = surface_positions(part, surface)
     used_photos = []
     for index in range(count):
-        progress.update(index / count, f"texture: looking at photo {index + 1} of {count}")
+        progress.update(index / count, f"texture: analysing photo {index + 1} of {count}")
         full = photos.camera(index, 1)
         coarse = max(1, math.ceil(max(full.width, full.height) / COARSE_LONG_SIDE_PX))
         coarse = min(coarse, full.width, full.height)
@@ -216,7 +216,7 @@ def prepare_photos(
         hit = view.visibility.depth[np.isfinite(view.visibility.depth)]
         if len(hit) == 0:
             continue
-        # At this level a texel near the camera still has one pixel.
+        # At this level, a texel near the camera still has one pixel.
         near = float(np.percentile(hit, 2.0))
         divisor = max(1, int(full.fx * surface.texel_size / near))
         used_photos.append(_UsedPhoto(index, min(divisor, full.width, full.height)))
@@ -272,7 +272,7 @@ def _blend(
         best = 0.0
         for k in range(slots):
             best = max(best, float(weights[i, k]))
-        # Last resorts count only where there is nothing else.
+        # Views of last resort count only if there are no others.
         least = LAST_RESORT_BELOW if best > LAST_RESORT_BELOW else 0.0
         for k in range(slots):
             if weights[i, k] > least:
@@ -320,7 +320,7 @@ def _blend(
 
 @part(fast=False)
 def _weighted_median(values: Any, share: Any, count: int, ranked: Any, mass: Any) -> float:
-    """Insertion sort into the scratch arrays, then the value at half of the weight."""
+    """Return the weighted median, by insertion sort into the scratch arrays."""
     total = 0.0
     for j in range(count):
         value, weight = values[j], share[j]

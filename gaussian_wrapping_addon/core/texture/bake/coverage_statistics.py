@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a texture is worth, counted atlas by atlas."""
+"""Texture coverage statistics, accumulated over atlases."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class CoverageStatistics:
     Parameters
     ----------
     faces : int
-        Of the mesh.
+        Number of faces of the mesh.
     """
 
     def __init__(self, faces: int) -> None:
@@ -30,7 +30,7 @@ class CoverageStatistics:
         self._baked: BakedColors | None = None
 
     def add(self, points: SurfacePoints, baked: BakedColors, overlaps: int) -> None:
-        """Count one atlas, of which ``overlaps`` texels are used twice."""
+        """Add one atlas, in which ``overlaps`` texels are used twice."""
         seen = baked.views > 0
         self._with_texel[points.face] = True
         self._face_seen[points.face[seen]] = True
@@ -46,19 +46,19 @@ class CoverageStatistics:
     def statistics(
         self, size_px: int, settings: TextureSettings, unwrapped: Unwrap, areas: np.ndarray
     ) -> dict[str, Any]:
-        """Return plain JSON values of all atlases together.
+        """Return plain JSON values over all atlases.
 
         Parameters
         ----------
         size_px : int
-            Side of each.
+            Side of each atlas.
         settings : TextureSettings
         unwrapped : Unwrap
         areas : (f,) float64
-            Of the faces.
+            Face areas.
         """
         baked = self._baked
-        assert baked is not None  # a mesh has an atlas
+        assert baked is not None  # a mesh has at least one atlas
         with_texel, face_seen = self._with_texel, self._face_seen
         used, seen = self._used, self._seen
         area_with_texel = float(areas[with_texel].sum())
@@ -79,7 +79,7 @@ class CoverageStatistics:
             "texels_overlapping": self._overlaps,
             "coverage": seen / max(used, 1),
             "faces_seen_share": float(face_seen.sum()) / max(int(with_texel.sum()), 1),
-            # Of the faces that have a texel: whether a photo saw the others is not known.
+            # Over faces with a texel: visibility of the others is unknown.
             "area_seen_share": float(areas[face_seen].sum()) / area_with_texel
             if area_with_texel
             else 0.0,

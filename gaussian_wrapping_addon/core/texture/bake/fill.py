@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fill what no photo has seen, and the space between charts.
+"""Fill unseen texels and the space between charts.
 
-Unseen surface takes a smooth (harmonic) continuation of the seen colours over the surface itself,
-in small cells in space, so that it does not depend on how charts were cut; near seen texels of
-the same chart it blends into their own colours. Space between charts repeats the chart's border,
-then fades to averages, so that mip maps stay clean.
+Unseen texels get a harmonic interpolation of the seen colours over the surface, on small cells in
+space, so that it does not depend on the charts; near seen texels of the same chart it blends into
+their colours. The space between charts repeats the chart's border, then fades to averages, so that
+mip maps stay clean.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from .photo_samples import SurfaceArrays, SurfacePoints
 CELLS_PER_SIDE = 96
 BLEND_TEXELS = 16
 NEAREST_WEIGHT = 1e-4
-"""Weight of the nearest seen cell against one neighbour: decides for pieces that touch none."""
+"""Weight of the nearest seen cell against one neighbour: determines pieces without seen cells."""
 UNKNOWN_GREY = 128
 CELL_BITS = 10
 BACKGROUND_ROWS = 256
-"""Rows of the image that are held as floats at once; even, so that pairs stay together."""
+"""Image rows held as floats at once; even, so that row pairs stay together."""
 
 
 def surface_positions(points: SurfacePoints, surface: SurfaceArrays) -> np.ndarray:
@@ -39,16 +39,16 @@ def surface_positions(points: SurfacePoints, surface: SurfaceArrays) -> np.ndarr
 
 
 class HarmonicFill:
-    """The harmonic continuation of some points' colours over the surface.
+    """Harmonic interpolation of point colours over the surface.
 
     Parameters
     ----------
     known : (n, 3) float64
-        Positions with colours; may be empty, then all is mid grey.
+        Positions with colours; if empty, the result is mid grey.
     colors : (n, 3) uint8
-    wanted : callable
-        Each call yields anew the positions that want a colour, (m, 3) float64 at a time: there
-        may be tens of millions of them.
+    queries : callable
+        Each call yields again all positions to colour, in blocks of (m, 3) float64: there may be
+        tens of millions of them.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class HarmonicFill:
         self._keys, self._values = keys, values
 
     def at(self, positions: np.ndarray) -> np.ndarray:
-        """Return (m, 3) float32 colours of positions that were wanted."""
+        """Return (m, 3) float32 colours of positions that ``queries`` yielded."""
         if len(self._keys) == 0:
             return np.full((len(positions), 3), UNKNOWN_GREY, np.float32)
         return _interpolate(self._keys, self._values, (positions - self._low) / self._cell)
@@ -97,7 +97,7 @@ def _key(coordinates: np.ndarray) -> np.ndarray:
 
 
 def _find(keys: np.ndarray, queries: np.ndarray) -> np.ndarray:
-    """Return the place of each wanted key, or -1."""
+    """Return the index of each key, or -1."""
     index = np.searchsorted(keys, queries).clip(0, len(keys) - 1)
     return np.where(keys[index] == queries, index, -1)
 
@@ -140,7 +140,7 @@ def _harmonic(
 
 
 def _interpolate(keys: np.ndarray, values: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Trilinear look-up among the cells that exist; a point's own cell always does."""
+    """Interpolate trilinearly among existing cells; the cell of a point always exists."""
     base = np.floor(positions - 0.5).astype(np.int64)
     share = positions - 0.5 - base
     total = np.zeros((len(positions), 3))
@@ -158,20 +158,20 @@ def _interpolate(keys: np.ndarray, values: np.ndarray, positions: np.ndarray) ->
 def dilate(
     image: np.ndarray, ring: np.ndarray, chart: np.ndarray, rings: int, inside: bool
 ) -> None:
-    """Grow filled texels ring by ring, each the mean of its neighbours of the ring before.
+    """Dilate filled texels ring by ring; each texel is the mean of its neighbours in earlier rings.
 
     Parameters
     ----------
     image : (h, w, 3) uint8
-        Changed in place.
+        Modified in place.
     ring : (h, w) int16
-        0 where filled, -1 where not; changed in place to the ring that filled the texel.
+        0 if filled, -1 if not; modified in place to the ring that filled the texel.
     chart : (h, w) int32
         Chart of each texel, -1 between charts.
     rings : int
-        How far to grow, texels.
+        Number of rings, texels.
     inside : bool
-        Grow within each chart only; otherwise only between charts.
+        Dilate only within each chart; otherwise only between charts.
     """
     frontier = np.empty(_border_texels(ring, chart, inside, np.empty(0, np.int64)), np.int64)
     _border_texels(ring, chart, inside, frontier)
@@ -183,7 +183,7 @@ def dilate(
 
 @kernel(fast=False)
 def _border_texels(ring: Any, chart: Any, inside: bool, out: Any) -> int:
-    """Count the filled texels beside some that are not; write as many as fit."""
+    """Count the filled texels next to unfilled ones; write as many as fit into ``out``."""
     height, width = ring.shape
     count = 0
     for y in range(height):
@@ -238,7 +238,7 @@ def _dilate_ring(
 
 
 def fill_background(image: np.ndarray, filled: np.ndarray) -> None:
-    """Colour the rest of the image by averages of ever larger blocks, in place."""
+    """Fill the rest of the image by averages of increasingly large blocks (pull-push), in place."""
     if filled.all():
         return
     if not filled.any():
@@ -247,7 +247,7 @@ def fill_background(image: np.ndarray, filled: np.ndarray) -> None:
     height, width = filled.shape
     if max(height, width) == 1:
         return
-    # The finest level is the image itself: as floats it would be the largest array of all.
+    # The finest level is the image itself: as floats it would be the largest array.
     colors = [np.empty((-(-height // 2), -(-width // 2), 3), np.float32)]
     weights = [np.empty(colors[0].shape[:2], np.float32)]
     bands = [(row, min(row + BACKGROUND_ROWS, height)) for row in range(0, height, BACKGROUND_ROWS)]
@@ -273,7 +273,7 @@ def fill_background(image: np.ndarray, filled: np.ndarray) -> None:
 
 
 def _coarser(color: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Average blocks of 2 x 2 by weights of 0 and 1; the result has such weights too."""
+    """Average blocks of 2 x 2 with weights of 0 and 1; return such weights too."""
     total = _halved(weight[..., None])
     known = (total > 0).astype(np.float32)
     return _halved(color) / np.maximum(total, 1e-6) * known, known[..., 0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a light mesh is given of its dense one: normal map, ambient occlusion, as settings ask."""
+"""Detail maps of a mesh from its dense version: normal map, ambient occlusion."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .occlusion import MAX_SIDE_PX, bake_occlusion
 
 @dataclass(frozen=True)
 class DetailMaps:
-    """Maps beside the colours; ``None`` where not asked for."""
+    """Maps in addition to the colours; ``None`` if not requested."""
 
     normal_map: np.ndarray | None = None
     """(h, w, 3) uint8."""
@@ -32,7 +32,7 @@ class DetailMaps:
 
 
 def wants_normal_map(settings: TextureSettings, *, is_decimated: bool) -> bool:
-    """Tell whether a mesh gets a normal map."""
+    """Return whether a mesh gets a normal map."""
     return settings.normal_map == "on" or (settings.normal_map == "auto" and is_decimated)
 
 
@@ -47,22 +47,22 @@ def bake_detail(
     threads: int,
     atlas: int = 0,
 ) -> DetailMaps:
-    """Bake the maps that the settings ask for.
+    """Bake the maps requested by the settings.
 
     Parameters
     ----------
     mesh : SurfaceMesh
-        The mesh that will carry them.
+        The mesh that uses the maps.
     unwrapped : Unwrap
     raster : AtlasRaster
-        Of the atlas of these UVs that is baked; the normal map has its size.
+        Raster of the baked atlas; the normal map has its size.
     dense : SurfaceMesh or None
-        What the mesh was decimated from; where it was not, it is its own dense mesh.
+        The mesh before decimation; without one, the mesh itself is the dense mesh.
     settings : TextureSettings
     progress : Progress
         Span of this step.
     atlas : int
-        Which one.
+        Number of the atlas.
     """
     with_normals = wants_normal_map(settings, is_decimated=dense is not None)
     with_occlusion = settings.ambient_occlusion == "on"
@@ -88,7 +88,7 @@ def bake_detail(
 
 
 def merged_statistics(details: Sequence[DetailMaps]) -> dict[str, Any]:
-    """Return the statistics of the atlases of one mesh as one: shares are their means."""
+    """Merge the statistics of the atlases of one mesh; shares are averaged."""
     merged: dict[str, Any] = {}
     for name, first in details[0].statistics.items():
         each = [detail.statistics[name] for detail in details]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Levels of detail: ever fewer faces, each level with an atlas and maps of its own.
+"""Levels of detail: successively decimated meshes, each with its own atlas and maps.
 
-Collapses across charts move the seams, so that one atlas for all levels would either forbid them
-or smear colours. Each level is therefore unwrapped anew, at half the side, and looks its colours
-up on the textured mesh by the same rays that find its normals on the dense one.
+Edge collapses across charts move the seams, so one atlas for all levels would either prevent them
+or smear colours. Each level is therefore unwrapped again, at half the side, and its colours are
+sampled from the textured mesh by the same rays that sample normals from the dense one.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from .detail import bake_detail, merged_statistics
 _logger = logging.getLogger(__name__)
 
 FACES_DIVISOR = 4
-"""A level's faces are twice as long, so half the texture side shows as much a face."""
+"""Edges of a level are twice as long, so half the texture side gives as many texels a face."""
 FLOOR_FACES = 100
-"""No level below has fewer: a shape would not be known again."""
+"""Minimum number of faces of a level; with fewer, the shape would not be recognisable."""
 MIN_SIDE_PX = 128
 
 
 class ColorSource(NamedTuple):
-    """Where a level looks up its colours."""
+    """Source of the colours of a level."""
 
     textured: TexturedMesh
     surface: DenseSurface
-    """Of the textured mesh."""
+    """Surface of the textured mesh."""
     pyramids: list[ChartPyramid]
-    """Of its texture, one for each atlas."""
+    """Pyramids of its texture, one for each atlas."""
 
 
 def levels_of_detail(
@@ -69,15 +69,15 @@ def levels_of_detail(
     textured : TexturedMesh
         Level 0.
     dense : SurfaceMesh or None
-        What level 0 was decimated from; otherwise level 0 is the dense mesh of the others.
+        Level 0 before decimation; without one, level 0 is the dense mesh of the others.
     settings : TextureSettings
-        ``lods`` levels are made, fewer where the next would have less than
-        :data:`FLOOR_FACES` faces, or where no more faces can go without tearing the mesh: why
-        becomes an entry of ``warnings`` in the statistics of ``textured``.
+        ``lods`` levels are made, fewer if the next would have less than :data:`FLOOR_FACES` faces,
+        or if no more faces can be removed without tearing the mesh. The reason is added to
+        ``warnings`` in the statistics of ``textured``.
     work_folder : Path
         For temporary sub-folders.
     region : Region, optional
-        The region that the mesh was made in: its flat boundary stays flat.
+        Region of the mesh: its flat boundary stays flat.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def levels_of_detail(
         span = progress.span((number - 1) / settings.lods, number / settings.lods)
         target = len(current.faces) // FACES_DIVISOR
         if target < FLOOR_FACES:
-            _warn_fewer_levels(textured, settings, number, f"it would have {target} faces")
+            _warn_fewer_levels(textured, settings, number, f"the next would have {target} faces")
             break
         try:
             fewer = decimate(
@@ -122,10 +122,10 @@ def levels_of_detail(
 def _warn_fewer_levels(
     textured: TexturedMesh, settings: TextureSettings, number: int, reason: str
 ) -> None:
-    """Say, in the log and for the report, why there is no further level."""
-    text = f"{number - 1} of {settings.lods} levels of detail were made, no further one: {reason}."
+    """Log and report why there is no further level."""
+    text = f"{number - 1} of {settings.lods} levels of detail were made: {reason}."
     _logger.warning("%s", text)
-    hint = "Ask for fewer with --lods, or for a mesh with more faces."
+    hint = "Choose fewer with --lods, or a mesh with more faces."
     warning = ReportWarning("fewer-levels", text, hint)
     textured.statistics.setdefault("warnings", []).append(warning.to_json())
 
@@ -172,14 +172,14 @@ def _level(
 def transfer_colors(
     mesh: SurfaceMesh, raster: AtlasRaster, colors: ColorSource, gutter_px: int, progress: Progress
 ) -> np.ndarray:
-    """Return the (h, w, 3) uint8 texture of a mesh, looked up on another textured one.
+    """Return the (h, w, 3) uint8 texture of a mesh, sampled from another textured mesh.
 
     Parameters
     ----------
     mesh : SurfaceMesh
     raster : AtlasRaster
-        Of its UVs, at the size wanted: the source is averaged to the same fineness, within its
-        charts.
+        Raster of its UVs at the wanted size; the source is averaged to the same resolution,
+        within its charts.
     gutter_px : int
     """
     size = raster.face.shape[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A tangent-space normal map: the detail of a dense mesh on a lighter one."""
+"""Tangent-space normal map: the detail of a dense mesh on a lighter one."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from .dense_surface import (
 )
 
 FLAT = (128, 128, 255)
-"""The colour of the light mesh's own normal: what is between charts."""
+"""Colour of the unperturbed normal, also used between charts."""
 
 
 @dataclass(frozen=True)
 class NormalMap:
-    """The image and where its normals came from."""
+    """Normal map and its statistics."""
 
     image: np.ndarray
-    """(h, w, 3) uint8, +Y (OpenGL, Blender, glTF), not a colour: no sRGB."""
+    """(h, w, 3) uint8, +Y (OpenGL, Blender, glTF), linear data, not sRGB."""
     statistics: dict[str, Any]
-    """Distance between the meshes, shares of texels found by rays, nearest points, not at all."""
+    """Distance of the meshes; shares of texels found by rays, by nearest points, or not at all."""
 
 
 def bake_normal_map(
@@ -46,27 +46,27 @@ def bake_normal_map(
     gutter_px: int,
     progress: Progress,
 ) -> NormalMap:
-    """Tell the dense mesh's normals in the frames of the light mesh, texel by texel.
+    """Bake the dense mesh's normals in the tangent frames of the light mesh.
 
     Parameters
     ----------
     light : SurfaceMesh
-        The mesh that will carry the map, smooth shaded.
+        The mesh that uses the map, smooth shaded.
     corner_uvs : (f, 3, 2) float32
     raster : AtlasRaster
-        Of these UVs; its size is the map's.
+        Raster of these UVs; the map has its size.
     dense : DenseSurface
-        The mesh with the detail, same units.
+        The mesh with the detail, in the same units.
     gutter_px : int
-        How far charts are continued outwards.
+        Width by which charts are dilated.
     progress : Progress
         Span of this step.
 
     Notes
     -----
     The three numbers of a texel solve ``x T + y B + z N = n`` with the interpolated tangent,
-    bitangent and normal of the light mesh, so that a reader finds ``n`` whatever their lengths and
-    angles. Normals that point below the light surface are laid into it: z is never negative.
+    bitangent and normal of the light mesh, so that a renderer recovers ``n`` for any lengths and
+    angles of these. Normals that point below the light surface are clamped to it: z >= 0.
     """
     size = raster.face.shape[0]
     frames = tangent_frames(light.vertices, light.faces, corner_uvs)
@@ -115,7 +115,7 @@ def to_tangent_space(
     face: np.ndarray,
     frames: TangentFrames,
 ) -> np.ndarray:
-    """Tell unit vectors in the frames of points on the light mesh.
+    """Transform unit vectors to the tangent frames of points on the light mesh.
 
     Parameters
     ----------
@@ -123,12 +123,12 @@ def to_tangent_space(
     normal : (n, 3) float64
         Interpolated, not of unit length.
     weights : (n, 3) float64
-        Of the corners of ``face`` (n,).
+        Barycentric weights of the corners of ``face`` (n,).
 
     Returns
     -------
     (n, 3) float64
-        Unit length, z not negative.
+        Unit length, z >= 0.
     """
     tangent = np.einsum("nc,ncx->nx", weights, frames.tangents[face])
     bitangent = frames.signs[face][:, None] * np.cross(normal, tangent)
@@ -144,5 +144,5 @@ def to_tangent_space(
 
 
 def encode_normals(vectors: np.ndarray) -> np.ndarray:
-    """Turn (n, 3) unit vectors into (n, 3) uint8, -1 to 1 over 0 to 255."""
+    """Encode (n, 3) unit vectors as (n, 3) uint8: [-1, 1] to [0, 255]."""
     return np.rint((0.5 * vectors + 0.5) * 255.0).clip(0, 255).astype(np.uint8)

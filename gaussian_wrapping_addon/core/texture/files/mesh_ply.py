@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mesh as PLY: exact coordinates, and the texture as vertex colours. Needs numpy alone."""
+"""Write a mesh as PLY: exact coordinates, texture as vertex colours. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def write_mesh_ply(
     path : Path
         Its folder must exist.
     vertices : (v, 3) float64
-        World coordinates; stored without loss.
+        World coordinates; stored losslessly.
     faces : (f, 3) int32
     colors : (v, 3) uint8 or None
 
@@ -71,19 +71,19 @@ def vertex_colors(
     albedos: Sequence[np.ndarray],
     face_atlas: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return (v, 3) uint8 means of the texture at the corners of each vertex.
+    """Return (v, 3) uint8 vertex colours: mean of the texture over the corners of each vertex.
 
     Parameters
     ----------
     count : int
-        Of the vertices.
+        Number of vertices.
     faces : (f, 3) int
     corner_uvs : (f, 3, 2) float
         v upwards.
     albedos : sequence of (h, w, 3) uint8
-        One for each atlas. The first row is the top.
+        One per atlas; the first row is the top.
     face_atlas : (f,) int, optional
-        Where there are several.
+        Atlas of each face, if there are several.
     """
     uvs = np.asarray(corner_uvs, np.float64).reshape(-1, 2)
     atlas = np.zeros(len(uvs), np.int64) if face_atlas is None else np.repeat(face_atlas, 3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fallback unwrap: charts of faces that look the same way along an axis, packed in shelves."""
+"""Fallback unwrap: box projection along the axes, charts packed in shelves."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from .chart_overlaps import split_overlaps
 SMOOTHING_ROUNDS = 8
 NEIGHBOUR_VOTE = 0.4
 MIN_COSINE = 0.15
-"""A face may be projected along an axis that its normal leaves by up to 81 degrees."""
+"""A face may be projected along an axis up to 81 degrees from its normal."""
 SCALE_STEPS = 24
 
 _AXES = np.repeat(np.eye(3), 2, axis=0) * np.array([[1.0], [-1.0]] * 3)
-# For each signed axis the two axes that make the projection counter-clockwise from outside.
+# For each signed axis, the two axes of a projection that is counter-clockwise from outside.
 _PLANES = ((1, 2), (2, 1), (2, 0), (0, 2), (0, 1), (1, 0))
 
 
@@ -30,16 +30,16 @@ def box_unwrap(
     progress: Progress,
     atlases: int = 1,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Unwrap by projection along six directions.
+    """Unwrap by projection along the six axis directions.
 
     Returns
     -------
     corner_uvs : (f, 3, 2) float32
-        UVs in [0, 1], v upwards; charts that would cover themselves are split.
+        UVs in [0, 1], v upwards; charts with overlaps are split.
     face_atlas : (f,) uint8
-        Which of the ``atlases`` each face is in.
+        Atlas of each face, below ``atlases``.
     gutter_px : float
-        Texels kept between charts; less than asked for when there is no room.
+        Texels kept between charts; fewer than requested if there is no room.
     """
     axis = _axis_of_faces(graph)
     corners = mesh.vertices[mesh.faces]
@@ -56,7 +56,7 @@ def box_unwrap(
 
 
 def _axis_of_faces(graph: FaceGraph) -> np.ndarray:
-    """Choose a direction for each face, smoothed so that noise does not shatter charts."""
+    """Choose a direction for each face, smoothed so that noise does not fragment charts."""
     cosines = graph.normals @ _AXES.T  # (f, 6)
     axis = cosines.argmax(axis=1)
     rows = np.arange(len(axis))
@@ -77,7 +77,7 @@ def _axis_of_faces(graph: FaceGraph) -> np.ndarray:
 def _pack(
     flat: np.ndarray, charts: np.ndarray, size_px: int, gutter_px: int, atlases: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Place charts in shelves at the largest scale that fits; gutters shrink when none does."""
+    """Pack charts in shelves at the largest scale that fits; reduce the gutters if none does."""
     count = int(charts.max()) + 1
     low = np.full((count, 2), np.inf)
     high = np.full((count, 2), -np.inf)
@@ -85,7 +85,7 @@ def _pack(
         np.minimum.at(low, charts, flat[:, corner])
         np.maximum.at(high, charts, flat[:, corner])
     extent = high - low
-    turned = extent[:, 1] > extent[:, 0]  # lying charts make lower shelves
+    turned = extent[:, 1] > extent[:, 0]  # wide charts make lower shelves
     lying = np.where(turned[:, None], extent[:, ::-1], extent)
     gutter = float(gutter_px)
     while True:
@@ -96,7 +96,7 @@ def _pack(
     assert positions is not None
     local = (flat - low[charts][:, None, :]) * scale  # (f, 3, 2)
     width = extent[charts, 0][:, None] * scale
-    # A quarter turn keeps the orientation: (x, y) -> (y, width - x).
+    # A rotation by 90 degrees keeps the orientation: (x, y) -> (y, width - x).
     quarter = np.stack([local[..., 1], width - local[..., 0]], axis=-1)
     local = np.where(turned[charts][:, None, None], quarter, local)
     corner_uvs = (local + positions[charts][:, None, :2]) / size_px
@@ -113,7 +113,7 @@ def _largest_scale(
     if positions is not None:
         return high, positions
     best: np.ndarray | None = None
-    # Charts of under a hundredth of the largest scale would hold no texels.
+    # Below a hundredth of the largest scale, charts would have no texels.
     low = 0.01 * high
     best = _shelves(extent * low, size_px, gutter, atlases)
     if best is None and gutter >= 0.01:
@@ -132,7 +132,7 @@ def _largest_scale(
 
 
 def _shelves(extent_px: np.ndarray, size_px: int, gutter: float, atlases: int) -> np.ndarray | None:
-    """Return x, y of the lower left corner of each box and its atlas; ``None``: no room."""
+    """Return x, y of the lower left corner of each box and its atlas; ``None`` without room."""
     if float(((extent_px + gutter) ** 2).min()) < 0:
         return None
     if float(np.prod(extent_px + gutter, axis=1).sum()) > atlases * float(size_px) ** 2:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shapes of charts: a smooth copy of a mesh to find them on, and their fit to the true mesh."""
+"""Geometry of charts: smoothing of the mesh before charting, ARAP relaxation of charts."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from ...mesh.topology import area_vectors, half_edges
 from .chart_overlaps import find_overlaps, signed_areas
 
 SMOOTHING_STEPS = 2
-"""More bring more charts again (the copy shrinks into folds), one leaves noise of 0.3 edges."""
+"""More give more charts again (the copy shrinks into folds); one leaves 0.3 edges of noise."""
 MAX_MOVE_SHARE = 0.5
-"""Of the mean length of a vertex's edges."""
+"""Share of the mean length of a vertex's edges."""
 MIN_AREA_SHARE = 0.03
-"""A face left with less of its area was crushed; xatlas hung on a wire of three faces around."""
+"""With a smaller share of its area, a face is crushed; xatlas hung on a wire three faces around."""
 RELAXATIONS = 6
-"""After six rounds the stretch of charts moves by less than 0.1 %."""
+"""After six rounds, the stretch of charts changes by less than 0.1 %."""
 MAX_ROUNDS_BACK = 30
-"""A point put back may spoil its neighbours, so all are looked at again."""
+"""Maximum number of rounds: restoring a point may fold its neighbours, so all are tested again."""
 MIN_HEIGHT_SHARE = 0.02
-"""Needles are given this height by their longest edge, so that their weights stay bounded."""
+"""Minimum height of needles relative to their longest edge, so that their weights stay bounded."""
 ANCHOR_WEIGHT = 1e-6
-"""Weight that keeps a chart in its place, by the mean weight of a vertex."""
+"""Weight that fixes the position of a chart, relative to the mean weight of a vertex."""
 
 
 def smooth_vertices(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Move vertices toward the mean of their neighbours, by half an edge at most.
+    """Move vertices towards the mean of their neighbours, by at most half an edge.
 
-    xatlas splits charts wherever faces are noisy or badly shaped; on the copy both are milder.
+    xatlas splits charts at noisy or badly shaped faces; smoothing reduces both.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def smooth_vertices(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _restore_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Put points back to their start where a face lost most of its area: wires keep their tubes."""
+    """Restore the vertices of faces that lost most of their area, so that thin tubes stay open."""
     before = np.linalg.norm(area_vectors(start, faces), axis=1)
     points = points.copy()
     while True:
@@ -69,7 +69,7 @@ def _restore_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndar
 
 
 def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number the different points of each chart.
+    """Index the distinct points of each chart.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray
     Returns
     -------
     corners : (f, 3) int64
-        Index of a point for each corner; charts share none.
+        Index of a point for each corner; charts share no points.
     first : (n,) int64
         A corner ``3 * face + k`` at each point.
     """
     bits = np.ascontiguousarray(corner_uvs, np.float32).reshape(-1, 2) + np.float32(0.0)
-    bits = bits.view(np.uint32).astype(np.int64)  # (3 f, 2); + 0.0 makes one zero of two
+    bits = bits.view(np.uint32).astype(np.int64)  # (3 f, 2); + 0.0 maps -0.0 to 0.0
     order = np.lexsort((bits[:, 1], bits[:, 0], np.repeat(charts, 3)))
     keys = np.column_stack([np.repeat(charts, 3), bits])[order]
     fresh = np.concatenate([[True], (keys[1:] != keys[:-1]).any(axis=1)])
@@ -94,7 +94,7 @@ def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray
 
 
 def equalise_density(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-    """Scale each chart so that its area is that of its faces, and put its corner at the origin.
+    """Scale each chart to the area of its faces, and move its lower corner to the origin.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def equalise_density(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndar
 
 
 def flatten_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Lay each face into the plane: (f, 3, 2) float64, counter-clockwise, first corner at 0."""
+    """Flatten each face to the plane: (f, 3, 2) float64, counter-clockwise, first corner at 0."""
     corners = np.asarray(vertices, np.float64)[faces]
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     length = np.maximum(np.linalg.norm(one, axis=1), 1e-300)
@@ -131,16 +131,16 @@ def flatten_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-    """Bring the faces of charts nearer to their true shapes (as rigid as possible).
+    """Relax charts towards the true shapes of their faces (as rigid as possible).
 
     Rounds of two steps (Liu and others 2008, "A Local/Global Approach to Mesh Parameterization"):
-    the best turn of each face, then the points that fit all turned faces in the least squares
-    sense. Where that turns faces over or lays them upon each other, points stay as they were.
+    the best rotation of each face, then the least-squares points for all rotated faces. Points of
+    faces that flip or overlap as a result are restored.
 
     Parameters
     ----------
     corner_uvs : (f, 3, 2) float
-        Charts of even density, counter-clockwise.
+        Charts of uniform density, counter-clockwise.
     charts : (f,) int
     shapes : (f, 3, 2) float64
 
@@ -152,7 +152,7 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
     corners, first = chart_points(corner_uvs.astype(np.float32), charts)
     points = start.reshape(-1, 2)[first]
     shapes = _widen_needles(shapes)
-    weights = _cotangents(shapes)  # (f, 3) of the edge from corner k to k + 1
+    weights = _cotangents(shapes)  # (f, 3) for the edge from corner k to k + 1
     size = len(points)
     begin, end = half_edges(corners)
     weight = weights.ravel()
@@ -191,7 +191,7 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
 def _restore_folded_faces(
     points: np.ndarray, start: np.ndarray, corners: np.ndarray, charts: np.ndarray
 ) -> np.ndarray:
-    """Put points back to their start where faces turned over or came to lie upon each other.
+    """Restore the points of faces that flipped or overlap since the start.
 
     Returns
     -------
@@ -205,7 +205,9 @@ def _restore_folded_faces(
     for _ in range(MAX_ROUNDS_BACK):
         now = points[corners]
         pairs = find_overlaps(now, charts)
-        pairs = pairs[folded[charts[pairs[:, 0]]] == 0]  # those that folded before are split later
+        pairs = pairs[
+            folded[charts[pairs[:, 0]]] == 0
+        ]  # charts that overlapped before are split later
         bad = was_up & (signed_areas(now) <= 0.0)
         bad[pairs] = True
         back = np.unique(corners[bad])
@@ -230,7 +232,7 @@ def _widen_needles(shapes: np.ndarray) -> np.ndarray:
 
 
 def _cotangents(shapes: np.ndarray) -> np.ndarray:
-    """(f, 3) half cotangent of the angle opposite to the edge from corner k to k + 1."""
+    """Return (f, 3) half cotangents of the angle opposite to the edge from corner k to k + 1."""
     result = np.empty((len(shapes), 3))
     for k in range(3):
         apex = shapes[:, (k + 2) % 3]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Strips show photo, rendering and error where they say; curves and sizes are what they claim."""
+"""Strips of photo, rendering and error; learning curves; sizes in world units."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_learning_curve_shows_every_entry(tmp_path: Path) -> None:
     assert [len(points) for points in lines] == [5, 5]
     texts = " ".join(e.text or "" for e in root.iter(f"{SVG}text"))
     assert "PSNR (dB)" in texts
-    assert "held out" in texts
+    assert "held-out photos" in texts
     history[2]["psnr"] = None
     assert write_learning_curve(training, path)
     first = next(ElementTree.parse(path).getroot().iter(f"{SVG}polyline"))

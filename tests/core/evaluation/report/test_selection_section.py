@@ -43,15 +43,15 @@ def test_every_decision_is_listed_with_its_evidence_and_setting() -> None:
         assert name in TrainingSettings.__dataclass_fields__
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(rows) == 2 + len(NAMES)
-    assert text.count("*To decide otherwise:*") == len(NAMES)
+    assert text.count("*To change this:*") == len(NAMES)
 
 
 def test_what_a_person_decided_is_told_apart() -> None:
     text = "\n".join(selection_lines(training()))
     assert "| off | you (off) |" in text
     assert text.count("| the photos |") == len(NAMES) - 1
-    assert "You decided this. What the photos say: Photos differ by 20 %." in text
-    assert text.count('"auto" leaves it to the photos') == 1
+    assert "Set by you. Evidence from the photos: Photos differ by 20 %." in text
+    assert text.count('"auto" chooses from the photos') == 1
 
 
 def test_where_nothing_was_measured_the_photos_say_nothing() -> None:
@@ -61,21 +61,21 @@ def test_where_nothing_was_measured_the_photos_say_nothing() -> None:
     assert stored == decision
     text = "\n".join(selection_lines({"decisions": [stored.to_json()]}))
     assert f"{evidence}\n" in text
-    assert "You decided this" not in text
+    assert "Set by you" not in text
     values = decision.to_json()
     del values["measured"]  # as version 0.1.0 wrote it
     assert Decision.from_json(values).measured
     text = "\n".join(selection_lines({"decisions": [values]}))
-    assert f"You decided this. What the photos say: {evidence}" in text
+    assert f"Set by you. Evidence from the photos: {evidence}" in text
 
 
 def test_the_section_stands_between_training_and_regions() -> None:
     summary = full_summary()
     summary["training"] |= training()
     text = report_markdown(summary, Path("nowhere"))
-    order = [text.index(f"\n## {title}") for title in ("Training", "What this scene", "Warnings")]
+    order = [text.index(f"\n## {title}") for title in ("Training", "Model selection", "Warnings")]
     assert order == sorted(order)
-    assert "What this scene needed" not in report_markdown(full_summary(), Path("nowhere"))
+    assert "## Model selection" not in report_markdown(full_summary(), Path("nowhere"))
 
 
 @pytest.mark.parametrize("decisions", [None, 3, "x", [], [None, 3, {}, {"chosen": "on"}]])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Samples of a surface: even, exact, deterministic, and the same at huge coordinates."""
+"""Surface samples: uniform, exact, deterministic, and the same at huge coordinates."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_bad_meshes_are_refused(sample: str) -> None:
     for bad in (np.nan, np.inf):
         with pytest.raises(MeshingError, match="not finite"):
             run(np.where(vertices == 1, bad, vertices), faces)
-    with pytest.raises(UsageError, match="outside of 0 to 2"):
+    with pytest.raises(UsageError, match="outside 0 to 2"):
         run(vertices, faces + 1)
     # A vertex that no face uses does not matter.
     run(np.concatenate([vertices, [[np.nan] * 3]]), faces)

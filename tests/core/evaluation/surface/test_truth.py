@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ground truth of a scene's folder: read as written, refused with its entry named."""
+"""Ground-truth folders: read as written; errors state the invalid entry."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A job's mesh beside the job's photos: which photos, what is told, what is written."""
+"""Comparison of a job's mesh with photos: choice of photos, notes, files written."""
 
 from __future__ import annotations
 

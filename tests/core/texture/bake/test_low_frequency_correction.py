@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Smooth brightness fields are recovered, and absent ones are left alone."""
+"""Low-frequency corrections are recovered; photos without gradients are left unchanged."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Levels of detail: closed, of the faces asked for, coloured as the mesh they come from."""
+"""Levels of detail: closed, with the target number of faces, coloured like their source."""
 
 from __future__ import annotations
 

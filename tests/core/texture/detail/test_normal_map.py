@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Normal maps: decoded again they are the dense mesh's normals, whatever the mesh's place."""
+"""Normal maps decode to the dense mesh's normals, at any position of the mesh."""
 
 from __future__ import annotations
 

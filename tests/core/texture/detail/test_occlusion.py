@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ambient occlusion against cases that are known in closed form."""
+"""Ambient occlusion against closed forms."""
 
 from __future__ import annotations
 

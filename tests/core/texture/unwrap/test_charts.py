@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Charts: overlaps found exactly, folds cut, faces relaxed to their true shapes."""
+"""Charts: exact overlaps, splits at folds, relaxation to the true shapes of faces."""
 
 from __future__ import annotations
 

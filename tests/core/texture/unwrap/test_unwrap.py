@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Unwrap: chunks, xatlas in its helper, the fallback, and what both promise."""
+"""Unwrap: chunks, xatlas in its helper, the fallback, and the guarantees of both."""
 
 from __future__ import annotations
 
