@@ -54,7 +54,7 @@ def test_photos_are_chosen_evenly_and_held_out_ones_first(tmp_path: Path) -> Non
     assert names_of(values) == [f"{i}.jpg" for i in range(0, 22, 3)]
     assert len(values["views"]) == MAX_PHOTOS
     assert values["held_out"] is False
-    assert "all photos, these included" in values["note"]
+    assert "all photos, including those compared" in values["note"]
     values = compared(photos, {"3.jpg", "9.jpg"}, tmp_path)
     assert names_of(values) == ["3.jpg", "9.jpg"]
     assert values["held_out"] is True
