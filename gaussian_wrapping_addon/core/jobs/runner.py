@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The one runner behind button and command line: cameras, train, mesh, texture, export."""
+"""Run the stages of a job in order: cameras, train, mesh, texture, export."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _logger = logging.getLogger(__name__)
 STAGE_SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
 
 DENSE_MESH = "dense.npz"
-"""In a mesh stage whose mesh was decimated: the mesh before, for the texture stage's maps."""
+"""In a mesh stage: the mesh before decimation, if it was decimated; texture maps use it."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class _Span:
 
 
 class _JobProgress:
-    """Maps the fraction of each stage onto the whole job, with the time left of the whole."""
+    """Map the progress of each stage onto the whole job and estimate the time left."""
 
     def __init__(
         self, sink: Callable[[ProgressEvent], None], is_cancelled: Callable[[], bool]
@@ -72,7 +72,7 @@ class _JobProgress:
         return Progress(name, forward, self._is_cancelled)
 
     def skip_to(self, fraction: float) -> None:
-        """Stages up to here were re-used: they tell nothing about the time left."""
+        """Exclude re-used stages up to ``fraction`` from the estimate of the time left."""
         self._begun_s = time.monotonic()
         self._offset = fraction
 
@@ -175,7 +175,7 @@ def _run_cameras(folder: JobFolder, job: JobFile, overall: _JobProgress, threads
 
 
 def _cameras_of_finished_training(folder: JobFolder, job: JobFile) -> Stage | None:
-    """Return the newest finished cameras that the job's training was finished on."""
+    """Return the newest finished cameras stage with a finished training of this job."""
     from .stages.training_stage import training_keys
 
     found: list[tuple[float, int, Stage]] = []

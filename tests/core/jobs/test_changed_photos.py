@@ -54,7 +54,7 @@ def finish(folder: JobFolder, name: str, finished_unix_s: float) -> None:
 
 
 def cameras_of(folder: JobFolder, job: JobFile) -> Stage:
-    overall = runner._Overall(lambda _event: None, lambda: False)
+    overall = runner._JobProgress(lambda _event: None, lambda: False)
     return runner._run_cameras(folder, job, overall, 1)
 
 

@@ -67,4 +67,4 @@ def test_a_permuted_splat_becomes_a_closed_mesh_on_its_surface(tmp_path: Path) -
     truth = SIZE * fibonacci_directions(400) * AXES + MOVE
     _, gap, _ = trimesh.proximity.closest_point(mesh, truth)
     assert np.percentile(gap / SIZE, 95) < 0.08
-    assert "made-up views" in (result / "report.json").read_text()
+    assert "virtual views" in (result / "report.json").read_text()
