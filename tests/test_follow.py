@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the command line says of a job: nothing that is not so."""
+"""The command line reports the progress and outcome of a job correctly."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mesh from a finished training trains nothing again, whatever became of the photos."""
+"""Meshing a finished training does not train again, even if the photos have changed."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The whole road on a tiny scene with exact ground truth, through the command line."""
+"""All stages on a tiny scene with exact ground truth, through the command line."""
 
 from __future__ import annotations
 

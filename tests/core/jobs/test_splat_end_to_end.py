@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A splat of another program becomes a closed mesh through the command line, without photos."""
+"""A splat of another program is meshed without photos through the command line."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pythons that are refused, commands as they are shown, versions, failures of commands."""
+"""Parts of the set-up: unsuitable Pythons, displayed commands, versions, failed commands."""
 
 from __future__ import annotations
 

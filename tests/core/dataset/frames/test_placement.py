@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scale, ground and origin: exact where the answer is known, refused where there is none."""
+"""Steps of the placement: exact results for known cases, errors for degenerate input."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Loading whole inputs: every kind, every repair, every refusal."""
+"""Loading complete inputs: every kind, every repair, every error."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cameras made up around a splat, and what the check says of a splat as an input."""
+"""Virtual cameras around a splat, and the check of a splat as an input."""
 
 from __future__ import annotations
 

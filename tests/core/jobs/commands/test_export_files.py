@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Exports of a result: coordinates lead back to the world, and bad data writes nothing."""
+"""Exports of a result: coordinates map back to the world, and invalid data writes no file."""
 
 from __future__ import annotations
 
