@@ -23,7 +23,7 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
     """
     from .command_line.options.option_names import with_option_name
     from .command_line.parser import build_parser
-    from .core.errors import EXIT_OTHER, NO_ROOM, SettingError, WrapError, cannot_be_written
+    from .core.errors import DISK_FULL_ERRNOS, EXIT_OTHER, SettingError, WrapError, unwritable_error
     from .core.processes.worker_environment import interpreter_of, ready_worker
 
     _log_to_terminal()
@@ -44,8 +44,8 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
         _logger.error("error: This Python lacks %s. Use another Python: %s", error.name, worker)
         return EXIT_OTHER
     except OSError as error:
-        if error.errno in NO_ROOM:
-            full = cannot_be_written(error.filename or "A file", error)
+        if error.errno in DISK_FULL_ERRNOS:
+            full = unwritable_error(error.filename or "A file", error)
             _logger.error("error: %s", full)
             return full.exit_code
         _logger.error("error: %s", error)

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, cannot_be_written
+from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, unwritable_error
 from ..processes.helper_process import child_command
 from ..processes.spawn import kill_group, spawn
 from ..processes.worker_environment import ready_worker
@@ -79,7 +79,7 @@ def _writing(root: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise cannot_be_written(error.filename2 or error.filename or root, error) from None
+        raise unwritable_error(error.filename2 or error.filename or root, error) from None
 
 
 class JobClient:

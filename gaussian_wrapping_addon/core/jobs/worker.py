@@ -17,13 +17,13 @@ from types import FrameType
 
 from .. import limits
 from ..errors import (
+    DISK_FULL_ERRNOS,
     EXIT_DONE,
     EXIT_OTHER,
     EXIT_RESOURCES,
-    NO_ROOM,
     Cancelled,
     WrapError,
-    cannot_be_written,
+    unwritable_error,
 )
 from ..processes.helper_process import kill_helpers
 from ..progress import COMPILING, ProgressEvent
@@ -199,12 +199,12 @@ def main(arguments: list[str]) -> int:
     except WrapError as failure:
         _logger.error("%s", failure)
         code, state, error, hint = failure.exit_code, "FAILED", failure.message, failure.hint
-        if isinstance(failure.__cause__, OSError) and failure.__cause__.errno in NO_ROOM:
+        if isinstance(failure.__cause__, OSError) and failure.__cause__.errno in DISK_FULL_ERRNOS:
             hint = FULL_DISK_HINT
     except OSError as failure:
         _logger.exception("a file could not be read or written")
-        if failure.errno in NO_ROOM:
-            full = cannot_be_written(failure.filename or folder.root, failure)
+        if failure.errno in DISK_FULL_ERRNOS:
+            full = unwritable_error(failure.filename or folder.root, failure)
             code, state, error = full.exit_code, "FAILED", full.message
             hint = FULL_DISK_HINT
         else:

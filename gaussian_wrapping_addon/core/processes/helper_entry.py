@@ -29,7 +29,7 @@ def main(arguments: list[str]) -> int:
     _request_parent_death_signal()
     threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
     try:
-        package = __name__.rsplit(".", 1)[0]
+        package = __name__.rpartition(".processes.")[0]
         importlib.import_module(f"{package}.{module}").main(folder)
     except WrapError as error:
         emit(error=error.message, hint=error.hint)

@@ -29,7 +29,7 @@ from ..errors import (
     UsageError,
     WorkerError,
     WrapError,
-    cannot_be_written,
+    unwritable_error,
 )
 from ..files import write_json
 from ..jobs.store.job_folder import JobFolder, JobStatus
@@ -97,7 +97,7 @@ class SetupTask(threading.Thread):
         except WrapError as error:
             self._end("CANCELLED" if isinstance(error, Cancelled) else "FAILED", error)
         except OSError as error:
-            self._end("FAILED", cannot_be_written(error.filename or self.request.root, error))
+            self._end("FAILED", unwritable_error(error.filename or self.request.root, error))
         except Exception as error:  # without a final status, the user would wait forever
             _logger.exception("set-up")
             self._end("FAILED", WorkerError(f"{type(error).__name__}: {error}.", _SEE_LOG))

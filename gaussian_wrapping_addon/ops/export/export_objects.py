@@ -23,7 +23,7 @@ from ...core.errors import ResourceError, UsageError
 from ...core.export_formats import EXPORT_FORMATS, MESH_FORMATS
 from ...core.jobs.store.sidecar import write_sidecar
 from ...core.names import file_stems
-from ...core.texture.files.file_checks import check_mesh, writing
+from ...core.texture.files.file_checks import validate_for_export, write_errors
 from ...core.texture.files.mesh_ply import vertex_colors, write_mesh_ply
 from ..common import tags
 from ..placement.placement import placement_of
@@ -87,7 +87,7 @@ def export_objects(
     world_from_scene = tags.world_from_scene(frame)
     blender_from_scene = placement_of(frame)
     target_from_scene = blender_from_scene if request.placed else world_from_scene
-    with writing(request.folder):
+    with write_errors(request.folder):
         request.folder.mkdir(parents=True, exist_ok=True)
     paths = []
     stems = _stems(frame, things)
@@ -185,7 +185,7 @@ def _write(
     data.loop_triangles.foreach_get("loops", corners)
     faces = faces.reshape(-1, 3)
     uvs = _corner_uvs(data, corners)
-    check_mesh(local, faces, uvs, name=f"mesh {thing.name}")
+    validate_for_export(local, faces, uvs, name=f"mesh {thing.name}")
     data.vertices.foreach_set("co", local.astype(np.float32).ravel())
     data.update()
     contents = {

@@ -29,8 +29,8 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
     from ...training.cost.machine_speed import machine_speed, renderer_is_compiled
     from ...training.cost.training_estimate import (
         MESH_AND_TEXTURE_SHARE,
+        check_resources,
         estimate,
-        judge,
         this_machine,
     )
     from ...training.initialisation.splat_start import wrapping_settings
@@ -59,7 +59,7 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
         lines.append("solving the cameras: minutes before")
     if not compiled:
         lines.append("not timed here: the first job compiles the renderer, about a minute, once")
-    return [*lines, *judge(expected, machine)]
+    return [*lines, *check_resources(expected, machine)]
 
 
 def input_facts(source: Path) -> SceneFacts:

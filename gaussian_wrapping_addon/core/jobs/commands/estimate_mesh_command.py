@@ -44,7 +44,7 @@ def _newest_stage(stages: Path, name: str) -> Path:
 
 def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     from ...dataset.scene_file import load_saved_scene
-    from ...field.depth_samples import find_sightings
+    from ...field.depth_samples import sample_depth_maps
     from ...field.vacancy.vacancy import VacancyField
     from ...gaussians.gaussian_file import load_gaussians
     from ...meshing.points.resolution import checked_request
@@ -69,11 +69,11 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     cameras = scene.cameras[:: max(1, -(-len(scene.cameras) // MAX_VIEWS))]
     edge_length = meshing.edge_length / scene.world_from_scene.scale
     notes = checked_request(edge_length, meshing.points, region).notes  # raises before any work
-    sightings = find_sightings(
+    depth_samples = sample_depth_maps(
         gaussians, cameras, lambda points: region.contains(points, 0.0), Progress(),
         most=MAX_DEPTH_SAMPLES, threads=threads,
     )  # fmt: skip
-    if len(sightings) == 0:
+    if len(depth_samples) == 0:
         raise MeshingError(
             f"The cameras see no surface in region {region.name!r}.",
             "Draw the region around something that was photographed.",
@@ -81,10 +81,12 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     vacancy = VacancyField(arrays, scene.cameras, threads=threads)
     memory_bytes = free_bytes(folder.root, threads)
     if meshing.method == "pivots":
-        by_pivots = estimate_region_pivots(vacancy, arrays, region, meshing, sightings)
+        by_pivots = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
         by_pivots.refuse(memory_bytes)
         return [*by_pivots.lines()]
-    expected = estimate_region_mesh(vacancy, scene.cameras, region, meshing, edge_length, sightings)
+    expected = estimate_region_mesh(
+        vacancy, scene.cameras, region, meshing, edge_length, depth_samples
+    )
     tiled = meshing.tiles != "off" and (meshing.tiles != "auto" or expected.tiles_for(memory_bytes))
     expected.refuse(memory_bytes, tiled=tiled)
     mode = "it would be meshed in tiles" if tiled else "it would be meshed whole"

@@ -26,7 +26,7 @@ from ...errors import (
     ParseError,
     UsageError,
     WorkerError,
-    cannot_be_written,
+    unwritable_error,
 )
 from ...files import read_json, write_json
 from ...processes.helper_process import child_command, emit
@@ -121,7 +121,7 @@ def _log_line(raw: bytes) -> bool:
 def main(arguments: list[str]) -> int:
     """Evaluate ``arguments = [request as JSON]`` in this process; return the exit code."""
 
-    from ...texture.files.file_checks import writing
+    from ...texture.files.file_checks import write_errors
 
     def work() -> list[str]:
         request = json.loads(arguments[0])
@@ -130,7 +130,7 @@ def main(arguments: list[str]) -> int:
             _check_output(out)
         report, lines = _evaluate(request)
         if out is not None:
-            with writing(out):
+            with write_errors(out):
                 write_json(out, report)
             lines.append(f"written to {out}")
         return lines
@@ -144,7 +144,7 @@ def _check_output(out: Path) -> None:
         raise UsageError(f"{out} is a folder.", "Give a file for the figures.")
     if not (out.parent.is_dir() and os.access(out.parent, os.W_OK)):
         reason = errno.EACCES if out.parent.is_dir() else errno.ENOENT
-        raise cannot_be_written(out, OSError(reason, os.strerror(reason)))
+        raise unwritable_error(out, OSError(reason, os.strerror(reason)))
 
 
 def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:

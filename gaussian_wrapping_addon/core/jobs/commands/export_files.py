@@ -129,7 +129,7 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
     ResourceError
         The folder cannot be written.
     """
-    from ...texture.files.file_checks import writing
+    from ...texture.files.file_checks import write_errors
 
     for name, known in (("formats", WORKER_FORMATS), ("shading", SHADINGS)):
         given = getattr(request, name)
@@ -141,7 +141,7 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
         _splat_of(request.result)  # before anything is written
     if request.out.exists() and not request.out.is_dir():
         raise UsageError(f"{request.out} is a file.", "Give a folder for the exports.")
-    with writing(request.out):
+    with write_errors(request.out):
         request.out.mkdir(parents=True, exist_ok=True)
     wanted = [f for f in request.formats if f != "splat"]
     if wanted:
@@ -179,7 +179,7 @@ def _levels(folder: Path) -> Iterator[tuple[int, Path]]:
 
 
 def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
-    from ...texture.files.file_checks import check_face_atlas, check_mesh
+    from ...texture.files.file_checks import validate_face_atlas, validate_for_export
 
     path = folder / "mesh.npz"
     try:
@@ -190,7 +190,7 @@ def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
             )
             face_atlas = arrays["face_atlas"] if "face_atlas" in arrays.files else None
         if face_atlas is not None:
-            face_atlas = check_face_atlas(face_atlas, len(faces))
+            face_atlas = validate_face_atlas(face_atlas, len(faces))
         if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
             raise ValueError("not lists of triples")
         if corner_uvs.shape != (len(faces), 3, 2):
@@ -200,7 +200,7 @@ def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
             path, "whole file", f"not a mesh file ({error}).", "Mesh the region again."
         ) from None
     mesh = StoredMesh(region, level, folder, vertices, faces, corner_uvs, stem, face_atlas)
-    check_mesh(vertices, faces, corner_uvs, name=f"mesh {mesh.stem}")
+    validate_for_export(vertices, faces, corner_uvs, name=f"mesh {mesh.stem}")
     return mesh
 
 
@@ -211,7 +211,7 @@ def _write_mesh(
     world_from_scene: Similarity,
     blender_from_scene: Similarity,
 ) -> Path:
-    from ...texture.files.file_checks import writing
+    from ...texture.files.file_checks import write_errors
     from ...texture.files.mesh_ply import vertex_colors, write_mesh_ply
     from ...texture.files.textured_files import write_glb, write_obj
 
@@ -240,7 +240,7 @@ def _write_mesh(
         textures = [*copy_names["albedo"], *copy_names["normal"]]
         for file in [*sources["albedo"], *sources["normal"]]:
             data, copy = _png(file), request.out / f"{mesh.stem}-{file.name}"
-            with writing(copy):
+            with write_errors(copy):
                 write_bytes(copy, data)
         write_obj(
             path, local @ frame.turn.T, mesh.faces, mesh.corner_uvs,
@@ -301,8 +301,8 @@ def _write_splat(
     request: ExportRequest, world_from_scene: Similarity, blender_from_scene: Similarity
 ) -> Path:
     from ...gaussians.splat_ply import read_splat_ply, write_viewer_ply
-    from ...texture.files.file_checks import writing
-    from ...training.initialisation.splat_motion import move_gaussians
+    from ...texture.files.file_checks import write_errors
+    from ...training.initialisation.splat_transform import transform_gaussians
 
     found = read_splat_ply(_splat_of(request.result))
     target_from_scene = blender_from_scene if request.placed else world_from_scene
@@ -310,9 +310,9 @@ def _write_splat(
     if not request.placed:
         offset = file_offset(target_from_scene.points(found.gaussians.means.double().numpy()))
     frame = FileFrame("splat", target_from_scene, offset)
-    moved = move_gaussians(found.gaussians, frame.file_from_scene())
+    moved = transform_gaussians(found.gaussians, frame.file_from_scene())
     path = request.out / SPLAT_NAME
-    with writing(path):
+    with write_errors(path):
         write_viewer_ply(path, moved)
     write_sidecar(
         path, frame, world_from_scene, blender_from_scene,

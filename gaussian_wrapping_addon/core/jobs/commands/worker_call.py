@@ -12,13 +12,13 @@ import time
 from collections.abc import Callable, Iterable
 
 from ...errors import (
+    DISK_FULL_ERRNOS,
     EXIT_CANCELLED,
     EXIT_DONE,
     EXIT_OTHER,
     EXIT_RESOURCES,
-    NO_ROOM,
     WrapError,
-    cannot_be_written,
+    unwritable_error,
 )
 from ...processes.helper_process import emit
 from ...report_warning import ReportWarning
@@ -54,8 +54,8 @@ def run_command(
         )
         return EXIT_OTHER
     except OSError as error:
-        if error.errno in NO_ROOM:
-            full = cannot_be_written(error.filename or "a file", error)
+        if error.errno in DISK_FULL_ERRNOS:
+            full = unwritable_error(error.filename or "a file", error)
             emit(error=full.message, hint=full.hint)
             return full.exit_code
         emit(error=f"{error}.", hint="Check the path and its permissions.")

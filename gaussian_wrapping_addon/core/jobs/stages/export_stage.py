@@ -11,7 +11,7 @@ from typing import Any
 from ...dataset.similarity import Similarity
 from ...evaluation.report.markdown import CURVE
 from ...evaluation.report.report import write_report
-from ...files import finite, read_json, resolve_inside, write_json
+from ...files import finite_json, read_json, resolve_inside, write_json
 from ...names import REPORT_FOLDER
 from ...progress import Progress
 from ..store.job_file import JobFile
@@ -135,4 +135,4 @@ def _training_pictures(trained: Stage, folder: Path) -> None:
 
 def _json_values(values: Any) -> Any:
     """Return the values as read back from JSON: lists for tuples, finite numbers only."""
-    return json.loads(json.dumps(finite(values)))
+    return json.loads(json.dumps(finite_json(values)))

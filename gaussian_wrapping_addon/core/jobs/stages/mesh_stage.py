@@ -50,14 +50,14 @@ def run_mesh(
         import numpy as np
 
         from ...dataset.scene_file import load_saved_scene
-        from ...field.depth_samples import find_sightings
+        from ...field.depth_samples import sample_depth_maps
         from ...field.vector_field import VectorField
         from ...gaussians.gaussian_file import load_gaussians
         from ...mesh.mesh_file import save_mesh
-        from ...meshing.checks.mesh_check import check_mesh
+        from ...meshing.checks.manifold_check import validate_manifold
         from ...meshing.checks.mesh_statistics import mesh_statistics
         from ...meshing.cleanup.clean_up import clean_up
-        from ...meshing.cleanup.open_boundary import opened
+        from ...meshing.cleanup.open_boundary import without_caps
         from ...regions.region import write_region
         from .region_field import field_figures, region_field, requested_region
         from .region_meshing import (
@@ -75,7 +75,7 @@ def run_mesh(
             scene, arrays, region, job.settings.training, meshing, threads=threads,
             device=str(gaussians.means.device),
         )  # fmt: skip
-        sightings = find_sightings(
+        depth_samples = sample_depth_maps(
             gaussians, scene.cameras, lambda points: region.contains(points, 0.0),
             progress.span(0.0, 0.15), threads=threads,
         )  # fmt: skip
@@ -83,22 +83,22 @@ def run_mesh(
             mesh, expected = mesh_by_pivots_in_stage(
                 stage_folder, vacancy, arrays, scene.cameras, region, meshing,
                 progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
-                sightings=sightings,
+                depth_samples=depth_samples,
             )  # fmt: skip
         else:
             mesh, expected = mesh_in_stage(
                 stage_folder, vacancy, VectorField(arrays, threads=threads), arrays, scene.cameras,
                 region, meshing, progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
                 edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
-                sightings=sightings,
+                depth_samples=depth_samples,
                 origin=tiles_origin(cameras.folder, trained.folder, job.settings),
             )  # fmt: skip
         mesh, dense = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
         open_at = region if meshing.boundary == "open" else None
         if open_at is not None:
-            mesh = opened(mesh, open_at, meshing.min_component_share)
+            mesh = without_caps(mesh, open_at, meshing.min_component_share)
             if dense is not None:
-                dense = opened(dense, open_at, meshing.min_component_share)
+                dense = without_caps(dense, open_at, meshing.min_component_share)
         mesh.provenance.update(field_figures(vacancy))
         if not np.isfinite(mesh.vertices).all():
             raise MeshingError(
@@ -113,7 +113,7 @@ def run_mesh(
         progress.update(0.97, "measuring the mesh")
         return {
             "statistics": mesh_statistics(mesh).to_json(),
-            "check": check_mesh(mesh.vertices, mesh.faces, open_at).to_json(),
+            "check": validate_manifold(mesh.vertices, mesh.faces, open_at).to_json(),
             "provenance": mesh.provenance,
             "edge_length_world": meshing.edge_length,
             "estimate": expected,

@@ -21,7 +21,7 @@ from .mesh_keys import mesh_stages
 
 if TYPE_CHECKING:
     from ...dataset.camera import Camera
-    from ...field.depth_samples import Sightings
+    from ...field.depth_samples import DepthSamples
     from ...field.vacancy.vacancy import VacancyField
     from ...field.vector_field import VectorField
     from ...gaussians.model import GaussianArrays
@@ -55,7 +55,7 @@ def mesh_in_stage(
     seed: int,
     threads: int,
     edge_length_scene: float,
-    sightings: Sightings,
+    depth_samples: DepthSamples,
     origin: dict[str, Any],
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
     """Estimate the mesh of a region, then make it, whole or in tiles.
@@ -77,7 +77,9 @@ def mesh_in_stage(
     from ...meshing.tiles.plan import Field
     from ...meshing.tiles.store import LIST_NAME
 
-    expected = estimate_region_mesh(vacancy, cameras, region, meshing, edge_length_scene, sightings)
+    expected = estimate_region_mesh(
+        vacancy, cameras, region, meshing, edge_length_scene, depth_samples
+    )
     for line in expected.lines():
         _logger.info("region %s, estimated %s", region.name, line)
     memory_bytes = free_bytes(stage_folder, threads)
@@ -90,12 +92,12 @@ def mesh_in_stage(
         mesh = mesh_tiled_in_stage(
             stage_folder, Field(vacancy, vectors, threads), arrays, cameras, region, meshing,
             progress, tiles=0 if meshing.tiles == "auto" else int(meshing.tiles), seed=seed,
-            edge_length_scene=edge_length_scene, sightings=sightings, origin=origin,
+            edge_length_scene=edge_length_scene, depth_samples=depth_samples, origin=origin,
         )  # fmt: skip
     else:
         mesh = mesh_region(
             vacancy, vectors, arrays, cameras, region, meshing, progress, seed=seed,
-            threads=threads, edge_length_scene=edge_length_scene, sightings=sightings,
+            threads=threads, edge_length_scene=edge_length_scene, depth_samples=depth_samples,
         )  # fmt: skip
     return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": tiled}
 
@@ -111,18 +113,18 @@ def mesh_by_pivots_in_stage(
     *,
     seed: int,
     threads: int,
-    sightings: Sightings,
+    depth_samples: DepthSamples,
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
     """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
     from ...meshing.pivot_meshing import mesh_by_pivots
 
-    expected = estimate_region_pivots(vacancy, arrays, region, meshing, sightings)
+    expected = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
     for line in expected.lines():
         _logger.info("region %s, estimated %s", region.name, line)
     memory_bytes = free_bytes(stage_folder, threads)
     expected.refuse(memory_bytes)
     mesh = mesh_by_pivots(
-        vacancy, arrays, cameras, region, meshing, progress, seed=seed, sightings=sightings
+        vacancy, arrays, cameras, region, meshing, progress, seed=seed, depth_samples=depth_samples
     )
     return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": False}
 
@@ -132,15 +134,15 @@ def estimate_region_pivots(
     arrays: GaussianArrays,
     region: Region,
     meshing: MeshingSettings,
-    sightings: Sightings,
+    depth_samples: DepthSamples,
 ) -> PivotEstimate:
-    """Estimate the mesh of a region by pivots from the Gaussians and sightings in it."""
+    """Estimate the mesh of a region by pivots from the Gaussians and depth_samples in it."""
     from ...meshing.cost.mesh_estimate import evaluation_seconds
-    from ...meshing.cost.pivot_estimate import estimate_pivots
+    from ...meshing.cost.pivot_estimate import estimate_pivot_mesh
 
-    return estimate_pivots(
-        arrays, region, meshing.pivots, len(sightings),
-        evaluation_s=evaluation_seconds(vacancy, sightings.points),
+    return estimate_pivot_mesh(
+        arrays, region, meshing.pivots, len(depth_samples),
+        evaluation_s=evaluation_seconds(vacancy, depth_samples.points),
     )  # fmt: skip
 
 
@@ -150,26 +152,26 @@ def estimate_region_mesh(
     region: Region,
     meshing: MeshingSettings,
     edge_length_scene: float,
-    sightings: Sightings,
+    depth_samples: DepthSamples,
 ) -> MeshEstimate:
     """Estimate the mesh of a region from the depth samples of its surface."""
     from ...meshing.cost.mesh_estimate import (
-        area_of,
+        box_counting_area,
         estimate_mesh,
         evaluation_seconds,
-        occupied_boundary,
+        occupied_boundary_area,
     )
     from ...meshing.points.resolution import checked_request
     from ...meshing.points.spacing import resolved_edges
 
     adaptive = meshing.spacing == "adaptive"
-    subset = sightings.points[:: max(1, len(sightings) // MAX_SPACING_SAMPLES)]
+    subset = depth_samples.points[:: max(1, len(depth_samples) // MAX_SPACING_SAMPLES)]
     return estimate_mesh(
-        area_of(sightings.points),
-        occupied_boundary(region, vacancy.is_empty),
+        box_counting_area(depth_samples.points),
+        occupied_boundary_area(region, vacancy.is_empty),
         checked_request(edge_length_scene, meshing.points, region),
         adaptive=adaptive,
-        evaluation_s=evaluation_seconds(vacancy, sightings.points),
+        evaluation_s=evaluation_seconds(vacancy, depth_samples.points),
         resolved=resolved_edges(subset, cameras) if adaptive else None,
     )
 
@@ -193,7 +195,7 @@ def mesh_tiled_in_stage(
     tiles: int,
     seed: int,
     edge_length_scene: float,
-    sightings: Sightings | None,
+    depth_samples: DepthSamples | None,
     origin: dict[str, Any],
 ) -> SurfaceMesh:
     """Mesh a region tile by tile, alone or together with other processes.
@@ -225,7 +227,7 @@ def mesh_tiled_in_stage(
             folder,
             plan_tiles(
                 field, arrays, cameras, region, meshing, progress.span(0.0, 0.2), tiles=tiles,
-                seed=seed, edge_length_scene=edge_length_scene, sightings=sightings,
+                seed=seed, edge_length_scene=edge_length_scene, depth_samples=depth_samples,
             ),
             origin,
         )  # fmt: skip

@@ -58,8 +58,8 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
     from ...gaussians.initialisation import SH_C0
     from ...render.render import render
     from ...render.types.options import RenderOptions
-    from ...training.initialisation.splat_motion import move_gaussians
     from ...training.initialisation.splat_start import baked, fit_filter
+    from ...training.initialisation.splat_transform import transform_gaussians
 
     progress.update(0.0, "reading the splat")
     splat = read_foreign_splat(source)
@@ -69,7 +69,7 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
     file_cameras = cameras_on_spheres(extent)
     scene_from_world = scene_frame(file_cameras)
     cameras = [camera.moved(scene_from_world) for camera in file_cameras]
-    gaussians = fit_filter(move_gaussians(world, scene_from_world), cameras, threads=threads)
+    gaussians = fit_filter(transform_gaussians(world, scene_from_world), cameras, threads=threads)
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     options = RenderOptions(depth=False, threads=threads)

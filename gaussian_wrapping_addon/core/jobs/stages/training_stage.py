@@ -183,7 +183,12 @@ def _estimate(
     Compiles the renderer first if that was never done on this machine.
     """
     from ...training.cost.machine_speed import machine_speed, renderer_is_compiled
-    from ...training.cost.training_estimate import estimate, judge, scene_facts, this_machine
+    from ...training.cost.training_estimate import (
+        check_resources,
+        estimate,
+        scene_facts,
+        this_machine,
+    )
     from ...training.initialisation.splat_start import wrapping_settings
     from ...training.warm_up import compile_kernels
     from .splat_scene import start_splat_of
@@ -199,7 +204,7 @@ def _estimate(
     done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
     first = max(done, default=0)
     expected = estimate(scene_facts(scene), training, machine, first=first)
-    warnings = judge(expected, machine)  # raises where the disk is too full
+    warnings = check_resources(expected, machine)  # raises where the disk is too full
     _logger.info("estimate: %s", expected.sentence())
     for warning in warnings:
         _logger.warning("%s", warning.text)

@@ -109,7 +109,7 @@ def test_names_that_differ_in_case_alone_are_one() -> None:
 
 def test_two_names_for_one_folder_are_both_told() -> None:
     requests = ["x/a b.json", "x/auto.json", "x/a_b.json"]
-    with pytest.raises(UsageError, match="a_b: 'a b' and 'a_b' are kept in one folder"):
+    with pytest.raises(UsageError, match="a_b: 'a b' and 'a_b' use the same folder"):
         region_names(requests, {})
     assert region_names(requests[:2], {})[0] == "a_b"
 
