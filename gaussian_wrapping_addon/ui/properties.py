@@ -79,8 +79,8 @@ CLASSES: Final = (GWRAP_PG_finding, GWRAP_PG_scene)
 
 def add_pointers() -> None:
     """Give scenes and regions their properties."""
-    bpy.types.Scene.gwrap = PointerProperty(type=GWRAP_PG_scene)
-    bpy.types.Object.gwrap = PointerProperty(type=GWRAP_PG_region)
+    bpy.types.Scene.gwrap = PointerProperty(type=GWRAP_PG_scene)  # type: ignore[attr-defined]
+    bpy.types.Object.gwrap = PointerProperty(type=GWRAP_PG_region)  # type: ignore[attr-defined]
 
 
 def remove_pointers() -> None:

@@ -229,7 +229,7 @@ def _goes_on(function: Callable[[], bool]) -> bool:
         return False
 
 
-@persistent  # type: ignore[untyped-decorator]
+@persistent
 def before_load(*_arguments: object) -> None:
     """``load_pre``: nobody waits any more for what is about the open file."""
     for lane in list(_lanes):

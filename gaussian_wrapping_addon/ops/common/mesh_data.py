@@ -3,8 +3,34 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import bpy
 import numpy as np
+
+
+def mesh_of(thing: bpy.types.Object) -> bpy.types.Mesh:
+    """Return the data of a mesh object."""
+    return cast(bpy.types.Mesh, thing.data)
+
+
+def values_of(elements: Any, name: str, width: int, dtype: type) -> np.ndarray:
+    """Return a property of all elements of a collection.
+
+    Parameters
+    ----------
+    elements : bpy_prop_collection
+        Of n elements.
+    width : int
+        Numbers of the property per element.
+
+    Returns
+    -------
+    values : (n * width,) ndarray
+    """
+    values: np.ndarray = np.empty(width * len(elements), dtype)
+    elements.foreach_get(name, values)
+    return values
 
 
 def build_mesh(
@@ -30,13 +56,16 @@ def build_mesh(
     mesh.loops.add(3 * count)
     mesh.polygons.add(count)
     # Attributes are copied in one piece, which vertices and loops themselves are not.
+    attributes: Any = mesh.attributes
+    polygons: Any = mesh.polygons
     positions = np.ascontiguousarray(vertices, np.float32)
-    mesh.attributes["position"].data.foreach_set("vector", positions.ravel())
-    mesh.attributes[".corner_vert"].data.foreach_set("value", faces.astype(np.int32).ravel())
-    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
+    attributes["position"].data.foreach_set("vector", positions.ravel())
+    attributes[".corner_vert"].data.foreach_set("value", faces.astype(np.int32).ravel())
+    polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
     if face_material is not None:
-        mesh.polygons.foreach_set("material_index", face_material.astype(np.int32))
+        polygons.foreach_set("material_index", face_material.astype(np.int32))
     layer = mesh.uv_layers.new(name="UVMap", do_init=False)
-    layer.uv.foreach_set("vector", corner_uvs.astype(np.float32, copy=False).ravel())
+    uvs: Any = layer.uv
+    uvs.foreach_set("vector", corner_uvs.astype(np.float32, copy=False).ravel())
     mesh.update(calc_edges=True)
     return mesh

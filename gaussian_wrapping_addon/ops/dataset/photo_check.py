@@ -10,6 +10,7 @@ import bpy
 
 from ...core.errors import WrapError
 from ..common import tags
+from ..common.addon import properties_of
 from ..common.background import Lane
 from ..common.redrawing import redraw
 from ..jobs import panel_state
@@ -66,11 +67,11 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None) -> None:
     stop()
     if choice is not None:
         training_estimate.get_ready()
-    uid, chosen = scene.session_uid, scene.gwrap.source
+    uid, chosen = scene.session_uid, properties_of(scene).source
 
     def keep(found: list[Finding]) -> None:
         scene = tags.scene_of_uid(uid)
-        if scene is not None and scene.gwrap.source == chosen:
+        if scene is not None and properties_of(scene).source == chosen:
             _keep(scene, found)
             if choice is not None:
                 _estimate(scene, choice)
@@ -85,7 +86,7 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None) -> None:
 
 
 def _keep(scene: bpy.types.Scene, found: list[Finding]) -> None:
-    properties = scene.gwrap
+    properties = properties_of(scene)
     properties.findings.clear()
     properties.checked_source = properties.source
     properties.checked_text = ", ".join(f.short for f in found if f.short)

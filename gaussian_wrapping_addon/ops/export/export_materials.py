@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
+from typing import Any, cast
 
 import bpy
 import numpy as np
@@ -66,7 +67,7 @@ class MaterialCopies:
                 self.shading = "emission"
             if self._fold_specular:
                 fold_specular(copy)
-        tree = copy.node_tree
+        tree: Any = copy.node_tree
         for node in tree.nodes if tree is not None else ():
             if node.bl_idname == "ShaderNodeNormalMap" and self.shading != "unlit":
                 self.has_normal_map = True
@@ -141,7 +142,7 @@ def _write_image(image: bpy.types.Image, path: Path) -> None:
         if not _is_file(image) or image.file_format not in ("PNG", "JPEG"):
             _save_as_png(image, path)
         elif image.packed_file is not None:
-            path.write_bytes(image.packed_file.data)
+            path.write_bytes(cast(bytes, image.packed_file.data))
         elif source.resolve() != path.resolve():
             shutil.copyfile(source, path)
     except (OSError, RuntimeError) as error:
@@ -152,7 +153,8 @@ def _write_image(image: bpy.types.Image, path: Path) -> None:
 
 def _loads(image: bpy.types.Image) -> bool:
     """Tell whether there is a picture in it; Blender reads files when they are first looked at."""
-    return bool(image.size[0] * image.size[1] and len(image.pixels) and image.has_data)
+    pixels: Any = image.pixels
+    return bool(image.size[0] * image.size[1] and len(pixels) and image.has_data)
 
 
 def _save_as_png(image: bpy.types.Image, path: Path) -> None:
@@ -179,7 +181,8 @@ def pixels_of(image: bpy.types.Image) -> np.ndarray:
             "Put it back, or import the result again.",
         )
     values = np.empty(width * height * image.channels, np.float32)
-    image.pixels.foreach_get(values)
+    pixels: Any = image.pixels
+    pixels.foreach_get(values)
     grid = values.reshape(height, width, image.channels)[::-1]
     colors = grid[..., :3] if image.channels >= 3 else np.repeat(grid[..., :1], 3, axis=2)
     return np.rint(255.0 * np.nan_to_num(colors).clip(0.0, 1.0)).astype(np.uint8)

@@ -26,6 +26,7 @@ from ...core.names import file_stems
 from ...core.texture.files.file_checks import check_mesh, writing
 from ...core.texture.files.mesh_ply import vertex_colors, write_mesh_ply
 from ..common import tags
+from ..common.mesh_data import mesh_of, values_of
 from ..placement.placement import placement_of
 from ..regions.region_objects import matrix_of
 from ..results.materials import texture_of
@@ -145,7 +146,7 @@ def _copy_of(
     """Yield the mesh with modifiers applied, and its (v, 3) float64 vertices in the scene frame."""
     hidden = thing.hide_viewport
     thing.hide_viewport = False  # Blender does not evaluate what is disabled in viewports
-    thing.data.update_tag()  # scripts may have changed it without a word
+    mesh_of(thing).update_tag()  # scripts may have changed it without a word
     bpy.context.view_layer.update()
     try:
         depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -156,8 +157,7 @@ def _copy_of(
     finally:
         thing.hide_viewport = hidden
     try:
-        vertices = np.empty(3 * len(data.vertices), np.float32)
-        data.vertices.foreach_get("co", vertices)
+        vertices = values_of(data.vertices, "co", 3, np.float32)
         scene = vertices.reshape(-1, 3).astype(np.float64)
         if np.abs(relative - np.eye(4)).max() > _SAME_PLACE:
             scene = scene @ relative[:3, :3].T + relative[:3, 3]
@@ -180,13 +180,12 @@ def _write(
     region, level = str(thing.get(tags.REGION, thing.name)), int(thing.get(tags.LEVEL, 0))
     data.calc_loop_triangles()
     count = len(data.loop_triangles)
-    faces, corners = np.empty(3 * count, np.int32), np.empty(3 * count, np.int32)
-    data.loop_triangles.foreach_get("vertices", faces)
-    data.loop_triangles.foreach_get("loops", corners)
-    faces = faces.reshape(-1, 3)
+    faces = values_of(data.loop_triangles, "vertices", 3, np.int32).reshape(-1, 3)
+    corners = values_of(data.loop_triangles, "loops", 3, np.int32)
     uvs = _corner_uvs(data, corners)
     check_mesh(local, faces, uvs, name=f"mesh {thing.name}")
-    data.vertices.foreach_set("co", local.astype(np.float32).ravel())
+    vertices: Any = data.vertices
+    vertices.foreach_set("co", local.astype(np.float32).ravel())
     data.update()
     contents = {
         "region": region, "level": level, "vertices": len(local), "faces": count,
@@ -222,8 +221,7 @@ def _corner_uvs(data: bpy.types.Mesh, corners: np.ndarray) -> np.ndarray | None:
     layer = data.uv_layers.active
     if layer is None:
         return None
-    uvs = np.empty(2 * len(data.loops), np.float32)
-    layer.uv.foreach_get("vector", uvs)
+    uvs = values_of(layer.uv, "vector", 2, np.float32)
     return uvs.reshape(-1, 2)[corners].reshape(-1, 3, 2)
 
 
@@ -238,10 +236,8 @@ def _colors(
     used = [image for image in images if image is not None]
     if not used or uvs is None:
         return None
-    slots = np.empty(len(data.polygons), np.int32)
-    data.polygons.foreach_get("material_index", slots)
-    polygons = np.empty(len(faces), np.int32)
-    data.loop_triangles.foreach_get("polygon_index", polygons)
+    slots = values_of(data.polygons, "material_index", 1, np.int32)
+    polygons = values_of(data.loop_triangles, "polygon_index", 1, np.int32)
     # A slot without our texture, as with one atlas, takes the first that there is.
     numbers = [used.index(image if image is not None else used[0]) for image in images]
     owner = np.array(numbers)[slots[polygons].clip(0, len(numbers) - 1)]
@@ -254,7 +250,7 @@ def _alone(thing: bpy.types.Object, data: bpy.types.Mesh) -> Iterator[None]:
     layer = bpy.context.view_layer
     chosen, active = [o for o in layer.objects if o.select_get()], layer.objects.active
     copy = bpy.data.objects.new("exported", data)
-    name, data_name = lend_name(thing, copy), lend_name(thing.data, data)
+    name, data_name = lend_name(thing, copy), lend_name(mesh_of(thing), data)
     try:
         bpy.context.scene.collection.objects.link(copy)
         for other in chosen:
@@ -266,7 +262,7 @@ def _alone(thing: bpy.types.Object, data: bpy.types.Mesh) -> Iterator[None]:
     finally:
         bpy.data.objects.remove(copy)
         data.name = "exported"
-        for original, own in ((thing, name), (thing.data, data_name)):
+        for original, own in ((thing, name), (mesh_of(thing), data_name)):
             if original.library is None:
                 original.name = own
         for other in chosen:

@@ -2,7 +2,7 @@
 """Operators that hand results on: files for other programs, images inside the .blend file."""
 
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
@@ -10,7 +10,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from ...core.errors import UsageError
 from ...core.export_formats import EXPORT_FORMATS, MESH_FORMATS, PACKABLE_FORMATS
 from ..common import tags
-from ..common.error_reporting import NeedsObjectMode, NeedsResult, ReportsErrors
+from ..common.error_reporting import NeedsObjectMode, NeedsResult, OperatorResult, ReportsErrors
 from ..results.materials import images_of
 from .export_objects import ObjectExport, export_objects
 
@@ -51,9 +51,10 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run; Blender calls this."""
-        return NeedsResult.poll.__func__(cls, context) and super().poll(context)
+        needs_result: Any = NeedsResult.poll
+        return bool(needs_result.__func__(cls, context)) and super().poll(context)
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         if not chosen_meshes(context):
             self.scope = "ALL"
         context.window_manager.fileselect_add(self)
@@ -71,7 +72,7 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
         if self.format.lower() in PACKABLE_FORMATS:
             layout.prop(self, "pack")
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose where the files go.")
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
@@ -81,7 +82,8 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
                 raise UsageError("No mesh of a result is selected.", "Select some, or export all.")
         else:
             kinds = ("mesh", "lod") if self.levels else ("mesh",)
-            chosen = [t for t in frame.children_recursive if tags.kind_of(t) in kinds]
+            children = frame.children_recursive if frame is not None else ()
+            chosen = [t for t in children if tags.kind_of(t) in kinds]
         request = ObjectExport(
             self.format.lower(),
             Path(bpy.path.abspath(self.directory)).resolve(),
@@ -89,9 +91,9 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
             self.pack and self.format.lower() in PACKABLE_FORMATS,
         )
         paths = []
-        frames = {t: tags.frame_of(t) for t in chosen}
+        frames = {t: owner for t in chosen if (owner := tags.frame_of(t)) is not None}
         for owner in dict.fromkeys(frames.values()):
-            paths += export_objects(owner, [t for t in chosen if frames[t] == owner], request)
+            paths += export_objects(owner, [t for t in chosen if frames.get(t) == owner], request)
         self.report({"INFO"}, f"{len(paths)} files written to {request.folder}")
         return {"FINISHED"}
 
@@ -104,7 +106,7 @@ class GWRAP_OT_pack_images(NeedsResult, ReportsErrors, bpy.types.Operator):
 
     pack: BoolProperty(name="Pack", default=True)  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         count = 0
         for image in images_of(frame):

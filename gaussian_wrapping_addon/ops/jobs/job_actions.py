@@ -19,6 +19,7 @@ from ...core.names import AUTOMATIC_REGIONS, region_name, region_names
 from ...core.regions.region_file import read_region_file
 from ...core.settings import with_values
 from ..common import tags
+from ..common.addon import properties_of
 from ..regions.region_objects import export_region
 from ..regions.region_resolution import own_lengths, world_per_blender
 from ..worker.preferred_worker import WorkerChoice
@@ -35,7 +36,7 @@ def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     WrapError
         The source, the output or a setting cannot be used.
     """
-    properties = scene.gwrap
+    properties = properties_of(scene)
     source = source_of(scene)
     folder = output_of(scene, source)
     job = make_job("wrap", source, job_settings(scene, choice.threads))
@@ -70,7 +71,7 @@ def start_mesh(
     _refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
     _refuse_linked(regions)
-    properties = scene.gwrap
+    properties = properties_of(scene)
     own = own_lengths(scene, regions, frame)
     requests = []
     for region in regions:
@@ -118,21 +119,21 @@ def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerCh
     folder = job_folder_of(frame)
     _refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
-    job = job_with_more(JobFolder(folder), earlier, scene.gwrap.training.more_iterations)
+    job = job_with_more(JobFolder(folder), earlier, properties_of(scene).training.more_iterations)
     job = replace(job, settings=replace(job.settings, threads=choice.threads))
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
     )
-    scene.gwrap.job_command = "WRAP"
+    properties_of(scene).job_command = "WRAP"
     job_timer.watch(scene, folder, client)
     return folder
 
 
 def resume(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     """Continue a scene's job; finished stages are re-used. Return the job folder."""
-    if not scene.gwrap.job_folder:
+    if not properties_of(scene).job_folder:
         raise UsageError("This scene has no job.", "Wrap the scene first.")
-    folder = Path(bpy.path.abspath(scene.gwrap.job_folder))
+    folder = Path(bpy.path.abspath(properties_of(scene).job_folder))
     _refuse_running(folder)
     client = JobClient.resume(
         folder, python=worker_python(choice.python), keep_running=choice.keep_running

@@ -14,6 +14,7 @@ from ...core.errors import WrapError
 from ...core.jobs.client import JobClient
 from ...core.jobs.store.job_folder import JobStatus
 from ..common import known_jobs, tags
+from ..common.addon import properties_of
 from . import job_timer, watched_jobs
 from .watched_jobs import WatchedJob, gone, jobs, key_of
 
@@ -55,10 +56,10 @@ def attach(scene: bpy.types.Scene, folder: Path) -> JobStatus:
 
 def attach_open_file() -> None:
     """Find the jobs of the open file again; only reads their status, starts and asks nothing."""
-    for job in jobs.values():
-        job.scene_uid = 0
+    for known in jobs.values():
+        known.scene_uid = 0
     for scene in bpy.data.scenes:
-        stored = scene.gwrap.job_folder
+        stored = properties_of(scene).job_folder
         job = jobs.get(key_of(stored))
         if job is not None:
             job.scene_uid = scene.session_uid
@@ -98,6 +99,6 @@ def after_undo(_scene: object = None, _unused: object = None) -> None:
     newest = {job.scene_uid: folder for folder, job in jobs.items() if job.scene_uid}
     for uid, folder in newest.items():
         scene = tags.scene_of_uid(uid)
-        if scene is not None and key_of(scene.gwrap.job_folder) != folder:
-            scene.gwrap.job_folder = folder
-            scene.gwrap.job_command = jobs[folder].command
+        if scene is not None and key_of(properties_of(scene).job_folder) != folder:
+            properties_of(scene).job_folder = folder
+            properties_of(scene).job_command = jobs[folder].command

@@ -6,24 +6,25 @@ from pathlib import Path
 import bpy
 
 from ..common import known_jobs, tags
-from ..common.error_reporting import ReportsErrors
+from ..common.addon import properties_of
+from ..common.error_reporting import OperatorResult, ReportsErrors
 from ..worker import worker_setup
 from . import watched_jobs
 
 
-def no_job_runs(cls: type, context: bpy.types.Context) -> bool:
+def no_job_runs(cls: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
     """Tell whether no job runs in the scene; the tooltip says why a button is grey."""
-    if watched_jobs.is_running(context.scene.gwrap.job_folder):
-        cls.poll_message_set("A job is running; cancel it or wait for it")  # type: ignore[attr-defined]
+    if watched_jobs.is_running(properties_of(context.scene).job_folder):
+        cls.poll_message_set("A job is running; cancel it or wait for it")
         return False
     return True
 
 
-def has_worker(cls: type) -> bool:
+def has_worker(cls: type[bpy.types.Operator]) -> bool:
     """Tell whether a job has a Python to run in; the tooltip says what to do where it has none."""
     problem = worker_setup.worker_problem()
     if problem:
-        cls.poll_message_set(problem)  # type: ignore[attr-defined]
+        cls.poll_message_set(problem)
     return not problem
 
 
@@ -43,7 +44,7 @@ def chosen_regions(context: bpy.types.Context, *, checked: bool) -> list[bpy.typ
     if not checked:
         return selected_regions(context)
     things = tags.objects_of_kind(context.scene, "region")
-    return sorted((t for t in things if t.gwrap.checked), key=lambda t: t.name)
+    return sorted((t for t in things if properties_of(t).checked), key=lambda t: t.name)
 
 
 class AsksAboutFolder(ReportsErrors):
@@ -53,12 +54,12 @@ class AsksAboutFolder(ReportsErrors):
         """Return the folder that the operator would use."""
         raise NotImplementedError
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         """Ask where the folder is not known on this machine."""
         folder = self.folder(context)
         if folder is None or known_jobs.is_trusted(folder):
             return self.execute(context)
-        return context.window_manager.invoke_confirm(  # type: ignore[no-any-return]
+        return context.window_manager.invoke_confirm(
             self,
             event,
             title="Use This Job Folder?",

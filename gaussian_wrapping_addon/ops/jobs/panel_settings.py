@@ -12,6 +12,7 @@ import bpy
 from ...core.errors import UsageError
 from ...core.settings import Declaration, JobSettings, declarations, preset, with_values
 from ..common import known_jobs
+from ..common.addon import properties_of
 
 
 def settings_of_scene() -> list[Declaration]:
@@ -55,7 +56,8 @@ def chosen_values(
 
 
 def _stored(declared: Declaration, properties: bpy.types.PropertyGroup) -> Any:
-    owner = properties.training if declared.property_owner == "training" else properties
+    owner: Any = properties
+    owner = owner.training if declared.property_owner == "training" else owner
     return getattr(owner, declared.property_name)
 
 
@@ -70,7 +72,7 @@ def job_settings(scene: bpy.types.Scene, threads: int) -> JobSettings:
         The splat to start from is not there.
     """
     settings = [declared for declared in settings_of_scene() if declared.group != "meshing"]
-    values = chosen_values(scene.gwrap, settings)
+    values = chosen_values(properties_of(scene), settings)
     values["start_splat"] = _splat(values["start_splat"])
     chosen = preset(values.pop("preset"), threads=threads)
     return with_values(chosen, values)
@@ -85,7 +87,7 @@ def meshing_choices(scene: bpy.types.Scene, world_per_blender: float) -> dict[st
         World units of the input per unit of length in Blender.
     """
     settings = [declared for declared in settings_of_scene() if declared.group == "meshing"]
-    values = chosen_values(scene.gwrap, settings)
+    values = chosen_values(properties_of(scene), settings)
     if values["meshing.edge_length"]:
         values["meshing.edge_length"] *= world_per_blender
     return values
@@ -101,14 +103,14 @@ def method_choices(scene: bpy.types.Scene) -> dict[str, Any]:
         for declared in settings_of_scene()
         if declared.option is not None and declared.scope == "method"
     ]
-    values = chosen_values(scene.gwrap, settings)
+    values = chosen_values(properties_of(scene), settings)
     return {path.rpartition(".")[2]: value for path, value in values.items()}
 
 
 def texture_choices(scene: bpy.types.Scene) -> dict[str, Any]:
     """Return the texture settings, by path, that the panels of a scene ask for."""
     settings = [declared for declared in settings_of_scene() if declared.group == "texture"]
-    return chosen_values(scene.gwrap, settings)
+    return chosen_values(properties_of(scene), settings)
 
 
 def _splat(stored: str) -> str:
@@ -139,7 +141,7 @@ def preset_lines(name: str) -> tuple[str, ...]:
 
 def choices_key(scene: bpy.types.Scene) -> tuple[object, ...]:
     """Return what an estimate of time and memory depends on; reads no file, for panels."""
-    properties = scene.gwrap
+    properties = properties_of(scene)
     own = (properties.source, properties.preset, properties.texture_size)
     training = [d for d in settings_of_scene() if d.property_owner == "training"]
     return (*own, *(_stored(declared, properties) for declared in training))

@@ -9,6 +9,7 @@ from typing import Final
 import bpy
 
 from ..common import tags
+from ..common.addon import properties_of
 from . import watched_jobs
 
 
@@ -45,7 +46,7 @@ PRIMARY: Final = {
 def stage_of(context: bpy.types.Context) -> Stage:
     """Return where the scene stands."""
     scene = context.scene
-    properties = scene.gwrap
+    properties = properties_of(scene)
     frame = tags.current_frame(scene, context.view_layer.objects.active)
     if properties.job_folder:
         status = watched_jobs.status_of(properties.job_folder)
@@ -75,10 +76,10 @@ def primary_of(context: bpy.types.Context) -> str:
 
 def is_checked(scene: bpy.types.Scene) -> bool:
     """Tell whether the findings kept are about the input that is chosen."""
-    properties = scene.gwrap
+    properties = properties_of(scene)
     return bool(properties.source) and properties.checked_source == properties.source
 
 
 def has_errors(scene: bpy.types.Scene) -> bool:
     """Tell whether the check found what keeps the input from being loaded."""
-    return is_checked(scene) and any(f.severity == "error" for f in scene.gwrap.findings)
+    return is_checked(scene) and any(f.severity == "error" for f in properties_of(scene).findings)

@@ -16,6 +16,7 @@ import bpy
 from ...core.jobs.client import JobClient
 from ...core.jobs.store.job_folder import JobStatus
 from ..common import tags
+from ..common.addon import properties_of
 from ..common.background import Lane, Task
 from ..results.result_files import ResultFiles
 
@@ -61,7 +62,7 @@ def key_of(folder: str) -> str:
 
 def show(scene: bpy.types.Scene, folder: Path, job: WatchedJob) -> None:
     """Let a scene show a job."""
-    properties = scene.gwrap
+    properties = properties_of(scene)
     properties.job_folder = str(folder)
     job.command = properties.job_command
     key = key_of(properties.job_folder)
@@ -77,7 +78,7 @@ def detach(scene: bpy.types.Scene) -> None:
     for job in jobs.values():
         if job.scene_uid == scene.session_uid:
             job.scene_uid, job.imports = 0, False
-    scene.gwrap.job_folder = ""
+    properties_of(scene).job_folder = ""
 
 
 def forget_all() -> None:
@@ -112,7 +113,7 @@ def waits_for_object_mode(folder: str) -> bool:
 
 def result_to_import(scene: bpy.types.Scene) -> str:
     """Return the result folder of a finished job that the scene does not show, or ``""``."""
-    status = status_of(scene.gwrap.job_folder)
+    status = status_of(properties_of(scene).job_folder)
     if status is None or status.state != "DONE" or not status.result:
         return ""
     wanted = os.path.normpath(status.result)

@@ -9,7 +9,8 @@ from bpy.props import BoolProperty, StringProperty
 
 from ...core.errors import UsageError
 from ..common import tags
-from ..common.error_reporting import NeedsObjectMode
+from ..common.error_reporting import NeedsObjectMode, OperatorResult
+from ..common.mesh_data import mesh_of
 from ..jobs import job_actions, scene_folders
 from ..jobs.job_guards import AsksAboutFolder, chosen_regions
 from ..worker import preferred_worker
@@ -37,7 +38,7 @@ class GWRAP_OT_estimate_regions(AsksAboutFolder, bpy.types.Operator):
         frame = tags.frame_of(regions[0]) if regions else None
         return tags.result_folder(frame).parent if frame and frame.get(tags.RESULT) else None
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         regions = chosen_regions(context, checked=self.checked)
         folder = scene_folders.job_folder_of(job_actions.common_frame(regions))
         python = preferred_worker.worker_choice(context).python
@@ -53,7 +54,7 @@ class GWRAP_OT_delete_region(NeedsObjectMode, bpy.types.Operator):
 
     name: StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         thing = context.scene.objects.get(self.name)
         if thing is None or tags.kind_of(thing) != "region":
             raise UsageError(f"The scene has no region {self.name}.", "Choose one of the list.")
@@ -61,7 +62,7 @@ class GWRAP_OT_delete_region(NeedsObjectMode, bpy.types.Operator):
             raise UsageError(
                 f"{thing.name} is linked from a library.", "Remove it in the library's file."
             )
-        mesh = thing.data if thing.type == "MESH" else None
+        mesh = mesh_of(thing) if thing.type == "MESH" else None
         bpy.data.objects.remove(thing)
         if mesh is not None and mesh.users == 0:
             bpy.data.meshes.remove(mesh)

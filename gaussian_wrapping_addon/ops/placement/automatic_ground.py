@@ -12,6 +12,7 @@ from ...core.dataset.frames.placement import Plane
 from ...core.errors import UsageError
 from ..cameras.camera_objects import cameras_under
 from ..common import tags
+from ..common.mesh_data import mesh_of, values_of
 from ..regions.region_objects import hull_in_blender, matrix_of, transformed
 
 _FLIP_YZ = np.array([1.0, -1.0, -1.0])
@@ -73,11 +74,9 @@ def automatic_plane(frame: bpy.types.Object) -> tuple[Plane, str]:
 
 def _triangles(thing: bpy.types.Object) -> np.ndarray:
     """Return the (f, 3, 3) corners of an object's triangles in Blender's world."""
-    mesh = thing.data
+    mesh = mesh_of(thing)
     mesh.calc_loop_triangles()
-    corners = np.empty(3 * len(mesh.loop_triangles), np.int32)
-    mesh.loop_triangles.foreach_get("vertices", corners)
-    vertices = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", vertices)
+    corners = values_of(mesh.loop_triangles, "vertices", 3, np.int32)
+    vertices = values_of(mesh.vertices, "co", 3, np.float32)
     placed = transformed(matrix_of(thing), vertices.reshape(-1, 3).astype(np.float64))
     return placed[corners].reshape(-1, 3, 3)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...core.errors import UsageError
 from ..common import tags
+from ..common.mesh_data import mesh_of
 from ..regions.region_objects import matrix_of, scene_from_blender, transformed
 
 # Size of a new point's cross, in scene units: a hundredth of the cameras' reach.
@@ -57,7 +58,7 @@ def picked_points(context: bpy.types.Context, frame: bpy.types.Object) -> np.nda
 
 
 def _selected_vertices(thing: bpy.types.Object, frame: bpy.types.Object) -> np.ndarray:
-    vertices = [v.co[:] for v in bmesh.from_edit_mesh(thing.data).verts if v.select]
+    vertices = [v.co[:] for v in bmesh.from_edit_mesh(mesh_of(thing)).verts if v.select]
     if vertices and tags.frame_of(thing) != frame:
         raise UsageError(
             f"{thing.name} is not part of the result under {frame.name}.",

@@ -30,13 +30,13 @@ def is_editable_box(thing: bpy.types.Object | None) -> bool:
         and not any((*thing.lock_location, *thing.lock_scale))
         and (thing.parent is None or thing.parent_type == "OBJECT")
         and _parent_matrix(thing) is not None
-        and all(abs(value) > 0.0 for value in thing.scale)
+        and all(abs(value) > 0.0 for value in thing.scale[:])
     )
 
 
 def _parent_matrix(thing: bpy.types.Object) -> np.ndarray | None:
     """Return the (4, 4) matrix from the object's parent space to Blender's world, or None."""
-    matrix = np.eye(4)
+    matrix: np.ndarray = np.eye(4)
     if thing.parent is not None:
         matrix = matrix_of(thing.parent) @ np.array(thing.matrix_parent_inverse, np.float64)
     good = np.isfinite(matrix).all() and abs(np.linalg.det(matrix[:3, :3])) > 0.0

@@ -17,6 +17,7 @@ from ...core.regions.box import CUBE_CORNERS, CUBE_TRIANGLES, box_matrix
 from ...core.regions.region_file import region_to_json
 from ...core.regions.volume import check_volume
 from ..common import tags
+from ..common.mesh_data import values_of
 from .region_hull import convex_hull
 
 # Share of the hull's volume by which that of a convex mesh may be off (float32 coordinates).
@@ -110,8 +111,7 @@ def _mesh_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int
             "Enable it, or apply its modifiers.",
         )
     mesh = evaluated.to_mesh()
-    points = np.zeros(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", points)
+    points = values_of(mesh.vertices, "co", 3, np.float32)
     evaluated.to_mesh_clear()
     return convex_hull(points.reshape(-1, 3).astype(np.float64), thing.name)
 
@@ -123,10 +123,8 @@ def is_convex(thing: bpy.types.Object) -> bool:
     evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
     mesh = evaluated.to_mesh()
     mesh.calc_loop_triangles()
-    vertices = np.zeros(3 * len(mesh.vertices), np.float32)
-    corners = np.zeros(3 * len(mesh.loop_triangles), np.int32)
-    mesh.vertices.foreach_get("co", vertices)
-    mesh.loop_triangles.foreach_get("vertices", corners)
+    vertices = values_of(mesh.vertices, "co", 3, np.float32)
+    corners = values_of(mesh.loop_triangles, "vertices", 3, np.int32)
     evaluated.to_mesh_clear()
     own = vertices.reshape(-1, 3).astype(np.float64)[corners.reshape(-1, 3)] - center  # (m, 3, 3)
     volume = abs(float(np.linalg.det(own).sum()))

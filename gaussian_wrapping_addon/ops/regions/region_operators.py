@@ -3,7 +3,7 @@
 
 import itertools
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import bpy
 import numpy as np
@@ -14,7 +14,7 @@ from ...core.names import file_stem
 from ...core.regions.box import CUBE_CORNERS
 from ...core.regions.region_file import read_region_file
 from ..common import tags
-from ..common.error_reporting import NeedsObjectMode, ReportsErrors
+from ..common.error_reporting import NeedsObjectMode, OperatorResult, ReportsErrors
 from .region_objects import (
     box_around,
     create_region,
@@ -40,6 +40,11 @@ def _select_only(context: bpy.types.Context, thing: bpy.types.Object) -> None:
     for other in context.view_layer.objects:
         other.select_set(other == thing)
     context.view_layer.objects.active = thing
+
+
+def _active(context: bpy.types.Context) -> bpy.types.Object:
+    """Return the active object, where ``poll`` has found one."""
+    return cast(bpy.types.Object, context.view_layer.objects.active)
 
 
 def _target(context: bpy.types.Context) -> tuple[bpy.types.Object | None, bpy.types.Collection]:
@@ -82,7 +87,7 @@ class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
 
     around: EnumProperty(name="Around", items=_AROUND, default="CURSOR")  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame, collection = _target(context)
         if self.around == "SELECTED":
             things = [t for t in context.selected_objects if tags.kind_of(t) != "region"]
@@ -121,11 +126,11 @@ class GWRAP_OT_select_region(NeedsObjectMode, bpy.types.Operator):
     name: StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
     extend: bpy.props.BoolProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         self.extend = event.shift
         return self.execute(context)
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         thing = context.view_layer.objects.get(self.name)
         if thing is None:
             raise UsageError(f"Region {self.name} is not in this view layer.", "Enable it.")
@@ -154,15 +159,15 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
             return False
         return True
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        name = file_stem(context.view_layer.objects.active.name, 0)
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
+        name = file_stem(_active(context).name, 0)
         self.filepath = str(Path(self.filepath).parent / f"{name}.json")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         path = Path(bpy.path.abspath(self.filepath))
-        export_region(context.view_layer.objects.active, path)
+        export_region(_active(context), path)
         self.report({"INFO"}, f"Wrote {path}")
         return {"FINISHED"}
 
@@ -176,11 +181,11 @@ class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
     filepath: StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
     filter_glob: StringProperty(default="*.json", options={"HIDDEN"})  # type: ignore[valid-type]
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         path = Path(bpy.path.abspath(self.filepath))
         vertices = read_region_file(path).vertices
         frame, collection = _target(context)
@@ -206,8 +211,8 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
             return False
         return super().poll(context)
 
-    def work(self, context: bpy.types.Context) -> set[str]:
-        active = context.view_layer.objects.active
+    def work(self, context: bpy.types.Context) -> OperatorResult:
+        active = _active(context)
         frame, _ = _target(context)
         if not active.is_editable:
             raise UsageError(

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.errors import UsageError
 from ..common import tags
+from ..common.addon import properties_of
 from .region_objects import hull_in_blender, scene_from_blender
 
 COARSEST_SHARE = 0.5
@@ -20,14 +21,18 @@ FINEST_SHARE = 1e-6
 
 def has_own(scene: bpy.types.Scene, region: bpy.types.Object) -> bool:
     """Tell whether a region's own edge length decides; meshes by pivots have none."""
-    return bool(region.gwrap.own_edge_length) and scene.gwrap.method != "PIVOTS"
+    return bool(properties_of(region).own_edge_length) and properties_of(scene).method != "PIVOTS"
 
 
 def edge_length_in_blender(scene: bpy.types.Scene, region: bpy.types.Object) -> float:
     """Return the edge length that decides, as seen in Blender; 0 where none does."""
     if has_own(scene, region):
-        return float(region.gwrap.edge_length)
-    return float(scene.gwrap.edge_length) if scene.gwrap.resolution == "EDGE_LENGTH" else 0.0
+        return float(properties_of(region).edge_length)
+    return (
+        float(properties_of(scene).edge_length)
+        if properties_of(scene).resolution == "EDGE_LENGTH"
+        else 0.0
+    )
 
 
 def checked_edge_length(scene: bpy.types.Scene, region: bpy.types.Object) -> float:
@@ -40,7 +45,7 @@ def checked_edge_length(scene: bpy.types.Scene, region: bpy.types.Object) -> flo
     """
     edge_length = edge_length_in_blender(scene, region)
     diagonal = float(np.linalg.norm(np.ptp(hull_in_blender(region)[0], 0)))
-    if not has_own(scene, region) and scene.gwrap.resolution != "EDGE_LENGTH":
+    if not has_own(scene, region) and properties_of(scene).resolution != "EDGE_LENGTH":
         return 0.0
     if not math.isfinite(edge_length) or edge_length <= 0.0:
         raise UsageError(

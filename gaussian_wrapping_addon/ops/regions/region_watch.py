@@ -25,7 +25,7 @@ class _Known:
 _known = _Known()
 
 
-@persistent  # type: ignore[untyped-decorator]
+@persistent
 def after_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Handler: something in a scene has changed."""
     if depsgraph is None:
@@ -44,7 +44,7 @@ def after_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None 
             _known.versions[uid] = _known.versions.get(uid, 0) + 1
 
 
-@persistent  # type: ignore[untyped-decorator]
+@persistent
 def after_load(*_arguments: object) -> None:
     """Handler: another file, or an undo; session ids may mean other objects."""
     forget()

@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from ..common import tags
-from ..common.mesh_data import build_mesh
+from ..common.mesh_data import build_mesh, mesh_of
 from .materials import create_materials
 from .result_files import RegionResult
 
@@ -70,7 +70,7 @@ def update_levels(
 
 def _remove(thing: bpy.types.Object) -> None:
     """Delete a level with its mesh and material, where nothing else uses them."""
-    data = thing.data
+    data = mesh_of(thing)
     materials = [m for m in data.materials if m is not None]
     bpy.data.objects.remove(thing)
     if data.users == 0:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -29,7 +30,8 @@ def load_texture(path: Path, colorspace: str = "sRGB") -> bpy.types.Image:
         image.pack()
     elif image.users:
         image.reload()
-    image.colorspace_settings.name = colorspace
+    settings: Any = image.colorspace_settings
+    settings.name = colorspace
     return image
 
 
@@ -43,7 +45,8 @@ def create_material(
     material = bpy.data.materials.new(name)
     if material.node_tree is None:  # Blender 4 makes materials without nodes
         material.use_nodes = True
-    nodes, links = material.node_tree.nodes, material.node_tree.links
+    tree: Any = material.node_tree
+    nodes, links = tree.nodes, tree.links
     nodes.clear()
     texture = nodes.new("ShaderNodeTexImage")
     texture.name, texture.image, texture.location = _IMAGE, image, (-600, 200)
@@ -100,7 +103,7 @@ def set_normal_map(material: bpy.types.Material, image: bpy.types.Image | None) 
 
     The image goes through a Normal Map node, without which glTF exporters drop it.
     """
-    tree = material.node_tree
+    tree: Any = material.node_tree
     if tree is None or _LIT not in tree.nodes:
         return False
     nodes, links = tree.nodes, tree.links
@@ -148,7 +151,7 @@ def show_as_emission(material: bpy.types.Material) -> None:
 
     For formats without unlit materials: what is left of ``Unlit`` there, without the texture lost.
     """
-    tree = material.node_tree
+    tree: Any = material.node_tree
     lit, texture = tree.nodes[_LIT], tree.nodes[_IMAGE]
     set_normal_map(material, None)
     for link in list(lit.inputs["Base Color"].links):
@@ -166,7 +169,8 @@ def fold_specular(material: bpy.types.Material) -> None:
     Blender's reader of USD takes the level for 0.5, which leaves the reflectance
     ((ior - 1) / (ior + 1))^2 as it is; twice the level is a factor of it.
     """
-    inputs = material.node_tree.nodes[_LIT].inputs
+    tree: Any = material.node_tree
+    inputs = tree.nodes[_LIT].inputs
     level, index = inputs["Specular IOR Level"], inputs["IOR"]
     root = (
         abs(index.default_value - 1.0)
@@ -178,10 +182,15 @@ def fold_specular(material: bpy.types.Material) -> None:
 
 def texture_of(material: bpy.types.Material | None) -> bpy.types.Image | None:
     """Return the photo texture of one of our materials, else None."""
-    if shading_of(material) is None:
+    tree: Any = material.node_tree if material is not None else None
+    if tree is None or shading_of(material) is None:
         return None
-    node = material.node_tree.nodes.get(_IMAGE)
+    node = tree.nodes.get(_IMAGE)
     return None if node is None else node.image
+
+
+def _nodes_of(material: Any) -> Any:
+    return material.node_tree.nodes
 
 
 def images_of(frame: bpy.types.Object | None) -> list[bpy.types.Image]:
@@ -192,7 +201,7 @@ def images_of(frame: bpy.types.Object | None) -> list[bpy.types.Image]:
         if tags.kind_of(child) in ("mesh", "lod")
         for slot in child.material_slots
         if shading_of(slot.material) is not None
-        for node in slot.material.node_tree.nodes
+        for node in _nodes_of(slot.material)
         if node.bl_idname == "ShaderNodeTexImage" and node.image is not None
     ]
     return list(dict.fromkeys(found))

@@ -2,13 +2,13 @@
 """Operators that open a job's report and show its pictures."""
 
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import bpy
 
 from ...core.errors import UsageError
 from ..common import known_jobs, tags
-from ..common.error_reporting import ReportsErrors
+from ..common.error_reporting import OperatorResult, ReportsErrors
 from .report_data import report_of
 
 MAX_PICTURES = 40
@@ -47,7 +47,7 @@ class _NeedsResult(ReportsErrors):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if tags.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene holds no result; wrap it, or import one")  # type: ignore[attr-defined]
+            cls.poll_message_set("The scene holds no result; wrap it, or import one")
             return False
         return True
 
@@ -57,7 +57,7 @@ class GWRAP_OT_read_report(_NeedsResult, bpy.types.Operator):
     bl_label = "Open Report"
     bl_description = "Open report.md: all figures of the job, its warnings and pictures"
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         folder = _result_folder(context)
         path = folder / "report.md"
         if path.is_symlink() or not _inside(folder, path):
@@ -72,7 +72,7 @@ class GWRAP_OT_show_pictures(_NeedsResult, bpy.types.Operator):
     bl_description = "Load the report's pictures; they are listed in the Image Editor"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         folder = _result_folder(context)
         paths = [path for pattern in _PICTURES for path in sorted(folder.glob(pattern))]
         paths = [path for path in paths if _inside(folder, path)][:MAX_PICTURES]
@@ -87,7 +87,8 @@ class GWRAP_OT_show_pictures(_NeedsResult, bpy.types.Operator):
             images.append(image)
         for area in context.screen.areas if context.screen else ():
             if area.type == "IMAGE_EDITOR":
-                area.spaces.active.image = images[min(1, len(images) - 1)]
+                editor: Any = area.spaces.active
+                editor.image = images[min(1, len(images) - 1)]
         self.report({"INFO"}, f"{len(images)} pictures are in the Image Editor's list")
         return {"FINISHED"}
 
@@ -107,7 +108,7 @@ class GWRAP_OT_copy_report(_NeedsResult, bpy.types.Operator):
             return False
         return True
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         text = report_of(tags.figures_of(frame)).as_text()
         context.window_manager.clipboard = text.replace(str(Path.home()), "~")

@@ -147,10 +147,13 @@ def _scene(path: Path) -> tuple[tuple[tuple[Camera, str], ...], Similarity, floa
             photo = str(entry.pop("photo"))
             cameras.append((Camera.from_json(entry), photo))
         numbers = np.concatenate(
-            [world_from_scene.matrix().ravel(), [radius]]
-            + [
-                np.array([*c.cam_from_world.ravel(), c.fx, c.fy, c.cx, c.cy, c.width, c.height])
-                for c, _ in cameras
+            [
+                world_from_scene.matrix().ravel(),
+                np.array([radius]),
+                *(
+                    np.array([*c.cam_from_world.ravel(), c.fx, c.fy, c.cx, c.cy, c.width, c.height])
+                    for c, _ in cameras
+                ),
             ]
         )
         if not np.isfinite(numbers).all():
@@ -174,12 +177,13 @@ def _region(folder: Path) -> RegionResult:
     albedo, normal_map = _textures(folder, face_atlas)
     box = read_region_file(region_path).vertices
     stamp = f"{state.st_size}:{state.st_mtime_ns}"
-    levels = []
+    levels: list[LevelResult] = []
     while (level := folder / f"lod{len(levels) + 1}" / "mesh.npz").is_file():
         if len(levels) == MAX_LODS:
             raise DatasetError(f"{folder} holds too many levels.", "Mesh the region again.")
-        *arrays, owner = _mesh(level)
-        levels.append(LevelResult(*arrays, *_textures(level.parent, owner), owner))
+        arrays = _mesh(level)
+        textures = _textures(level.parent, arrays[3])
+        levels.append(LevelResult(*arrays[:3], *textures, arrays[3]))
     return RegionResult(
         folder.name, vertices, faces, corner_uvs, albedo, box, stamp, normal_map, face_atlas,
         tuple(levels),

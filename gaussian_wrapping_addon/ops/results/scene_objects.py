@@ -13,7 +13,7 @@ import bpy
 from ...core.errors import UsageError
 from ..cameras.camera_objects import create_camera, scale_display
 from ..common import tags
-from ..common.mesh_data import build_mesh
+from ..common.mesh_data import build_mesh, mesh_of
 from ..placement.placement import restore, scale_of
 from ..regions.region_objects import create_region
 from .level_objects import update_levels
@@ -185,7 +185,7 @@ def _update_mesh(
         thing[tags.REGION] = region.name
         collection.objects.link(thing)
     else:
-        old = thing.data
+        old = mesh_of(thing)
         _keep_materials(list(old.materials), mesh, region)
         thing.data = mesh
         if old.users == 0:
@@ -207,17 +207,18 @@ def _keep_materials(
     normals = load_normal_maps(region.normal_map, len(images))
     for number, (image, normal_map) in enumerate(zip(images, normals, strict=True)):
         if number < len(old):
-            mesh.materials.append(old[number])
-            if old[number] is not None:
-                set_normal_map(old[number], normal_map)
+            kept = old[number]
+            mesh.materials.append(kept)
+            if kept is not None:
+                set_normal_map(kept, normal_map)
         else:
             name = f"{region.name} {number + 1}"
             material = create_material(name, image, normal_map)
             set_shading(material, shading_of(old[0] if old else None) or "LIT")
             mesh.materials.append(material)
-    for material in old[len(images) :]:
-        if shading_of(material) is None:
-            mesh.materials.append(material)
+    for further in old[len(images) :]:
+        if shading_of(further) is None:
+            mesh.materials.append(further)
 
 
 def _update_region(

@@ -8,7 +8,8 @@ import bpy
 
 from ...core.errors import UsageError
 from ..common import tags
-from ..common.error_reporting import ReportsErrors
+from ..common.addon import properties_of
+from ..common.error_reporting import OperatorResult, ReportsErrors
 from ..jobs import job_actions
 from ..jobs.job_guards import AsksAboutFolder, no_job_runs
 from ..worker import preferred_worker
@@ -26,7 +27,7 @@ class GWRAP_OT_estimate(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not context.scene.gwrap.source:
+        if not properties_of(context.scene).source:
             cls.poll_message_set("Choose the folder of the photos first")
             return False
         if training_estimate.is_busy():
@@ -34,7 +35,7 @@ class GWRAP_OT_estimate(ReportsErrors, bpy.types.Operator):
             return False
         return True
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         training_estimate.start(context.scene, preferred_worker.worker_choice(context))
         return {"FINISHED"}
 
@@ -57,12 +58,12 @@ class GWRAP_OT_train_more(AsksAboutFolder, bpy.types.Operator):
         frame = _frame(context)
         return tags.result_folder(frame).parent if frame and frame.get(tags.RESULT) else None
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = _frame(context)
         if frame is None:
             raise UsageError("The scene holds no result.", "Wrap the scene or import a result.")
         job_actions.start_more(context.scene, frame, preferred_worker.worker_choice(context))
-        count = context.scene.gwrap.training.more_iterations
+        count = properties_of(context.scene).training.more_iterations
         self.report({"INFO"}, f"Training {count:,} iterations more")
         return {"FINISHED"}
 
@@ -77,8 +78,8 @@ class GWRAP_OT_reset_training(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return no_job_runs(cls, context)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        training = context.scene.gwrap.training
+    def execute(self, context: bpy.types.Context) -> OperatorResult:
+        training = properties_of(context.scene).training
         for name in training.bl_rna.properties.keys():  # noqa: SIM118 - no mapping
             if name != "rna_type":
                 training.property_unset(name)

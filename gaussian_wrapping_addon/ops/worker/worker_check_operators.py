@@ -5,7 +5,7 @@ from typing import Final
 
 import bpy
 
-from ..common.error_reporting import ReportsErrors
+from ..common.error_reporting import OperatorResult, ReportsErrors
 from . import preferred_worker, worker_check
 
 
@@ -21,7 +21,7 @@ class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
             return False
         return True
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         worker_check.start(preferred_worker.worker_choice(context).python)
         return {"FINISHED"}
 
@@ -38,7 +38,7 @@ class GWRAP_OT_copy_findings(bpy.types.Operator):
             return False
         return True
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> OperatorResult:
         context.window_manager.clipboard = worker_check.as_text()
         return {"FINISHED"}
 

@@ -10,7 +10,7 @@ from bpy.props import EnumProperty, StringProperty
 from ...core.errors import WrapError
 from ...core.setup.commands import all_commands, as_line
 from ..common.addon import addon_package, addon_preferences
-from ..common.error_reporting import ReportsErrors
+from ..common.error_reporting import OperatorResult, ReportsErrors
 from . import worker_setup
 from .worker_setup import state
 
@@ -96,7 +96,7 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
         cls.poll_message_set(reason)
         return not reason
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_props_dialog(self, width=_DIALOG_PX)
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -115,13 +115,14 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
                 line, _LINE_CHARACTERS, subsequent_indent="      ", break_on_hyphens=False
             ):
                 column.label(text=part, translate=False)
-        copy = layout.row().operator("gwrap.copy_setup_commands", icon="COPYDOWN")
+        copy: Any = layout.row().operator("gwrap.copy_setup_commands", icon="COPYDOWN")
         copy.text = "\n".join(lines)
         size = "About 2 GiB on the disk; several" if self.torch == "cpu" else "Up to 10 GiB; many"
         layout.label(text=f"{size} minutes. Blender stays free meanwhile", icon="INFO")
 
-    def work(self, context: bpy.types.Context) -> set[str]:
-        python = self.python or state.pythons[0].path
+    def work(self, context: bpy.types.Context) -> OperatorResult:
+        found = state.pythons or []
+        python = self.python or found[0].path
         request = worker_setup.request_for(python, self.torch or "cpu", wheel_folder(context))
         worker_setup.start(request)
         return {"FINISHED"}
@@ -134,7 +135,7 @@ class GWRAP_OT_copy_setup_commands(bpy.types.Operator):
 
     text: StringProperty(options={"SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> OperatorResult:
         context.window_manager.clipboard = self.text
         return {"FINISHED"}
 
@@ -151,10 +152,10 @@ class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
         cls.poll_message_set(reason)
         return not reason
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_confirm(self, event)
 
-    def work(self, _context: bpy.types.Context) -> set[str]:
+    def work(self, _context: bpy.types.Context) -> OperatorResult:
         worker_setup.start(worker_setup.request_for("", "cpu", ""), removes=True)
         return {"FINISHED"}
 
@@ -168,8 +169,9 @@ class GWRAP_OT_cancel_setup(bpy.types.Operator):
     def poll(cls, _context: bpy.types.Context) -> bool:
         return state.is_busy and state.task is not None and not state.task.is_cancelling
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        state.task.cancel()
+    def execute(self, _context: bpy.types.Context) -> OperatorResult:
+        if state.task is not None:
+            state.task.cancel()
         return {"FINISHED"}
 
 
@@ -178,7 +180,7 @@ class GWRAP_OT_open_preferences(bpy.types.Operator):
     bl_label = "Open Preferences"
     bl_description = "Show this add-on's preferences, where the worker is set up"
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
+    def execute(self, _context: bpy.types.Context) -> OperatorResult:
         package = addon_package()
         try:
             return bpy.ops.preferences.addon_show(module=package)

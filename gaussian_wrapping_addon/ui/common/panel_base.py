@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import bpy
 
@@ -13,6 +13,12 @@ from ...ops.jobs import panel_state
 CATEGORY: Final = "Gaussian Wrapping"
 LARGE: Final = 1.6
 """Height of the button that is the next step."""
+
+
+if TYPE_CHECKING:
+    _Panel = bpy.types.Panel
+else:
+    _Panel = object
 
 
 @dataclass(frozen=True)
@@ -24,7 +30,7 @@ class Readiness:
     """None stands for what is not there yet: the text is dimmed."""
 
 
-class TabPanel:
+class TabPanel(_Panel):
     """Mixin: a panel of our tab; :meth:`readiness` is drawn in its header."""
 
     bl_space_type = "VIEW_3D"
@@ -38,7 +44,7 @@ class TabPanel:
     def draw_header_preset(self, context: bpy.types.Context) -> None:
         """Draw at the right of the header; Blender calls this."""
         ready = self.readiness(context)
-        row = self.layout.row()  # type: ignore[attr-defined]
+        row: Any = self.layout.row()
         row.active = ready.icon != "NONE"
         row.label(text=ready.text, icon=ready.icon, translate=False)
         row.separator(factor=0.25)

@@ -94,7 +94,7 @@ def edges_of(thing: bpy.types.Object) -> np.ndarray | None:
 
 
 def _draw(context: bpy.types.Context) -> None:
-    space = context.space_data
+    space: Any = context.space_data
     if space is None or not space.overlay.show_overlays:
         return
     things = visible_regions(context.scene, context.view_layer, space)

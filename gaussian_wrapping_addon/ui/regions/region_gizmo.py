@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import bpy
 import numpy as np
@@ -118,13 +118,14 @@ class GWRAP_GGT_region_box(bpy.types.GizmoGroup):
         box = context.view_layer.objects.active
         return (
             context.mode == "OBJECT"
+            and box is not None
             and is_editable_box(box)
             and box.select_get()
-            and box.visible_get(viewport=context.space_data)
+            and box.visible_get(viewport=cast(bpy.types.SpaceView3D, context.space_data))
         )
 
     def setup(self, _context: bpy.types.Context) -> None:
-        cage = self.gizmos.new("GIZMO_GT_cage_3d")
+        cage: Any = self.gizmos.new("GIZMO_GT_cage_3d")
         cage.transform = {"SCALE", "TRANSLATE"}
         cage.draw_style = "BOX"
         cage.dimensions = (2.0, 2.0, 2.0)
