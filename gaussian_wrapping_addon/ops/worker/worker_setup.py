@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The worker's environment as Blender sees it: is it there, what does a set-up do just now.
+"""State of the worker's environment: readiness, search for Pythons, set-up and removal.
 
-Nothing here waits: threads look for Pythons, set up and remove, and one timer looks after them.
-The state outlives the preferences' window.
+Nothing here waits: Pythons are searched, set-ups and removals run in the background
+(``ops/common/background.py``). The state outlives the preferences' window.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,12 +24,13 @@ from ...core.processes.worker_requirements import requirements_file
 from ...core.setup.commands import SetupRequest, cuda_present
 from ...core.setup.install import SetupTask
 from ...core.setup.pythons import FoundPython, find_pythons
+from ..common import background
 from ..common.addon import addon_package
+from ..common.background import Lane
 from ..common.redrawing import redraw
 from . import worker_check
 from .preferred_worker import worker_choice
 
-POLL_S = 0.3
 READY_FOR_S = 2.0
 """For so long an answer of :func:`worker_ready` is taken as it was."""
 
@@ -42,7 +42,8 @@ class State:
     pythons: list[FoundPython] | None = None
     """None while they are not looked for yet."""
     has_cuda: bool = False
-    search: threading.Thread | None = None
+    has_searched: bool = False
+    """Whether a search for Pythons has begun."""
     task: SetupTask | None = None
     is_busy: bool = False
     """Whether the task's end is still to be dealt with."""
@@ -52,6 +53,7 @@ class State:
 
 
 state = State()
+_searches, _setups, _endings = Lane(), Lane(), Lane()
 
 
 def environment() -> WorkerEnvironment:
@@ -88,17 +90,16 @@ def forget_answer() -> None:
 
 
 def look_around() -> None:
-    """Look for Pythons once, in a thread; drawing may call this."""
-    if state.search is None:
-        state.search = threading.Thread(target=_search, args=(sys.executable,), daemon=True)
-        state.search.start()
-        _start_timer()
+    """Search for Pythons once, in the background; drawing may call this."""
+    if not state.has_searched:
+        state.has_searched = True
+        own = sys.executable
+        _searches.submit(lambda: (cuda_present(), find_pythons(own)), _keep_search)
 
 
-def _search(own: str) -> None:
-    """Thread: touches nothing of Blender."""
-    state.has_cuda = cuda_present()
-    state.pythons = find_pythons(own)
+def _keep_search(found: tuple[bool, list[FoundPython]]) -> None:
+    state.has_cuda, state.pythons = found
+    redraw("PREFERENCES", "VIEW_3D")
 
 
 def request_for(python: str, torch: str, wheel_folder: str) -> SetupRequest:
@@ -124,17 +125,20 @@ def start(request: SetupRequest, *, removes: bool = False) -> None:
     if state.task is not None and state.task.status.active:
         raise UsageError("A set-up is running.", "Cancel it or wait for it.")
     state.task, state.is_busy = SetupTask(request, removes=removes), True
-    state.task.start()
-    _start_timer()
+    _setups.submit(state.task.run)
+    _endings.start()  # now: cancelling starts no thread
+    background.watch(tick)
 
 
-def _start_timer() -> None:
-    if not bpy.app.timers.is_registered(tick):
-        bpy.app.timers.register(tick, first_interval=POLL_S, persistent=True)
+def cancel() -> None:
+    """Cancel a set-up; its process is ended in the background."""
+    if state.task is not None and state.task.status.active:
+        state.task.is_cancelling = True
+        _endings.submit(state.task.cancel)
 
 
-def tick() -> float | None:
-    """Timer: redraw, and go on while something is at work."""
+def tick() -> bool:
+    """Redraw, and deal with the end of a set-up; tell whether one is still at work."""
     if state.is_busy and state.task is not None and not state.task.status.active:
         state.is_busy = False
         forget_answer()
@@ -142,15 +146,13 @@ def tick() -> float | None:
             with contextlib.suppress(WrapError):
                 worker_check.start(worker_choice(bpy.context).python)
     redraw("PREFERENCES", "VIEW_3D")
-    searching = state.search is not None and state.search.is_alive()
-    return POLL_S if state.is_busy or searching else None
+    return state.is_busy
 
 
 def stop() -> None:
-    """Take the timer out and cancel a set-up."""
-    if bpy.app.timers.is_registered(tick):
-        bpy.app.timers.unregister(tick)
-    if state.task is not None:
-        state.task.cancel()
+    """Cancel a set-up and a search."""
+    cancel()
+    _searches.cancel()
+    state.has_searched = state.pythons is not None
     state.is_busy = False
     forget_answer()

@@ -167,11 +167,14 @@ class GWRAP_OT_cancel_setup(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        return state.is_busy and state.task is not None and not state.task.is_cancelling
+        reason = "" if state.is_busy else "No set-up is running"
+        if state.is_busy and state.task is not None and state.task.is_cancelling:
+            reason = "The set-up is being cancelled"
+        cls.poll_message_set(reason)
+        return not reason
 
     def execute(self, _context: bpy.types.Context) -> OperatorResult:
-        if state.task is not None:
-            state.task.cancel()
+        worker_setup.cancel()
         return {"FINISHED"}
 
 
