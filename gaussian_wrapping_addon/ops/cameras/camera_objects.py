@@ -144,9 +144,9 @@ def show_photo(thing: bpy.types.Object) -> None:
         The photo is not there.
     """
     path = photo_of(thing)
-    hint = "Put it back, or look through the camera without it."
+    hint = "Restore it, or look through the camera without it."
     if known_jobs.is_remote(path) or not path.is_file():
-        raise DatasetError(f"The photo {path} is not there.", hint)
+        raise DatasetError(f"The photo {path} does not exist.", hint)
     try:
         image = bpy.data.images.load(str(path), check_existing=True)
     except RuntimeError as error:

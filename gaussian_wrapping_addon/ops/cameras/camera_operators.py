@@ -23,7 +23,7 @@ class GWRAP_OT_view_photo(NeedsResult, ReportsErrors, bpy.types.Operator):
 
     step: IntProperty(  # type: ignore[valid-type]
         name="Step",
-        description="0 for the selected photo camera, else so many photos on from the present one",
+        description="0: the selected photo camera; otherwise photos to step from the current one",
         options={"SKIP_SAVE"},
     )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The package of this add-on, as Blender knows it."""
+"""Name, preferences and properties of the add-on in Blender."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The base of our operators: typed errors become one report with its next step."""
+"""Mixins of operators: typed errors become one report with its next step."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ...core.errors import WrapError
 from . import tags
 
 OperatorResult = set[Literal["RUNNING_MODAL", "CANCELLED", "FINISHED", "PASS_THROUGH", "INTERFACE"]]
-"""What Blender expects of ``execute``, ``invoke`` and ``modal``."""
+"""Return type of ``execute``, ``invoke`` and ``modal``."""
 
 if TYPE_CHECKING:
     _Operator = bpy.types.Operator
@@ -26,7 +26,7 @@ class ReportsErrors(_Operator):
     """Mixin: ``execute`` calls ``work`` and reports what it raises."""
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        """Do what the operator is for."""
+        """Perform the operation."""
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> OperatorResult:
@@ -43,7 +43,7 @@ class ReportsErrors(_Operator):
 
 
 class NeedsObjectMode(ReportsErrors):
-    """Mixin: the operator works in Object Mode only."""
+    """Mixin: the operator is available in Object Mode only."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -55,12 +55,12 @@ class NeedsObjectMode(ReportsErrors):
 
 
 class NeedsResult(_Operator):
-    """Mixin: the operator is about the scene's current result."""
+    """Mixin: the operator acts on the scene's current result."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run; Blender calls this."""
         if tags.current_frame(context.scene, context.view_layer.objects.active) is None:
-            cls.poll_message_set("The scene holds no result; wrap it, or import one")
+            cls.poll_message_set("The scene has no result; wrap it, or import one")
             return False
         return True

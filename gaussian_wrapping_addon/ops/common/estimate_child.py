@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A question to the worker's Python: start the child, wait for what it says, or end it."""
+"""Estimates by the worker's Python: run a child process and parse its output, or end it."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ def ask_child(
     Parameters
     ----------
     begun : callable
-        Takes the process; false where nobody waits for the answer any more, which ends it.
+        Receives the process; returns false if the estimate is no longer wanted, which ends it.
 
     Returns
     -------
     said : list of dict
-        The JSON objects that it wrote, one a line.
+        JSON objects from standard output, one a line.
     last_words : str
-        The last line that it wrote to its terminal.
+        The last line of standard error.
 
     Raises
     ------
     WorkerError
-        It does not run, or takes too long.
+        The child does not start, or takes too long.
     """
     try:
         process = spawn(command)
@@ -64,12 +64,12 @@ def ask_child(
 
 
 def get_ready() -> None:
-    """Start the thread that ends children, where the next one is ended by a timer."""
+    """Start the thread that ends children, ahead of a timer that uses it."""
     _endings.start()
 
 
 class Child:
-    """A question that may be given up before it is answered."""
+    """A child process that can be cancelled before it has answered."""
 
     def __init__(self) -> None:
         self.process: subprocess.Popen[bytes] | None = None
@@ -86,7 +86,7 @@ class Child:
             return self._wanted
 
     def end(self) -> None:
-        """Give up: end the process in the background, or as soon as it begins."""
+        """Cancel: end the process in the background, or as soon as it has started."""
         with self._guard:
             self._wanted = False
             process = self.process

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blender mesh data of plain arrays."""
+"""Blender mesh data from and to arrays."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def build_mesh(
     corner_uvs: np.ndarray,
     face_material: np.ndarray | None = None,
 ) -> bpy.types.Mesh:
-    """Make mesh data of arrays: smooth shaded, one UV layer, a material slot for each face.
+    """Build mesh data from arrays: smooth shaded, one UV layer, a material slot for each face.
 
     Parameters
     ----------
     vertices : (v, 3) ndarray
     faces : (f, 3) ndarray of int32
-        Sound (``result_files.sound_faces``): Blender's own check takes longer than all the rest.
+        Valid (``result_files.sound_faces``): Blender's own check takes longer than all the rest.
     corner_uvs : (f, 3, 2) ndarray of float32
     face_material : (f,) ndarray of int, optional
     """
@@ -55,7 +55,7 @@ def build_mesh(
     mesh.vertices.add(len(vertices))
     mesh.loops.add(3 * count)
     mesh.polygons.add(count)
-    # Attributes are copied in one piece, which vertices and loops themselves are not.
+    # Attributes are copied as one block, unlike the properties of vertices and loops.
     attributes: Any = mesh.attributes
     polygons: Any = mesh.polygons
     positions = np.ascontiguousarray(vertices, np.float32)

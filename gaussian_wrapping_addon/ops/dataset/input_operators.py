@@ -17,7 +17,7 @@ from ..worker import preferred_worker
 from . import photo_check
 
 _INPUT_FILES: Final = (".ply", ".json")
-"""Files that are an input themselves; another file stands for its folder."""
+"""Files that are inputs themselves; for any other file, its folder is the input."""
 
 
 class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
@@ -74,7 +74,7 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
 class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.check_photos"
     bl_label = "Check Photos"
-    bl_description = "Look through the photos and camera poses and list what stands in the way"
+    bl_description = "Check the photos and camera poses and list problems"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -82,12 +82,12 @@ class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
             cls.poll_message_set("Choose the folder of the photos first")
             return False
         if photo_check.is_busy():
-            cls.poll_message_set("The check is under way; it takes seconds")
+            cls.poll_message_set("The check is running; it takes seconds")
             return False
         return True
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
-        """Look in a thread: the button must not make Blender wait for a slow disk."""
+        """Check in a thread: Blender must not wait for a slow disk."""
         try:
             photo_check.start(context.scene)
         except WrapError as error:

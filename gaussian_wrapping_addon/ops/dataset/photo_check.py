@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Check an input in the background, and keep the findings with its scene."""
+"""Check an input in the background and store the findings in its scene."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _checks = Lane(of_file=True)
 
 
 def is_busy() -> bool:
-    """Tell whether a check is under way."""
+    """Return whether a check is running."""
     return _checks.busy
 
 
 def check_now(scene: bpy.types.Scene) -> None:
-    """Check a scene's input and keep the findings; Blender waits.
+    """Check a scene's input and store the findings; blocks Blender.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None) -> None:
     Parameters
     ----------
     choice : WorkerChoice, optional
-        Ask this worker for an estimate of the training as well, where there are no errors.
+        If there are no errors, request an estimate of the training from this worker.
 
     Raises
     ------
@@ -107,5 +107,5 @@ def _estimate(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 
 
 def stop() -> None:
-    """Forget a check that is under way."""
+    """Cancel a running check."""
     _checks.cancel()

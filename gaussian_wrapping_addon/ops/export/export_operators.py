@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators that hand results on: files for other programs, images inside the .blend file."""
+"""Operators that export meshes and pack textures."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +18,7 @@ from .export_objects import ObjectExport, export_objects
 class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.export_meshes"
     bl_label = "Export Meshes"
-    bl_description = "Write meshes of a result for other programs, one file each, with a sidecar"
+    bl_description = "Export meshes of a result to other programs, one file and sidecar each"
 
     directory: StringProperty(name="Folder", subtype="DIR_PATH", options={"SKIP_SAVE"})  # type: ignore[valid-type]
     filter_folder: BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
@@ -32,12 +32,13 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
     scope: EnumProperty(  # type: ignore[valid-type]
         name="Meshes",
         items=(
-            ("SELECTED", "Selected", "The meshes that are selected, levels of detail too"),
+            ("SELECTED", "Selected", "The selected meshes, levels of detail included"),
             ("ALL", "All Regions", "The mesh of each region of the result"),
         ),
     )
     levels: BoolProperty(  # type: ignore[valid-type]
-        name="Levels of Detail", description="Of each region, as files of their own"
+        name="Levels of Detail",
+        description="Export the levels of detail of each region as separate files",
     )
     placed: BoolProperty(  # type: ignore[valid-type]
         name="As Placed",
@@ -74,7 +75,7 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         if not self.directory:
-            raise UsageError("No folder was chosen.", "Choose where the files go.")
+            raise UsageError("No folder was chosen.", "Choose the folder of the exported files.")
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         if self.scope == "SELECTED":
             chosen = chosen_meshes(context)
@@ -101,7 +102,7 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
 class GWRAP_OT_pack_images(NeedsResult, ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.pack_images"
     bl_label = "Pack Textures"
-    bl_description = "Keep the result's textures inside the .blend file, or as files again"
+    bl_description = "Pack the result's textures into the .blend file, or unpack them to files"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     pack: BoolProperty(name="Pack", default=True)  # type: ignore[valid-type]
@@ -113,7 +114,7 @@ class GWRAP_OT_pack_images(NeedsResult, ReportsErrors, bpy.types.Operator):
             if self.pack and image.packed_file is None:
                 if not Path(bpy.path.abspath(image.filepath)).is_file():
                     raise UsageError(
-                        f"The texture {image.filepath} is not there.", "Import the result again."
+                        f"The texture {image.filepath} does not exist.", "Import the result again."
                     )
                 image.pack()
                 count += 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Conditions and questions that operators on jobs share."""
+"""Poll conditions and the confirmation shared by operators on jobs."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from . import watched_jobs
 
 
 def no_job_runs(cls: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    """Tell whether no job runs in the scene; the tooltip says why a button is grey."""
+    """Return whether no job runs in the scene; else set the poll message."""
     if watched_jobs.is_running(properties_of(context.scene).job_folder):
         cls.poll_message_set("A job is running; cancel it or wait for it")
         return False
@@ -21,7 +21,7 @@ def no_job_runs(cls: type[bpy.types.Operator], context: bpy.types.Context) -> bo
 
 
 def has_worker(cls: type[bpy.types.Operator]) -> bool:
-    """Tell whether a job has a Python to run in; the tooltip says what to do where it has none."""
+    """Return whether jobs have a Python to run in; else set the poll message."""
     problem = worker_setup.worker_problem()
     if problem:
         cls.poll_message_set(problem)
@@ -29,7 +29,7 @@ def has_worker(cls: type[bpy.types.Operator]) -> bool:
 
 
 def selected_regions(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the selected region objects, the active one first; else a result's only one."""
+    """Return the selected region objects, the active one first; else the result's only region."""
     active = context.view_layer.objects.active
     things = [t for t in context.selected_objects if tags.kind_of(t) == "region"]
     frame = None if things else tags.current_frame(context.scene, active)
@@ -48,14 +48,14 @@ def chosen_regions(context: bpy.types.Context, *, checked: bool) -> list[bpy.typ
 
 
 class AsksAboutFolder(ReportsErrors):
-    """Asks before it works in a folder that only the file names (it may come from elsewhere)."""
+    """Mixin: confirm a job folder known from the open file alone, which may come from elsewhere."""
 
     def folder(self, context: bpy.types.Context) -> Path | None:
         """Return the folder that the operator would use."""
         raise NotImplementedError
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
-        """Ask where the folder is not known on this machine."""
+        """Ask for confirmation if the folder is unknown on this machine."""
         folder = self.folder(context)
         if folder is None or known_jobs.is_trusted(folder):
             return self.execute(context)
@@ -63,6 +63,6 @@ class AsksAboutFolder(ReportsErrors):
             self,
             event,
             title="Use This Job Folder?",
-            message=f"The file names a job folder that is new on this machine: {folder}",
+            message=f"The file names a job folder not yet used on this computer: {folder}",
             confirm_text="Use Folder",
         )

@@ -60,7 +60,7 @@ class GWRAP_OT_mesh_region(AsksAboutFolder, bpy.types.Operator):
         return has_worker(cls) and no_job_runs(cls, context)
 
     def _regions(self, context: bpy.types.Context) -> list[bpy.types.Object]:
-        # With nothing selected, what is checked was meant.
+        # Without a selection, the checked regions are meant.
         return (not self.checked and selected_regions(context)) or chosen_regions(
             context, checked=True
         )
@@ -98,7 +98,7 @@ class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
 class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
     bl_idname = "gwrap.resume_job"
     bl_label = "Resume"
-    bl_description = "Continue the job from its last checkpoint; finished stages are used again"
+    bl_description = "Continue the job from its last checkpoint; finished stages are reused"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -106,7 +106,7 @@ class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
             cls.poll_message_set("This scene has no job; press Wrap Scene, or find its folder")
             return False
         if watched_jobs.is_gone(properties_of(context.scene).job_folder):
-            cls.poll_message_set("The job's folder is gone; press Find Job where it was moved")
+            cls.poll_message_set("The job folder is missing; press Find Job if it was moved")
             return False
         return no_job_runs(cls, context)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Look at the watched jobs from Blender's timer, and import what they have made."""
+"""Poll the watched jobs from Blender's timer and import their results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .watched_jobs import WatchedJob, jobs
 _logger = logging.getLogger(__name__)
 
 LOOK_WAIT_S = 0.0
-"""For the disk to tell of a job; what it has told is seen at the next look."""
+"""Time that a poll waits for the disk; a later answer is used by the next poll."""
 
 IMPORT_STAGE = "import"
 """Shown as a stage of the job while its result is read."""
@@ -42,7 +42,7 @@ def watch(scene: bpy.types.Scene, folder: Path, client: JobClient, *, imports: b
 
 
 def cancel(folder: str) -> None:
-    """Ask a job to stop; it is ended by force when it does not.
+    """Request a job to stop; it is killed if it does not.
 
     A finished job whose result is being read stays finished, and its result is offered.
 
@@ -73,7 +73,7 @@ def forget_all() -> None:
 
 
 def start_timer() -> None:
-    """Look at the jobs from now on, as long as one is at work."""
+    """Poll the jobs as long as one is running."""
     _looks.start()
     _readings.start()
     live_preview.start()
@@ -81,12 +81,12 @@ def start_timer() -> None:
 
 
 def tick() -> bool:
-    """Look at all jobs once, by the add-on's timer."""
+    """Poll all jobs once, from the add-on's timer."""
     return poll_jobs()
 
 
 def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
-    """Look at all jobs once and import what is done; tell whether another look is needed."""
+    """Poll all jobs once and import finished ones; return whether to poll again."""
     busy = changed = False
     for folder, job in list(jobs.items()):
         if not (job.status.active or job.waits_for_mode):
@@ -95,7 +95,7 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
         now_s = clock()
         try:
             _poll(folder, job, now_s)
-        except Exception as error:  # a timer that raises would be dropped without a word
+        except Exception as error:  # a timer that raises would be dropped silently
             _logger.exception("looking at the job in %s", folder)
             job.status = replace(
                 job.status,
@@ -140,14 +140,14 @@ def _poll(folder: str, job: WatchedJob, now_s: float) -> None:
 
 
 def _looked(client: JobClient) -> JobStatus:
-    """Look at a job's folder; runs in a thread."""
+    """Read a job's status from its folder; runs in a thread."""
     status = client.poll()
-    # It may have written its last word between our look at the file and at the process.
+    # It may have written its last status between our reads of the file and of the process.
     return client.poll() if status.state == "LOST" else status
 
 
 def _bring_in(folder: str, job: WatchedJob) -> None:
-    """Read a finished job's result in the background, then import it in one piece."""
+    """Read a finished job's result in the background, then import it in one step."""
     scene = tags.scene_of_uid(job.scene_uid)
     if scene is None:
         job.reading = None  # another file is open: opening the old one again imports it

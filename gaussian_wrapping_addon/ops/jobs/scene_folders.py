@@ -54,9 +54,9 @@ def output_of(scene: bpy.types.Scene, source: Path) -> Path:
 
 
 def _is_of_other_photos(scene: bpy.types.Scene, source: Path) -> bool:
-    """Tell whether the output is that of this scene's last job, which had another source.
+    """Return whether the output is that of this scene's last job with another source.
 
-    Typing over the photos' path must not wrap other photos over a finished job.
+    Changing the path of the photos must not overwrite a finished job of other photos.
     """
     properties = properties_of(scene)
     if not properties.output or properties.output != properties.job_folder:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ask the worker in the background what the meshes of regions will take.
+"""Estimate the meshes of regions (triangles, time, memory) by the worker, in the background.
 
-Regions are asked about one after the other. An answer stays until its region is asked about again;
-:func:`answer_for` tells whether what it was about has changed since.
+Regions are estimated one after the other. An estimate stays until its region is estimated again;
+:func:`answer_for` returns whether its inputs have changed since.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ from ..training.training_estimate import Estimate, estimate_of, estimate_of_fail
 MODULE = "jobs.commands.estimate_mesh_command"
 DEADLINE_S = 600.0
 
-# Relative: what float32 matrices of an object that nobody moved may differ by.
+# Relative: difference of the float32 matrices of an object that has not moved.
 _SAME = 1e-5
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What an estimate is about."""
+    """Inputs of an estimate."""
 
     relative: np.ndarray
     """(4, 4) matrix of the region in its frame."""
     rest: tuple[object, ...]
 
     def is_as(self, other: Asked) -> bool:
-        """Tell whether an answer to one is an answer to the other."""
+        """Return whether both give the same estimate."""
         scale = float(np.abs(self.relative[:3]).max())
         same = np.allclose(self.relative, other.relative, rtol=0.0, atol=_SAME * scale)
         return self.rest == other.rest and bool(same)
@@ -86,18 +86,18 @@ _state = _State()
 
 
 def is_busy() -> bool:
-    """Tell whether answers are awaited."""
+    """Return whether estimates are running."""
     return _questions.busy
 
 
 def is_waiting(region: bpy.types.Object) -> bool:
-    """Tell whether a region's answer is awaited."""
+    """Return whether a region's estimate is running."""
     asking = _state.asking.get(region.session_uid)
     return asking is not None and asking.task.pending
 
 
 def answer_for(scene: bpy.types.Scene, region: bpy.types.Object) -> tuple[Estimate | None, bool]:
-    """Return a region's estimate, if there is one, and whether it still holds."""
+    """Return a region's estimate, if there is one, and whether it is up to date."""
     answer = _state.answers.get(region.session_uid)
     if answer is None:
         return None, False
@@ -105,7 +105,7 @@ def answer_for(scene: bpy.types.Scene, region: bpy.types.Object) -> tuple[Estima
 
 
 def asked_of(scene: bpy.types.Scene, region: bpy.types.Object) -> Asked:
-    """Return what an estimate for a region would be about now; cheap, for panels."""
+    """Return the current inputs of a region's estimate; cheap, for panels."""
     frame = tags.frame_of(region)
     matrix = np.array(region.matrix_world, np.float64)
     scale, folder = 1.0, ""
@@ -133,12 +133,12 @@ def start(
     folder : Path
         The job folder of the finished training.
     python : str
-        As the preferences say.
+        From the preferences.
 
     Raises
     ------
     WrapError
-        A region, its resolution or the interpreter cannot be used; nothing is asked then.
+        A region, its resolution or the interpreter cannot be used; no estimate is started.
     """
     interpreter = worker_python(python)
     questions = [_question(scene, region, folder, interpreter) for region in regions]
@@ -172,7 +172,7 @@ def _question(
 
 
 def _ask(child: Child, question: _Question) -> Estimate:
-    """Ask one question; runs in a thread."""
+    """Run one estimate; in a thread."""
     with tempfile.TemporaryDirectory(prefix="gwrap-") as folder:
         path = os.path.join(folder, "region.json")
         write_json(Path(path), question.body)
@@ -192,13 +192,13 @@ def _keep_failure(uid: int, error: Exception) -> None:
 
 
 def stop_asking() -> None:
-    """End what is being asked; answers stay."""
+    """Cancel running estimates; finished ones stay."""
     _questions.cancel()
     _state.asking.clear()
 
 
 def stop() -> None:
-    """Forget all questions and answers."""
+    """Cancel and forget all estimates."""
     stop_asking()
     _state.asked.clear()
     _state.answers.clear()

@@ -21,7 +21,7 @@ class GWRAP_OT_estimate_regions(AsksAboutFolder, bpy.types.Operator):
     bl_idname = "gwrap.estimate_regions"
     bl_label = "Estimate"
     bl_description = (
-        "Ask the worker how many triangles, how much time and memory the selected regions will take"
+        "Estimate the triangles, time and memory that meshing the selected regions will take"
     )
 
     checked: BoolProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
@@ -29,7 +29,7 @@ class GWRAP_OT_estimate_regions(AsksAboutFolder, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if region_estimate.is_busy():
-            cls.poll_message_set("An estimate is being made")
+            cls.poll_message_set("An estimate is running")
             return False
         return True
 
@@ -49,7 +49,7 @@ class GWRAP_OT_estimate_regions(AsksAboutFolder, bpy.types.Operator):
 class GWRAP_OT_delete_region(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.delete_region"
     bl_label = "Delete Region"
-    bl_description = "Delete this region; a mesh that was made of it stays"
+    bl_description = "Delete this region; its mesh stays"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     name: StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
@@ -60,7 +60,7 @@ class GWRAP_OT_delete_region(NeedsObjectMode, bpy.types.Operator):
             raise UsageError(f"The scene has no region {self.name}.", "Choose one of the list.")
         if not thing.is_editable:
             raise UsageError(
-                f"{thing.name} is linked from a library.", "Remove it in the library's file."
+                f"{thing.name} is linked from a library.", "Delete it in the library's file."
             )
         mesh = mesh_of(thing) if thing.type == "MESH" else None
         bpy.data.objects.remove(thing)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Up and ground of a result as it stands in Blender: cameras, meshes, regions as plain arrays."""
+"""Automatic up direction and ground plane of a result in Blender."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FLIP_YZ = np.array([1.0, -1.0, -1.0])
 
 
 def camera_poses(frame: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
-    """Return the photo cameras of a result in Blender's world.
+    """Return the poses of a result's photo cameras in Blender's world.
 
     Returns
     -------
@@ -37,15 +37,15 @@ def camera_poses(frame: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
 
 
 def automatic_plane(frame: bpy.types.Object) -> tuple[Plane, str]:
-    """Find the ground of a result, and tell how.
+    """Find the ground of a result; return the plane and the rule used.
 
-    Up comes from the cameras. The ground is the main level plane of the meshes; where none is
-    clear, it goes through their lowest point; without meshes, through the regions' lowest corner.
+    Up comes from the cameras. The ground is the main level plane of the meshes; if none is
+    clear, it passes through their lowest point; without meshes, through the regions' lowest corner.
 
     Raises
     ------
     UsageError
-        The cameras do not tell which way is up, or nothing tells where the ground is.
+        The cameras do not determine up, or nothing determines the ground.
     """
     up, rule = camera_up(*camera_poses(frame))
     meshes = [c for c in frame.children if tags.kind_of(c) == "mesh" and c.type == "MESH"]

@@ -29,27 +29,27 @@ _TARGETS: Final = (
 
 
 class _Tool(NeedsResult, ReportsErrors):
-    """Mixin: a tool that works in Object Mode and on the vertices of a mesh in Edit Mode."""
+    """Mixin: a tool for Object Mode, and for vertices of a mesh in Edit Mode."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the tool can run; Blender calls this."""
+        """Return whether the tool can run; Blender calls this."""
         if context.mode not in ("OBJECT", "EDIT_MESH"):
             cls.poll_message_set("Leave the current mode first")
             return False
         return super().poll(context)
 
     def frame(self, context: bpy.types.Context) -> bpy.types.Object:
-        """Return the parent empty that the tool is about."""
+        """Return the parent empty that the tool transforms."""
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         if frame is None:
-            raise UsageError("The scene holds no result.", "Wrap the scene or import a result.")
+            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
         return frame
 
     def apply(
         self, context: bpy.types.Context, frame: bpy.types.Object, step: Similarity, done: str
     ) -> OperatorResult:
-        """Place the frame one step further."""
+        """Apply a step to the placement of the frame."""
         placement = step.after(placement_of(frame))
         release(context)
         note = place(frame, placement)
@@ -155,7 +155,7 @@ class GWRAP_OT_auto_ground(_Tool, bpy.types.Operator):
 class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
     bl_idname = "gwrap.set_origin"
     bl_label = "Set Origin"
-    bl_description = "Move the result so that this place lies at the world's origin"
+    bl_description = "Move the result so that this point becomes the world origin"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     target: EnumProperty(name="Target", items=_TARGETS, default="POINTS")  # type: ignore[valid-type]
@@ -169,26 +169,26 @@ class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
             if len(points) == 0:
                 raise UsageError("No point is picked.", "Select a vertex or a point.")
             point = points.mean(0)
-        return self.apply(context, frame, origin_step(point), "The place is the origin")
+        return self.apply(context, frame, origin_step(point), "The point is the origin")
 
 
 class GWRAP_OT_keep_placement(_Tool, bpy.types.Operator):
     bl_idname = "gwrap.keep_placement"
     bl_label = "Keep Placement"
     bl_description = (
-        "Keep beside the result how its parent was moved, turned and scaled by hand, so that "
-        "another import places it so"
+        "Save the location, rotation and scale of the result's parent beside the result, so that "
+        "later imports place it the same way"
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
-        return self.apply(context, self.frame(context), Similarity(), "The placement is kept")
+        return self.apply(context, self.frame(context), Similarity(), "The placement is saved")
 
 
 class GWRAP_OT_reset_placement(_Tool, bpy.types.Operator):
     bl_idname = "gwrap.reset_placement"
     bl_label = "Reset Placement"
-    bl_description = "Place the result as it was trained, without scale, ground and origin"
+    bl_description = "Undo scale, ground and origin: place the result as trained"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     def work(self, context: bpy.types.Context) -> OperatorResult:

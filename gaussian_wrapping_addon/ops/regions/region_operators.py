@@ -31,7 +31,7 @@ _CURSOR_BOX_HALF = 0.5
 _AROUND: Final = (
     ("CURSOR", "At 3D Cursor", "A cube at the 3D cursor"),
     ("SELECTED", "Around Selected", "The box around the selected objects"),
-    ("RESULT", "Around Result", "A copy of the region that the first mesh was made of"),
+    ("RESULT", "Around Result", "A copy of the region of the first mesh"),
 )
 
 
@@ -52,8 +52,8 @@ def _target(context: bpy.types.Context) -> tuple[bpy.types.Object | None, bpy.ty
     frame = tags.current_frame(context.scene, context.view_layer.objects.active)
     if frame is None:
         return None, context.scene.collection
-    # Linked and overridden ones take no new objects; what is left out of the view layer cannot
-    # be selected.
+    # Linked and overridden collections accept no new objects; objects excluded from the view layer
+    # cannot be selected.
     shown = _shown_collections(context.view_layer.layer_collection)
     places = [
         c
@@ -69,7 +69,7 @@ def _shown_collections(layer: bpy.types.LayerCollection) -> list[bpy.types.Colle
 
 
 def _free_name(frame: bpy.types.Object | None) -> str:
-    """Return a name for a new box under which no mesh was made: meshing would replace it."""
+    """Return a name for a new box that has no mesh yet: meshing would replace that mesh."""
     children = frame.children if frame is not None else ()
     made = {str(t.get(tags.REGION, "")) for t in children}
     numbers = itertools.count(2)
@@ -82,7 +82,7 @@ def _free_name(frame: bpy.types.Object | None) -> str:
 class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.add_region_box"
     bl_label = "Add Region Box"
-    bl_description = "Add a box that can be moved, turned and scaled; what it encloses is meshed"
+    bl_description = "Add a box to move, rotate and scale; the space inside it is meshed"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     around: EnumProperty(name="Around", items=_AROUND, default="CURSOR")  # type: ignore[valid-type]
@@ -105,7 +105,7 @@ class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
 
     def _result_box(self, context: bpy.types.Context, frame: bpy.types.Object | None) -> np.ndarray:
         if frame is None:
-            raise UsageError("The scene holds no result.", "Wrap the scene or import a result.")
+            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
         regions = [
             t
             for t in tags.objects_of_kind(context.scene, "region")
@@ -219,7 +219,7 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
                 f"{active.name} is linked from a library.",
                 "Make it local (Object > Relations > Make Local).",
             )
-        hull_in_blender(active)  # refuses what encloses no volume
+        hull_in_blender(active)  # raises if it encloses no volume
         if not is_convex(active):
             text = f"{active.name} is not convex: its convex hull is the region"
             self.report({"WARNING"}, text)

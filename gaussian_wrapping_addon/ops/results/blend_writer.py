@@ -19,7 +19,7 @@ from .scene_objects import import_result
 def write_blend(result_folder: Path, path: Path) -> None:
     """Write a .blend file of a result; images stay beside it, with relative paths.
 
-    The file that is open in this Blender is closed without saving, so that this is for
+    The file that is open in this Blender is closed without saving, so this is for
     background Blender only.
 
     Raises
@@ -27,7 +27,7 @@ def write_blend(result_folder: Path, path: Path) -> None:
     UsageError
         Blender has a window, or the file cannot be written.
     DatasetError, ParseError
-        The folder does not hold a sound result.
+        The folder contains no valid result.
     """
     path = path.resolve()
     start_empty("Writing a .blend file of a result")
@@ -95,14 +95,14 @@ def export_usd(result_folder: Path) -> list[Path]:
 
 
 def start_empty(purpose: str) -> None:
-    """Close the open file without saving and begin an empty one; refuse where a person works."""
+    """Close the open file without saving and begin an empty one; refuse if Blender has a window."""
     if not bpy.app.background:
         raise UsageError(f"{purpose} would close the open file.", "Do it in background Blender.")
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """Return Blender's way to write a path relative to the file in ``folder``."""
+    """Return a path in Blender's notation relative to a file in ``folder``."""
     try:
         return "//" + os.path.relpath(path, folder).replace("\\", "/")
     except ValueError:  # another Windows drive

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators around results: import, open the report, shading."""
+"""Operators that import results, open their folder and set their shading."""
 
 from pathlib import Path
 from typing import Final
@@ -18,7 +18,7 @@ from .scene_objects import import_result
 class GWRAP_OT_import_result(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.import_result"
     bl_label = "Import Result"
-    bl_description = "Show a finished job's meshes, cameras and regions, or bring them up to date"
+    bl_description = "Import a finished job's meshes, cameras and regions, or update them"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     directory: StringProperty(name="Result Folder", subtype="DIR_PATH", options={"SKIP_SAVE"})  # type: ignore[valid-type]
@@ -51,14 +51,14 @@ class GWRAP_OT_open_report(NeedsResult, ReportsErrors, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         if frame is None:
-            raise UsageError("The scene holds no result.", "Wrap the scene or import a result.")
+            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
         folder = tags.result_folder(frame)
         # A folder only: the path comes from the .blend, and opening a file could run it.
         if known_jobs.is_remote(folder) or not (
             folder.is_dir() and (folder / "scene.json").is_file()
         ):
             raise UsageError(
-                f"{folder} is no result folder.", "Import the result from where it is now."
+                f"{folder} is not a result folder.", "Import the result from where it is now."
             )
         bpy.ops.wm.path_open(filepath=str(folder))
         return {"FINISHED"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ask the worker in the background what a training will need."""
+"""Estimate time and memory of a training by the worker, in the background."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ DEADLINE_S = 300.0
 MAX_LINES = 20
 MAX_TEXT = 300
 MAX_KNOWN = 20
-"""Answers kept, so that going back to a preset shows its estimate again."""
+"""Estimates kept, so that switching back to a preset shows its estimate again."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One answer, ready to draw."""
+    """An estimate, ready to draw."""
 
     lines: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    """What stands in the way, or may."""
+    """Warnings, or the reason of a failure."""
 
 
 _questions = Lane(of_file=True)
@@ -43,17 +43,17 @@ _known: dict[tuple[object, ...], Estimate] = {}
 
 
 def is_busy() -> bool:
-    """Tell whether an answer is awaited."""
+    """Return whether an estimate is running."""
     return _questions.busy
 
 
 def answer_for(scene: bpy.types.Scene) -> Estimate | None:
-    """Return the estimate for what a scene's panels ask for now; None where it is not known."""
+    """Return the estimate for the current settings of a scene's panels, or None."""
     return _known.get(choices_key(scene))
 
 
 def answer_with(scene: bpy.types.Scene, error: WrapError) -> None:
-    """Show in place of an estimate why there is none."""
+    """Show the reason of a failure in place of an estimate."""
     _keep(choices_key(scene), estimate_of_failure(error))
 
 
@@ -65,13 +65,13 @@ def _keep(key: tuple[object, ...], answer: Estimate) -> None:
 
 
 def forget() -> None:
-    """Forget all answers: the photos may be others under the same names."""
+    """Forget all estimates: photos may have been replaced under the same names."""
     stop()
     _known.clear()
 
 
 def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
-    """Begin an estimate for a scene's photos and choices.
+    """Start an estimate for a scene's photos and settings.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 
 
 def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
-    """Turn what the child said into lines for the panel.
+    """Convert the child's output into lines for the panel.
 
     Parameters
     ----------
@@ -106,12 +106,12 @@ def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
         ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
         ``{"error": text, "hint": text}``.
     last_words : str
-        The end of what the child wrote to its terminal, in case it said nothing else.
+        The last line of the child's standard error, reported if there is no other output.
 
     Raises
     ------
     WorkerError
-        It said nothing.
+        There is no output.
     """
     for values in said:
         if values.get("error"):
@@ -119,7 +119,7 @@ def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
     told = [values for values in said if values.get("line") or values.get("warning")][:MAX_LINES]
     if not told:
         raise WorkerError(
-            f"There is no estimate: {last_words or 'the worker said nothing'}.",
+            f"The estimate failed: {last_words or 'the worker wrote nothing'}.",
             "Check the worker in the add-on's preferences.",
         )
     return Estimate(_texts(told, "line"), _texts(told, "warning"))
@@ -132,18 +132,18 @@ def _texts(said: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
 
 
 def estimate_of_failure(error: Exception) -> Estimate:
-    """Return what the panel shows where asking has failed."""
+    """Return what the panel shows if the estimate has failed."""
     if isinstance(error, WrapError):
         return Estimate((), (error.message, error.hint))
     return Estimate((), (f"{type(error).__name__}: {error}",))
 
 
 def get_ready() -> None:
-    """Start the threads of the next estimate ahead of it, where a timer begins it."""
+    """Start the threads of the next estimate ahead of a timer that starts it."""
     _questions.start()
     estimate_child.get_ready()
 
 
 def stop() -> None:
-    """Forget the question and end its process."""
+    """Cancel the estimate and end its process."""
     _questions.cancel()

@@ -23,7 +23,7 @@ def _frame(context: bpy.types.Context) -> bpy.types.Object | None:
 class GWRAP_OT_estimate(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.estimate"
     bl_label = "Estimate"
-    bl_description = "Say how long this training will take, and what memory and disk it needs"
+    bl_description = "Estimate the time, memory and disk space that this training needs"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -31,7 +31,7 @@ class GWRAP_OT_estimate(ReportsErrors, bpy.types.Operator):
             cls.poll_message_set("Choose the folder of the photos first")
             return False
         if training_estimate.is_busy():
-            cls.poll_message_set("The estimate is under way; it takes seconds")
+            cls.poll_message_set("The estimate is running; it takes seconds")
             return False
         return True
 
@@ -44,7 +44,7 @@ class GWRAP_OT_train_more(AsksAboutFolder, bpy.types.Operator):
     bl_idname = "gwrap.train_more"
     bl_label = "Train More"
     bl_description = (
-        "Go on with the finished training for more iterations, then mesh and texture it again"
+        "Continue the finished training for more iterations, then mesh and texture again"
     )
 
     @classmethod
@@ -61,7 +61,7 @@ class GWRAP_OT_train_more(AsksAboutFolder, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = _frame(context)
         if frame is None:
-            raise UsageError("The scene holds no result.", "Wrap the scene or import a result.")
+            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
         job_actions.start_more(context.scene, frame, preferred_worker.worker_choice(context))
         count = properties_of(context.scene).training.more_iterations
         self.report({"INFO"}, f"Training {count:,} iterations more")
@@ -71,7 +71,7 @@ class GWRAP_OT_train_more(AsksAboutFolder, bpy.types.Operator):
 class GWRAP_OT_reset_training(bpy.types.Operator):
     bl_idname = "gwrap.reset_training"
     bl_label = "Back to Preset"
-    bl_description = "Leave every choice of this panel to the preset and the photos again"
+    bl_description = "Reset every setting of this panel to that of the preset or to Auto"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     @classmethod

@@ -12,7 +12,7 @@ from . import preferred_worker, worker_check
 class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.check_worker"
     bl_label = "Check Worker"
-    bl_description = "Look whether the worker's Python has what jobs need, in the background"
+    bl_description = "Check in the background that the worker's Python has all that jobs need"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

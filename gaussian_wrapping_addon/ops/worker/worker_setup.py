@@ -32,21 +32,21 @@ from . import worker_check
 from .preferred_worker import worker_choice
 
 READY_FOR_S = 2.0
-"""For so long an answer of :func:`worker_ready` is taken as it was."""
+"""Lifetime of a cached result of :func:`worker_problem`."""
 
 
 @dataclass
 class State:
-    """What was found, and what is at work in this session; others only read it."""
+    """Findings and running work of this session; other modules only read it."""
 
     pythons: list[FoundPython] | None = None
-    """None while they are not looked for yet."""
+    """None until the search has ended."""
     has_cuda: bool = False
     has_searched: bool = False
     """Whether a search for Pythons has begun."""
     task: SetupTask | None = None
     is_busy: bool = False
-    """Whether the task's end is still to be dealt with."""
+    """Whether the end of the task is still to be handled."""
     problem: str = ""
     ready_key: tuple[str, str] | None = None
     ready_s: float = -1e9
@@ -65,12 +65,12 @@ def environment() -> WorkerEnvironment:
 
 
 def worker_ready() -> bool:
-    """Tell whether jobs have a Python to run in; cheap enough for every redraw."""
+    """Return whether jobs have a Python to run in; cheap enough for every redraw."""
     return not worker_problem()
 
 
 def worker_problem() -> str:
-    """Return why jobs have no Python to run in, and the next step; ``""`` where they have one."""
+    """Return why jobs have no Python to run in, and the next step; ``""`` if they have one."""
     preference = worker_choice(bpy.context).python
     key = (preference, os.environ.get(PYTHON_VARIABLE, ""))
     now_s = time.monotonic()
@@ -85,7 +85,7 @@ def worker_problem() -> str:
 
 
 def forget_answer() -> None:
-    """Look anew at the next question whether a worker is there."""
+    """Discard the cached result of :func:`worker_problem`."""
     state.ready_s = -1e9
 
 
@@ -103,7 +103,7 @@ def _keep_search(found: tuple[bool, list[FoundPython]]) -> None:
 
 
 def request_for(python: str, torch: str, wheel_folder: str) -> SetupRequest:
-    """Return what a set-up with these choices is.
+    """Return the request of a set-up with these choices.
 
     Raises
     ------
@@ -115,12 +115,12 @@ def request_for(python: str, torch: str, wheel_folder: str) -> SetupRequest:
 
 
 def start(request: SetupRequest, *, removes: bool = False) -> None:
-    """Begin a set-up or a removal.
+    """Start a set-up or a removal.
 
     Raises
     ------
     UsageError
-        One is at work.
+        One is running.
     """
     if state.task is not None and state.task.status.active:
         raise UsageError("A set-up is running.", "Cancel it or wait for it.")
@@ -138,7 +138,7 @@ def cancel() -> None:
 
 
 def tick() -> bool:
-    """Redraw, and deal with the end of a set-up; tell whether one is still at work."""
+    """Redraw, and handle the end of a set-up; return whether one is still running."""
     if state.is_busy and state.task is not None and not state.task.status.active:
         state.is_busy = False
         forget_answer()

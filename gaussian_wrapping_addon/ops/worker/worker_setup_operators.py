@@ -42,9 +42,9 @@ def _python_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
 def _torch_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
     cuda = ("cuda", "NVIDIA GPU (CUDA)", "Several GiB more; an NVIDIA driver was found")
     _items["torch"] = [
-        ("cpu", "Processor (Default)", "The small build; what jobs use today on every system"),
+        ("cpu", "Processor (Default)", "The small build, which jobs use today on every system"),
         *([cuda] if state.has_cuda else []),
-        ("index", "As in pip's Own Index",
+        ("index", "From pip's Index",
          "For mirrors. On Linux pip's index has the CUDA build, elsewhere the processor's"),
     ]  # fmt: skip
     return _items["torch"]
@@ -67,8 +67,8 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.set_up_worker"
     bl_label = "Set Up Worker"
     bl_description = (
-        "Make a private environment with torch and the other packages that jobs need, in place of "
-        "the one that is there; shows the commands first and changes nothing in Blender"
+        "Create a private environment with torch and the other packages that jobs need, replacing "
+        "an earlier one; shows the commands first and changes nothing in Blender"
     )
 
     python: EnumProperty(  # type: ignore[valid-type]
@@ -90,7 +90,7 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
             )
         elif state.pythons is None:
             worker_setup.look_around()
-            reason = "Looking for Pythons"
+            reason = "Searching for Python installations"
         elif not state.pythons:
             reason = "No Python 3.11 or newer was found: install one from python.org"
         cls.poll_message_set(reason)
@@ -118,7 +118,7 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
         copy: Any = layout.row().operator("gwrap.copy_setup_commands", icon="COPYDOWN")
         copy.text = "\n".join(lines)
         size = "About 2 GiB on the disk; several" if self.torch == "cpu" else "Up to 10 GiB; many"
-        layout.label(text=f"{size} minutes. Blender stays free meanwhile", icon="INFO")
+        layout.label(text=f"{size} minutes. Blender stays usable meanwhile", icon="INFO")
 
     def work(self, context: bpy.types.Context) -> OperatorResult:
         found = state.pythons or []
@@ -131,7 +131,7 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
 class GWRAP_OT_copy_setup_commands(bpy.types.Operator):
     bl_idname = "gwrap.copy_setup_commands"
     bl_label = "Copy Commands"
-    bl_description = "Copy the commands, to run them by hand or to ask somebody about them"
+    bl_description = "Copy the commands, to run them by hand or to ask for help"
 
     text: StringProperty(options={"SKIP_SAVE"})  # type: ignore[valid-type]
 
@@ -143,7 +143,7 @@ class GWRAP_OT_copy_setup_commands(bpy.types.Operator):
 class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.remove_worker"
     bl_label = "Remove"
-    bl_description = "Delete the worker's environment, which this add-on has made, and nothing else"
+    bl_description = "Delete the worker's environment that this add-on has made, and nothing else"
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -163,7 +163,7 @@ class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
 class GWRAP_OT_cancel_setup(bpy.types.Operator):
     bl_idname = "gwrap.cancel_setup"
     bl_label = "Cancel"
-    bl_description = "Stop the set-up and delete what it has begun"
+    bl_description = "Stop the set-up and delete its unfinished environment"
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What all panels of the tab have in common: place, readiness in the header, the large button."""
+"""Base of the tab's panels: location, readiness in the header, the large button."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ else:
 
 @dataclass(frozen=True)
 class Readiness:
-    """What a header says at its right, also while its panel is closed."""
+    """Text at the right of a header, shown also while its panel is closed."""
 
     text: str
     icon: str = "NONE"
-    """None stands for what is not there yet: the text is dimmed."""
+    """``"NONE"`` dims the text: nothing is there yet."""
 
 
 class TabPanel(_Panel):
@@ -38,7 +38,7 @@ class TabPanel(_Panel):
     bl_category = CATEGORY
 
     def readiness(self, context: bpy.types.Context) -> Readiness:
-        """Return how far the panel's part is; from memory alone."""
+        """Return the progress of the panel's part, from memory alone."""
         raise NotImplementedError
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
@@ -51,13 +51,13 @@ class TabPanel(_Panel):
 
 
 def plain(layout: Any) -> None:
-    """Names at the left, values at the right, no dots for animation."""
+    """Set the layout: names at the left, values at the right, no animation dots."""
     layout.use_property_split = True
     layout.use_property_decorate = False
 
 
 def button(layout: Any, context: bpy.types.Context, operator: str, **keywords: Any) -> Any:
-    """Draw an operator, large where it is the next step; return its properties."""
+    """Draw an operator, large if it is the next step; return its properties."""
     row = layout.row()
     if panel_state.primary_of(context) == operator:
         row.scale_y = LARGE

@@ -39,7 +39,7 @@ class GWRAP_PT_dataset(TabPanel, bpy.types.Panel):
         characters = characters_of(context)
         draw_worker_missing(layout, characters)
         if not properties.source:
-            text = "Photos of one thing from all sides, in a folder of their own."
+            text = "Photos of one object from all sides, in a folder of their own."
             wrapped_label(layout, text, characters)
         column = layout.column()
         column.enabled = not watched_jobs.is_running(properties.job_folder)

@@ -17,7 +17,7 @@ from .live_view import draw_live
 
 
 def job_readiness(context: bpy.types.Context, command: str) -> Readiness | None:
-    """Return what a header says of the scene's job; None where it is not the panel's, or done."""
+    """Return the header text of the scene's job; None if it is another panel's, or done."""
     properties = properties_of(context.scene)
     if properties.job_command != command or not properties.job_folder:
         return None
@@ -34,7 +34,7 @@ def job_readiness(context: bpy.types.Context, command: str) -> Readiness | None:
 
 
 def draw_job(layout: Any, context: bpy.types.Context, command: str) -> bool:
-    """Draw the scene's job where it belongs; tell whether it is running."""
+    """Draw the scene's job in its panel; return whether it is running."""
     properties = properties_of(context.scene)
     if properties.job_command != command or not properties.job_folder:
         return False

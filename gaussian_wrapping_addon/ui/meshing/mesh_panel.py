@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The sub-panel "Mesh": how fine the selected regions are meshed, and the job that does it."""
+"""The sub-panel "Mesh": resolution of the selected regions, and the meshing job."""
 
 from typing import Final
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The sub-panel "Texture": size, where its colours come from, further maps, coarser meshes."""
+"""The sub-panel "Texture": size, source of the colours, further maps, coarser meshes."""
 
 from typing import Final
 
@@ -27,7 +27,7 @@ class GWRAP_PT_texture(TabPanel, bpy.types.Panel):
         column = layout.column()
         column.enabled = not watched_jobs.is_running(properties.job_folder)
         draw_settings(column, properties, settings_in("texture"))
-        text = "Counts for the next Wrap Scene or Mesh Region."
+        text = "Applies to the next Wrap Scene or Mesh Region."
         wrapped_label(layout, text, characters_of(context), icon="INFO")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The panel "Region": the list of regions, what is special about the active one, estimates."""
+"""The panel "Region": list of regions, settings of the active one, estimates."""
 
 from typing import Any, Final
 

@@ -83,7 +83,7 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
 
 
 def estimate_rows(lines: tuple[str, ...]) -> tuple[tuple[tuple[str, str], ...], tuple[str, ...]]:
-    """Return the figures of an estimate as rows, and what else it says.
+    """Return the figures of an estimate as rows, and its other lines.
 
     The first line, the photos, is left out: the panel Dataset has it.
     """
