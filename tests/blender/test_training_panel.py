@@ -214,7 +214,7 @@ def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> N
     bad_ones = (b"", b"no picture", b"PK\x03\x04 no zip", several.getvalue(), huge, flat)
     for bad in (*bad_ones, npy_bytes(picture())[:200], npy_bytes(np.zeros(0))):
         write_picture(tmp_path, data=bad)
-        assert not refreshed(key, live_preview._shown[key].looked_s + 10.0)
+        assert not refreshed(key, live_preview._shown[key].searched_s + 10.0)
         assert live_preview.icons_of(key)
     (path.parent / "done.json").write_text("{}")
     assert live_preview.newest_picture(tmp_path) is None, "a finished training is not under way"

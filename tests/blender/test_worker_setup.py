@@ -56,7 +56,7 @@ def drawn() -> FakeLayout:
 def no_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(job_client.PYTHON_VARIABLE, raising=False)
     monkeypatch.setattr(job_client, "_has_torch", lambda: False)
-    worker_setup.forget_answer()
+    worker_setup.forget_problem()
 
 
 def test_without_a_worker_the_panel_leads_to_the_button(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,11 +73,11 @@ def test_without_a_worker_the_panel_leads_to_the_button(monkeypatch: pytest.Monk
 def test_the_answer_is_kept_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     monkeypatch.setattr(worker_setup, "worker_python", lambda p: asked.append(p) or "x")
-    worker_setup.forget_answer()
+    worker_setup.forget_problem()
     for _ in range(50):
         assert worker_setup.worker_ready()
     assert len(asked) == 1
-    worker_setup.forget_answer()
+    worker_setup.forget_problem()
     worker_setup.worker_ready()
     assert len(asked) == 2
 
@@ -191,8 +191,8 @@ def test_a_set_up_is_cancelled(root: Path, tmp_path: Path) -> None:
 def test_pythons_are_searched_in_the_background(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_setup, "find_pythons", lambda _own: [PYTHON, PYTHON])
     worker_setup.state.pythons, worker_setup.state.has_searched = None, False
-    worker_setup.look_around()
-    worker_setup.look_around()
+    worker_setup.search_pythons()
+    worker_setup.search_pythons()
     while worker_setup.state.pythons is None:
         background.poll()
         time.sleep(0.01)

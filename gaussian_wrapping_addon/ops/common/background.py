@@ -27,10 +27,10 @@ _logger = logging.getLogger(__name__)
 POLL_S = 0.3
 """Interval of the timer."""
 
-Answer = TypeVar("Answer")
+Result = TypeVar("Result")
 
 
-class Task(Generic[Answer]):
+class Task(Generic[Result]):
     """One call of a :class:`Lane` and its outcome.
 
     Parameters
@@ -39,7 +39,7 @@ class Task(Generic[Answer]):
         Runs in the lane's thread.
     then : callable, optional
         Receives the result on the main thread. Without it, the caller polls :meth:`finished` and
-        reads :meth:`answer`.
+        reads :meth:`result`.
     failed : callable, optional
         Receives the exception if ``call`` raised one; by default it is logged.
     end : callable, optional
@@ -48,8 +48,8 @@ class Task(Generic[Answer]):
 
     def __init__(
         self,
-        call: Callable[[], Answer],
-        then: Callable[[Answer], None] | None = None,
+        call: Callable[[], Result],
+        then: Callable[[Result], None] | None = None,
         failed: Callable[[Exception], None] | None = None,
         end: Callable[[], None] | None = None,
     ) -> None:
@@ -57,7 +57,7 @@ class Task(Generic[Answer]):
         self._then = then
         self._failed = failed
         self._end = end
-        self._answers: list[Answer] = []
+        self._results: list[Result] = []
         self._failure: Exception | None = None
         self._ended = threading.Event()
         self._settled = then is None
@@ -67,8 +67,8 @@ class Task(Generic[Answer]):
         try:
             if self._then is not None and self._settled:
                 raise Cancelled()
-            self._answers.append(self._call())
-        except Exception as failure:  # delivered, or raised by answer()
+            self._results.append(self._call())
+        except Exception as failure:  # delivered, or raised by result()
             self._failure = failure
         self._ended.set()
 
@@ -76,12 +76,12 @@ class Task(Generic[Answer]):
         """Return whether the call has ended, waiting up to ``wait_s`` seconds."""
         return self._ended.wait(wait_s)
 
-    def answer(self) -> Answer:
+    def result(self) -> Result:
         """Wait for the call; return its result or raise its exception."""
         self._ended.wait()
         if self._failure is not None:
             raise self._failure
-        return self._answers[0]
+        return self._results[0]
 
     @property
     def pending(self) -> bool:
@@ -103,7 +103,7 @@ class Task(Generic[Answer]):
         failure = self._failure
         try:
             if failure is None:
-                self._then(self._answers[0])
+                self._then(self._results[0])
             elif self._failed is not None:
                 self._failed(failure)
             else:
@@ -139,12 +139,12 @@ class Lane:
 
     def submit(
         self,
-        call: Callable[[], Answer],
-        then: Callable[[Answer], None] | None = None,
+        call: Callable[[], Result],
+        then: Callable[[Result], None] | None = None,
         *,
         failed: Callable[[Exception], None] | None = None,
         end: Callable[[], None] | None = None,
-    ) -> Task[Answer]:
+    ) -> Task[Result]:
         """Run a call in the thread; see :class:`Task`."""
         self.start()
         task = Task(call, then, failed, end)
@@ -175,14 +175,14 @@ class Lane:
         for task in tasks:
             task.cancel()
         if not all(task.finished() for task in tasks):
-            self._let_go()
+            self._release()
 
     def stop(self) -> None:
         """Cancel, and let the thread end after its queued tasks, without waiting for it."""
         self.cancel()
-        self._let_go()
+        self._release()
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         if self._thread is not None:
             self._calls.put(None)
             self._calls, self._thread = queue.SimpleQueue(), None
@@ -214,14 +214,14 @@ def poll() -> float | None:
     """Timer: deliver finished tasks, call watched functions; return seconds to the next tick."""
     for function in _watched.copy():
         _watched.remove(function)
-        if _goes_on(function) and function not in _watched:
+        if _continues(function) and function not in _watched:
             _watched.append(function)
     for lane in list(_lanes):
         lane.deliver()
     return POLL_S if _watched or any(lane.busy for lane in _lanes) else None
 
 
-def _goes_on(function: Callable[[], bool]) -> bool:
+def _continues(function: Callable[[], bool]) -> bool:
     try:
         return function()
     except Exception:  # a timer that raises would be dropped silently

@@ -16,19 +16,19 @@ from .background import Lane
 _endings = Lane()
 
 
-def ask_child(
-    command: list[str], begun: Callable[[subprocess.Popen[bytes]], bool], deadline_s: float
+def run_child(
+    command: list[str], on_start: Callable[[subprocess.Popen[bytes]], bool], deadline_s: float
 ) -> tuple[list[dict[str, Any]], str]:
     """Run a child to its end; touches nothing of Blender.
 
     Parameters
     ----------
-    begun : callable
+    on_start : callable
         Receives the process; returns false if the estimate is no longer wanted, which ends it.
 
     Returns
     -------
-    said : list of dict
+    messages : list of dict
         JSON objects from standard output, one a line.
     last_words : str
         The last line of standard error.
@@ -44,7 +44,7 @@ def ask_child(
         raise WorkerError(
             f"{command[0]} does not run: {error}.", "Choose another Python."
         ) from None
-    if not begun(process):
+    if not on_start(process):
         kill_group(process)
     try:
         output, words = process.communicate(timeout=deadline_s)
@@ -76,11 +76,11 @@ class Child:
         self._guard = threading.Lock()
         self._wanted = True
 
-    def ask(self, command: list[str], deadline_s: float) -> tuple[list[dict[str, Any]], str]:
-        """Run a child to its end, in a thread; see :func:`ask_child`."""
-        return ask_child(command, self._begun, deadline_s)
+    def run(self, command: list[str], deadline_s: float) -> tuple[list[dict[str, Any]], str]:
+        """Run a child to its end, in a thread; see :func:`run_child`."""
+        return run_child(command, self._on_start, deadline_s)
 
-    def _begun(self, process: subprocess.Popen[bytes]) -> bool:
+    def _on_start(self, process: subprocess.Popen[bytes]) -> bool:
         with self._guard:
             self.process = process
             return self._wanted

@@ -47,7 +47,7 @@ def chosen_regions(context: bpy.types.Context, *, checked: bool) -> list[bpy.typ
     return sorted((t for t in things if properties_of(t).checked), key=lambda t: t.name)
 
 
-class AsksAboutFolder(ReportsErrors):
+class ConfirmsFolder(ReportsErrors):
     """Mixin: confirm a job folder known from the open file alone, which may come from elsewhere."""
 
     def folder(self, context: bpy.types.Context) -> Path | None:

@@ -13,7 +13,7 @@ from ..common.addon import properties_of
 from ..common.error_reporting import OperatorResult, ReportsErrors
 from ..worker import preferred_worker
 from . import job_actions, job_attach, job_timer, panel_state, watched_jobs
-from .job_guards import AsksAboutFolder, chosen_regions, has_worker, no_job_runs, selected_regions
+from .job_guards import ConfirmsFolder, chosen_regions, has_worker, no_job_runs, selected_regions
 
 
 class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
@@ -39,7 +39,7 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_mesh_region(AsksAboutFolder, bpy.types.Operator):
+class GWRAP_OT_mesh_region(ConfirmsFolder, bpy.types.Operator):
     bl_idname = "gwrap.mesh_region"
     bl_label = "Mesh Region"
     bl_description = (
@@ -95,7 +95,7 @@ class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
+class GWRAP_OT_resume_job(ConfirmsFolder, bpy.types.Operator):
     bl_idname = "gwrap.resume_job"
     bl_label = "Resume"
     bl_description = "Continue the job from its last checkpoint; finished stages are reused"

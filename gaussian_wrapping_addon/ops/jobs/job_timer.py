@@ -25,13 +25,13 @@ from .watched_jobs import WatchedJob, jobs
 
 _logger = logging.getLogger(__name__)
 
-LOOK_WAIT_S = 0.0
+POLL_WAIT_S = 0.0
 """Time that a poll waits for the disk; a later answer is used by the next poll."""
 
 IMPORT_STAGE = "import"
 """Shown as a stage of the job while its result is read."""
 
-_looks, _readings = Lane(), Lane()
+_status_reads, _readings = Lane(), Lane()
 
 
 def watch(scene: bpy.types.Scene, folder: Path, client: JobClient, *, imports: bool = True) -> None:
@@ -59,8 +59,8 @@ def cancel(folder: str) -> None:
         job.status = job.client.poll()
         return
     job.client.cancel()
-    if job.cancel_asked_s is None:
-        job.cancel_asked_s = time.monotonic()
+    if job.cancel_requested_s is None:
+        job.cancel_requested_s = time.monotonic()
         job.ending = Lane()
         job.ending.start()  # now: the timer starts no thread
 
@@ -68,13 +68,13 @@ def cancel(folder: str) -> None:
 def forget_all() -> None:
     """Stop watching; workers go on, and are found again by ``attach_open_file``."""
     watched_jobs.forget_all()
-    _looks.stop()
+    _status_reads.stop()
     _readings.stop()
 
 
 def start_timer() -> None:
     """Poll the jobs as long as one is running."""
-    _looks.start()
+    _status_reads.start()
     _readings.start()
     live_preview.start()
     background.watch(tick)
@@ -104,7 +104,7 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
                 hint="See the system console, then choose Find Job.",
             )
         if not job.status.active:
-            job.let_go()
+            job.release()
             live_preview.forget(folder)
         elif job.status.stage == "train":
             changed = live_preview.refresh(folder, now_s) or changed
@@ -116,30 +116,30 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
 
 
 def _poll(folder: str, job: WatchedJob, now_s: float) -> None:
-    asked_s = job.cancel_asked_s if job.status.active else None
-    if asked_s is not None and now_s - asked_s > limits.CANCEL_GRACE_S:
+    requested_s = job.cancel_requested_s if job.status.active else None
+    if requested_s is not None and now_s - requested_s > limits.CANCEL_GRACE_S:
         _logger.warning("job in %s does not stop; ending it", folder)
-        job.cancel_asked_s = now_s
+        job.cancel_requested_s = now_s
         if job.ending is not None:
             job.ending.submit(job.client.kill)
-    if job.look is None:
+    if job.status_read is None:
         client = job.client
-        job.look = _looks.submit(lambda: _looked(client))
-    if not job.look.finished(LOOK_WAIT_S):
+        job.status_read = _status_reads.submit(lambda: _read_status(client))
+    if not job.status_read.finished(POLL_WAIT_S):
         return
-    look, job.look = job.look, None
-    job.status = look.answer()
+    status_read, job.status_read = job.status_read, None
+    job.status = status_read.result()
     job.waits_for_mode = False
     if job.status.active:
         return
-    if job.status.state == "LOST" and job.cancel_asked_s is not None:
+    if job.status.state == "LOST" and job.cancel_requested_s is not None:
         hint = "Resume continues from the last checkpoint."
         job.status = replace(job.status, state="CANCELLED", error="", hint=hint)
     if job.status.state == "DONE" and job.imports:
         _bring_in(folder, job)
 
 
-def _looked(client: JobClient) -> JobStatus:
+def _read_status(client: JobClient) -> JobStatus:
     """Read a job's status from its folder; runs in a thread."""
     status = client.poll()
     # It may have written its last status between our reads of the file and of the process.
@@ -162,7 +162,7 @@ def _bring_in(folder: str, job: WatchedJob) -> None:
     job.waits_for_mode = bpy.context.mode != "OBJECT"
     if not job.waits_for_mode:
         reading, job.imports, job.reading = job.reading, False, None
-        _import(folder, job, scene, reading.answer)
+        _import(folder, job, scene, reading.result)
 
 
 def _reading(folder: Path) -> Task[ResultFiles]:

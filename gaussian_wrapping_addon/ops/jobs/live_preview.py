@@ -36,7 +36,7 @@ Stamp = tuple[str, int, int]
 
 @dataclass
 class _Shown:
-    looked_s: float = _NEVER_S
+    searched_s: float = _NEVER_S
     stamp: Stamp | None = None
     names: tuple[str, ...] = ()
     icons: tuple[int, ...] = ()
@@ -96,8 +96,8 @@ def refresh(folder: str, now_s: float) -> bool:
     """
     shown = _shown.setdefault(folder, _Shown())
     if shown.reading is None:
-        if now_s - shown.looked_s >= EVERY_S:
-            shown.looked_s = now_s
+        if now_s - shown.searched_s >= EVERY_S:
+            shown.searched_s = now_s
             known = shown.stamp
             shown.reading = _readings.submit(lambda: _read(Path(folder), known))
         return False
@@ -105,7 +105,7 @@ def refresh(folder: str, now_s: float) -> bool:
         return False
     reading, shown.reading = shown.reading, None
     try:
-        read = reading.answer()
+        read = reading.result()
         loaded = _load(read.parts) if read else None
     except Exception:  # whatever the file contains: the job continues without its image
         _logger.info("no picture of %s", folder, exc_info=True)

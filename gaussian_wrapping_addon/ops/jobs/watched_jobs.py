@@ -31,18 +31,18 @@ class WatchedJob:
     """Session uid of the scene that shows the job; 0 if none in the open file does."""
     imports: bool
     """Whether its result is still wanted in the scene."""
-    cancel_asked_s: float | None = None
+    cancel_requested_s: float | None = None
     ending: Lane | None = None
     """Kills the worker if it does not stop; set once cancelling was requested."""
     command: str = "WRAP"
     waits_for_mode: bool = False
     """Finished, but Blender's mode does not allow the import."""
-    look: Task[JobStatus] | None = None
+    status_read: Task[JobStatus] | None = None
     """Pending read of the job's status from the disk."""
     reading: Task[ResultFiles] | None = None
     """The result while it is read, until it can be imported."""
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """End the thread that kills the worker, if there is one."""
         if self.ending is not None:
             self.ending.stop()
@@ -69,7 +69,7 @@ def show(scene: bpy.types.Scene, folder: Path, job: WatchedJob) -> None:
     gone.discard(key)
     earlier = jobs.pop(key, None)
     if earlier is not None:
-        earlier.let_go()
+        earlier.release()
     jobs[key] = job
 
 
@@ -84,7 +84,7 @@ def detach(scene: bpy.types.Scene) -> None:
 def forget_all() -> None:
     """Stop watching all jobs; workers continue."""
     for job in jobs.values():
-        job.let_go()
+        job.release()
     jobs.clear()
 
 

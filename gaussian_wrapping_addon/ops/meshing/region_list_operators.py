@@ -12,12 +12,12 @@ from ..common import tags
 from ..common.error_reporting import NeedsObjectMode, OperatorResult
 from ..common.mesh_data import mesh_of
 from ..jobs import job_actions, scene_folders
-from ..jobs.job_guards import AsksAboutFolder, chosen_regions
+from ..jobs.job_guards import ConfirmsFolder, chosen_regions
 from ..worker import preferred_worker
 from . import region_estimate
 
 
-class GWRAP_OT_estimate_regions(AsksAboutFolder, bpy.types.Operator):
+class GWRAP_OT_estimate_regions(ConfirmsFolder, bpy.types.Operator):
     bl_idname = "gwrap.estimate_regions"
     bl_label = "Estimate"
     bl_description = (

@@ -38,16 +38,16 @@ class Estimate:
     """Warnings, or the reason of a failure."""
 
 
-_questions = Lane(of_file=True)
+_requests = Lane(of_file=True)
 _known: dict[tuple[object, ...], Estimate] = {}
 
 
 def is_busy() -> bool:
     """Return whether an estimate is running."""
-    return _questions.busy
+    return _requests.busy
 
 
-def answer_for(scene: bpy.types.Scene) -> Estimate | None:
+def estimate_for(scene: bpy.types.Scene) -> Estimate | None:
     """Return the estimate for the current settings of a scene's panels, or None."""
     return _known.get(choices_key(scene))
 
@@ -57,9 +57,9 @@ def answer_with(scene: bpy.types.Scene, error: WrapError) -> None:
     _keep(choices_key(scene), estimate_of_failure(error))
 
 
-def _keep(key: tuple[object, ...], answer: Estimate) -> None:
+def _keep(key: tuple[object, ...], estimate: Estimate) -> None:
     _known.pop(key, None)
-    _known[key] = answer
+    _known[key] = estimate
     while len(_known) > MAX_KNOWN:
         del _known[next(iter(_known))]
 
@@ -85,24 +85,24 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
     stop()
     key, child = choices_key(scene), Child()
 
-    def keep(answer: Estimate) -> None:
-        _keep(key, answer)
+    def keep(estimate: Estimate) -> None:
+        _keep(key, estimate)
         redraw()
 
-    _questions.submit(
-        lambda: estimate_of(*child.ask(command, DEADLINE_S)),
+    _requests.submit(
+        lambda: estimate_of(*child.run(command, DEADLINE_S)),
         keep,
         failed=lambda error: keep(estimate_of_failure(error)),
         end=child.end,
     )
 
 
-def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
+def estimate_of(messages: list[dict[str, Any]], last_words: str = "") -> Estimate:
     """Convert the child's output into lines for the panel.
 
     Parameters
     ----------
-    said : list of dict
+    messages : list of dict
         ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
         ``{"error": text, "hint": text}``.
     last_words : str
@@ -113,10 +113,12 @@ def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
     WorkerError
         There is no output.
     """
-    for values in said:
+    for values in messages:
         if values.get("error"):
             return Estimate((), (str(values["error"]), str(values.get("hint", ""))))
-    told = [values for values in said if values.get("line") or values.get("warning")][:MAX_LINES]
+    told = [values for values in messages if values.get("line") or values.get("warning")][
+        :MAX_LINES
+    ]
     if not told:
         raise WorkerError(
             f"The estimate failed: {last_words or 'the worker wrote nothing'}.",
@@ -125,9 +127,9 @@ def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
     return Estimate(_texts(told, "line"), _texts(told, "warning"))
 
 
-def _texts(said: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
+def _texts(messages: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
     """Return the texts of one kind, as sentences."""
-    texts = (str(values[kind])[:MAX_TEXT] for values in said if values.get(kind))
+    texts = (str(values[kind])[:MAX_TEXT] for values in messages if values.get(kind))
     return tuple(text[:1].upper() + text[1:] for text in texts)
 
 
@@ -140,10 +142,10 @@ def estimate_of_failure(error: Exception) -> Estimate:
 
 def get_ready() -> None:
     """Start the threads of the next estimate ahead of a timer that starts it."""
-    _questions.start()
+    _requests.start()
     estimate_child.get_ready()
 
 
 def stop() -> None:
     """Cancel the estimate and end its process."""
-    _questions.cancel()
+    _requests.cancel()

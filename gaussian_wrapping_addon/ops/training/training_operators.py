@@ -11,7 +11,7 @@ from ..common import tags
 from ..common.addon import properties_of
 from ..common.error_reporting import OperatorResult, ReportsErrors
 from ..jobs import job_actions
-from ..jobs.job_guards import AsksAboutFolder, no_job_runs
+from ..jobs.job_guards import ConfirmsFolder, no_job_runs
 from ..worker import preferred_worker
 from . import training_estimate
 
@@ -40,7 +40,7 @@ class GWRAP_OT_estimate(ReportsErrors, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GWRAP_OT_train_more(AsksAboutFolder, bpy.types.Operator):
+class GWRAP_OT_train_more(ConfirmsFolder, bpy.types.Operator):
     bl_idname = "gwrap.train_more"
     bl_label = "Train More"
     bl_description = (

@@ -84,12 +84,12 @@ def worker_problem() -> str:
     return state.problem
 
 
-def forget_answer() -> None:
+def forget_problem() -> None:
     """Discard the cached result of :func:`worker_problem`."""
     state.ready_s = -1e9
 
 
-def look_around() -> None:
+def search_pythons() -> None:
     """Search for Pythons once, in the background; drawing may call this."""
     if not state.has_searched:
         state.has_searched = True
@@ -141,7 +141,7 @@ def tick() -> bool:
     """Redraw, and handle the end of a set-up; return whether one is still running."""
     if state.is_busy and state.task is not None and not state.task.status.active:
         state.is_busy = False
-        forget_answer()
+        forget_problem()
         if state.task.status.state == "DONE" and not state.task.removes:
             with contextlib.suppress(WrapError):
                 worker_check.start(worker_choice(bpy.context).python)
@@ -155,4 +155,4 @@ def stop() -> None:
     _searches.cancel()
     state.has_searched = state.pythons is not None
     state.is_busy = False
-    forget_answer()
+    forget_problem()

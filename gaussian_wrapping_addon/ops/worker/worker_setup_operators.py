@@ -89,7 +89,7 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
                 "or choose a Wheel Folder"
             )
         elif state.pythons is None:
-            worker_setup.look_around()
+            worker_setup.search_pythons()
             reason = "Searching for Python installations"
         elif not state.pythons:
             reason = "No Python 3.11 or newer was found: install one from python.org"

@@ -105,7 +105,7 @@ def _draw_estimate(layout: Any, context: bpy.types.Context, region: bpy.types.Ob
     if region_estimate.is_waiting(region):
         layout.label(text="Estimating…", icon="SORTTIME")
         return
-    estimate, holds = region_estimate.answer_for(context.scene, region)
+    estimate, holds = region_estimate.estimate_for(context.scene, region)
     if estimate is not None:
         column = layout.column(align=True)
         column.active = holds

@@ -66,18 +66,18 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
         if training_estimate.is_busy():
             layout.operator("gwrap.estimate", text="Estimating…", icon="SORTTIME")
             return
-        answer = training_estimate.answer_for(context.scene)
-        if answer is None:
+        estimate = training_estimate.estimate_for(context.scene)
+        if estimate is None:
             if primary_of(context) == "gwrap.wrap_scene":
                 layout.operator("gwrap.estimate", text="Estimate Time and Memory", icon="TIME")
             return
-        rows, remarks = estimate_rows(answer.lines)
+        rows, remarks = estimate_rows(estimate.lines)
         if rows:
             table(layout.box(), rows)
         for text in remarks:
             wrapped_label(layout, text, characters)
         icon = "ERROR"
-        for text in filter(None, answer.warnings):
+        for text in filter(None, estimate.warnings):
             wrapped_label(layout, text, characters - 4, icon=icon)
             icon = "BLANK1"
 

@@ -15,7 +15,7 @@ from ..common.text import characters_of, wrapped_label
 
 def draw_setup(layout: Any, context: Any) -> None:
     """Draw state, progress and buttons of the worker's environment."""
-    worker_setup.look_around()
+    worker_setup.search_pythons()
     characters = characters_of(context)
     environment = worker_setup.environment()
     if environment.is_ready():
