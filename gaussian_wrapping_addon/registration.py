@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Register and unregister everything, in order and back, whatever has failed before."""
+"""Register the add-on, unregister it in reverse order, robust against earlier failures."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ HANDLERS: Final[tuple[tuple[str, Callable[..., None]], ...]] = (
 
 
 def register() -> None:
-    """Add everything; what an earlier, failed attempt left behind is taken out first."""
+    """Register everything; remnants of a failed earlier attempt are removed first."""
     unregister()
     try:
         for cls in CLASSES:
@@ -95,7 +95,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take everything out, as far as it is there; workers go on and are found again."""
+    """Unregister everything that is registered; workers continue and are found again."""
     worker_setup.stop()
     training_estimate.forget()
     region_estimate.stop()

@@ -51,10 +51,13 @@ if [ -n "$missing" ]; then
 fi
 
 stamp=.venv/requirements.stamp
-wanted=$(cat requirements-worker.txt requirements-dev.txt)
+wanted=$(cat requirements-worker.txt requirements-dev.txt requirements-stubs.txt)
 if [ ! -f "$stamp" ] || [ "$(cat "$stamp")" != "$wanted" ]; then
   say "Making .venv (about 2 GB; a few minutes the first time) with $("$python" --version)"
   [ -x .venv/bin/python ] || "$python" -m venv .venv
   .venv/bin/python -m pip install -q --disable-pip-version-check -r requirements-dev.txt
+  rm -rf .venv/stubs
+  .venv/bin/python -m pip install -q --disable-pip-version-check --no-deps \
+    --target .venv/stubs -r requirements-stubs.txt
   printf '%s' "$wanted" >"$stamp"
 fi

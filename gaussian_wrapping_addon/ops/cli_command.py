@@ -17,7 +17,7 @@ _handle: Any = None
 
 
 def register(main: Callable[[list[str], str], int]) -> None:
-    """Make the command known to Blender, once.
+    """Register the command with Blender, once.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def register(main: Callable[[list[str], str], int]) -> None:
 
 
 def unregister() -> None:
-    """Take the command out where it is known."""
+    """Unregister the command if it is registered."""
     global _handle
     if _handle is not None:
         bpy.utils.unregister_cli_command(_handle)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The add-on's preferences: which Python works, and how."""
+"""The add-on's preferences: the worker's Python and its options."""
 
 from typing import Final
 
@@ -26,14 +26,14 @@ class GWRAP_preferences(bpy.types.AddonPreferences):
         name="Wheel Folder",
         description=(
             "Folder with the wheels of all packages, for a set-up without network; "
-            "empty asks pip's package index"
+            "empty uses pip's package index"
         ),
         subtype="DIR_PATH",
     )
     threads: property_of(declared("threads"))  # type: ignore[valid-type]
     keep_running: BoolProperty(  # type: ignore[valid-type]
         name="Keep Jobs Running After Blender Closes",
-        description="Jobs go on when Blender ends; opening the file again finds them",
+        description="Jobs continue after Blender closes; opening the file again finds them",
         default=False,
     )
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the panels edit: ``Scene.gwrap``.
+"""Properties edited by the panels: ``Scene.gwrap``.
 
 Settings of a job come from their declarations (``setting_properties.py``). Regions have
-``Object.gwrap`` (``region_properties.py``). All other marks of objects are plain custom properties
+``Object.gwrap`` (``region_properties.py``). All other tags of objects are plain custom properties
 (``ops/common/tags.py``), which also exist where the add-on is not enabled. No property has a
 callback: in Blender 4.2 one that ever had crashes the process at exit.
 """
@@ -55,13 +55,13 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     )
     resolution: EnumProperty(  # type: ignore[valid-type]
         name="Resolution",
-        description="What decides how fine the mesh of a region is",
+        description="How the resolution of a mesh is set",
         items=_RESOLUTIONS,
         default="AUTOMATIC",
     )
     decimate: BoolProperty(  # type: ignore[valid-type]
         name="Limit Faces",
-        description="Decimate the mesh; it stays closed, and its parts and holes stay",
+        description="Decimate the mesh; it stays closed and keeps its parts and holes",
         default=False,
     )
     training: PointerProperty(type=GWRAP_PG_training)  # type: ignore[valid-type]
@@ -78,13 +78,13 @@ CLASSES: Final = (GWRAP_PG_finding, GWRAP_PG_scene)
 
 
 def add_pointers() -> None:
-    """Give scenes and regions their properties."""
-    bpy.types.Scene.gwrap = PointerProperty(type=GWRAP_PG_scene)
-    bpy.types.Object.gwrap = PointerProperty(type=GWRAP_PG_region)
+    """Add the properties of scenes and regions."""
+    bpy.types.Scene.gwrap = PointerProperty(type=GWRAP_PG_scene)  # type: ignore[attr-defined]
+    bpy.types.Object.gwrap = PointerProperty(type=GWRAP_PG_region)  # type: ignore[attr-defined]
 
 
 def remove_pointers() -> None:
-    """Take them away, where they are there."""
+    """Remove the properties if they exist."""
     for owner in (bpy.types.Object, bpy.types.Scene):
         if hasattr(owner, "gwrap"):
             del owner.gwrap

@@ -62,7 +62,7 @@ def addon(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     from gaussian_wrapping_addon.ops.jobs import job_timer
 
     # One look at a job is enough, however busy the machine is.
-    monkeypatch.setattr(job_timer, "LOOK_WAIT_S", 30.0)
+    monkeypatch.setattr(job_timer, "POLL_WAIT_S", 30.0)
     gaussian_wrapping_addon.register()
     try:
         yield gaussian_wrapping_addon

@@ -93,9 +93,9 @@ def test_who_asks_for_it_gets_the_result_itself(lane: Lane, gate: threading.Even
     assert not task.finished()
     assert background.poll() is None, "nothing is to be delivered"
     gate.set()
-    assert task.answer() is True
+    assert task.result() is True
     with pytest.raises(ZeroDivisionError):
-        failing.answer()
+        failing.result()
 
 
 def test_cancelled_tasks_are_not_run_and_not_delivered(lane: Lane, gate: threading.Event) -> None:
@@ -116,9 +116,9 @@ def test_cancelled_tasks_are_not_run_and_not_delivered(lane: Lane, gate: threadi
     lane.submit(lambda: "next", told.append)
     play()
     assert told == ["ended", "next"], "the next one did not wait for the one that was given up"
-    assert running.answer() == "late"
+    assert running.result() == "late"
     with pytest.raises(Cancelled):
-        waiting.answer()
+        waiting.result()
     running.cancel()
     background.poll()
     assert told == ["ended", "next"], "once"

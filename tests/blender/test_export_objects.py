@@ -272,7 +272,7 @@ def test_what_cannot_be_done_is_said(
 ) -> None:
     (thing,) = imported.meshes
     frame = imported.frame
-    with pytest.raises(UsageError, match="no export"):
+    with pytest.raises(UsageError, match="not an export format"):
         export_objects(frame, [thing], ObjectExport("stl", tmp_path))
     with pytest.raises(UsageError, match="no mesh"):
         export_objects(frame, [], ObjectExport("glb", tmp_path))
@@ -289,7 +289,7 @@ def test_what_cannot_be_done_is_said(
             export_objects(frame, [thing], ObjectExport(format, tmp_path / "out"))
     albedo.unlink()
     for format in ("glb", "obj"):
-        with pytest.raises(UsageError, match=r"albedo\.png is not there"):
+        with pytest.raises(UsageError, match=r"albedo\.png does not exist"):
             export_objects(frame, [thing], ObjectExport(format, tmp_path / "out"))
 
 

@@ -66,7 +66,7 @@ pytestmark = pytest.mark.usefixtures("ended_workers")
 
 STAGES = ("cameras", "train", "texture", "import")
 STALL_S = 0.05
-LOOK_WAIT_S = job_timer.LOOK_WAIT_S
+POLL_WAIT_S = job_timer.POLL_WAIT_S
 """As people have it; the fixture ``addon`` waits longer, so that one look is enough."""
 
 GRID = 317
@@ -443,7 +443,7 @@ def test_no_tick_blocks_blender(
     """With a long log and new pictures of the size that trainings write, at every look."""
     folder = job_in("train", photos, worker)
     monkeypatch.setattr(live_preview, "EVERY_S", 0.0)
-    monkeypatch.setattr(job_timer, "LOOK_WAIT_S", LOOK_WAIT_S)
+    monkeypatch.setattr(job_timer, "POLL_WAIT_S", POLL_WAIT_S)
     for name in ("log.txt", "worker-output.txt"):
         (folder / name).write_bytes(b"2026-01-01 12:00:00 INFO train 12.3 % a line\n" * 200_000)
     random = np.random.default_rng(0)

@@ -318,7 +318,7 @@ def check_buttons(state: State, panels: dict[str, FakeLayout]) -> None:
 
 
 SAID: dict[State, dict[str, str]] = {
-    no_data: {"Dataset": "Photos of one thing", "Mesh": "Needs a finished training."},
+    no_data: {"Dataset": "Photos of one object", "Mesh": "Needs a finished training."},
     not_checked: {"Dataset": "Check Photos", "Train": "Estimate Time and Memory"},
     checking: {"Dataset": "Checking…"},
     checked: {"Dataset": "3 photos, cameras to be solved", "Dataset / Details": "no camera poses"},

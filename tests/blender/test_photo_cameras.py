@@ -147,7 +147,7 @@ def test_a_missing_photo_is_told_and_the_view_is_right(
     assert bpy.context.scene.render.resolution_x == CAMERAS[-1].width
     assert not lost.data.background_images
     text = capfd.readouterr()
-    assert "is not there" in text.out + text.err
+    assert "does not exist" in text.out + text.err
 
 
 @pytest.mark.parametrize("moved", [False, True])

@@ -73,16 +73,16 @@ def test_the_workers_answer_is_shown_until_something_changes(tmp_path: Path) -> 
     assert region_estimate.is_waiting(region)
     assert not bpy.ops.gwrap.estimate_regions.poll()
     play_until(lambda: not region_estimate.is_busy())
-    answer, holds = region_estimate.answer_for(scene, region)
-    assert answer is not None
+    estimate, holds = region_estimate.estimate_for(scene, region)
+    assert estimate is not None
     assert holds
-    assert not answer.warnings, answer.warnings
-    assert answer.lines[0].startswith("Triangles: ")
-    assert any(line.startswith("Time: ") for line in answer.lines)
+    assert not estimate.warnings, estimate.warnings
+    assert estimate.lines[0].startswith("Triangles: ")
+    assert any(line.startswith("Time: ") for line in estimate.lines)
 
     def still() -> bool:
         bpy.context.view_layer.update()
-        return region_estimate.answer_for(scene, region)[1]
+        return region_estimate.estimate_for(scene, region)[1]
 
     region.location.x += 0.5
     assert not still()
@@ -105,15 +105,15 @@ def test_the_workers_answer_is_shown_until_something_changes(tmp_path: Path) -> 
     region.gwrap.own_edge_length, region.gwrap.edge_length = True, 0.6  # of a diagonal of 4.85
     assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
     play_until(lambda: not region_estimate.is_busy())
-    answer, _ = region_estimate.answer_for(scene, region)
-    assert answer is not None
-    assert not answer.warnings
+    estimate, _ = region_estimate.estimate_for(scene, region)
+    assert estimate is not None
+    assert not estimate.warnings
     region.gwrap.edge_length = 1.0
     assert bpy.ops.gwrap.estimate_regions() == {"FINISHED"}
     play_until(lambda: not region_estimate.is_busy())
-    answer, _ = region_estimate.answer_for(scene, region)
-    assert answer is not None
-    assert "reduced" in " ".join(answer.warnings)
+    estimate, _ = region_estimate.estimate_for(scene, region)
+    assert estimate is not None
+    assert "reduced" in " ".join(estimate.warnings)
 
 
 def test_disabling_the_addon_ends_the_process(
@@ -124,7 +124,7 @@ def test_disabling_the_addon_ends_the_process(
     slow = [sys.executable, "-c", "import time; time.sleep(100)"]
     monkeypatch.setattr(region_estimate, "child_command", lambda *_, **__: slow)
     region_estimate.start(bpy.context.scene, [region], folder, sys.executable)
-    child = region_estimate._state.asking[region.session_uid].child
+    child = region_estimate._state.running[region.session_uid].child
     play_until(lambda: child.process is not None)
     process = child.process
     assert process is not None
@@ -150,8 +150,8 @@ def test_a_worker_that_says_nothing_is_an_answer(
         monkeypatch.setattr(region_estimate, "child_command", lambda *_, c=command, **__: c)
         region_estimate.start(bpy.context.scene, [region], tmp_path, sys.executable)
         play_until(lambda: not region_estimate.is_busy())
-        answer, _ = region_estimate.answer_for(bpy.context.scene, region)
-        assert answer is not None
-        assert answer.warnings
-        assert words in " ".join(answer.warnings)
-    assert estimate_child.ask_child([sys.executable, "-c", "print(1)"], lambda _: True, 20)[0] == []
+        estimate, _ = region_estimate.estimate_for(bpy.context.scene, region)
+        assert estimate is not None
+        assert estimate.warnings
+        assert words in " ".join(estimate.warnings)
+    assert estimate_child.run_child([sys.executable, "-c", "print(1)"], lambda _: True, 20)[0] == []

@@ -42,8 +42,8 @@ def test_a_regions_own_length_goes_before_the_scenes(region: bpy.types.Object) -
 
 @pytest.mark.parametrize(
     ("length", "words"),
-    [(float("nan"), "not possible"), (float("inf"), "not possible"), (0.0, "not possible"),
-     (-1.0, "not possible"), (1e3, "too coarse"), (1e-6, "too many")],
+    [(float("nan"), "not valid"), (float("inf"), "not valid"), (0.0, "not valid"),
+     (-1.0, "not valid"), (1e3, "too coarse"), (1e-6, "too many")],
 )  # fmt: skip
 def test_impossible_lengths_are_refused(
     region: bpy.types.Object, length: float, words: str, monkeypatch: pytest.MonkeyPatch

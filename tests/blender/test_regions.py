@@ -122,7 +122,7 @@ def test_box_around_selected_and_around_result(result: ImportedResult) -> None:
     assert same_set(region_from_object(copy), region_from_object(result.regions[0]))
     for thing in bpy.context.view_layer.objects:
         thing.select_set(False)
-    with pytest.raises(RuntimeError, match="Nothing with an extent"):
+    with pytest.raises(RuntimeError, match="no extent"):
         bpy.ops.gwrap.add_region_box(around="SELECTED")
 
 

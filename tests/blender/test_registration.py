@@ -14,7 +14,6 @@ import gaussian_wrapping_addon
 from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.ops.common import background
 from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer
-from gaussian_wrapping_addon.ops.worker import worker_setup
 
 REPOSITORY = Path(gaussian_wrapping_addon.__file__).resolve().parents[1]
 
@@ -26,9 +25,8 @@ def left_behind() -> list[str]:
         handlers = getattr(bpy.app.handlers, name)
         if isinstance(handlers, list):
             found += [name for h in handlers if "gaussian_wrapping" in h.__module__]
-    for function in (background.poll, worker_setup.tick):
-        if bpy.app.timers.is_registered(function):
-            found.append(function.__name__)
+    if bpy.app.timers.is_registered(background.poll):
+        found.append("poll")
     return found
 
 

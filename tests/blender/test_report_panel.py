@@ -70,7 +70,7 @@ def test_full_report(tmp_path: Path) -> None:
         (f"Texture {REGION}", "10 s"),
         ("Faces", "196"),
         ("Closed", "No"),
-        ("Texture Seen", "25.0 %"),
+        ("Texture Coverage", "25.0 %"),
         ("Textured Mesh PSNR", "20.0 dB"),
     ):
         assert found[name] == value
@@ -110,7 +110,7 @@ def test_what_an_older_report_lacks_is_not_measured(tmp_path: Path, report: Any)
     assert found["Held-Out PSNR"] == "not measured"
     assert found["Peak Memory"] == "not measured"
     if "regions" in report:
-        for name in ("Faces", "Closed", "Texture Seen", "Textured Mesh PSNR"):
+        for name in ("Faces", "Closed", "Texture Coverage", "Textured Mesh PSNR"):
             assert found[name] == "not measured"
 
 
@@ -185,7 +185,7 @@ def test_opening_the_report(tmp_path: Path, opened: list[str]) -> None:
     result = write_result(tmp_path / "job")
     assert not bpy.ops.gwrap.read_report.poll()
     import_result(result, bpy.context.scene)
-    with pytest.raises(RuntimeError, match="new on this machine"):
+    with pytest.raises(RuntimeError, match="not been used on this computer"):
         bpy.ops.gwrap.read_report()
     known_jobs.remember(result.parent)
     with pytest.raises(RuntimeError, match=r"no report\.md"):

@@ -437,7 +437,7 @@ def test_where_the_folder_cannot_be_written_the_scene_is_placed_all_the_same(
     pick_vertices(result.meshes[0], [0, 7])
     assert bpy.ops.gwrap.set_scale(distance=3.0) == {"FINISHED"}
     text = capfd.readouterr()
-    assert "kept in this .blend file alone" in text.out + text.err
+    assert "saved in this .blend file only" in text.out + text.err
     assert placement.placement_of(result.frame).scale == pytest.approx(np.sqrt(3.0), rel=1e-6)
     assert not list(job.parent.rglob(FILE_NAME))
 

@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.ops.jobs import job_timer, watched_jobs
 from tests.blender.job_play import play_until, start_wrap, status_of, write_fake_python
 
 STALL_S = 0.05
-LOOK_WAIT_S = job_timer.LOOK_WAIT_S
+POLL_WAIT_S = job_timer.POLL_WAIT_S
 """As people have it; the fixture ``addon`` waits longer, so that one look is enough."""
 
 pytestmark = pytest.mark.usefixtures("ended_workers")
@@ -54,16 +54,16 @@ class SleepingDisk:
         self.kills += 1
 
     def wake(self) -> None:
-        look = self.job.look
+        status_read = self.job.status_read
         self._awake.set()
-        assert look is None or look.finished(60.0)
+        assert status_read is None or status_read.finished(60.0)
 
 
 @pytest.fixture
 def disk(running: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SleepingDisk]:
     sleeping = SleepingDisk(running)
     with monkeypatch.context() as patch:
-        patch.setattr(job_timer, "LOOK_WAIT_S", LOOK_WAIT_S)
+        patch.setattr(job_timer, "POLL_WAIT_S", POLL_WAIT_S)
         patch.setattr(sleeping.job.client, "poll", sleeping.poll)
         patch.setattr(sleeping.job.client, "kill", sleeping.kill)
         yield sleeping
@@ -107,7 +107,7 @@ def test_an_answer_that_nobody_waits_for_changes_nothing(
 ) -> None:
     disk.told = replace(disk.told, state="DONE", result=str(running / "result"))
     job_timer.poll_jobs()
-    assert disk.job.look is not None
+    assert disk.job.status_read is not None
     if away == "detached":
         watched_jobs.detach(bpy.context.scene)
     elif away == "another file":

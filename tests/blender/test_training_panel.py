@@ -18,6 +18,8 @@ from gaussian_wrapping_addon.core.errors import UsageError, WorkerError
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE, JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
+from gaussian_wrapping_addon.core.regions.region_file import region_to_json
 from gaussian_wrapping_addon.core.settings import (
     MASK_MODES,
     MODEL_SELECTION,
@@ -101,9 +103,9 @@ def test_each_choice_changes_its_setting_and_no_other(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        ("/nowhere/x.obj", "no PLY"),
+        ("/nowhere/x.obj", "not a PLY"),
         ("/nowhere/missing.ply", "does not exist"),
-        (r"\\server\share\x.ply", "another machine"),
+        (r"\\server\share\x.ply", "another computer"),
     ],
 )
 def test_a_splat_that_cannot_be_used_is_refused(path: str, words: str) -> None:
@@ -212,7 +214,7 @@ def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> N
     bad_ones = (b"", b"no picture", b"PK\x03\x04 no zip", several.getvalue(), huge, flat)
     for bad in (*bad_ones, npy_bytes(picture())[:200], npy_bytes(np.zeros(0))):
         write_picture(tmp_path, data=bad)
-        assert not refreshed(key, live_preview._shown[key].looked_s + 10.0)
+        assert not refreshed(key, live_preview._shown[key].searched_s + 10.0)
         assert live_preview.icons_of(key)
     (path.parent / "done.json").write_text("{}")
     assert live_preview.newest_picture(tmp_path) is None, "a finished training is not under way"
@@ -251,7 +253,8 @@ def finished_job(folder: Path) -> Path:
     made = make_job("wrap", photos, preset("draft"))
     region = str(folder / "gone.json")
     settings = replace(made.settings, regions=(region,))
-    write_job(job.job_path, JobFile("mesh", made.source, settings, {region: {"a": 1}}))
+    body = region_to_json("gone", np.array(CUBE_CORNERS, np.float64))
+    write_job(job.job_path, JobFile("mesh", made.source, settings, {region: body}))
     (job.stages / "train-abc").mkdir()
     (job.stages / "train-abc" / "done.json").write_text('{"seconds": 1.0}')
     (job.stages / "train-abc" / "checkpoint-000300.json").write_text("{}")

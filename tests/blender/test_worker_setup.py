@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +20,7 @@ from gaussian_wrapping_addon.core.processes.worker_requirements import requireme
 from gaussian_wrapping_addon.core.setup.commands import SetupRequest
 from gaussian_wrapping_addon.core.setup.install import SetupTask
 from gaussian_wrapping_addon.core.setup.pythons import FoundPython, probe
+from gaussian_wrapping_addon.ops.common import background
 from gaussian_wrapping_addon.ops.worker import worker_check, worker_setup, worker_setup_operators
 from gaussian_wrapping_addon.ui.dataset import dataset_panel
 from gaussian_wrapping_addon.ui.worker import worker_setup_view
@@ -39,7 +39,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     # What a set-up has made is remembered here; no later test may take it for its worker.
     monkeypatch.setenv(worker_environment.DATA_VARIABLE, str(tmp_path / "data"))
     monkeypatch.setattr(worker_setup, "environment", lambda: WorkerEnvironment(folder))
-    fresh = worker_setup.State(pythons=[PYTHON], search=threading.Thread())
+    fresh = worker_setup.State(pythons=[PYTHON], has_searched=True)
     for name, value in vars(fresh).items():
         monkeypatch.setattr(worker_setup.state, name, value)
     yield folder
@@ -56,7 +56,7 @@ def drawn() -> FakeLayout:
 def no_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(job_client.PYTHON_VARIABLE, raising=False)
     monkeypatch.setattr(job_client, "_has_torch", lambda: False)
-    worker_setup.forget_answer()
+    worker_setup.forget_problem()
 
 
 def test_without_a_worker_the_panel_leads_to_the_button(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,11 +73,11 @@ def test_without_a_worker_the_panel_leads_to_the_button(monkeypatch: pytest.Monk
 def test_the_answer_is_kept_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     monkeypatch.setattr(worker_setup, "worker_python", lambda p: asked.append(p) or "x")
-    worker_setup.forget_answer()
+    worker_setup.forget_problem()
     for _ in range(50):
         assert worker_setup.worker_ready()
     assert len(asked) == 1
-    worker_setup.forget_answer()
+    worker_setup.forget_problem()
     worker_setup.worker_ready()
     assert len(asked) == 2
 
@@ -115,7 +115,7 @@ def test_only_what_we_made_can_be_removed(root: Path) -> None:
     assert bpy.ops.gwrap.remove_worker.poll()
     assert bpy.ops.gwrap.remove_worker() == {"FINISHED"}
     while worker_setup.state.is_busy:
-        worker_setup.tick()
+        background.poll()
         time.sleep(0.02)
     assert not root.exists()
     assert "The worker is removed" in drawn().texts
@@ -155,10 +155,10 @@ def test_a_set_up_from_start_to_end_in_blender(
     no_worker(monkeypatch)
     longest_s = 0.0
     worker_setup.start(request)
-    assert bpy.app.timers.is_registered(worker_setup.tick)
+    assert bpy.app.timers.is_registered(background.poll)
     while worker_setup.state.is_busy:
         begun_s = time.monotonic()
-        worker_setup.tick()
+        background.poll()
         longest_s = max(longest_s, time.monotonic() - begun_s)
         time.sleep(0.05)
     task = worker_setup.state.task
@@ -168,3 +168,33 @@ def test_a_set_up_from_start_to_end_in_blender(
     assert worker_setup.worker_ready(), "found at once"
     assert job_client.worker_python() == WorkerEnvironment(root).worker()
     assert longest_s < 1.0, "a tick never waits for the set-up"
+
+
+def test_a_set_up_is_cancelled(root: Path, tmp_path: Path) -> None:
+    write_wheel(tmp_path / "wheels", "gwalpha", "1.0")
+    requirements = tmp_path / "r.txt"
+    requirements.write_text("gwalpha==1.0\n")
+    python = probe(sys.executable).path
+    worker_setup.start(
+        SetupRequest(str(root), python, str(requirements), "cpu", str(tmp_path / "wheels"))
+    )
+    assert bpy.ops.gwrap.cancel_setup() == {"FINISHED"}
+    assert not bpy.ops.gwrap.cancel_setup.poll(), "once is enough"
+    assert "Cancelling…" in drawn().texts
+    while worker_setup.state.is_busy:
+        background.poll()
+        time.sleep(0.05)
+    assert worker_setup.state.task is not None
+    assert worker_setup.state.task.status.state == "CANCELLED"
+    assert not root.exists()
+
+
+def test_pythons_are_searched_in_the_background(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_setup, "find_pythons", lambda _own: [PYTHON, PYTHON])
+    worker_setup.state.pythons, worker_setup.state.has_searched = None, False
+    worker_setup.search_pythons()
+    worker_setup.search_pythons()
+    while worker_setup.state.pythons is None:
+        background.poll()
+        time.sleep(0.01)
+    assert worker_setup.state.pythons == [PYTHON, PYTHON]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
+from typing import cast
 
 import bpy
 import numpy as np
@@ -90,7 +91,7 @@ def scale_display(thing: bpy.types.Object, scale: float) -> None:
     """
     known = thing.get(tags.DISPLAY_SCALE, 1.0)
     ratio = scale / (known if isinstance(known, float) and known > 0.0 else 1.0)
-    data = thing.data
+    data = cast(bpy.types.Camera, thing.data)
     data.clip_start *= ratio
     data.clip_end *= ratio
     data.display_size *= ratio
@@ -99,7 +100,8 @@ def scale_display(thing: bpy.types.Object, scale: float) -> None:
 
 def cameras_under(frame: bpy.types.Object) -> list[bpy.types.Object]:
     """Return the photo cameras of a result in the order of their photos' paths."""
-    found = [c for c in frame.children if tags.kind_of(c) == "camera" and tags.RESOLUTION in c]
+    cameras = [c for c in frame.children if tags.kind_of(c) == "camera"]
+    found = [c for c in cameras if c.get(tags.RESOLUTION) is not None]
     return sorted(found, key=lambda c: str(c.get(tags.PHOTO, "")))
 
 
@@ -142,14 +144,14 @@ def show_photo(thing: bpy.types.Object) -> None:
         The photo is not there.
     """
     path = photo_of(thing)
-    hint = "Put it back, or look through the camera without it."
+    hint = "Restore it, or look through the camera without it."
     if known_jobs.is_remote(path) or not path.is_file():
-        raise DatasetError(f"The photo {path} is not there.", hint)
+        raise DatasetError(f"The photo {path} does not exist.", hint)
     try:
         image = bpy.data.images.load(str(path), check_existing=True)
     except RuntimeError as error:
         raise DatasetError(f"The photo {path} cannot be read: {error}.", hint) from None
-    data = thing.data
+    data = cast(bpy.types.Camera, thing.data)
     background = data.background_images[0] if data.background_images else None
     if background is None:
         background = data.background_images.new()

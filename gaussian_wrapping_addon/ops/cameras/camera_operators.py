@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Look through the photo cameras, one after another, with their photos behind the mesh."""
 
-from typing import Final
+from typing import Any, Final
 
 import bpy
 from bpy.props import IntProperty
 
 from ...core.errors import DatasetError, UsageError
 from ..common import tags
-from ..common.error_reporting import NeedsResult, ReportsErrors
+from ..common.error_reporting import NeedsResult, OperatorResult, ReportsErrors
 from .camera_objects import bring_forward, cameras_under, look_through, show_photo
 
 
@@ -23,17 +23,18 @@ class GWRAP_OT_view_photo(NeedsResult, ReportsErrors, bpy.types.Operator):
 
     step: IntProperty(  # type: ignore[valid-type]
         name="Step",
-        description="0 for the selected photo camera, else so many photos on from the present one",
+        description="0: the selected photo camera; otherwise photos to step from the current one",
         options={"SKIP_SAVE"},
     )
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame, thing = self._camera(context)
         bring_forward(frame, thing)
         look_through(context.scene, thing)
         for area in context.screen.areas if context.screen else ():
             if area.type == "VIEW_3D":
-                area.spaces.active.region_3d.view_perspective = "CAMERA"
+                view: Any = area.spaces.active
+                view.region_3d.view_perspective = "CAMERA"
         try:
             show_photo(thing)
         except DatasetError as error:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What several features share: tags of objects, reports, background work, known job folders."""
+"""Shared by the features: tags of objects, error reports, background work, known job folders."""

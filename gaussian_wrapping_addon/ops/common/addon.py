@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The package of this add-on, as Blender knows it."""
+"""Name, preferences and properties of the add-on in Blender."""
 
 from __future__ import annotations
 
@@ -17,3 +17,8 @@ def addon_preferences(context: bpy.types.Context) -> Any:
     """Return the preferences, or ``None`` where the package is not enabled as an add-on."""
     addon = context.preferences.addons.get(addon_package())
     return addon.preferences if addon is not None else None
+
+
+def properties_of(owner: bpy.types.Scene | bpy.types.Object) -> Any:
+    """Return the add-on's properties of a scene or region (``ui/properties.py``)."""
+    return owner.gwrap  # type: ignore[union-attr]

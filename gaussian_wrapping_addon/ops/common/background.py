@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Background work in Blender: threads do it, one timer delivers what comes of it.
+"""Background work in Blender: threads run tasks, one timer delivers their results.
 
 A :class:`Lane` is a thread that runs one :class:`Task` after the other. Tasks touch nothing of
 Blender. Their results and errors are delivered on the main thread by :func:`poll`, the only timer
-of background work, which also calls the functions that were given to :func:`watch`. The timer
-waits for nothing and starts no thread: threads are started when work is submitted, or ahead of
+of background work, which also calls the functions registered with :func:`watch`. The timer
+never waits and starts no thread: threads are started when work is submitted, or ahead of
 time by :meth:`Lane.start`.
 """
 
@@ -25,12 +25,12 @@ from ...core.errors import Cancelled
 _logger = logging.getLogger(__name__)
 
 POLL_S = 0.3
-"""Between two ticks of the timer."""
+"""Interval of the timer."""
 
-Answer = TypeVar("Answer")
+Result = TypeVar("Result")
 
 
-class Task(Generic[Answer]):
+class Task(Generic[Result]):
     """One call of a :class:`Lane` and its outcome.
 
     Parameters
@@ -38,18 +38,18 @@ class Task(Generic[Answer]):
     call : callable
         Runs in the lane's thread.
     then : callable, optional
-        Receives the result on the main thread. Without it, the one who submitted the task asks for
-        :meth:`finished` and :meth:`answer`.
+        Receives the result on the main thread. Without it, the caller polls :meth:`finished` and
+        reads :meth:`result`.
     failed : callable, optional
-        Receives the exception instead where ``call`` raised one; without it, it is logged.
+        Receives the exception if ``call`` raised one; by default it is logged.
     end : callable, optional
-        Called by :meth:`cancel`, to end what the call waits for; it must not wait itself.
+        Called by :meth:`cancel` to end what the call waits for; must not block.
     """
 
     def __init__(
         self,
-        call: Callable[[], Answer],
-        then: Callable[[Answer], None] | None = None,
+        call: Callable[[], Result],
+        then: Callable[[Result], None] | None = None,
         failed: Callable[[Exception], None] | None = None,
         end: Callable[[], None] | None = None,
     ) -> None:
@@ -57,71 +57,71 @@ class Task(Generic[Answer]):
         self._then = then
         self._failed = failed
         self._end = end
-        self._answers: list[Answer] = []
+        self._results: list[Result] = []
         self._failure: Exception | None = None
         self._ended = threading.Event()
         self._settled = then is None
 
     def run(self) -> None:
-        """Make the call; the lane's thread does."""
+        """Make the call, in the lane's thread."""
         try:
             if self._then is not None and self._settled:
                 raise Cancelled()
-            self._answers.append(self._call())
-        except Exception as failure:  # delivered, or raised where somebody waits for it
+            self._results.append(self._call())
+        except Exception as failure:  # delivered, or raised by result()
             self._failure = failure
         self._ended.set()
 
     def finished(self, wait_s: float = 0.0) -> bool:
-        """Tell whether :meth:`answer` has one, or gets one within a time."""
+        """Return whether the call has ended, waiting up to ``wait_s`` seconds."""
         return self._ended.wait(wait_s)
 
-    def answer(self) -> Answer:
-        """Return what the call returned, or raise what it raised; waits for it."""
+    def result(self) -> Result:
+        """Wait for the call; return its result or raise its exception."""
         self._ended.wait()
         if self._failure is not None:
             raise self._failure
-        return self._answers[0]
+        return self._results[0]
 
     @property
     def pending(self) -> bool:
-        """Whether something is still to be delivered."""
+        """Whether a result is still to be delivered."""
         return not self._settled
 
     def cancel(self) -> None:
-        """Deliver nothing; end what the call waits for."""
+        """Discard the result; end what the call waits for."""
         if self.pending:
             self._settled = True
             if self._end is not None:
                 self._end()
 
     def deliver(self) -> None:
-        """Hand on the result or the error of a finished call; the timer does, once."""
+        """Pass the result or error of a finished call on, once; called by the timer."""
         if self._then is None or self._settled:
             return
         self._settled = True
         failure = self._failure
         try:
             if failure is None:
-                self._then(self._answers[0])
+                self._then(self._results[0])
             elif self._failed is not None:
                 self._failed(failure)
             else:
                 _logger.error("a background task failed", exc_info=failure)
-        except Exception:  # a timer that raises would be dropped without a word
+        except Exception:  # a timer that raises would be dropped silently
             _logger.exception("delivering the result of a background task")
 
 
 class Lane:
     """A thread that runs one task after the other.
 
-    Starting a thread means waiting for it, which takes long where a worker keeps all processors
+    Starting a thread blocks until it runs, which takes long while a worker keeps all processors
     busy: :meth:`start` does it ahead of time.
 
     Parameters
     ----------
     of_file : bool
-        Tasks are about the open file: they are cancelled before another one is loaded.
+        Tasks concern the open file and are cancelled before another one is loaded.
     """
 
     def __init__(self, *, of_file: bool = False) -> None:
@@ -132,19 +132,19 @@ class Lane:
         _lanes.add(self)
 
     def start(self) -> None:
-        """Start the thread where it does not run yet."""
+        """Start the thread unless it is running."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._work, args=(self._calls,), daemon=True)
             self._thread.start()
 
     def submit(
         self,
-        call: Callable[[], Answer],
-        then: Callable[[Answer], None] | None = None,
+        call: Callable[[], Result],
+        then: Callable[[Result], None] | None = None,
         *,
         failed: Callable[[Exception], None] | None = None,
         end: Callable[[], None] | None = None,
-    ) -> Task[Answer]:
+    ) -> Task[Result]:
         """Run a call in the thread; see :class:`Task`."""
         self.start()
         task = Task(call, then, failed, end)
@@ -160,29 +160,29 @@ class Lane:
         return any(task.pending for task in self._tasks)
 
     def deliver(self) -> None:
-        """Deliver the tasks that have finished, in their order; the timer does."""
+        """Deliver finished tasks in order; called by the timer."""
         for task in self._tasks.copy():
             if task.finished():
                 task.deliver()
         self._tasks = [task for task in self._tasks if task.pending]
 
     def cancel(self) -> None:
-        """Cancel what is to be delivered; tasks without a receiver are still run.
+        """Cancel all pending deliveries; tasks without a receiver still run.
 
-        A thread that is at work ends by itself, and the next task gets a new one.
+        A busy thread ends after its current task; the next task gets a new thread.
         """
         tasks, self._tasks = self._tasks, []
         for task in tasks:
             task.cancel()
         if not all(task.finished() for task in tasks):
-            self._let_go()
+            self._release()
 
     def stop(self) -> None:
-        """Cancel, and let the thread end after what it has to do; nobody waits for it."""
+        """Cancel, and let the thread end after its queued tasks, without waiting for it."""
         self.cancel()
-        self._let_go()
+        self._release()
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         if self._thread is not None:
             self._calls.put(None)
             self._calls, self._thread = queue.SimpleQueue(), None
@@ -198,47 +198,47 @@ _watched: list[Callable[[], bool]] = []
 
 
 def watch(function: Callable[[], bool]) -> None:
-    """Have a function called at every tick, on the main thread, as long as it returns true."""
+    """Call a function at every tick, on the main thread, as long as it returns true."""
     if function not in _watched:
         _watched.append(function)
     start_timer()
 
 
 def start_timer() -> None:
-    """Let Blender call :func:`poll`."""
+    """Register :func:`poll` as a timer."""
     if not bpy.app.timers.is_registered(poll):
         bpy.app.timers.register(poll, first_interval=POLL_S, persistent=True)
 
 
 def poll() -> float | None:
-    """Timer: deliver what has finished, call what is watched; return seconds to the next tick."""
+    """Timer: deliver finished tasks, call watched functions; return seconds to the next tick."""
     for function in _watched.copy():
         _watched.remove(function)
-        if _goes_on(function) and function not in _watched:
+        if _continues(function) and function not in _watched:
             _watched.append(function)
     for lane in list(_lanes):
         lane.deliver()
     return POLL_S if _watched or any(lane.busy for lane in _lanes) else None
 
 
-def _goes_on(function: Callable[[], bool]) -> bool:
+def _continues(function: Callable[[], bool]) -> bool:
     try:
         return function()
-    except Exception:  # a timer that raises would be dropped without a word
+    except Exception:  # a timer that raises would be dropped silently
         _logger.exception("background timer")
         return False
 
 
-@persistent  # type: ignore[untyped-decorator]
+@persistent
 def before_load(*_arguments: object) -> None:
-    """``load_pre``: nobody waits any more for what is about the open file."""
+    """``load_pre``: cancel the tasks that concern the open file."""
     for lane in list(_lanes):
         if lane.of_file:
             lane.cancel()
 
 
 def stop() -> None:
-    """Take the timer out and cancel everything; threads end after what they are at."""
+    """Remove the timer and cancel everything; threads end after their current task."""
     if bpy.app.timers.is_registered(poll):
         bpy.app.timers.unregister(poll)
     _watched.clear()

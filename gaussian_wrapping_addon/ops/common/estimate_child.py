@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A question to the worker's Python: start the child, wait for what it says, or end it."""
+"""Estimates by the worker's Python: run a child process and parse its output, or end it."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from .background import Lane
 _endings = Lane()
 
 
-def ask_child(
-    command: list[str], begun: Callable[[subprocess.Popen[bytes]], bool], deadline_s: float
+def run_child(
+    command: list[str], on_start: Callable[[subprocess.Popen[bytes]], bool], deadline_s: float
 ) -> tuple[list[dict[str, Any]], str]:
     """Run a child to its end; touches nothing of Blender.
 
     Parameters
     ----------
-    begun : callable
-        Takes the process; false where nobody waits for the answer any more, which ends it.
+    on_start : callable
+        Receives the process; returns false if the estimate is no longer wanted, which ends it.
 
     Returns
     -------
-    said : list of dict
-        The JSON objects that it wrote, one a line.
+    messages : list of dict
+        JSON objects from standard output, one a line.
     last_words : str
-        The last line that it wrote to its terminal.
+        The last line of standard error.
 
     Raises
     ------
     WorkerError
-        It does not run, or takes too long.
+        The child does not start, or takes too long.
     """
     try:
         process = spawn(command)
@@ -44,7 +44,7 @@ def ask_child(
         raise WorkerError(
             f"{command[0]} does not run: {error}.", "Choose another Python."
         ) from None
-    if not begun(process):
+    if not on_start(process):
         kill_group(process)
     try:
         output, words = process.communicate(timeout=deadline_s)
@@ -64,29 +64,29 @@ def ask_child(
 
 
 def get_ready() -> None:
-    """Start the thread that ends children, where the next one is ended by a timer."""
+    """Start the thread that ends children, ahead of a timer that uses it."""
     _endings.start()
 
 
 class Child:
-    """A question that may be given up before it is answered."""
+    """A child process that can be cancelled before it has answered."""
 
     def __init__(self) -> None:
         self.process: subprocess.Popen[bytes] | None = None
         self._guard = threading.Lock()
         self._wanted = True
 
-    def ask(self, command: list[str], deadline_s: float) -> tuple[list[dict[str, Any]], str]:
-        """Run a child to its end, in a thread; see :func:`ask_child`."""
-        return ask_child(command, self._begun, deadline_s)
+    def run(self, command: list[str], deadline_s: float) -> tuple[list[dict[str, Any]], str]:
+        """Run a child to its end, in a thread; see :func:`run_child`."""
+        return run_child(command, self._on_start, deadline_s)
 
-    def _begun(self, process: subprocess.Popen[bytes]) -> bool:
+    def _on_start(self, process: subprocess.Popen[bytes]) -> bool:
         with self._guard:
             self.process = process
             return self._wanted
 
     def end(self) -> None:
-        """Give up: end the process in the background, or as soon as it begins."""
+        """Cancel: end the process in the background, or as soon as it has started."""
         with self._guard:
             self._wanted = False
             process = self.process

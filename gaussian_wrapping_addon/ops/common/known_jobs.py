@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which job folders this person has worked in, so that a .blend from elsewhere opens none.
+"""Job folders used on this machine, so that a .blend from elsewhere opens none.
 
-A .blend file names its job folder. It may come from the internet, so that the folder is read
-without a question only where it lies beside the file or was used on this machine before.
+A .blend file names its job folder. It may come from the internet, so the folder is read without
+confirmation only if it lies beside the file or was used on this machine before.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _session: list[str] = []
 
 
 def remember(folder: Path) -> None:
-    """Note a folder that the user has chosen."""
+    """Record a folder that the user has chosen."""
     text = str(folder.resolve())
     if text in _session:
         return
@@ -40,7 +40,7 @@ def remember(folder: Path) -> None:
 
 
 def is_trusted(folder: Path) -> bool:
-    """Tell whether a folder named by the open file may be read without asking."""
+    """Return whether a folder named by the open file may be read without confirmation."""
     if is_remote(folder):
         return False
     absolute = folder.resolve()
@@ -53,7 +53,7 @@ def is_trusted(folder: Path) -> bool:
 
 
 def is_remote(folder: Path) -> bool:
-    r"""Tell whether a path is ``\\server\share``: Windows would send it the user's name."""
+    r"""Return whether a path is ``\\server\share``: Windows would send it the user's name."""
     return str(folder).replace("\\", "/").startswith("//")
 
 

@@ -1,10 +1,36 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blender mesh data of plain arrays."""
+"""Blender mesh data from and to arrays."""
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import bpy
 import numpy as np
+
+
+def mesh_of(thing: bpy.types.Object) -> bpy.types.Mesh:
+    """Return the data of a mesh object."""
+    return cast(bpy.types.Mesh, thing.data)
+
+
+def values_of(elements: Any, name: str, width: int, dtype: type) -> np.ndarray:
+    """Return a property of all elements of a collection.
+
+    Parameters
+    ----------
+    elements : bpy_prop_collection
+        Of n elements.
+    width : int
+        Numbers of the property per element.
+
+    Returns
+    -------
+    values : (n * width,) ndarray
+    """
+    values: np.ndarray = np.empty(width * len(elements), dtype)
+    elements.foreach_get(name, values)
+    return values
 
 
 def build_mesh(
@@ -14,13 +40,13 @@ def build_mesh(
     corner_uvs: np.ndarray,
     face_material: np.ndarray | None = None,
 ) -> bpy.types.Mesh:
-    """Make mesh data of arrays: smooth shaded, one UV layer, a material slot for each face.
+    """Build mesh data from arrays: smooth shaded, one UV layer, a material slot for each face.
 
     Parameters
     ----------
     vertices : (v, 3) ndarray
     faces : (f, 3) ndarray of int32
-        Sound (``result_files.sound_faces``): Blender's own check takes longer than all the rest.
+        Valid (``result_files.sound_faces``): Blender's own check takes longer than all the rest.
     corner_uvs : (f, 3, 2) ndarray of float32
     face_material : (f,) ndarray of int, optional
     """
@@ -29,14 +55,17 @@ def build_mesh(
     mesh.vertices.add(len(vertices))
     mesh.loops.add(3 * count)
     mesh.polygons.add(count)
-    # Attributes are copied in one piece, which vertices and loops themselves are not.
+    # Attributes are copied as one block, unlike the properties of vertices and loops.
+    attributes: Any = mesh.attributes
+    polygons: Any = mesh.polygons
     positions = np.ascontiguousarray(vertices, np.float32)
-    mesh.attributes["position"].data.foreach_set("vector", positions.ravel())
-    mesh.attributes[".corner_vert"].data.foreach_set("value", faces.astype(np.int32).ravel())
-    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
+    attributes["position"].data.foreach_set("vector", positions.ravel())
+    attributes[".corner_vert"].data.foreach_set("value", faces.astype(np.int32).ravel())
+    polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
     if face_material is not None:
-        mesh.polygons.foreach_set("material_index", face_material.astype(np.int32))
+        polygons.foreach_set("material_index", face_material.astype(np.int32))
     layer = mesh.uv_layers.new(name="UVMap", do_init=False)
-    layer.uv.foreach_set("vector", corner_uvs.astype(np.float32, copy=False).ravel())
+    uvs: Any = layer.uv
+    uvs.foreach_set("vector", corner_uvs.astype(np.float32, copy=False).ravel())
     mesh.update(calc_edges=True)
     return mesh

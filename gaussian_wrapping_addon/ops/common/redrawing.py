@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ask Blender to draw what has changed."""
+"""Redraw areas of Blender's windows."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import bpy
 
 
 def redraw(*kinds: str) -> None:
-    """Let all areas of these kinds be drawn again, of 3D views where none is named."""
+    """Tag all areas of these types for redrawing; by default 3D views."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type in (kinds or ("VIEW_3D",)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Custom properties that mark our objects; they outlive undo, renaming and saving."""
+"""Custom properties that tag the add-on's objects; they survive undo, renaming and saving."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ DISPLAY_SCALE = "gwrap_display_scale"
 
 
 def kind_of(thing: bpy.types.Object | None) -> str:
-    """Return the mark of an object, ``""`` without one."""
+    """Return the tag of an object, or ``""``."""
     value = thing.get(KIND, "") if thing is not None else ""
     return value if isinstance(value, str) else ""
 
 
 def objects_of_kind(scene: bpy.types.Scene, kind: str) -> Iterator[bpy.types.Object]:
-    """Yield the objects of a scene that carry a mark."""
+    """Yield the objects of a scene that have a tag."""
     return (thing for thing in scene.objects if kind_of(thing) == kind)
 
 
@@ -79,11 +79,11 @@ def result_folder(frame: bpy.types.Object) -> Path:
     Raises
     ------
     UsageError
-        The frame names none.
+        The frame has none.
     """
     text = frame.get(RESULT, "")
     if not isinstance(text, str) or not text:
-        raise UsageError(f"{frame.name} names no result folder.", "Import the result again.")
+        raise UsageError(f"{frame.name} has no result folder.", "Import the result again.")
     return Path(bpy.path.abspath(text))
 
 

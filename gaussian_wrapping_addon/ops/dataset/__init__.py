@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Choosing the photos and checking them."""
+"""Choice and check of the photos."""

@@ -8,7 +8,8 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ...core.errors import UsageError, WrapError
-from ..common.error_reporting import ReportsErrors
+from ..common.addon import properties_of
+from ..common.error_reporting import OperatorResult, ReportsErrors
 from ..jobs import watched_jobs
 from ..jobs.job_guards import no_job_runs
 from ..training import training_estimate
@@ -16,7 +17,7 @@ from ..worker import preferred_worker
 from . import photo_check
 
 _INPUT_FILES: Final = (".ply", ".json")
-"""Files that are an input themselves; another file stands for its folder."""
+"""Files that are inputs themselves; for any other file, its folder is the input."""
 
 
 class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
@@ -39,8 +40,8 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return no_job_runs(cls, context)
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        source = context.scene.gwrap.source
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
+        source = properties_of(context.scene).source
         if source:
             self.filepath = source.rstrip("/\\") + ("" if Path(source).suffix else "/")
         context.window_manager.fileselect_add(self)
@@ -51,7 +52,7 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
         column.label(text="Open the folder with the photos,")
         column.label(text="then press Choose Photos.")
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         if not self.filepath:
             raise UsageError("No folder was chosen.", "Open the folder of the photos.")
         path = Path(bpy.path.abspath(self.filepath))
@@ -59,7 +60,7 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
             path = path.parent  # a photo was clicked, or a name that does not exist
         if not path.exists():
             raise UsageError(f"{path} does not exist.", "Choose another folder.")
-        properties = context.scene.gwrap
+        properties = properties_of(context.scene)
         if properties.source and Path(bpy.path.abspath(properties.source)) != path:
             if properties.output == properties.job_folder:
                 properties.output = ""  # it was made for the photos before
@@ -73,20 +74,20 @@ class GWRAP_OT_choose_input(ReportsErrors, bpy.types.Operator):
 class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.check_photos"
     bl_label = "Check Photos"
-    bl_description = "Look through the photos and camera poses and list what stands in the way"
+    bl_description = "Check the photos and camera poses and list problems"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not context.scene.gwrap.source:
+        if not properties_of(context.scene).source:
             cls.poll_message_set("Choose the folder of the photos first")
             return False
         if photo_check.is_busy():
-            cls.poll_message_set("The check is under way; it takes seconds")
+            cls.poll_message_set("The check is running; it takes seconds")
             return False
         return True
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Look in a thread: the button must not make Blender wait for a slow disk."""
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
+        """Check in a thread: Blender must not wait for a slow disk."""
         try:
             photo_check.start(context.scene)
         except WrapError as error:
@@ -94,13 +95,15 @@ class GWRAP_OT_check_photos(ReportsErrors, bpy.types.Operator):
             return {"CANCELLED"}
         return {"FINISHED"}
 
-    def work(self, context: bpy.types.Context) -> set[str]:
-        properties = context.scene.gwrap
+    def work(self, context: bpy.types.Context) -> OperatorResult:
+        properties = properties_of(context.scene)
         photo_check.check_now(context.scene)
         errors = sum(row.severity == "error" for row in properties.findings)
         warnings = sum(row.severity == "warning" for row in properties.findings)
-        kind = "WARNING" if errors or warnings else "INFO"
-        self.report({kind}, f"Photos checked: {errors} errors, {warnings} warnings")
+        self.report(
+            {"WARNING"} if errors or warnings else {"INFO"},
+            f"Photos checked: {errors} errors, {warnings} warnings",
+        )
         return {"FINISHED"}
 
 

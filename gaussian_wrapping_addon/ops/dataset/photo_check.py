@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Check an input in the background, and keep the findings with its scene."""
+"""Check an input in the background and store the findings in its scene."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import bpy
 
 from ...core.errors import WrapError
 from ..common import tags
+from ..common.addon import properties_of
 from ..common.background import Lane
 from ..common.redrawing import redraw
 from ..jobs import panel_state
@@ -26,12 +27,12 @@ _checks = Lane(of_file=True)
 
 
 def is_busy() -> bool:
-    """Tell whether a check is under way."""
+    """Return whether a check is running."""
     return _checks.busy
 
 
 def check_now(scene: bpy.types.Scene) -> None:
-    """Check a scene's input and keep the findings; Blender waits.
+    """Check a scene's input and store the findings; blocks Blender.
 
     Raises
     ------
@@ -50,7 +51,7 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None) -> None:
     Parameters
     ----------
     choice : WorkerChoice, optional
-        Ask this worker for an estimate of the training as well, where there are no errors.
+        If there are no errors, request an estimate of the training from this worker.
 
     Raises
     ------
@@ -66,11 +67,11 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None) -> None:
     stop()
     if choice is not None:
         training_estimate.get_ready()
-    uid, chosen = scene.session_uid, scene.gwrap.source
+    uid, chosen = scene.session_uid, properties_of(scene).source
 
     def keep(found: list[Finding]) -> None:
         scene = tags.scene_of_uid(uid)
-        if scene is not None and scene.gwrap.source == chosen:
+        if scene is not None and properties_of(scene).source == chosen:
             _keep(scene, found)
             if choice is not None:
                 _estimate(scene, choice)
@@ -85,7 +86,7 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice | None = None) -> None:
 
 
 def _keep(scene: bpy.types.Scene, found: list[Finding]) -> None:
-    properties = scene.gwrap
+    properties = properties_of(scene)
     properties.findings.clear()
     properties.checked_source = properties.source
     properties.checked_text = ", ".join(f.short for f in found if f.short)
@@ -106,5 +107,5 @@ def _estimate(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
 
 
 def stop() -> None:
-    """Forget a check that is under way."""
+    """Cancel a running check."""
     _checks.cancel()

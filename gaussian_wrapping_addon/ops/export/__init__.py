@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes of a result as files of other programs, written by Blender."""
+"""Export of meshes to the formats of other programs, by Blender's exporters."""

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Copies of materials for an export: images stand beside the file, in names of their own."""
+"""Copies of materials for an export, with images beside the file under names of their own."""
 
 from __future__ import annotations
 
 import re
 import shutil
 from pathlib import Path
+from typing import Any, cast
 
 import bpy
 import numpy as np
@@ -22,14 +23,14 @@ class MaterialCopies:
     Parameters
     ----------
     stem : str
-        Name of the exported file without its ending: begins the names of images.
+        Name of the exported file without its suffix; prefix of the image names.
     folder : Path
         Where images are written to.
     unlit : str
         What becomes of our unlit materials: ``"keep"`` (glTF has them), ``"emission"`` or
-        ``"lit"``, for formats that know no unlit material and would drop the texture.
+        ``"lit"``, for formats without unlit materials, which would drop the texture.
     fold_specular : bool
-        Whether the format knows reflectance by the index of refraction alone.
+        Whether the format describes reflectance by the index of refraction alone.
     """
 
     def __init__(self, stem: str, folder: Path, *, unlit: str, fold_specular: bool = False) -> None:
@@ -50,7 +51,7 @@ class MaterialCopies:
         Raises
         ------
         UsageError
-            An image is not there, or of a kind that cannot be written as one file.
+            An image is missing, or of a kind that cannot be written as one file.
         """
         copy = material.copy()
         self._materials.append((material, copy))
@@ -66,7 +67,7 @@ class MaterialCopies:
                 self.shading = "emission"
             if self._fold_specular:
                 fold_specular(copy)
-        tree = copy.node_tree
+        tree: Any = copy.node_tree
         for node in tree.nodes if tree is not None else ():
             if node.bl_idname == "ShaderNodeNormalMap" and self.shading != "unlit":
                 self.has_normal_map = True
@@ -75,7 +76,7 @@ class MaterialCopies:
         return copy
 
     def remove(self) -> None:
-        """Take every copy out of the file."""
+        """Remove all copies from the .blend data."""
         for material, copy in reversed(self._materials):
             name = copy.name
             bpy.data.materials.remove(copy)
@@ -107,7 +108,7 @@ class MaterialCopies:
 def lend_name(original: bpy.types.ID, copy: bpy.types.ID) -> str:
     """Give the copy the name of the original, so that the file has it; return the name.
 
-    When the copy has been removed, the original wants its name back.
+    After removing the copy, the caller restores the original's name.
     """
     name = original.name
     if original.library is None:  # others cannot be renamed, and do not stand in the way
@@ -125,23 +126,23 @@ def _is_file(image: bpy.types.Image) -> bool:
 
 
 def _write_image(image: bpy.types.Image, path: Path) -> None:
-    """Write the image's own bytes where it is a file of this format, else what Blender holds."""
+    """Write the image's own bytes if it is a file of this format, else Blender's pixels."""
     if image.source not in ("FILE", "GENERATED"):
-        raise UsageError(f"Image {image.name} is no single picture.", "Use one image file.")
+        raise UsageError(f"Image {image.name} is not a single image.", "Use a single image file.")
     source = Path(bpy.path.abspath(image.filepath, library=image.library))
     if _is_file(image) and image.packed_file is None and not source.is_file():
         raise UsageError(
-            f"The texture {source} is not there.", "Put it back, or import the result again."
+            f"The texture {source} does not exist.", "Restore it, or import the result again."
         )
     if not image.has_data and not _loads(image):
         raise UsageError(
-            f"The texture {source} cannot be read.", "Put it back, or import the result again."
+            f"The texture {source} cannot be read.", "Restore it, or import the result again."
         )
     try:
         if not _is_file(image) or image.file_format not in ("PNG", "JPEG"):
             _save_as_png(image, path)
         elif image.packed_file is not None:
-            path.write_bytes(image.packed_file.data)
+            path.write_bytes(cast(bytes, image.packed_file.data))
         elif source.resolve() != path.resolve():
             shutil.copyfile(source, path)
     except (OSError, RuntimeError) as error:
@@ -151,8 +152,9 @@ def _write_image(image: bpy.types.Image, path: Path) -> None:
 
 
 def _loads(image: bpy.types.Image) -> bool:
-    """Tell whether there is a picture in it; Blender reads files when they are first looked at."""
-    return bool(image.size[0] * image.size[1] and len(image.pixels) and image.has_data)
+    """Return whether the image has pixels; Blender reads files on first access."""
+    pixels: Any = image.pixels
+    return bool(image.size[0] * image.size[1] and len(pixels) and image.has_data)
 
 
 def _save_as_png(image: bpy.types.Image, path: Path) -> None:
@@ -176,10 +178,11 @@ def pixels_of(image: bpy.types.Image) -> np.ndarray:
     if width * height == 0:
         raise UsageError(
             f"The texture {image.filepath} cannot be read.",
-            "Put it back, or import the result again.",
+            "Restore it, or import the result again.",
         )
     values = np.empty(width * height * image.channels, np.float32)
-    image.pixels.foreach_get(values)
+    pixels: Any = image.pixels
+    pixels.foreach_get(values)
     grid = values.reshape(height, width, image.channels)[::-1]
     colors = grid[..., :3] if image.channels >= 3 else np.repeat(grid[..., :1], 3, axis=2)
     return np.rint(255.0 * np.nan_to_num(colors).clip(0.0, 1.0)).astype(np.uint8)

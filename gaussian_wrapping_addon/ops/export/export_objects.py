@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes of a result as files, as they stand in Blender: modifiers, edits, materials, placement.
+"""Export meshes as they are in Blender: with modifiers, edits, materials and placement.
 
-Each mesh is copied, moved in double precision to where the file wants it, checked, and handed to
-Blender's exporter of the format (PLY to our own, which keeps doubles). The scene stays as it is.
+Each mesh is copied, transformed in double precision to the coordinates of the file, checked, and
+passed to Blender's exporter of the format (PLY to our own, which keeps doubles). The scene is not
+changed.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from ...core.names import file_stems
 from ...core.texture.files.file_checks import validate_for_export, write_errors
 from ...core.texture.files.mesh_ply import vertex_colors, write_mesh_ply
 from ..common import tags
+from ..common.mesh_data import mesh_of, values_of
 from ..placement.placement import placement_of
 from ..regions.region_objects import matrix_of
 from ..results.materials import texture_of
@@ -45,14 +47,14 @@ _SAME_PLACE = 1e-6
 
 @dataclass(frozen=True)
 class ObjectExport:
-    """What is to be written, and where."""
+    """Format, folder and options of an export."""
 
     format: str
-    """Among :data:`MESH_FORMATS`."""
+    """One of :data:`MESH_FORMATS`."""
     folder: Path
-    """Made where it is missing; files of the same names are replaced."""
+    """Created if missing; files of the same names are replaced."""
     placed: bool = True
-    """Whether coordinates are those seen in Blender, else the world of the input."""
+    """Whether coordinates are those in Blender, else those of the input's world."""
     pack: bool = False
     """Whether images go into the file, where the format can: GLB always does, OBJ and PLY never."""
 
@@ -72,15 +74,17 @@ def export_objects(
     Raises
     ------
     UsageError
-        Nothing to write, an unknown format, an exporter that is not there or fails, an image that
-        is missing, or a frame that is scaled differently along its axes.
+        Nothing to write, an unknown format, an exporter that is missing or fails, a missing image,
+        or a frame with non-uniform scale.
     MeshingError
-        A mesh has no faces or is not finite; nothing of it is written.
+        A mesh has no faces or values that are not finite; it is not written.
     ResourceError
         The folder cannot be written.
     """
     if request.format not in MESH_FORMATS:
-        raise UsageError(f"{request.format!r} is no export.", f"Use {', '.join(MESH_FORMATS)}.")
+        raise UsageError(
+            f"{request.format!r} is not an export format.", f"Use {', '.join(MESH_FORMATS)}."
+        )
     if not things:
         raise UsageError("There is no mesh to export.", "Select meshes of a result.")
     operator = _operator(request.format) if request.format in _OPERATORS else None
@@ -144,8 +148,8 @@ def _copy_of(
 ) -> Iterator[tuple[bpy.types.Mesh, np.ndarray]]:
     """Yield the mesh with modifiers applied, and its (v, 3) float64 vertices in the scene frame."""
     hidden = thing.hide_viewport
-    thing.hide_viewport = False  # Blender does not evaluate what is disabled in viewports
-    thing.data.update_tag()  # scripts may have changed it without a word
+    thing.hide_viewport = False  # Blender does not evaluate objects that are disabled in viewports
+    mesh_of(thing).update_tag()  # scripts may have changed it without tagging it
     bpy.context.view_layer.update()
     try:
         depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -156,8 +160,7 @@ def _copy_of(
     finally:
         thing.hide_viewport = hidden
     try:
-        vertices = np.empty(3 * len(data.vertices), np.float32)
-        data.vertices.foreach_get("co", vertices)
+        vertices = values_of(data.vertices, "co", 3, np.float32)
         scene = vertices.reshape(-1, 3).astype(np.float64)
         if np.abs(relative - np.eye(4)).max() > _SAME_PLACE:
             scene = scene @ relative[:3, :3].T + relative[:3, 3]
@@ -176,17 +179,16 @@ def _write(
     request: ObjectExport,
     operator: Any,
 ) -> tuple[Path, dict[str, Any]]:
-    """Write one checked mesh; return its file and what the sidecar says it holds."""
+    """Write one checked mesh; return its file and the contents listed in the sidecar."""
     region, level = str(thing.get(tags.REGION, thing.name)), int(thing.get(tags.LEVEL, 0))
     data.calc_loop_triangles()
     count = len(data.loop_triangles)
-    faces, corners = np.empty(3 * count, np.int32), np.empty(3 * count, np.int32)
-    data.loop_triangles.foreach_get("vertices", faces)
-    data.loop_triangles.foreach_get("loops", corners)
-    faces = faces.reshape(-1, 3)
+    faces = values_of(data.loop_triangles, "vertices", 3, np.int32).reshape(-1, 3)
+    corners = values_of(data.loop_triangles, "loops", 3, np.int32)
     uvs = _corner_uvs(data, corners)
     validate_for_export(local, faces, uvs, name=f"mesh {thing.name}")
-    data.vertices.foreach_set("co", local.astype(np.float32).ravel())
+    vertices: Any = data.vertices
+    vertices.foreach_set("co", local.astype(np.float32).ravel())
     data.update()
     contents = {
         "region": region, "level": level, "vertices": len(local), "faces": count,
@@ -222,8 +224,7 @@ def _corner_uvs(data: bpy.types.Mesh, corners: np.ndarray) -> np.ndarray | None:
     layer = data.uv_layers.active
     if layer is None:
         return None
-    uvs = np.empty(2 * len(data.loops), np.float32)
-    layer.uv.foreach_get("vector", uvs)
+    uvs = values_of(layer.uv, "vector", 2, np.float32)
     return uvs.reshape(-1, 2)[corners].reshape(-1, 3, 2)
 
 
@@ -238,11 +239,9 @@ def _colors(
     used = [image for image in images if image is not None]
     if not used or uvs is None:
         return None
-    slots = np.empty(len(data.polygons), np.int32)
-    data.polygons.foreach_get("material_index", slots)
-    polygons = np.empty(len(faces), np.int32)
-    data.loop_triangles.foreach_get("polygon_index", polygons)
-    # A slot without our texture, as with one atlas, takes the first that there is.
+    slots = values_of(data.polygons, "material_index", 1, np.int32)
+    polygons = values_of(data.loop_triangles, "polygon_index", 1, np.int32)
+    # A slot without our texture takes the first texture, as with one atlas.
     numbers = [used.index(image if image is not None else used[0]) for image in images]
     owner = np.array(numbers)[slots[polygons].clip(0, len(numbers) - 1)]
     return vertex_colors(count, faces, uvs, [pixels_of(image) for image in used], owner)
@@ -254,7 +253,7 @@ def _alone(thing: bpy.types.Object, data: bpy.types.Mesh) -> Iterator[None]:
     layer = bpy.context.view_layer
     chosen, active = [o for o in layer.objects if o.select_get()], layer.objects.active
     copy = bpy.data.objects.new("exported", data)
-    name, data_name = lend_name(thing, copy), lend_name(thing.data, data)
+    name, data_name = lend_name(thing, copy), lend_name(mesh_of(thing), data)
     try:
         bpy.context.scene.collection.objects.link(copy)
         for other in chosen:
@@ -266,7 +265,7 @@ def _alone(thing: bpy.types.Object, data: bpy.types.Mesh) -> Iterator[None]:
     finally:
         bpy.data.objects.remove(copy)
         data.name = "exported"
-        for original, own in ((thing, name), (thing.data, data_name)):
+        for original, own in ((thing, name), (mesh_of(thing), data_name)):
             if original.library is None:
                 original.name = own
         for other in chosen:
@@ -275,7 +274,7 @@ def _alone(thing: bpy.types.Object, data: bpy.types.Mesh) -> Iterator[None]:
 
 
 def _options(request: ObjectExport, *, tangents: bool) -> dict[str, Any]:
-    """Return the exporter's options; those that this Blender does not know are left out."""
+    """Return the exporter's options; :func:`_run` drops those unknown to this Blender."""
     if request.format == "glb":
         return {
             "export_format": "GLB", "use_selection": True, "export_yup": True,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators that hand results on: files for other programs, images inside the .blend file."""
+"""Operators that export meshes and pack textures."""
 
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
@@ -10,7 +10,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from ...core.errors import UsageError
 from ...core.export_formats import EXPORT_FORMATS, MESH_FORMATS, PACKABLE_FORMATS
 from ..common import tags
-from ..common.error_reporting import NeedsObjectMode, NeedsResult, ReportsErrors
+from ..common.error_reporting import NeedsObjectMode, NeedsResult, OperatorResult, ReportsErrors
 from ..results.materials import images_of
 from .export_objects import ObjectExport, export_objects
 
@@ -18,7 +18,7 @@ from .export_objects import ObjectExport, export_objects
 class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.export_meshes"
     bl_label = "Export Meshes"
-    bl_description = "Write meshes of a result for other programs, one file each, with a sidecar"
+    bl_description = "Export meshes of a result to other programs, one file and sidecar each"
 
     directory: StringProperty(name="Folder", subtype="DIR_PATH", options={"SKIP_SAVE"})  # type: ignore[valid-type]
     filter_folder: BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
@@ -32,12 +32,13 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
     scope: EnumProperty(  # type: ignore[valid-type]
         name="Meshes",
         items=(
-            ("SELECTED", "Selected", "The meshes that are selected, levels of detail too"),
+            ("SELECTED", "Selected", "The selected meshes, levels of detail included"),
             ("ALL", "All Regions", "The mesh of each region of the result"),
         ),
     )
     levels: BoolProperty(  # type: ignore[valid-type]
-        name="Levels of Detail", description="Of each region, as files of their own"
+        name="Levels of Detail",
+        description="Export the levels of detail of each region as separate files",
     )
     placed: BoolProperty(  # type: ignore[valid-type]
         name="As Placed",
@@ -51,9 +52,10 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run; Blender calls this."""
-        return NeedsResult.poll.__func__(cls, context) and super().poll(context)
+        needs_result: Any = NeedsResult.poll
+        return bool(needs_result.__func__(cls, context)) and super().poll(context)
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         if not chosen_meshes(context):
             self.scope = "ALL"
         context.window_manager.fileselect_add(self)
@@ -71,9 +73,9 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
         if self.format.lower() in PACKABLE_FORMATS:
             layout.prop(self, "pack")
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         if not self.directory:
-            raise UsageError("No folder was chosen.", "Choose where the files go.")
+            raise UsageError("No folder was chosen.", "Choose the folder of the exported files.")
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         if self.scope == "SELECTED":
             chosen = chosen_meshes(context)
@@ -81,7 +83,8 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
                 raise UsageError("No mesh of a result is selected.", "Select some, or export all.")
         else:
             kinds = ("mesh", "lod") if self.levels else ("mesh",)
-            chosen = [t for t in frame.children_recursive if tags.kind_of(t) in kinds]
+            children = frame.children_recursive if frame is not None else ()
+            chosen = [t for t in children if tags.kind_of(t) in kinds]
         request = ObjectExport(
             self.format.lower(),
             Path(bpy.path.abspath(self.directory)).resolve(),
@@ -89,9 +92,9 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
             self.pack and self.format.lower() in PACKABLE_FORMATS,
         )
         paths = []
-        frames = {t: tags.frame_of(t) for t in chosen}
+        frames = {t: owner for t in chosen if (owner := tags.frame_of(t)) is not None}
         for owner in dict.fromkeys(frames.values()):
-            paths += export_objects(owner, [t for t in chosen if frames[t] == owner], request)
+            paths += export_objects(owner, [t for t in chosen if frames.get(t) == owner], request)
         self.report({"INFO"}, f"{len(paths)} files written to {request.folder}")
         return {"FINISHED"}
 
@@ -99,19 +102,19 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
 class GWRAP_OT_pack_images(NeedsResult, ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.pack_images"
     bl_label = "Pack Textures"
-    bl_description = "Keep the result's textures inside the .blend file, or as files again"
+    bl_description = "Pack the result's textures into the .blend file, or unpack them to files"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     pack: BoolProperty(name="Pack", default=True)  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         count = 0
         for image in images_of(frame):
             if self.pack and image.packed_file is None:
                 if not Path(bpy.path.abspath(image.filepath)).is_file():
                     raise UsageError(
-                        f"The texture {image.filepath} is not there.", "Import the result again."
+                        f"The texture {image.filepath} does not exist.", "Import the result again."
                     )
                 image.pack()
                 count += 1

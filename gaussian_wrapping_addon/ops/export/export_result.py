@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A result folder as USD and FBX, through a file of its own: for background Blender."""
+"""Export a result folder as USD and FBX from an empty file, in background Blender."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def export_result(
     requests : list of ObjectExport
         One for each format.
     regions : tuple of str
-        Names; none for all.
+        Names; empty for all.
     levels : bool
         Whether levels of detail are written too.
     shading : str
@@ -44,7 +44,7 @@ def export_result(
     UsageError
         Blender has a window, or there is no such region; what :func:`export_objects` raises.
     DatasetError, ParseError
-        The folder does not hold a sound result.
+        The folder contains no valid result.
     """
     start_empty("Exporting a result")
     imported = import_result(result, bpy.context.scene)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the job buttons do, as plain functions: from properties to a running worker."""
+"""Actions of the job buttons as plain functions: from properties to a running worker."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from ...core.names import AUTOMATIC_REGIONS, region_name, region_names
 from ...core.regions.region_file import read_region_file
 from ...core.settings import with_values
 from ..common import tags
+from ..common.addon import properties_of
 from ..regions.region_objects import export_region
 from ..regions.region_resolution import own_lengths, world_per_blender
 from ..worker.preferred_worker import WorkerChoice
@@ -28,14 +29,14 @@ from .scene_folders import job_folder_of, output_of, source_of
 
 
 def start_wrap(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
-    """Start the whole road for a scene's photos; return the job folder.
+    """Start the whole pipeline for a scene's photos; return the job folder.
 
     Raises
     ------
     WrapError
         The source, the output or a setting cannot be used.
     """
-    properties = scene.gwrap
+    properties = properties_of(scene)
     source = source_of(scene)
     folder = output_of(scene, source)
     job = make_job("wrap", source, job_settings(scene, choice.threads))
@@ -62,7 +63,7 @@ def start_mesh(
     Raises
     ------
     WrapError
-        A region cannot be used, or the job folder holds no finished training.
+        A region cannot be used, or the job folder contains no finished training.
     """
     frame = common_frame(regions)
     folder = job_folder_of(frame)
@@ -70,7 +71,7 @@ def start_mesh(
     _refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
     _refuse_linked(regions)
-    properties = scene.gwrap
+    properties = properties_of(scene)
     own = own_lengths(scene, regions, frame)
     requests = []
     for region in regions:
@@ -96,7 +97,9 @@ def start_mesh(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
     )
     for region, name in zip(regions, names, strict=True):
-        region[tags.REGION] = name  # so that the import finds this box and makes no second one
+        region[tags.REGION] = (
+            name  # so that the import finds this box and does not add a second one
+        )
     properties.job_command = "MESH"
     job_timer.watch(scene, folder, client)
     return folder
@@ -113,26 +116,28 @@ def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerCh
     Raises
     ------
     WrapError
-        The job folder holds no finished training, or too many iterations are asked for.
+        The job folder contains no finished training, or too many iterations are requested.
     """
     folder = job_folder_of(frame)
     _refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
-    job = continue_training_job(JobFolder(folder), earlier, scene.gwrap.training.more_iterations)
+    job = continue_training_job(
+        JobFolder(folder), earlier, properties_of(scene).training.more_iterations
+    )
     job = replace(job, settings=replace(job.settings, threads=choice.threads))
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running
     )
-    scene.gwrap.job_command = "WRAP"
+    properties_of(scene).job_command = "WRAP"
     job_timer.watch(scene, folder, client)
     return folder
 
 
 def resume(scene: bpy.types.Scene, choice: WorkerChoice) -> Path:
     """Continue a scene's job; finished stages are re-used. Return the job folder."""
-    if not scene.gwrap.job_folder:
+    if not properties_of(scene).job_folder:
         raise UsageError("This scene has no job.", "Wrap the scene first.")
-    folder = Path(bpy.path.abspath(scene.gwrap.job_folder))
+    folder = Path(bpy.path.abspath(properties_of(scene).job_folder))
     _refuse_running(folder)
     client = JobClient.resume(
         folder, python=worker_python(choice.python), keep_running=choice.keep_running
@@ -158,11 +163,11 @@ def _refuse_linked(regions: list[bpy.types.Object]) -> None:
 
 
 def _result_name(region: bpy.types.Object, frame: bpy.types.Object) -> str:
-    """Return the name under which a region's mesh replaces the one made of it before.
+    """Return the name under which a region's new mesh replaces its earlier one.
 
-    A region that was renamed keeps it. Its copies, which carry the same mark, do not have it: of
-    several, it belongs to the one that is still called so, or else to none. Nor has the automatic
-    region, once a person asks for what its box encloses.
+    A renamed region keeps it. Its copies, which have the same tag, do not: of several regions, it
+    belongs to the one that still has this name, or else to none. Nor does the automatic region
+    have it, once the user meshes its box.
     """
     name = region.get(tags.REGION, "")
     if not isinstance(name, str) or name in ("", *AUTOMATIC_REGIONS):
@@ -175,7 +180,7 @@ def _result_name(region: bpy.types.Object, frame: bpy.types.Object) -> str:
 
 
 def _stored_name(frame: bpy.types.Object, folder: str) -> str:
-    """Return the name of the region whose result lies in a folder: the folder's is a simpler one.
+    """Return the name of the region whose result is in a folder; the folder's name is a safe form.
 
     Under another name it would be another region, whose result may not be replaced.
     """
@@ -192,7 +197,7 @@ def _refuse_running(folder: Path) -> None:
 
 
 def common_frame(regions: list[bpy.types.Object]) -> bpy.types.Object:
-    """Return the frame that regions have in common.
+    """Return the common frame of regions.
 
     Raises
     ------

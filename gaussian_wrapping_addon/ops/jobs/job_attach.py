@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Find the jobs that the open file names, and keep scenes and jobs together over undo."""
+"""Find the jobs named by the open file, and keep scenes and jobs connected across undo."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ...core.errors import WrapError
 from ...core.jobs.client import JobClient
 from ...core.jobs.store.job_folder import JobStatus
 from ..common import known_jobs, tags
+from ..common.addon import properties_of
 from . import job_timer, watched_jobs
 from .watched_jobs import WatchedJob, gone, jobs, key_of
 
@@ -21,7 +22,7 @@ _logger = logging.getLogger(__name__)
 
 
 def find_job_folder(stored: str) -> Path | None:
-    """Return the job folder that the open file means, or None where there is none to be had.
+    """Return the job folder named by the open file, or None if there is none.
 
     A folder that has moved together with the .blend file is found beside it.
     """
@@ -38,12 +39,12 @@ def find_job_folder(stored: str) -> Path | None:
 
 
 def attach(scene: bpy.types.Scene, folder: Path) -> JobStatus:
-    """Watch a job that lies in a folder; a running one is imported when it is done.
+    """Watch the job of a folder; a running one is imported when done.
 
     Raises
     ------
     UsageError
-        The folder holds no job.
+        The folder contains no job.
     """
     client = JobClient.attach(folder)
     status = client.poll()
@@ -54,11 +55,11 @@ def attach(scene: bpy.types.Scene, folder: Path) -> JobStatus:
 
 
 def attach_open_file() -> None:
-    """Find the jobs of the open file again; only reads their status, starts and asks nothing."""
-    for job in jobs.values():
-        job.scene_uid = 0
+    """Find the jobs of the open file again; only reads their status."""
+    for known in jobs.values():
+        known.scene_uid = 0
     for scene in bpy.data.scenes:
-        stored = scene.gwrap.job_folder
+        stored = properties_of(scene).job_folder
         job = jobs.get(key_of(stored))
         if job is not None:
             job.scene_uid = scene.session_uid
@@ -69,7 +70,7 @@ def attach_open_file() -> None:
         folder = find_job_folder(stored)
         if folder is None:
             place = Path(key_of(stored))
-            # Folders that only the file names are not touched: they may be on anybody's network.
+            # Folders known from the file alone are not touched: they may be on any network.
             if stored and known_jobs.is_trusted(place) and not place.is_dir():
                 gone.add(str(place))
             continue
@@ -80,7 +81,7 @@ def attach_open_file() -> None:
 
 
 def attach_later() -> bool:
-    """Attach once Blender lets scripts see the open file; at one tick of the timer."""
+    """Attach once scripts can access the open file, at one tick of the timer."""
     attach_open_file()
     return False
 
@@ -98,6 +99,6 @@ def after_undo(_scene: object = None, _unused: object = None) -> None:
     newest = {job.scene_uid: folder for folder, job in jobs.items() if job.scene_uid}
     for uid, folder in newest.items():
         scene = tags.scene_of_uid(uid)
-        if scene is not None and key_of(scene.gwrap.job_folder) != folder:
-            scene.gwrap.job_folder = folder
-            scene.gwrap.job_command = jobs[folder].command
+        if scene is not None and key_of(properties_of(scene).job_folder) != folder:
+            properties_of(scene).job_folder = folder
+            properties_of(scene).job_command = jobs[folder].command

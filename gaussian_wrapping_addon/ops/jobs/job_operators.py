@@ -9,10 +9,11 @@ from bpy.props import BoolProperty, StringProperty
 
 from ...core.errors import UsageError
 from ..common import known_jobs, tags
-from ..common.error_reporting import ReportsErrors
+from ..common.addon import properties_of
+from ..common.error_reporting import OperatorResult, ReportsErrors
 from ..worker import preferred_worker
 from . import job_actions, job_attach, job_timer, panel_state, watched_jobs
-from .job_guards import AsksAboutFolder, chosen_regions, has_worker, no_job_runs, selected_regions
+from .job_guards import ConfirmsFolder, chosen_regions, has_worker, no_job_runs, selected_regions
 
 
 class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
@@ -22,7 +23,7 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not context.scene.gwrap.source:
+        if not properties_of(context.scene).source:
             cls.poll_message_set("Choose the folder of the photos first")
             return False
         if panel_state.has_errors(context.scene):
@@ -32,13 +33,13 @@ class GWRAP_OT_wrap_scene(ReportsErrors, bpy.types.Operator):
             return False
         return has_worker(cls) and no_job_runs(cls, context)
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         folder = job_actions.start_wrap(context.scene, preferred_worker.worker_choice(context))
         self.report({"INFO"}, f"Wrapping in {folder}")
         return {"FINISHED"}
 
 
-class GWRAP_OT_mesh_region(AsksAboutFolder, bpy.types.Operator):
+class GWRAP_OT_mesh_region(ConfirmsFolder, bpy.types.Operator):
     bl_idname = "gwrap.mesh_region"
     bl_label = "Mesh Region"
     bl_description = (
@@ -59,7 +60,7 @@ class GWRAP_OT_mesh_region(AsksAboutFolder, bpy.types.Operator):
         return has_worker(cls) and no_job_runs(cls, context)
 
     def _regions(self, context: bpy.types.Context) -> list[bpy.types.Object]:
-        # With nothing selected, what is checked was meant.
+        # Without a selection, the checked regions are meant.
         return (not self.checked and selected_regions(context)) or chosen_regions(
             context, checked=True
         )
@@ -69,7 +70,7 @@ class GWRAP_OT_mesh_region(AsksAboutFolder, bpy.types.Operator):
         frame = tags.frame_of(regions[0]) if regions else None
         return tags.result_folder(frame).parent if frame and frame.get(tags.RESULT) else None
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         regions = self._regions(context)
         choice = preferred_worker.worker_choice(context)
         job_actions.start_mesh(context.scene, regions, choice)
@@ -84,35 +85,35 @@ class GWRAP_OT_cancel_job(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not watched_jobs.is_running(context.scene.gwrap.job_folder):
+        if not watched_jobs.is_running(properties_of(context.scene).job_folder):
             cls.poll_message_set("No job is running; Wrap Scene starts one")
             return False
         return True
 
-    def work(self, context: bpy.types.Context) -> set[str]:
-        job_timer.cancel(context.scene.gwrap.job_folder)
+    def work(self, context: bpy.types.Context) -> OperatorResult:
+        job_timer.cancel(properties_of(context.scene).job_folder)
         return {"FINISHED"}
 
 
-class GWRAP_OT_resume_job(AsksAboutFolder, bpy.types.Operator):
+class GWRAP_OT_resume_job(ConfirmsFolder, bpy.types.Operator):
     bl_idname = "gwrap.resume_job"
     bl_label = "Resume"
-    bl_description = "Continue the job from its last checkpoint; finished stages are used again"
+    bl_description = "Continue the job from its last checkpoint; finished stages are reused"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not context.scene.gwrap.job_folder:
+        if not properties_of(context.scene).job_folder:
             cls.poll_message_set("This scene has no job; press Wrap Scene, or find its folder")
             return False
-        if watched_jobs.is_gone(context.scene.gwrap.job_folder):
-            cls.poll_message_set("The job's folder is gone; press Find Job where it was moved")
+        if watched_jobs.is_gone(properties_of(context.scene).job_folder):
+            cls.poll_message_set("The job folder is missing; press Find Job if it was moved")
             return False
         return no_job_runs(cls, context)
 
     def folder(self, context: bpy.types.Context) -> Path | None:
-        return Path(bpy.path.abspath(context.scene.gwrap.job_folder))
+        return Path(bpy.path.abspath(properties_of(context.scene).job_folder))
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         job_actions.resume(context.scene, preferred_worker.worker_choice(context))
         return {"FINISHED"}
 
@@ -125,11 +126,11 @@ class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
     directory: StringProperty(name="Job Folder", subtype="DIR_PATH", options={"SKIP_SAVE"})  # type: ignore[valid-type]
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose the folder of a job.")
         folder = Path(bpy.path.abspath(self.directory)).resolve()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Look at the watched jobs from Blender's timer, and import what they have made."""
+"""Poll the watched jobs from Blender's timer and import their results."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from .watched_jobs import WatchedJob, jobs
 
 _logger = logging.getLogger(__name__)
 
-LOOK_WAIT_S = 0.0
-"""For the disk to tell of a job; what it has told is seen at the next look."""
+POLL_WAIT_S = 0.0
+"""Time that a poll waits for the disk; a later answer is used by the next poll."""
 
 IMPORT_STAGE = "import"
 """Shown as a stage of the job while its result is read."""
 
-_looks, _readings = Lane(), Lane()
+_status_reads, _readings = Lane(), Lane()
 
 
 def watch(scene: bpy.types.Scene, folder: Path, client: JobClient, *, imports: bool = True) -> None:
@@ -42,7 +42,7 @@ def watch(scene: bpy.types.Scene, folder: Path, client: JobClient, *, imports: b
 
 
 def cancel(folder: str) -> None:
-    """Ask a job to stop; it is ended by force when it does not.
+    """Request a job to stop; it is killed if it does not.
 
     A finished job whose result is being read stays finished, and its result is offered.
 
@@ -59,8 +59,8 @@ def cancel(folder: str) -> None:
         job.status = job.client.poll()
         return
     job.client.cancel()
-    if job.cancel_asked_s is None:
-        job.cancel_asked_s = time.monotonic()
+    if job.cancel_requested_s is None:
+        job.cancel_requested_s = time.monotonic()
         job.ending = Lane()
         job.ending.start()  # now: the timer starts no thread
 
@@ -68,25 +68,25 @@ def cancel(folder: str) -> None:
 def forget_all() -> None:
     """Stop watching; workers go on, and are found again by ``attach_open_file``."""
     watched_jobs.forget_all()
-    _looks.stop()
+    _status_reads.stop()
     _readings.stop()
 
 
 def start_timer() -> None:
-    """Look at the jobs from now on, as long as one is at work."""
-    _looks.start()
+    """Poll the jobs as long as one is running."""
+    _status_reads.start()
     _readings.start()
     live_preview.start()
     background.watch(tick)
 
 
 def tick() -> bool:
-    """Look at all jobs once, by the add-on's timer."""
+    """Poll all jobs once, from the add-on's timer."""
     return poll_jobs()
 
 
 def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
-    """Look at all jobs once and import what is done; tell whether another look is needed."""
+    """Poll all jobs once and import finished ones; return whether to poll again."""
     busy = changed = False
     for folder, job in list(jobs.items()):
         if not (job.status.active or job.waits_for_mode):
@@ -95,7 +95,7 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
         now_s = clock()
         try:
             _poll(folder, job, now_s)
-        except Exception as error:  # a timer that raises would be dropped without a word
+        except Exception as error:  # a timer that raises would be dropped silently
             _logger.exception("looking at the job in %s", folder)
             job.status = replace(
                 job.status,
@@ -104,7 +104,7 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
                 hint="See the system console, then choose Find Job.",
             )
         if not job.status.active:
-            job.let_go()
+            job.release()
             live_preview.forget(folder)
         elif job.status.stage == "train":
             changed = live_preview.refresh(folder, now_s) or changed
@@ -116,38 +116,38 @@ def poll_jobs(clock: Callable[[], float] = time.monotonic) -> bool:
 
 
 def _poll(folder: str, job: WatchedJob, now_s: float) -> None:
-    asked_s = job.cancel_asked_s if job.status.active else None
-    if asked_s is not None and now_s - asked_s > limits.CANCEL_GRACE_S:
+    requested_s = job.cancel_requested_s if job.status.active else None
+    if requested_s is not None and now_s - requested_s > limits.CANCEL_GRACE_S:
         _logger.warning("job in %s does not stop; ending it", folder)
-        job.cancel_asked_s = now_s
+        job.cancel_requested_s = now_s
         if job.ending is not None:
             job.ending.submit(job.client.kill)
-    if job.look is None:
+    if job.status_read is None:
         client = job.client
-        job.look = _looks.submit(lambda: _looked(client))
-    if not job.look.finished(LOOK_WAIT_S):
+        job.status_read = _status_reads.submit(lambda: _read_status(client))
+    if not job.status_read.finished(POLL_WAIT_S):
         return
-    look, job.look = job.look, None
-    job.status = look.answer()
+    status_read, job.status_read = job.status_read, None
+    job.status = status_read.result()
     job.waits_for_mode = False
     if job.status.active:
         return
-    if job.status.state == "LOST" and job.cancel_asked_s is not None:
+    if job.status.state == "LOST" and job.cancel_requested_s is not None:
         hint = "Resume continues from the last checkpoint."
         job.status = replace(job.status, state="CANCELLED", error="", hint=hint)
     if job.status.state == "DONE" and job.imports:
         _bring_in(folder, job)
 
 
-def _looked(client: JobClient) -> JobStatus:
-    """Look at a job's folder; runs in a thread."""
+def _read_status(client: JobClient) -> JobStatus:
+    """Read a job's status from its folder; runs in a thread."""
     status = client.poll()
-    # It may have written its last word between our look at the file and at the process.
+    # It may have written its last status between our reads of the file and of the process.
     return client.poll() if status.state == "LOST" else status
 
 
 def _bring_in(folder: str, job: WatchedJob) -> None:
-    """Read a finished job's result in the background, then import it in one piece."""
+    """Read a finished job's result in the background, then import it in one step."""
     scene = tags.scene_of_uid(job.scene_uid)
     if scene is None:
         job.reading = None  # another file is open: opening the old one again imports it
@@ -162,7 +162,7 @@ def _bring_in(folder: str, job: WatchedJob) -> None:
     job.waits_for_mode = bpy.context.mode != "OBJECT"
     if not job.waits_for_mode:
         reading, job.imports, job.reading = job.reading, False, None
-        _import(folder, job, scene, reading.answer)
+        _import(folder, job, scene, reading.result)
 
 
 def _reading(folder: Path) -> Task[ResultFiles]:

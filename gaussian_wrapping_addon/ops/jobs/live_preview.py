@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The picture of a running training, loaded by the job timer, drawn from memory.
+"""Preview image of a running training, loaded by the job timer, drawn from memory.
 
-Panels draw often and must neither read the disk nor make anything: they ask :func:`icons_of`. The
-pictures lie in a preview collection, not in ``bpy.data``, so that no file is saved with them and
-undo does not know them. Files are looked for and read in a thread, as bare pixels: to decode its
-first picture, Blender needs longer than its window may wait.
+Panels draw often and must neither read the disk nor create data: they call :func:`icons_of`. The
+images are in a preview collection, not in ``bpy.data``, so that they are neither saved nor part of
+undo. Files are searched and read in a thread, as plain pixels: Blender takes longer to decode its
+first image than its window may wait.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _logger = logging.getLogger(__name__)
 
 PICTURE = "preview-training.npy"
 EVERY_S = 3.0
-"""Between two looks at the folder."""
+"""Interval between two searches of the folder."""
 MAX_BYTES = 8 * 2**20
-"""Larger files are not a preview; drawing them would be felt."""
+"""Larger files are not a preview; drawing them would be noticeable."""
 
 _NEVER_S = float("-inf")
 
@@ -36,7 +36,7 @@ Stamp = tuple[str, int, int]
 
 @dataclass
 class _Shown:
-    looked_s: float = _NEVER_S
+    searched_s: float = _NEVER_S
     stamp: Stamp | None = None
     names: tuple[str, ...] = ()
     icons: tuple[int, ...] = ()
@@ -52,12 +52,12 @@ class _Read:
 
 _readings = Lane()
 _shown: dict[str, _Shown] = {}
-_pictures: Any = None  # ImagePreviewCollection, made when the first picture is there
+_pictures: Any = None  # ImagePreviewCollection, created with the first image
 _count = 0
 
 
 def icons_of(folder: str) -> tuple[int, ...]:
-    """Return the icons of a job folder's picture, none where there is none; reads nothing.
+    """Return the icons of a job folder's image, or none; reads no file.
 
     A photo beside its rendering gives two: an icon is drawn in a square.
     """
@@ -72,7 +72,7 @@ def path_of(folder: str) -> str:
 
 
 def newest_picture(folder: Path) -> Stamp | None:
-    """Return the file of the training that is under way, or None."""
+    """Return the image file of the running training, or None."""
     found = []
     for path in (folder / "stages").glob(f"train-*/{PICTURE}"):
         try:
@@ -89,15 +89,15 @@ def newest_picture(folder: Path) -> Stamp | None:
 
 
 def refresh(folder: str, now_s: float) -> bool:
-    """Look for a new picture, at most every few seconds; tell whether one is shown now.
+    """Search for a new image, at most every few seconds; return whether a new one is shown.
 
-    It is read in a thread and shown by a later call. The old picture stays until then: one that
-    is being written, or is broken, changes nothing.
+    It is read in a thread and shown by a later call. The old image stays until then: an incomplete
+    or broken file changes nothing.
     """
     shown = _shown.setdefault(folder, _Shown())
     if shown.reading is None:
-        if now_s - shown.looked_s >= EVERY_S:
-            shown.looked_s = now_s
+        if now_s - shown.searched_s >= EVERY_S:
+            shown.searched_s = now_s
             known = shown.stamp
             shown.reading = _readings.submit(lambda: _read(Path(folder), known))
         return False
@@ -105,9 +105,9 @@ def refresh(folder: str, now_s: float) -> bool:
         return False
     reading, shown.reading = shown.reading, None
     try:
-        read = reading.answer()
+        read = reading.result()
         loaded = _load(read.parts) if read else None
-    except Exception:  # whatever the file holds: the job goes on without its picture
+    except Exception:  # whatever the file contains: the job continues without its image
         _logger.info("no picture of %s", folder, exc_info=True)
         return False
     if read is None or loaded is None:
@@ -119,19 +119,19 @@ def refresh(folder: str, now_s: float) -> bool:
 
 
 def forget(folder: str) -> None:
-    """Let go of the picture of a job that has ended."""
+    """Remove the image of a job that has ended."""
     shown = _shown.pop(folder, None)
     if shown is not None:
         _drop(shown.names)
 
 
 def start() -> None:
-    """Make ready what the first picture would have to wait for."""
+    """Start the thread that reads images, ahead of the first one."""
     _readings.start()
 
 
 def stop() -> None:
-    """Let go of everything; Blender complains about collections left behind."""
+    """Remove everything; Blender warns about collections left behind."""
     global _pictures
     _shown.clear()
     _readings.stop()
@@ -141,17 +141,17 @@ def stop() -> None:
 
 
 def _read(folder: Path, known: Stamp | None) -> _Read | None:
-    """Return the newest picture, cut in two where it is wide; None where there is nothing new.
+    """Return the newest image, cut in two if it is wide; None if there is no new one.
 
     Raises
     ------
     Exception
-        The file cannot be read, or holds no picture; NumPy raises many kinds.
+        The file cannot be read or contains no image; NumPy raises many types.
     """
     stamp = newest_picture(folder)
     if stamp is None or stamp == known or stamp[2] > MAX_BYTES:
         return None
-    data = Path(stamp[0]).read_bytes()  # whole: what is replaced meanwhile is not mapped
+    data = Path(stamp[0]).read_bytes()  # not mapped: the file may be replaced meanwhile
     pixels = np.load(io.BytesIO(data), allow_pickle=False)
     if not isinstance(pixels, np.ndarray):
         raise ValueError(f"{stamp[0]} holds several arrays")
@@ -166,17 +166,17 @@ def _read(folder: Path, known: Stamp | None) -> _Read | None:
 
 
 def _load(parts: tuple[np.ndarray, ...]) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Make pictures of (h, w, 4) values; return names and icons."""
+    """Create previews from (h, w, 4) values; return names and icons."""
     global _pictures, _count
     if _pictures is None:
         _pictures = bpy.utils.previews.new()
-    _count += 1  # new names each time: Blender keeps what it has drawn of an old one
+    _count += 1  # new names each time: Blender caches what it has drawn under a name
     names = tuple(f"{_count} {part}" for part in ("photo", "rendering")[: len(parts)])
     return names, tuple(map(_new, names, parts))
 
 
 def _new(name: str, pixels: np.ndarray) -> int:
-    """Make a picture of (h, w, 4) float32 values; return its icon."""
+    """Create a preview from (h, w, 4) float32 values; return its icon."""
     picture = _pictures.new(name)
     picture.image_size = pixels.shape[1::-1]
     picture.image_pixels_float.foreach_set(np.ascontiguousarray(pixels).ravel())

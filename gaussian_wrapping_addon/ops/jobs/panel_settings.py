@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From what the panels show to the settings of a job."""
+"""Settings of a job from the properties of the panels."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import bpy
 from ...core.errors import UsageError
 from ...core.settings import Declaration, JobSettings, declarations, preset, with_values
 from ..common import known_jobs
+from ..common.addon import properties_of
 
 
 def settings_of_scene() -> list[Declaration]:
@@ -24,7 +25,7 @@ def settings_of_scene() -> list[Declaration]:
 
 
 def is_shown(declared: Declaration, properties: bpy.types.PropertyGroup) -> bool:
-    """Tell whether a setting's property is shown, given the choices of ``Scene.gwrap``."""
+    """Return whether a setting's property is shown, given the choices of ``Scene.gwrap``."""
     panel = declared.panel
     if panel is None or panel.shown_if is None:
         return panel is not None
@@ -35,9 +36,9 @@ def is_shown(declared: Declaration, properties: bpy.types.PropertyGroup) -> bool
 def chosen_values(
     properties: bpy.types.PropertyGroup, settings: Iterable[Declaration]
 ) -> dict[str, Any]:
-    """Return the values, by path, that properties hold for settings.
+    """Return the values of settings, by path, from their properties.
 
-    A number that is left to the preset is not among them.
+    Numbers left to the preset are omitted.
 
     Parameters
     ----------
@@ -55,29 +56,30 @@ def chosen_values(
 
 
 def _stored(declared: Declaration, properties: bpy.types.PropertyGroup) -> Any:
-    owner = properties.training if declared.property_owner == "training" else properties
+    owner: Any = properties
+    owner = owner.training if declared.property_owner == "training" else owner
     return getattr(owner, declared.property_name)
 
 
 def job_settings(scene: bpy.types.Scene, threads: int) -> JobSettings:
-    """Return the settings that the panels of a scene ask for: the preset, then the choices.
+    """Return the job settings of a scene's panels: the preset, then the choices.
 
-    The meshing is not among them: a job that trains meshes with the settings' defaults.
+    Meshing settings are omitted: a job that trains uses their defaults.
 
     Raises
     ------
     UsageError
-        The splat to start from is not there.
+        The splat to start from does not exist.
     """
     settings = [declared for declared in settings_of_scene() if declared.group != "meshing"]
-    values = chosen_values(scene.gwrap, settings)
+    values = chosen_values(properties_of(scene), settings)
     values["start_splat"] = _splat(values["start_splat"])
     chosen = preset(values.pop("preset"), threads=threads)
     return with_values(chosen, values)
 
 
 def meshing_choices(scene: bpy.types.Scene, world_per_blender: float) -> dict[str, Any]:
-    """Return the meshing settings, by path, that the panels of a scene ask for.
+    """Return the meshing settings, by path, of a scene's panels.
 
     Parameters
     ----------
@@ -85,7 +87,7 @@ def meshing_choices(scene: bpy.types.Scene, world_per_blender: float) -> dict[st
         World units of the input per unit of length in Blender.
     """
     settings = [declared for declared in settings_of_scene() if declared.group == "meshing"]
-    values = chosen_values(scene.gwrap, settings)
+    values = chosen_values(properties_of(scene), settings)
     if values["meshing.edge_length"]:
         values["meshing.edge_length"] *= world_per_blender
     return values
@@ -101,25 +103,25 @@ def method_choices(scene: bpy.types.Scene) -> dict[str, Any]:
         for declared in settings_of_scene()
         if declared.option is not None and declared.scope == "method"
     ]
-    values = chosen_values(scene.gwrap, settings)
+    values = chosen_values(properties_of(scene), settings)
     return {path.rpartition(".")[2]: value for path, value in values.items()}
 
 
 def texture_choices(scene: bpy.types.Scene) -> dict[str, Any]:
-    """Return the texture settings, by path, that the panels of a scene ask for."""
+    """Return the texture settings, by path, of a scene's panels."""
     settings = [declared for declared in settings_of_scene() if declared.group == "texture"]
-    return chosen_values(scene.gwrap, settings)
+    return chosen_values(properties_of(scene), settings)
 
 
 def _splat(stored: str) -> str:
     if not stored:
         return ""
     path = Path(bpy.path.abspath(stored))
-    # A path in the open file may come from elsewhere: no name of a server is looked up.
+    # A path in the open file may come from elsewhere: no server name is resolved.
     if known_jobs.is_remote(path):
-        raise UsageError(f"{path} lies on another machine.", "Copy the splat to this one.")
+        raise UsageError(f"{path} is on another computer.", "Copy the splat to this one.")
     if path.suffix.lower() != ".ply":
-        raise UsageError(f"{path.name} is no PLY file.", "Choose a splat saved as PLY, or none.")
+        raise UsageError(f"{path.name} is not a PLY file.", "Choose a splat saved as PLY, or none.")
     if not path.is_file():
         raise UsageError(
             f"The splat {path} does not exist.",
@@ -129,7 +131,7 @@ def _splat(stored: str) -> str:
 
 
 def preset_lines(name: str) -> tuple[str, ...]:
-    """Return what the preset of a scene takes where a number is 0."""
+    """Return lines on the preset's values, which apply where a number is 0."""
     training = preset(name.lower()).training
     return (
         f"0 takes {name.capitalize()}'s: {training.iterations:,},",
@@ -139,7 +141,7 @@ def preset_lines(name: str) -> tuple[str, ...]:
 
 def choices_key(scene: bpy.types.Scene) -> tuple[object, ...]:
     """Return what an estimate of time and memory depends on; reads no file, for panels."""
-    properties = scene.gwrap
+    properties = properties_of(scene)
     own = (properties.source, properties.preset, properties.texture_size)
     training = [d for d in settings_of_scene() if d.property_owner == "training"]
     return (*own, *(_stored(declared, properties) for declared in training))

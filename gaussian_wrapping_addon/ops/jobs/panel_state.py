@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where a scene stands, and which button is the next step; reads no file, for panels and polls."""
+"""Stage of a scene and the button of the next step; reads no file, for panels and polls."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Final
 import bpy
 
 from ..common import tags
+from ..common.addon import properties_of
 from . import watched_jobs
 
 
 class Stage(enum.Enum):
-    """What a person sees first in the tab."""
+    """Stage of a scene's work, as the tab shows it."""
 
     NO_DATA = "no data"
     BAD_DATA = "the check found errors"
@@ -43,9 +44,9 @@ PRIMARY: Final = {
 
 
 def stage_of(context: bpy.types.Context) -> Stage:
-    """Return where the scene stands."""
+    """Return the stage of the scene."""
     scene = context.scene
-    properties = scene.gwrap
+    properties = properties_of(scene)
     frame = tags.current_frame(scene, context.view_layer.objects.active)
     if properties.job_folder:
         status = watched_jobs.status_of(properties.job_folder)
@@ -74,11 +75,11 @@ def primary_of(context: bpy.types.Context) -> str:
 
 
 def is_checked(scene: bpy.types.Scene) -> bool:
-    """Tell whether the findings kept are about the input that is chosen."""
-    properties = scene.gwrap
+    """Return whether the stored findings are those of the chosen input."""
+    properties = properties_of(scene)
     return bool(properties.source) and properties.checked_source == properties.source
 
 
 def has_errors(scene: bpy.types.Scene) -> bool:
-    """Tell whether the check found what keeps the input from being loaded."""
-    return is_checked(scene) and any(f.severity == "error" for f in scene.gwrap.findings)
+    """Return whether the check found errors that prevent loading the input."""
+    return is_checked(scene) and any(f.severity == "error" for f in properties_of(scene).findings)

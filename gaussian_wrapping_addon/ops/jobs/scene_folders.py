@@ -11,6 +11,7 @@ from ...core.errors import UsageError, WrapError
 from ...core.jobs.store.job_file import read_job
 from ...core.jobs.store.job_folder import JobFolder
 from ..common import tags
+from ..common.addon import properties_of
 
 
 def source_of(scene: bpy.types.Scene) -> Path:
@@ -21,9 +22,9 @@ def source_of(scene: bpy.types.Scene) -> Path:
     UsageError
         None is chosen.
     """
-    if not scene.gwrap.source:
+    if not properties_of(scene).source:
         raise UsageError("No photo folder is chosen.", "Choose one in Dataset.")
-    return Path(bpy.path.abspath(scene.gwrap.source)).resolve()
+    return Path(bpy.path.abspath(properties_of(scene).source)).resolve()
 
 
 def output_of(scene: bpy.types.Scene, source: Path) -> Path:
@@ -34,7 +35,7 @@ def output_of(scene: bpy.types.Scene, source: Path) -> Path:
     UsageError
         It lies inside the photo folder, which is never written to.
     """
-    text = "" if _is_of_other_photos(scene, source) else scene.gwrap.output
+    text = "" if _is_of_other_photos(scene, source) else properties_of(scene).output
     if source.suffix.lower() == ".ply":
         base = source.with_suffix("")  # a splat: other files in its folder are not its input
     else:
@@ -53,11 +54,11 @@ def output_of(scene: bpy.types.Scene, source: Path) -> Path:
 
 
 def _is_of_other_photos(scene: bpy.types.Scene, source: Path) -> bool:
-    """Tell whether the output is that of this scene's last job, which had another source.
+    """Return whether the output is that of this scene's last job with another source.
 
-    Typing over the photos' path must not wrap other photos over a finished job.
+    Changing the path of the photos must not overwrite a finished job of other photos.
     """
-    properties = scene.gwrap
+    properties = properties_of(scene)
     if not properties.output or properties.output != properties.job_folder:
         return False
     job = JobFolder(Path(bpy.path.abspath(properties.job_folder)))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The jobs that this Blender watches, by their folder, and what panels ask about them.
+"""Jobs watched by this Blender, by folder, and queries of the panels about them.
 
-Nothing of Blender is kept: undo and file loading invalidate every reference, so that scenes are
-found by their session uid and jobs by their folder. No function here reads a file.
+No Blender objects are kept: undo and file loading invalidate every reference, so scenes are found
+by their session uid and jobs by their folder. No function here reads a file.
 """
 
 from __future__ import annotations
@@ -16,74 +16,75 @@ import bpy
 from ...core.jobs.client import JobClient
 from ...core.jobs.store.job_folder import JobStatus
 from ..common import tags
+from ..common.addon import properties_of
 from ..common.background import Lane, Task
 from ..results.result_files import ResultFiles
 
 
 @dataclass
 class WatchedJob:
-    """One job and what is known of it."""
+    """A watched job and its state."""
 
     client: JobClient
     status: JobStatus
     scene_uid: int
-    """Session uid of the scene that shows the job; 0 where the open file has none."""
+    """Session uid of the scene that shows the job; 0 if none in the open file does."""
     imports: bool
     """Whether its result is still wanted in the scene."""
-    cancel_asked_s: float | None = None
+    cancel_requested_s: float | None = None
     ending: Lane | None = None
-    """Ends the worker by force where it does not stop; there once cancelling was asked for."""
+    """Kills the worker if it does not stop; set once cancelling was requested."""
     command: str = "WRAP"
     waits_for_mode: bool = False
-    """Finished, but Blender is in a mode in which nothing can be imported."""
-    look: Task[JobStatus] | None = None
-    """A look at the job's folder that the disk has not answered yet."""
+    """Finished, but Blender's mode does not allow the import."""
+    status_read: Task[JobStatus] | None = None
+    """Pending read of the job's status from the disk."""
     reading: Task[ResultFiles] | None = None
-    """The result while it is read, and until it can be imported."""
+    """The result while it is read, until it can be imported."""
 
-    def let_go(self) -> None:
-        """End the thread that was to end the worker, where there is one."""
+    def release(self) -> None:
+        """End the thread that kills the worker, if there is one."""
         if self.ending is not None:
             self.ending.stop()
 
 
 jobs: dict[str, WatchedJob] = {}
-"""By :func:`key_of` their folders; the newest job of a scene is its last."""
+"""By :func:`key_of` the folder; the newest job of a scene comes last."""
 
 gone: set[str] = set()
-"""Folders of this machine's jobs that were not there when their file was opened."""
+"""Folders of this machine's jobs that were missing when their file was opened."""
 
 
 def key_of(folder: str) -> str:
-    """Return the name by which the job of a stored folder is known; ``""`` for none."""
+    """Return the key in :data:`jobs` of a stored folder; ``""`` for none."""
     return str(Path(bpy.path.abspath(folder))) if folder else ""
 
 
 def show(scene: bpy.types.Scene, folder: Path, job: WatchedJob) -> None:
-    """Let a scene show a job."""
-    properties = scene.gwrap
+    """Show a job in a scene."""
+    properties = properties_of(scene)
     properties.job_folder = str(folder)
     job.command = properties.job_command
     key = key_of(properties.job_folder)
     gone.discard(key)
     earlier = jobs.pop(key, None)
     if earlier is not None:
-        earlier.let_go()
+        earlier.release()
     jobs[key] = job
 
 
 def detach(scene: bpy.types.Scene) -> None:
-    """Let a scene show no job any more; the job's folder and its result stay."""
+    """Stop showing a job in a scene; the job's folder and result stay."""
     for job in jobs.values():
         if job.scene_uid == scene.session_uid:
             job.scene_uid, job.imports = 0, False
-    scene.gwrap.job_folder = ""
+    properties_of(scene).job_folder = ""
 
 
 def forget_all() -> None:
-    """Watch no job any more; workers go on."""
+    """Stop watching all jobs; workers continue."""
     for job in jobs.values():
-        job.let_go()
+        job.release()
     jobs.clear()
 
 
@@ -94,25 +95,25 @@ def status_of(folder: str) -> JobStatus | None:
 
 
 def is_gone(folder: str) -> bool:
-    """Tell whether a scene's job folder was not to be found."""
+    """Return whether a scene's job folder is missing."""
     return key_of(folder) in gone
 
 
 def is_running(folder: str) -> bool:
-    """Tell whether a job works in this folder, as far as this Blender knows."""
+    """Return whether a watched job is running in this folder."""
     status = status_of(folder)
     return status is not None and status.active
 
 
 def waits_for_object_mode(folder: str) -> bool:
-    """Tell whether a finished job waits for Object Mode to be imported."""
+    """Return whether a finished job waits for Object Mode to be imported."""
     job = jobs.get(key_of(folder))
     return job is not None and job.waits_for_mode
 
 
 def result_to_import(scene: bpy.types.Scene) -> str:
     """Return the result folder of a finished job that the scene does not show, or ``""``."""
-    status = status_of(scene.gwrap.job_folder)
+    status = status_of(properties_of(scene).job_folder)
     if status is None or status.state != "DONE" or not status.result:
         return ""
     wanted = os.path.normpath(status.result)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Estimating and selecting the regions that are to be meshed."""
+"""Estimates and the list of regions to be meshed."""

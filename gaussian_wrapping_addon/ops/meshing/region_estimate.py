@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ask the worker in the background what the meshes of regions will take.
+"""Estimate the meshes of regions (triangles, time, memory) by the worker, in the background.
 
-Regions are asked about one after the other. An answer stays until its region is asked about again;
-:func:`answer_for` tells whether what it was about has changed since.
+Regions are estimated one after the other. An estimate stays until its region is estimated again;
+:func:`estimate_for` returns whether its inputs have changed since.
 """
 
 from __future__ import annotations
@@ -39,27 +39,27 @@ from ..training.training_estimate import Estimate, estimate_of, estimate_of_fail
 MODULE = "jobs.commands.estimate_mesh_command"
 DEADLINE_S = 600.0
 
-# Relative: what float32 matrices of an object that nobody moved may differ by.
+# Relative: difference of the float32 matrices of an object that has not moved.
 _SAME = 1e-5
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What an estimate is about."""
+class EstimateInputs:
+    """Inputs of an estimate."""
 
     relative: np.ndarray
     """(4, 4) matrix of the region in its frame."""
     rest: tuple[object, ...]
 
-    def is_as(self, other: Asked) -> bool:
-        """Tell whether an answer to one is an answer to the other."""
+    def matches(self, other: EstimateInputs) -> bool:
+        """Return whether both give the same estimate."""
         scale = float(np.abs(self.relative[:3]).max())
         same = np.allclose(self.relative, other.relative, rtol=0.0, atol=_SAME * scale)
         return self.rest == other.rest and bool(same)
 
 
 @dataclass(frozen=True)
-class _Question:
+class _Request:
     uid: int
     body: dict[str, Any]
     """The region file's content."""
@@ -68,44 +68,44 @@ class _Question:
 
 
 @dataclass(frozen=True)
-class _Asking:
+class _Running:
     child: Child
     task: Task[Estimate]
 
 
 @dataclass
 class _State:
-    asking: dict[int, _Asking] = field(default_factory=dict)
+    running: dict[int, _Running] = field(default_factory=dict)
     """By the region's session id."""
-    asked: dict[int, Asked] = field(default_factory=dict)
-    answers: dict[int, Estimate] = field(default_factory=dict)
+    inputs: dict[int, EstimateInputs] = field(default_factory=dict)
+    estimates: dict[int, Estimate] = field(default_factory=dict)
 
 
-_questions = Lane(of_file=True)
+_requests = Lane(of_file=True)
 _state = _State()
 
 
 def is_busy() -> bool:
-    """Tell whether answers are awaited."""
-    return _questions.busy
+    """Return whether estimates are running."""
+    return _requests.busy
 
 
 def is_waiting(region: bpy.types.Object) -> bool:
-    """Tell whether a region's answer is awaited."""
-    asking = _state.asking.get(region.session_uid)
-    return asking is not None and asking.task.pending
+    """Return whether a region's estimate is running."""
+    running = _state.running.get(region.session_uid)
+    return running is not None and running.task.pending
 
 
-def answer_for(scene: bpy.types.Scene, region: bpy.types.Object) -> tuple[Estimate | None, bool]:
-    """Return a region's estimate, if there is one, and whether it still holds."""
-    answer = _state.answers.get(region.session_uid)
-    if answer is None:
+def estimate_for(scene: bpy.types.Scene, region: bpy.types.Object) -> tuple[Estimate | None, bool]:
+    """Return a region's estimate, if there is one, and whether it is up to date."""
+    estimate = _state.estimates.get(region.session_uid)
+    if estimate is None:
         return None, False
-    return answer, _state.asked[region.session_uid].is_as(asked_of(scene, region))
+    return estimate, _state.inputs[region.session_uid].matches(inputs_of(scene, region))
 
 
-def asked_of(scene: bpy.types.Scene, region: bpy.types.Object) -> Asked:
-    """Return what an estimate for a region would be about now; cheap, for panels."""
+def inputs_of(scene: bpy.types.Scene, region: bpy.types.Object) -> EstimateInputs:
+    """Return the current inputs of a region's estimate; cheap, for panels."""
     frame = tags.frame_of(region)
     matrix = np.array(region.matrix_world, np.float64)
     scale, folder = 1.0, ""
@@ -120,7 +120,7 @@ def asked_of(scene: bpy.types.Scene, region: bpy.types.Object) -> Asked:
     if length:
         choices["points"] = 0
     shape = region_watch.shape_key(region)
-    return Asked(matrix, (folder, *choices.values(), *shape))
+    return EstimateInputs(matrix, (folder, *choices.values(), *shape))
 
 
 def start(
@@ -133,33 +133,33 @@ def start(
     folder : Path
         The job folder of the finished training.
     python : str
-        As the preferences say.
+        From the preferences.
 
     Raises
     ------
     WrapError
-        A region, its resolution or the interpreter cannot be used; nothing is asked then.
+        A region, its resolution or the interpreter cannot be used; no estimate is started.
     """
     interpreter = worker_python(python)
-    questions = [_question(scene, region, folder, interpreter) for region in regions]
-    stop_asking()
+    requests = [_request(scene, region, folder, interpreter) for region in regions]
+    cancel_estimates()
     for region in regions:
-        _state.asked[region.session_uid] = asked_of(scene, region)
-        _state.answers.pop(region.session_uid, None)
-    for question in questions:
+        _state.inputs[region.session_uid] = inputs_of(scene, region)
+        _state.estimates.pop(region.session_uid, None)
+    for request in requests:
         child = Child()
-        task = _questions.submit(
-            partial(_ask, child, question),
-            partial(_keep, question.uid),
-            failed=partial(_keep_failure, question.uid),
+        task = _requests.submit(
+            partial(_run, child, request),
+            partial(_keep, request.uid),
+            failed=partial(_keep_failure, request.uid),
             end=child.end,
         )
-        _state.asking[question.uid] = _Asking(child, task)
+        _state.running[request.uid] = _Running(child, task)
 
 
-def _question(
+def _request(
     scene: bpy.types.Scene, region: bpy.types.Object, folder: Path, python: str
-) -> _Question:
+) -> _Request:
     frame = tags.frame_of(region)
     assert frame is not None  # whoever starts has found the job folder by it
     length = checked_edge_length(scene, region) * world_per_blender(frame)
@@ -168,22 +168,22 @@ def _question(
         values["points"] = 0
     meshing = MeshingSettings(**values)
     request = {"out": str(folder), "meshing": to_json(meshing), "threads": 0}
-    return _Question(region.session_uid, region_body(region), request, python)
+    return _Request(region.session_uid, region_body(region), request, python)
 
 
-def _ask(child: Child, question: _Question) -> Estimate:
-    """Ask one question; runs in a thread."""
+def _run(child: Child, request: _Request) -> Estimate:
+    """Run one estimate; in a thread."""
     with tempfile.TemporaryDirectory(prefix="gwrap-") as folder:
         path = os.path.join(folder, "region.json")
-        write_json(Path(path), question.body)
-        request = json.dumps({**question.request, "region": path}, allow_nan=False)
-        command = child_command(MODULE, request, python=question.python)
-        return estimate_of(*child.ask(command, DEADLINE_S))
+        write_json(Path(path), request.body)
+        text = json.dumps({**request.request, "region": path}, allow_nan=False)
+        command = child_command(MODULE, text, python=request.python)
+        return estimate_of(*child.run(command, DEADLINE_S))
 
 
-def _keep(uid: int, answer: Estimate) -> None:
-    _state.answers[uid] = answer
-    _state.asking.pop(uid, None)
+def _keep(uid: int, estimate: Estimate) -> None:
+    _state.estimates[uid] = estimate
+    _state.running.pop(uid, None)
     redraw()
 
 
@@ -191,14 +191,14 @@ def _keep_failure(uid: int, error: Exception) -> None:
     _keep(uid, estimate_of_failure(error))
 
 
-def stop_asking() -> None:
-    """End what is being asked; answers stay."""
-    _questions.cancel()
-    _state.asking.clear()
+def cancel_estimates() -> None:
+    """Cancel running estimates; finished ones stay."""
+    _requests.cancel()
+    _state.running.clear()
 
 
 def stop() -> None:
-    """Forget all questions and answers."""
-    stop_asking()
-    _state.asked.clear()
-    _state.answers.clear()
+    """Cancel and forget all estimates."""
+    cancel_estimates()
+    _state.inputs.clear()
+    _state.estimates.clear()

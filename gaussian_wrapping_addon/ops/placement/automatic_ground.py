@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Up and ground of a result as it stands in Blender: cameras, meshes, regions as plain arrays."""
+"""Automatic up direction and ground plane of a result in Blender."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from ...core.dataset.frames.placement import Plane
 from ...core.errors import UsageError
 from ..cameras.camera_objects import cameras_under
 from ..common import tags
+from ..common.mesh_data import mesh_of, values_of
 from ..regions.region_objects import hull_in_blender, matrix_of, transformed
 
 _FLIP_YZ = np.array([1.0, -1.0, -1.0])
 
 
 def camera_poses(frame: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
-    """Return the photo cameras of a result in Blender's world.
+    """Return the poses of a result's photo cameras in Blender's world.
 
     Returns
     -------
@@ -36,15 +37,15 @@ def camera_poses(frame: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
 
 
 def automatic_plane(frame: bpy.types.Object) -> tuple[Plane, str]:
-    """Find the ground of a result, and tell how.
+    """Find the ground of a result; return the plane and the rule used.
 
-    Up comes from the cameras. The ground is the main level plane of the meshes; where none is
-    clear, it goes through their lowest point; without meshes, through the regions' lowest corner.
+    Up comes from the cameras. The ground is the main level plane of the meshes; if none is
+    clear, it passes through their lowest point; without meshes, through the regions' lowest corner.
 
     Raises
     ------
     UsageError
-        The cameras do not tell which way is up, or nothing tells where the ground is.
+        The cameras do not determine up, or nothing determines the ground.
     """
     up, rule = camera_up(*camera_poses(frame))
     meshes = [c for c in frame.children if tags.kind_of(c) == "mesh" and c.type == "MESH"]
@@ -73,11 +74,9 @@ def automatic_plane(frame: bpy.types.Object) -> tuple[Plane, str]:
 
 def _triangles(thing: bpy.types.Object) -> np.ndarray:
     """Return the (f, 3, 3) corners of an object's triangles in Blender's world."""
-    mesh = thing.data
+    mesh = mesh_of(thing)
     mesh.calc_loop_triangles()
-    corners = np.empty(3 * len(mesh.loop_triangles), np.int32)
-    mesh.loop_triangles.foreach_get("vertices", corners)
-    vertices = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", vertices)
+    corners = values_of(mesh.loop_triangles, "vertices", 3, np.int32)
+    vertices = values_of(mesh.vertices, "co", 3, np.float32)
     placed = transformed(matrix_of(thing), vertices.reshape(-1, 3).astype(np.float64))
     return placed[corners].reshape(-1, 3, 3)

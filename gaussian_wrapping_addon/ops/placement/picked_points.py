@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Points that a person picks on a result: selected vertices in Edit Mode, or selected empties."""
+"""Points picked on a result: selected vertices in Edit Mode, or selected empties."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from ...core.errors import UsageError
 from ..common import tags
+from ..common.mesh_data import mesh_of
 from ..regions.region_objects import matrix_of, scene_from_blender, transformed
 
 # Size of a new point's cross, in scene units: a hundredth of the cameras' reach.
@@ -25,10 +26,10 @@ def point_empties(context: bpy.types.Context) -> list[bpy.types.Object]:
 
 
 def picked_points(context: bpy.types.Context, frame: bpy.types.Object) -> np.ndarray:
-    """Return what is picked on the result of ``frame``.
+    """Return the points picked on the result of ``frame``.
 
-    In Edit Mode the selected vertices of its meshes, else the selected empties; one that belongs
-    to nothing becomes a child of the frame where it stands, so that it moves along.
+    In Edit Mode the selected vertices of its meshes, else the selected empties; one without
+    a parent becomes a child of the frame in place, so that it moves along.
 
     Returns
     -------
@@ -57,7 +58,7 @@ def picked_points(context: bpy.types.Context, frame: bpy.types.Object) -> np.nda
 
 
 def _selected_vertices(thing: bpy.types.Object, frame: bpy.types.Object) -> np.ndarray:
-    vertices = [v.co[:] for v in bmesh.from_edit_mesh(thing.data).verts if v.select]
+    vertices = [v.co[:] for v in bmesh.from_edit_mesh(mesh_of(thing)).verts if v.select]
     if vertices and tags.frame_of(thing) != frame:
         raise UsageError(
             f"{thing.name} is not part of the result under {frame.name}.",
@@ -76,7 +77,7 @@ def _adopt(thing: bpy.types.Object, frame: bpy.types.Object) -> None:
 
 
 def add_point(context: bpy.types.Context, frame: bpy.types.Object) -> bpy.types.Object:
-    """Put a point under the frame at the 3D cursor, and select it beside other points."""
+    """Add a point under the frame at the 3D cursor; it and other points stay selected."""
     cursor = np.array(context.scene.cursor.location, np.float64)
     keep = point_empties(context)
     for thing in context.selected_objects:

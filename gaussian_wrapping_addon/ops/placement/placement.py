@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The transform of a result's parent empty: read, set, kept in double beside the result."""
+"""The transform of a result's parent empty: read, set, saved in double beside the result."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _written: dict[Path, tuple[str, str]] = {}
 
 
 def placement_of(frame: bpy.types.Object) -> Similarity:
-    """Return ``blender_from_scene``: in double where it was set so, else as Blender holds it.
+    """Return ``blender_from_scene``: in double if it was set so, else Blender's matrix.
 
     Raises
     ------
@@ -48,13 +48,13 @@ def placement_of(frame: bpy.types.Object) -> Similarity:
 
 
 def scale_of(frame: bpy.types.Object) -> float:
-    """Return the scale of a frame, whatever else was done to it; 1 where it has no size."""
+    """Return the scale of a frame of any transform; 1 if it is degenerate."""
     volume = abs(float(np.linalg.det(matrix_of(frame)[:3, :3])))
     return float(np.cbrt(volume)) if np.isfinite(volume) and volume > 0.0 else 1.0
 
 
 def place(frame: bpy.types.Object, placement: Similarity) -> str:
-    """Make ``placement`` the transform of a frame, and keep it beside the result.
+    """Set the transform of a frame to ``placement``, and save it beside the result.
 
     Nothing but the empty is moved; clipping and frustum size of the photo cameras follow its
     scale, since Blender does not let them.
@@ -62,12 +62,12 @@ def place(frame: bpy.types.Object, placement: Similarity) -> str:
     Returns
     -------
     note : str
-        Why the placement could not be kept beside the result; ``""`` where it was.
+        Why the placement could not be saved beside the result; ``""`` if it was.
 
     Raises
     ------
     UsageError
-        The scale is out of reach, or something else holds the empty in place.
+        The scale is out of range, or something else holds the empty in place.
     """
     check_scale(placement)
     before = frame.matrix_basis.copy()
@@ -86,7 +86,7 @@ def place(frame: bpy.types.Object, placement: Similarity) -> str:
 
 
 def restore(frame: bpy.types.Object, placement: Similarity) -> None:
-    """Give a new frame the placement that was kept beside its result."""
+    """Apply the placement saved beside its result to a new frame."""
     _set_matrix(frame, placement)
     frame[tags.PLACEMENT] = json.dumps(placement.to_json())
 
@@ -115,7 +115,7 @@ def _agrees(matrix: np.ndarray, placement: Similarity) -> bool:
 
 def _keep(frame: bpy.types.Object, placement: Similarity) -> str:
     """Write the placement beside the result; the folder is one that a .blend names."""
-    lost = "The placement is kept in this .blend file alone"
+    lost = "The placement is saved in this .blend file only"
     try:
         folder = tags.result_folder(frame).resolve()
         world_from_scene = tags.world_from_scene(frame)
@@ -124,7 +124,7 @@ def _keep(frame: bpy.types.Object, placement: Similarity) -> str:
     if not known_jobs.is_trusted(folder.parent):
         return f"{lost}: import the result from {folder} to keep it there too."
     if not (folder / "scene.json").is_file():
-        return f"{lost}: {folder} is not there."
+        return f"{lost}: {folder} does not exist."
     path = folder / FILE_NAME
     try:
         write_placement(path, placement, world_from_scene)

@@ -17,7 +17,7 @@ from ...core.dataset.frames.placement import (
 from ...core.dataset.similarity import Similarity
 from ...core.errors import UsageError, WrapError
 from ..common import tags
-from ..common.error_reporting import NeedsResult, ReportsErrors
+from ..common.error_reporting import NeedsResult, OperatorResult, ReportsErrors
 from .automatic_ground import automatic_plane, camera_poses
 from .picked_points import add_point, picked_points, release
 from .placement import place, placement_of
@@ -29,31 +29,31 @@ _TARGETS: Final = (
 
 
 class _Tool(NeedsResult, ReportsErrors):
-    """Mixin: a tool that works in Object Mode and on the vertices of a mesh in Edit Mode."""
+    """Mixin: a tool for Object Mode, and for vertices of a mesh in Edit Mode."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the tool can run; Blender calls this."""
+        """Return whether the tool can run; Blender calls this."""
         if context.mode not in ("OBJECT", "EDIT_MESH"):
-            cls.poll_message_set("Leave the current mode first")  # type: ignore[attr-defined]
+            cls.poll_message_set("Leave the current mode first")
             return False
         return super().poll(context)
 
     def frame(self, context: bpy.types.Context) -> bpy.types.Object:
-        """Return the parent empty that the tool is about."""
+        """Return the parent empty that the tool transforms."""
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
         if frame is None:
-            raise UsageError("The scene holds no result.", "Wrap the scene or import a result.")
+            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
         return frame
 
     def apply(
         self, context: bpy.types.Context, frame: bpy.types.Object, step: Similarity, done: str
-    ) -> set[str]:
-        """Place the frame one step further."""
+    ) -> OperatorResult:
+        """Apply a step to the placement of the frame."""
         placement = step.after(placement_of(frame))
         release(context)
         note = place(frame, placement)
-        self.report({"WARNING"} if note else {"INFO"}, f"{done}. {note}".strip())  # type: ignore[attr-defined]
+        self.report({"WARNING"} if note else {"INFO"}, f"{done}. {note}".strip())
         return {"FINISHED"}
 
 
@@ -73,7 +73,7 @@ class GWRAP_OT_add_point(_Tool, bpy.types.Operator):
             return False
         return super().poll(context)
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         add_point(context, self.frame(context))
         return {"FINISHED"}
 
@@ -98,7 +98,7 @@ class GWRAP_OT_set_scale(_Tool, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         try:
             points = picked_points(context, self.frame(context))
             scale_step(points, 1.0)
@@ -109,7 +109,7 @@ class GWRAP_OT_set_scale(_Tool, bpy.types.Operator):
             self.distance = float(np.linalg.norm(points[1] - points[0]))
         return context.window_manager.invoke_props_dialog(self)
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = self.frame(context)
         step = scale_step(picked_points(context, frame), self.distance)
         return self.apply(context, frame, step, f"Scaled by {step.scale:.6g}")
@@ -128,7 +128,7 @@ class GWRAP_OT_set_ground(_Tool, bpy.types.Operator):
         name="Flip", description="The other side of the plane is up", options={"SKIP_SAVE"}
     )
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = self.frame(context)
         plane = plane_through(picked_points(context, frame), camera_poses(frame)[1])
         if self.flip:
@@ -145,7 +145,7 @@ class GWRAP_OT_auto_ground(_Tool, bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = self.frame(context)
         release(context)  # edits of a mesh reach its data when Edit Mode ends
         plane, how = automatic_plane(frame)
@@ -155,12 +155,12 @@ class GWRAP_OT_auto_ground(_Tool, bpy.types.Operator):
 class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
     bl_idname = "gwrap.set_origin"
     bl_label = "Set Origin"
-    bl_description = "Move the result so that this place lies at the world's origin"
+    bl_description = "Move the result so that this point becomes the world origin"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     target: EnumProperty(name="Target", items=_TARGETS, default="POINTS")  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = self.frame(context)
         if self.target == "CURSOR":
             point = np.array(context.scene.cursor.location, np.float64)
@@ -169,29 +169,29 @@ class GWRAP_OT_set_origin(_Tool, bpy.types.Operator):
             if len(points) == 0:
                 raise UsageError("No point is picked.", "Select a vertex or a point.")
             point = points.mean(0)
-        return self.apply(context, frame, origin_step(point), "The place is the origin")
+        return self.apply(context, frame, origin_step(point), "The point is the origin")
 
 
 class GWRAP_OT_keep_placement(_Tool, bpy.types.Operator):
     bl_idname = "gwrap.keep_placement"
     bl_label = "Keep Placement"
     bl_description = (
-        "Keep beside the result how its parent was moved, turned and scaled by hand, so that "
-        "another import places it so"
+        "Save the location, rotation and scale of the result's parent beside the result, so that "
+        "later imports place it the same way"
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def work(self, context: bpy.types.Context) -> set[str]:
-        return self.apply(context, self.frame(context), Similarity(), "The placement is kept")
+    def work(self, context: bpy.types.Context) -> OperatorResult:
+        return self.apply(context, self.frame(context), Similarity(), "The placement is saved")
 
 
 class GWRAP_OT_reset_placement(_Tool, bpy.types.Operator):
     bl_idname = "gwrap.reset_placement"
     bl_label = "Reset Placement"
-    bl_description = "Place the result as it was trained, without scale, ground and origin"
+    bl_description = "Undo scale, ground and origin: place the result as trained"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = self.frame(context)
         release(context)
         note = place(frame, Similarity())

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Regions as Blender objects: create, edit, import, export, follow their changes."""
+"""Regions as Blender objects: create, edit, import, export, track their changes."""

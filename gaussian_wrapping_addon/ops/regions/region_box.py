@@ -11,14 +11,14 @@ from ..common import tags
 from .region_objects import matrix_of
 
 LEAST_HALF = 1e-3
-"""Half the side that a cage can be made, scene units; boxes that are smaller stay as they are."""
+"""Least half side of a dragged cage, scene units; smaller boxes are left as they are."""
 LEAST_TOUCH = 0.25
 """Share of a side's distance from the middle at which the mouse may seem to be when it is touched;
 below it, the side follows the mouse at the mouse's own pace."""
 
 
 def is_editable_box(thing: bpy.types.Object | None) -> bool:
-    """Tell whether a cage can edit an object: a box whose transform is its own."""
+    """Return whether a cage can edit an object: a box with an unconstrained transform."""
     return (
         thing is not None
         and tags.kind_of(thing) == "region"
@@ -30,13 +30,13 @@ def is_editable_box(thing: bpy.types.Object | None) -> bool:
         and not any((*thing.lock_location, *thing.lock_scale))
         and (thing.parent is None or thing.parent_type == "OBJECT")
         and _parent_matrix(thing) is not None
-        and all(abs(value) > 0.0 for value in thing.scale)
+        and all(abs(value) > 0.0 for value in thing.scale[:])
     )
 
 
 def _parent_matrix(thing: bpy.types.Object) -> np.ndarray | None:
     """Return the (4, 4) matrix from the object's parent space to Blender's world, or None."""
-    matrix = np.eye(4)
+    matrix: np.ndarray = np.eye(4)
     if thing.parent is not None:
         matrix = matrix_of(thing.parent) @ np.array(thing.matrix_parent_inverse, np.float64)
     good = np.isfinite(matrix).all() and abs(np.linalg.det(matrix[:3, :3])) > 0.0
@@ -136,12 +136,12 @@ def steadied(cage: np.ndarray, first: np.ndarray, before: np.ndarray) -> np.ndar
 
 
 def is_moved_only(cage: np.ndarray, before: np.ndarray) -> bool:
-    """Tell whether a cage has kept its size."""
+    """Return whether a cage has kept its size."""
     return bool(np.allclose(cage.diagonal(), before.diagonal(), rtol=1e-6))
 
 
 def as_columns(matrix: np.ndarray) -> list[float]:
-    """Return the 16 numbers of a matrix as gizmos want them."""
+    """Return the 16 numbers of a matrix in the order of gizmos."""
     return [float(value) for value in matrix.T.ravel()]
 
 
@@ -151,5 +151,5 @@ def from_columns(values: object) -> np.ndarray:
 
 
 def same_place(a: Matrix, b: Matrix) -> bool:
-    """Tell whether two matrices are the same but for rounding."""
+    """Return whether two matrices are equal up to rounding."""
     return bool(np.allclose(np.array(a), np.array(b), rtol=1e-6, atol=1e-9))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The convex hull of any mesh in bounded time: what cannot be a corner is left out first."""
+"""Convex hull of any mesh in bounded time: points that cannot be corners are dropped first."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from ...core.errors import UsageError
 
-# Points with which a hull is made in about a second.
+# Points whose hull takes about a second.
 MOST_CANDIDATES = 40_000
 # After the first round: of more, too many would be left after the second one too.
 MOST_HIDDEN = 10 * MOST_CANDIDATES
-# Hulls of fewer points are made at once.
+# Hulls of fewer points are computed directly.
 FEW = 4_000
 # Directions, one number a round, whose furthest points span the solid that hides the others.
 ROUNDS = (64, 400)

@@ -17,6 +17,7 @@ from ...core.regions.box import CUBE_CORNERS, CUBE_TRIANGLES, box_matrix
 from ...core.regions.region_file import region_to_json
 from ...core.regions.volume import check_volume
 from ..common import tags
+from ..common.mesh_data import values_of
 from .region_hull import convex_hull
 
 # Share of the hull's volume by which that of a convex mesh may be off (float32 coordinates).
@@ -24,7 +25,7 @@ CONVEX_TOLERANCE = 1e-3
 
 
 def matrix_of(thing: bpy.types.Object) -> np.ndarray:
-    """Return the (4, 4) float64 world matrix of an object as it stands now, hidden or not."""
+    """Return the current (4, 4) float64 world matrix of an object, hidden or not."""
     evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
     if evaluated.is_evaluated:
         return np.array(evaluated.matrix_world, np.float64)
@@ -46,7 +47,7 @@ def scene_from_blender(frame: bpy.types.Object | None) -> np.ndarray:
     Raises
     ------
     UsageError
-        The frame was scaled to nothing.
+        The scale of the frame is zero.
     """
     if frame is None:
         return np.eye(4)
@@ -55,7 +56,7 @@ def scene_from_blender(frame: bpy.types.Object | None) -> np.ndarray:
     except np.linalg.LinAlgError:
         inverse = np.full((4, 4), np.nan)
     if not np.isfinite(inverse).all():
-        raise UsageError(f"{frame.name} has no size.", "Clear its scale (Alt S).")
+        raise UsageError(f"{frame.name} has zero scale.", "Clear its scale (Alt S).")
     return inverse
 
 
@@ -75,7 +76,7 @@ def hull_in_blender(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int
     Raises
     ------
     UsageError, MeshingError
-        The object is of another kind, or encloses no volume.
+        The object is of another type, or encloses no volume.
     """
     local, triangles = local_hull(thing)
     vertices = transformed(matrix_of(thing), local)
@@ -110,23 +111,20 @@ def _mesh_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int
             "Enable it, or apply its modifiers.",
         )
     mesh = evaluated.to_mesh()
-    points = np.zeros(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", points)
+    points = values_of(mesh.vertices, "co", 3, np.float32)
     evaluated.to_mesh_clear()
     return convex_hull(points.reshape(-1, 3).astype(np.float64), thing.name)
 
 
 def is_convex(thing: bpy.types.Object) -> bool:
-    """Tell whether a mesh, with its modifiers, is its own convex hull: closed, without dents."""
+    """Return whether a mesh, with its modifiers, is closed and convex."""
     hull, triangles = _mesh_hull(thing)
     center = hull.mean(0)
     evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
     mesh = evaluated.to_mesh()
     mesh.calc_loop_triangles()
-    vertices = np.zeros(3 * len(mesh.vertices), np.float32)
-    corners = np.zeros(3 * len(mesh.loop_triangles), np.int32)
-    mesh.vertices.foreach_get("co", vertices)
-    mesh.loop_triangles.foreach_get("vertices", corners)
+    vertices = values_of(mesh.vertices, "co", 3, np.float32)
+    corners = values_of(mesh.loop_triangles, "vertices", 3, np.int32)
     evaluated.to_mesh_clear()
     own = vertices.reshape(-1, 3).astype(np.float64)[corners.reshape(-1, 3)] - center  # (m, 3, 3)
     volume = abs(float(np.linalg.det(own).sum()))
@@ -139,7 +137,7 @@ def region_from_object(thing: bpy.types.Object) -> np.ndarray:
     """Return the (n, 3) float64 hull vertices of a region object in the world of the input.
 
     The way is Blender -> scene frame (the parent empty's matrix) -> world (its
-    ``world_from_scene``); an object without a result's parent is taken to be in the world.
+    ``world_from_scene``); an object outside a result is taken to be in world coordinates.
 
     Raises
     ------
@@ -159,7 +157,7 @@ def _region_in_world(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[in
 
 
 def region_body(thing: bpy.types.Object, name: str = "") -> dict[str, Any]:
-    """Return the bounding-volume JSON of a region object, named as the object unless told.
+    """Return the bounding-volume JSON of a region object, named as the object by default.
 
     Raises
     ------
@@ -185,7 +183,7 @@ def create_region(
     frame: bpy.types.Object | None,
     collection: bpy.types.Collection,
 ) -> bpy.types.Object:
-    """Make a region object of (n, 3) vertices in the scene frame (of ``frame``).
+    """Create a region object from (n, 3) vertices in the scene frame (of ``frame``).
 
     A box becomes an Empty cube, which can be moved, turned and scaled; any other solid becomes
     a mesh of its convex hull.
@@ -237,7 +235,7 @@ def box_around(things: list[bpy.types.Object], frame: bpy.types.Object | None) -
         if thing.type in ("MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD")
     ]
     if not corners:
-        raise UsageError("Nothing with an extent is selected.", "Select a mesh object.")
+        raise UsageError("The selected objects have no extent.", "Select a mesh object.")
     points = transformed(scene_from_blender(frame), np.concatenate(corners))
     low, high = points.min(0), points.max(0)
     # A flat object still gets a box that encloses a volume.

@@ -3,7 +3,7 @@
 
 import itertools
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import bpy
 import numpy as np
@@ -14,7 +14,7 @@ from ...core.names import file_stem
 from ...core.regions.box import CUBE_CORNERS
 from ...core.regions.region_file import read_region_file
 from ..common import tags
-from ..common.error_reporting import NeedsObjectMode, ReportsErrors
+from ..common.error_reporting import NeedsObjectMode, OperatorResult, ReportsErrors
 from .region_objects import (
     box_around,
     create_region,
@@ -31,7 +31,7 @@ _CURSOR_BOX_HALF = 0.5
 _AROUND: Final = (
     ("CURSOR", "At 3D Cursor", "A cube at the 3D cursor"),
     ("SELECTED", "Around Selected", "The box around the selected objects"),
-    ("RESULT", "Around Result", "A copy of the region that the first mesh was made of"),
+    ("RESULT", "Around Result", "A copy of the region of the first mesh"),
 )
 
 
@@ -42,13 +42,18 @@ def _select_only(context: bpy.types.Context, thing: bpy.types.Object) -> None:
     context.view_layer.objects.active = thing
 
 
+def _active(context: bpy.types.Context) -> bpy.types.Object:
+    """Return the active object, where ``poll`` has found one."""
+    return cast(bpy.types.Object, context.view_layer.objects.active)
+
+
 def _target(context: bpy.types.Context) -> tuple[bpy.types.Object | None, bpy.types.Collection]:
     """Return the frame and the collection for a new region."""
     frame = tags.current_frame(context.scene, context.view_layer.objects.active)
     if frame is None:
         return None, context.scene.collection
-    # Linked and overridden ones take no new objects; what is left out of the view layer cannot
-    # be selected.
+    # Linked and overridden collections accept no new objects; objects excluded from the view layer
+    # cannot be selected.
     shown = _shown_collections(context.view_layer.layer_collection)
     places = [
         c
@@ -64,7 +69,7 @@ def _shown_collections(layer: bpy.types.LayerCollection) -> list[bpy.types.Colle
 
 
 def _free_name(frame: bpy.types.Object | None) -> str:
-    """Return a name for a new box under which no mesh was made: meshing would replace it."""
+    """Return a name for a new box that has no mesh yet: meshing would replace that mesh."""
     children = frame.children if frame is not None else ()
     made = {str(t.get(tags.REGION, "")) for t in children}
     numbers = itertools.count(2)
@@ -77,12 +82,12 @@ def _free_name(frame: bpy.types.Object | None) -> str:
 class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
     bl_idname = "gwrap.add_region_box"
     bl_label = "Add Region Box"
-    bl_description = "Add a box that can be moved, turned and scaled; what it encloses is meshed"
+    bl_description = "Add a box to move, rotate and scale; the space inside it is meshed"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     around: EnumProperty(name="Around", items=_AROUND, default="CURSOR")  # type: ignore[valid-type]
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame, collection = _target(context)
         if self.around == "SELECTED":
             things = [t for t in context.selected_objects if tags.kind_of(t) != "region"]
@@ -100,7 +105,7 @@ class GWRAP_OT_add_region_box(NeedsObjectMode, bpy.types.Operator):
 
     def _result_box(self, context: bpy.types.Context, frame: bpy.types.Object | None) -> np.ndarray:
         if frame is None:
-            raise UsageError("The scene holds no result.", "Wrap the scene or import a result.")
+            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
         regions = [
             t
             for t in tags.objects_of_kind(context.scene, "region")
@@ -121,11 +126,11 @@ class GWRAP_OT_select_region(NeedsObjectMode, bpy.types.Operator):
     name: StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
     extend: bpy.props.BoolProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         self.extend = event.shift
         return self.execute(context)
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         thing = context.view_layer.objects.get(self.name)
         if thing is None:
             raise UsageError(f"Region {self.name} is not in this view layer.", "Enable it.")
@@ -154,15 +159,15 @@ class GWRAP_OT_export_region(ReportsErrors, bpy.types.Operator):
             return False
         return True
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        name = file_stem(context.view_layer.objects.active.name, 0)
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
+        name = file_stem(_active(context).name, 0)
         self.filepath = str(Path(self.filepath).parent / f"{name}.json")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         path = Path(bpy.path.abspath(self.filepath))
-        export_region(context.view_layer.objects.active, path)
+        export_region(_active(context), path)
         self.report({"INFO"}, f"Wrote {path}")
         return {"FINISHED"}
 
@@ -176,11 +181,11 @@ class GWRAP_OT_import_region(NeedsObjectMode, bpy.types.Operator):
     filepath: StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
     filter_glob: StringProperty(default="*.json", options={"HIDDEN"})  # type: ignore[valid-type]
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         path = Path(bpy.path.abspath(self.filepath))
         vertices = read_region_file(path).vertices
         frame, collection = _target(context)
@@ -206,15 +211,15 @@ class GWRAP_OT_use_as_region(NeedsObjectMode, bpy.types.Operator):
             return False
         return super().poll(context)
 
-    def work(self, context: bpy.types.Context) -> set[str]:
-        active = context.view_layer.objects.active
+    def work(self, context: bpy.types.Context) -> OperatorResult:
+        active = _active(context)
         frame, _ = _target(context)
         if not active.is_editable:
             raise UsageError(
                 f"{active.name} is linked from a library.",
                 "Make it local (Object > Relations > Make Local).",
             )
-        hull_in_blender(active)  # refuses what encloses no volume
+        hull_in_blender(active)  # raises if it encloses no volume
         if not is_convex(active):
             text = f"{active.name} is not convex: its convex hull is the region"
             self.report({"WARNING"}, text)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which regions a scene has, and when their shape has changed, without looking at all each time.
+"""Cache of a scene's regions and their shapes, updated by handlers.
 
-Drawing asks many times a second. Names and numbers are kept, never objects.
+Drawing queries it many times a second. It stores names and numbers, never objects.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from ..common import tags
 @dataclass
 class _Known:
     names: dict[int, tuple[int, tuple[str, ...]]] = field(default_factory=dict)
-    """By the scene's session id: how many objects it had, and the names of its regions."""
+    """By the scene's session id: number of its objects and names of its regions."""
     versions: dict[int, int] = field(default_factory=dict)
-    """By the object's session id: how many times its geometry has changed."""
+    """By the object's session id: number of changes of its geometry."""
 
 
 _known = _Known()
 
 
-@persistent  # type: ignore[untyped-decorator]
+@persistent
 def after_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Handler: something in a scene has changed."""
     if depsgraph is None:
@@ -44,14 +44,14 @@ def after_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None 
             _known.versions[uid] = _known.versions.get(uid, 0) + 1
 
 
-@persistent  # type: ignore[untyped-decorator]
+@persistent
 def after_load(*_arguments: object) -> None:
     """Handler: another file, or an undo; session ids may mean other objects."""
     forget()
 
 
 def forget() -> None:
-    """Know nothing."""
+    """Clear the cache."""
     _known.names.clear()
     _known.versions.clear()
 
@@ -68,7 +68,7 @@ def region_names(scene: bpy.types.Scene) -> tuple[str, ...]:
 
 
 def shape_key(thing: bpy.types.Object) -> tuple[object, ...]:
-    """Return what the shape of a region depends on, in its own coordinates."""
+    """Return a key of a region's shape in its own coordinates."""
     if thing.type == "EMPTY":
         return ("EMPTY", thing.empty_display_type, thing.empty_display_size)
     return (thing.type, thing.session_uid, _known.versions.get(thing.session_uid, 0))

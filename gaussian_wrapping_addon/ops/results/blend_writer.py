@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -18,7 +19,7 @@ from .scene_objects import import_result
 def write_blend(result_folder: Path, path: Path) -> None:
     """Write a .blend file of a result; images stay beside it, with relative paths.
 
-    The file that is open in this Blender is closed without saving, so that this is for
+    The file that is open in this Blender is closed without saving, so this is for
     background Blender only.
 
     Raises
@@ -26,7 +27,7 @@ def write_blend(result_folder: Path, path: Path) -> None:
     UsageError
         Blender has a window, or the file cannot be written.
     DatasetError, ParseError
-        The folder does not hold a sound result.
+        The folder contains no valid result.
     """
     path = path.resolve()
     start_empty("Writing a .blend file of a result")
@@ -42,7 +43,8 @@ def write_blend(result_folder: Path, path: Path) -> None:
     for screen in bpy.data.screens:
         for area in screen.areas:
             if area.type == "VIEW_3D":
-                area.spaces.active.shading.color_type = "TEXTURE"
+                view: Any = area.spaces.active
+                view.shading.color_type = "TEXTURE"
     for image in bpy.data.images:
         if image.source == "FILE":
             image.filepath = _relative(Path(image.filepath), path.parent)
@@ -74,18 +76,18 @@ def export_usd(result_folder: Path) -> list[Path]:
         "export_textures": False,  # before Blender 4.4
         "export_textures_mode": "KEEP",  # since
     }
-    known = bpy.ops.wm.usd_export.get_rna_type().properties.keys()
+    usd_export: Any = bpy.ops.wm.usd_export
+    known = usd_export.get_rna_type().properties.keys()
     paths = []
     bpy.context.view_layer.update()  # new objects cannot be selected before
     for mesh in imported.meshes:
         for slot in mesh.material_slots:
-            fold_specular(slot.material)
+            if slot.material is not None:
+                fold_specular(slot.material)
         for thing in bpy.context.view_layer.objects:
             thing.select_set(thing == mesh)
         path = result_folder.resolve() / mesh[tags.REGION] / "mesh.usdc"
-        bpy.ops.wm.usd_export(
-            filepath=str(path), **{k: v for k, v in options.items() if k in known}
-        )
+        usd_export(filepath=str(path), **{k: v for k, v in options.items() if k in known})
         if not path.is_file():
             raise ResourceError(f"{path} cannot be written.", "Check the folder's permissions.")
         paths.append(path)
@@ -93,14 +95,14 @@ def export_usd(result_folder: Path) -> list[Path]:
 
 
 def start_empty(purpose: str) -> None:
-    """Close the open file without saving and begin an empty one; refuse where a person works."""
+    """Close the open file without saving and begin an empty one; refuse if Blender has a window."""
     if not bpy.app.background:
         raise UsageError(f"{purpose} would close the open file.", "Do it in background Blender.")
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """Return Blender's way to write a path relative to the file in ``folder``."""
+    """Return a path in Blender's notation relative to a file in ``folder``."""
     try:
         return "//" + os.path.relpath(path, folder).replace("\\", "/")
     except ValueError:  # another Windows drive

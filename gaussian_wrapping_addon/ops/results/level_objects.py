@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The levels of detail of a region: a collection of its own, in which only the finest is shown."""
+"""Levels of detail of a region, in a collection of their own; only the finest is shown."""
 
 from __future__ import annotations
 
 import bpy
 
 from ..common import tags
-from ..common.mesh_data import build_mesh
+from ..common.mesh_data import build_mesh, mesh_of
 from .materials import create_materials
 from .result_files import RegionResult
 
@@ -17,7 +17,7 @@ def update_levels(
     levels: list[bpy.types.Object],
     collection: bpy.types.Collection,
 ) -> tuple[bpy.types.Object, ...]:
-    """Bring the coarser levels of a region up to date.
+    """Update the coarser levels of a region.
 
     Levels are replaced when the region's mesh has changed: they are made from it. The region's own
     object is level 0; it moves into the levels' collection, unless the user has put it elsewhere.
@@ -28,14 +28,14 @@ def update_levels(
     mesh : Object
         The region's mesh object, up to date; its parent is that of the levels.
     levels : list of Object
-        All of the result's; those that are not of this region are left alone.
+        All levels of the result; those of other regions are left alone.
     collection : Collection
-        The result's, below which that of the levels stands.
+        The result's collection, parent of that of the levels.
     """
     old = [t for t in levels if t.get(tags.REGION) == region.name]
     if old and all(c.get(tags.STAMP) == region.stamp for c in old):
         return tuple(old)
-    # A user's own collection of them, where there is one, keeps them.
+    # If the user has put them into another collection, they stay there.
     folder = old[0].users_collection[0] if old and old[0].users_collection else None
     for thing in old:
         _remove(thing)
@@ -69,8 +69,8 @@ def update_levels(
 
 
 def _remove(thing: bpy.types.Object) -> None:
-    """Delete a level with its mesh and material, where nothing else uses them."""
-    data = thing.data
+    """Delete a level with its mesh and material, unless something else uses them."""
+    data = mesh_of(thing)
     materials = [m for m in data.materials if m is not None]
     bpy.data.objects.remove(thing)
     if data.users == 0:

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The material of a result: the photo texture, lit or unlit, glTF-safe both ways."""
+"""Material of a result: the photo texture, lit or unlit, both exportable to glTF."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -18,7 +19,7 @@ _IMAGE, _LIT, _UNLIT, _OUTPUT = "Photo Texture", "Lit", "Unlit", "Output"
 
 
 def load_texture(path: Path, colorspace: str = "sRGB") -> bpy.types.Image:
-    """Load an image by path (not packed), or reload it where it is loaded already.
+    """Load an image by path (not packed), or reload it if already loaded.
 
     Normal maps are no colours: their ``colorspace`` is ``"Non-Color"``.
     """
@@ -29,21 +30,23 @@ def load_texture(path: Path, colorspace: str = "sRGB") -> bpy.types.Image:
         image.pack()
     elif image.users:
         image.reload()
-    image.colorspace_settings.name = colorspace
+    settings: Any = image.colorspace_settings
+    settings.name = colorspace
     return image
 
 
 def create_material(
     name: str, image: bpy.types.Image, normal_map: bpy.types.Image | None = None
 ) -> bpy.types.Material:
-    """Make a material with both branches, linked as lit; the lit one takes the normal map.
+    """Create a material with both branches, linked as lit; the lit one takes the normal map.
 
-    Unlit is the pattern that the glTF exporter writes as ``KHR_materials_unlit``.
+    Unlit is the node pattern that the glTF exporter writes as ``KHR_materials_unlit``.
     """
     material = bpy.data.materials.new(name)
     if material.node_tree is None:  # Blender 4 makes materials without nodes
         material.use_nodes = True
-    nodes, links = material.node_tree.nodes, material.node_tree.links
+    tree: Any = material.node_tree
+    nodes, links = tree.nodes, tree.links
     nodes.clear()
     texture = nodes.new("ShaderNodeTexImage")
     texture.name, texture.image, texture.location = _IMAGE, image, (-600, 200)
@@ -76,7 +79,7 @@ def create_material(
 def create_materials(
     name: str, albedo: Sequence[Path], normal_map: Sequence[Path]
 ) -> list[bpy.types.Material]:
-    """Make a material for each atlas: ``name``, then ``name 2`` and on.
+    """Create a material for each atlas: ``name``, then ``name 2`` and on.
 
     Parameters
     ----------
@@ -91,16 +94,16 @@ def create_materials(
 
 
 def load_normal_maps(paths: Sequence[Path], count: int) -> list[bpy.types.Image | None]:
-    """Load the normal maps of ``count`` atlases; each None where there are none."""
+    """Load the normal maps of ``count`` atlases; each None if there are none."""
     return [load_texture(path, "Non-Color") for path in paths] or [None] * count
 
 
 def set_normal_map(material: bpy.types.Material, image: bpy.types.Image | None) -> bool:
-    """Give the lit branch a normal map, or take it away; False where it is none of our materials.
+    """Set or remove the normal map of the lit branch; False if the material is not ours.
 
     The image goes through a Normal Map node, without which glTF exporters drop it.
     """
-    tree = material.node_tree
+    tree: Any = material.node_tree
     if tree is None or _LIT not in tree.nodes:
         return False
     nodes, links = tree.nodes, tree.links
@@ -125,7 +128,7 @@ def set_normal_map(material: bpy.types.Material, image: bpy.types.Image | None) 
 
 
 def set_shading(material: bpy.types.Material, shading: str) -> bool:
-    """Link the lit or the unlit branch; False where the material is not one of ours."""
+    """Link the lit or the unlit branch; False if the material is not ours."""
     tree = material.node_tree
     if tree is None or not {_LIT, _UNLIT, _OUTPUT} <= set(tree.nodes.keys()):
         return False
@@ -135,7 +138,7 @@ def set_shading(material: bpy.types.Material, shading: str) -> bool:
 
 
 def shading_of(material: bpy.types.Material | None) -> str | None:
-    """Return ``"LIT"`` or ``"UNLIT"``, None where the material is not one of ours."""
+    """Return ``"LIT"`` or ``"UNLIT"``, None if the material is not ours."""
     tree = material.node_tree if material is not None else None
     if tree is None or not {_LIT, _UNLIT, _OUTPUT} <= set(tree.nodes.keys()):
         return None
@@ -144,11 +147,11 @@ def shading_of(material: bpy.types.Material | None) -> str | None:
 
 
 def show_as_emission(material: bpy.types.Material) -> None:
-    """Turn one of our materials into a black Principled one that glows in the texture's colours.
+    """Turn one of our materials into a black Principled BSDF that emits the texture's colours.
 
-    For formats without unlit materials: what is left of ``Unlit`` there, without the texture lost.
+    For formats without unlit materials: an approximation of ``Unlit`` that keeps the texture.
     """
-    tree = material.node_tree
+    tree: Any = material.node_tree
     lit, texture = tree.nodes[_LIT], tree.nodes[_IMAGE]
     set_normal_map(material, None)
     for link in list(lit.inputs["Base Color"].links):
@@ -161,12 +164,13 @@ def show_as_emission(material: bpy.types.Material) -> None:
 
 
 def fold_specular(material: bpy.types.Material) -> None:
-    """Say the reflectance of the lit branch by its index of refraction alone, as USD does.
+    """Describe the reflectance of the lit branch by its index of refraction alone, as USD does.
 
-    Blender's reader of USD takes the level for 0.5, which leaves the reflectance
-    ((ior - 1) / (ior + 1))^2 as it is; twice the level is a factor of it.
+    Blender's USD importer assumes a level of 0.5, which leaves the reflectance
+    ((ior - 1) / (ior + 1))^2 unchanged; twice the level is a factor of it.
     """
-    inputs = material.node_tree.nodes[_LIT].inputs
+    tree: Any = material.node_tree
+    inputs = tree.nodes[_LIT].inputs
     level, index = inputs["Specular IOR Level"], inputs["IOR"]
     root = (
         abs(index.default_value - 1.0)
@@ -178,10 +182,15 @@ def fold_specular(material: bpy.types.Material) -> None:
 
 def texture_of(material: bpy.types.Material | None) -> bpy.types.Image | None:
     """Return the photo texture of one of our materials, else None."""
-    if shading_of(material) is None:
+    tree: Any = material.node_tree if material is not None else None
+    if tree is None or shading_of(material) is None:
         return None
-    node = material.node_tree.nodes.get(_IMAGE)
+    node = tree.nodes.get(_IMAGE)
     return None if node is None else node.image
+
+
+def _nodes_of(material: Any) -> Any:
+    return material.node_tree.nodes
 
 
 def images_of(frame: bpy.types.Object | None) -> list[bpy.types.Image]:
@@ -192,7 +201,7 @@ def images_of(frame: bpy.types.Object | None) -> list[bpy.types.Image]:
         if tags.kind_of(child) in ("mesh", "lod")
         for slot in child.material_slots
         if shading_of(slot.material) is not None
-        for node in slot.material.node_tree.nodes
+        for node in _nodes_of(slot.material)
         if node.bl_idname == "ShaderNodeTexImage" and node.image is not None
     ]
     return list(dict.fromkeys(found))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the panel shows of a job's report: picked once at import, then kept in the .blend file.
+"""Figures of a job's report in the panel: selected at import, then stored in the .blend file.
 
-The figures lie as JSON text on the result's parent empty, so that drawing reads no file, and a
-.blend still tells them where the result folder is gone.
+The figures are stored as JSON text on the result's parent empty, so that drawing reads no file and
+a .blend still shows them if the result folder is gone.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from ...core.evaluation.report.text import (
 
 MAX_WARNINGS = 50
 MAX_TEXT = 400
-"""Characters of one warning or name that are kept."""
+"""Characters stored of one warning or name."""
 MAX_ROWS = 100
-"""Stages and regions that are kept."""
+"""Stages and regions stored at most."""
 
 _DECISIONS = {
     "harmonics": "Reflections",
@@ -56,20 +56,20 @@ class RegionRows:
 
 @dataclass(frozen=True)
 class ReportData:
-    """What the panel shows, ready to draw."""
+    """Rows of the panel, ready to draw."""
 
     rows: tuple[Row, ...] = ()
     stages: tuple[Row, ...] = ()
     decisions: tuple[Row, ...] = ()
-    """What the scene needed, or what somebody decided instead."""
+    """Model selection: decided from the photos, or by the user."""
     regions: tuple[RegionRows, ...] = ()
     warnings: tuple[str, ...] = ()
     known: bool = False
-    """Whether there is a report at all."""
+    """Whether there is a report."""
 
     @property
     def training(self) -> str:
-        """What was trained, for a heading: ``"12,235 Gaussians, 23.0 dB"``, or ``""``."""
+        """Summary of the training, for a heading: ``"12,235 Gaussians, 23.0 dB"``, or ``""``."""
         rows = dict(self.rows)
         gaussians, quality = rows.get("Gaussians"), rows.get("Held-Out PSNR")
         parts = [f"{gaussians} Gaussians"] if gaussians and gaussians != NOT_MEASURED else []
@@ -88,7 +88,7 @@ class ReportData:
 
 
 def figures_of_report(report: Any) -> dict[str, Any]:
-    """Pick the figures that the panel shows; what a report lacks is left out.
+    """Select the figures that the panel shows; those missing from the report are omitted.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def _measured(**values: Any) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=16)
 def report_of(text: str) -> ReportData:
-    """Return what the panel shows of the figures kept in a .blend, however they were edited.
+    """Parse the figures stored in a .blend for the panel; any text is accepted.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def _report_data(figures: dict[str, Any]) -> ReportData:
 
 
 def _decision(name: str, chosen: str, setting: str) -> Row:
-    """Return what was decided, in the panel's words; who decided where it was not the photos."""
+    """Return label and choice of a decision, and whether the user made it."""
     value = chosen.capitalize()[:MAX_TEXT]
     return _DECISIONS.get(name, name), value if setting == "auto" else f"{value} (set by you)"
 
@@ -215,7 +215,7 @@ def _region_rows(region: dict[str, Any]) -> tuple[Row, ...]:
     return (
         ("Faces", number(region.get("faces"))),
         ("Closed", ("Yes" if closed else no) if isinstance(closed, bool) else NOT_MEASURED),
-        ("Texture Seen", percent(region.get("coverage"))),
+        ("Texture Coverage", percent(region.get("coverage"))),
         ("Textured Mesh PSNR", number(region.get("mesh_psnr"), "dB", digits=1)),
     )
 

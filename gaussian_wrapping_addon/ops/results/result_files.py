@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Read a result folder into plain arrays, with every bound checked before Blender sees them."""
+"""Read a result folder into plain arrays, validated before they reach Blender."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class LevelResult:
     normal_map: tuple[Path, ...]
     """The same, or empty."""
     face_atlas: np.ndarray | None = None
-    """(f,) uint8 atlas of each face; None where there is one."""
+    """(f,) uint8 atlas of each face; None if there is one."""
 
 
 @dataclass(frozen=True)
@@ -67,14 +67,14 @@ class RegionResult:
     normal_map: tuple[Path, ...] = ()
     """One for each atlas, or empty."""
     face_atlas: np.ndarray | None = None
-    """(f,) uint8 atlas of each face; None where there is one."""
+    """(f,) uint8 atlas of each face; None if there is one."""
     levels: tuple[LevelResult, ...] = ()
     """Levels of detail 1, 2, ..."""
 
 
 @dataclass(frozen=True)
 class ResultFiles:
-    """All that Blender shows of a job."""
+    """Contents of a result folder that Blender shows."""
 
     folder: Path
     cameras: tuple[tuple[Camera, str], ...]
@@ -87,7 +87,7 @@ class ResultFiles:
     figures: dict[str, Any] = field(default_factory=dict)
     """The figures of the report that the panel shows; empty without a report."""
     placement: Similarity | None = None
-    """``blender_from_scene`` where the scene was placed before."""
+    """``blender_from_scene`` if the scene was placed before."""
 
 
 def read_result(folder: Path) -> ResultFiles:
@@ -96,9 +96,9 @@ def read_result(folder: Path) -> ResultFiles:
     Raises
     ------
     DatasetError
-        The folder is no result folder, or holds no region.
+        The folder is not a result folder, or contains no region.
     ParseError
-        A file in it is not what it should be; names file and place.
+        A file is invalid; names file and position.
     """
     folder = folder.resolve()
     scene_path = folder / "scene.json"
@@ -147,10 +147,13 @@ def _scene(path: Path) -> tuple[tuple[tuple[Camera, str], ...], Similarity, floa
             photo = str(entry.pop("photo"))
             cameras.append((Camera.from_json(entry), photo))
         numbers = np.concatenate(
-            [world_from_scene.matrix().ravel(), [radius]]
-            + [
-                np.array([*c.cam_from_world.ravel(), c.fx, c.fy, c.cx, c.cy, c.width, c.height])
-                for c, _ in cameras
+            [
+                world_from_scene.matrix().ravel(),
+                np.array([radius]),
+                *(
+                    np.array([*c.cam_from_world.ravel(), c.fx, c.fy, c.cx, c.cy, c.width, c.height])
+                    for c, _ in cameras
+                ),
             ]
         )
         if not np.isfinite(numbers).all():
@@ -174,12 +177,13 @@ def _region(folder: Path) -> RegionResult:
     albedo, normal_map = _textures(folder, face_atlas)
     box = read_region_file(region_path).vertices
     stamp = f"{state.st_size}:{state.st_mtime_ns}"
-    levels = []
+    levels: list[LevelResult] = []
     while (level := folder / f"lod{len(levels) + 1}" / "mesh.npz").is_file():
         if len(levels) == MAX_LODS:
             raise DatasetError(f"{folder} holds too many levels.", "Mesh the region again.")
-        *arrays, owner = _mesh(level)
-        levels.append(LevelResult(*arrays, *_textures(level.parent, owner), owner))
+        arrays = _mesh(level)
+        textures = _textures(level.parent, arrays[3])
+        levels.append(LevelResult(*arrays[:3], *textures, arrays[3]))
     return RegionResult(
         folder.name, vertices, faces, corner_uvs, albedo, box, stamp, normal_map, face_atlas,
         tuple(levels),
@@ -194,7 +198,7 @@ def _textures(
         tuple(folder / atlas_file(name, number) for number in atlases)
         for name in ("albedo", "normal")
     )
-    # A normal map is there whole or not at all.
+    # Normal maps exist for all atlases or for none.
     for path in (*albedo, *(normal_map if normal_map[0].is_file() else ())):
         if not path.is_file():
             raise DatasetError(f"{folder} holds no {path.name}.", "Mesh the region again.")
@@ -226,7 +230,7 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | 
     if len(faces) == 0:
         raise ParseError(path, "faces", "there is none.", hint)
     for name, values in (("vertices", vertices), ("corner_uvs", corner_uvs)):
-        # Blender holds floats of 32 bits: what is beyond them would become infinite there.
+        # Blender stores 32-bit floats: larger values would become infinite.
         bad = np.flatnonzero(~(np.abs(values) <= SINGLE_MAX).reshape(len(values), -1).all(1))
         if len(bad):
             raise ParseError(path, f"{name}[{bad[0]}]", "not a finite number of 32 bits.", hint)

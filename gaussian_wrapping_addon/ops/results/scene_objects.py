@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Turn a result folder into Blender objects, or bring these up to date."""
+"""Create or update the Blender objects of a result folder."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import bpy
 from ...core.errors import UsageError
 from ..cameras.camera_objects import create_camera, scale_display
 from ..common import tags
-from ..common.mesh_data import build_mesh
+from ..common.mesh_data import build_mesh, mesh_of
 from ..placement.placement import restore, scale_of
 from ..regions.region_objects import create_region
 from .level_objects import update_levels
@@ -39,7 +39,7 @@ _CAMERA_SIZE_SHARE = 0.03
 
 @dataclass(frozen=True)
 class ImportedResult:
-    """The objects of one result, new and found again."""
+    """The objects of one result, new and existing."""
 
     collection: bpy.types.Collection
     frame: bpy.types.Object
@@ -52,7 +52,7 @@ class ImportedResult:
 def import_result(
     folder: Path, scene: bpy.types.Scene, files: ResultFiles | None = None
 ) -> ImportedResult:
-    """Build, or bring up to date, the objects of a result folder.
+    """Create or update the objects of a result folder.
 
     A result that was placed before (``placement.json``) is placed so again. One that was imported
     before is found again by its folder; then meshes whose file has changed get the new geometry,
@@ -66,14 +66,14 @@ def import_result(
     scene : Scene
         Where new objects are linked.
     files : ResultFiles, optional
-        The content of the folder where it has been read already.
+        The content of the folder if it has been read already.
 
     Raises
     ------
     DatasetError, ParseError
-        The folder does not hold a sound result; nothing has been changed then.
+        The folder contains no valid result; nothing has been changed.
     UsageError
-        A mesh that has changed is in Edit Mode in another scene; nothing has been changed then.
+        A mesh that has changed is in Edit Mode in another scene; nothing has been changed.
     """
     files = files or read_result(folder)
     frame = _find_frame(files, scene)
@@ -95,10 +95,10 @@ def import_result(
         meshes.append(_update_mesh(region, children, frame, collection))
         regions.append(_update_region(region, files, children, frame, collection))
     for thing in (*meshes, *regions):
-        if not thing.users_collection:  # a person has deleted the collection, not what was in it
+        if not thing.users_collection:  # the user has deleted the collection, not its objects
             collection.objects.link(thing)
     cameras = _update_cameras(files, children, frame, collection)
-    # Last: levels that are made anew leave dead entries among the children.
+    # Last: recreated levels leave dead entries among the children.
     for region, mesh in zip(files.regions, meshes, strict=True):
         levels = [c for c in frame.children if tags.kind_of(c) == "lod"]
         update_levels(region, mesh, levels, collection)
@@ -185,7 +185,7 @@ def _update_mesh(
         thing[tags.REGION] = region.name
         collection.objects.link(thing)
     else:
-        old = thing.data
+        old = mesh_of(thing)
         _keep_materials(list(old.materials), mesh, region)
         thing.data = mesh
         if old.users == 0:
@@ -199,25 +199,26 @@ def _update_mesh(
 def _keep_materials(
     old: list[bpy.types.Material | None], mesh: bpy.types.Mesh, region: RegionResult
 ) -> None:
-    """Give new mesh data the materials that the object had, and those of further atlases.
+    """Assign the object's materials to new mesh data, and materials of further atlases.
 
-    Slots of atlases that are no more stay where they hold a material of the user.
+    Slots of atlases that no longer exist stay if they contain a material of the user.
     """
     images = [load_texture(path) for path in region.albedo]
     normals = load_normal_maps(region.normal_map, len(images))
     for number, (image, normal_map) in enumerate(zip(images, normals, strict=True)):
         if number < len(old):
-            mesh.materials.append(old[number])
-            if old[number] is not None:
-                set_normal_map(old[number], normal_map)
+            kept = old[number]
+            mesh.materials.append(kept)
+            if kept is not None:
+                set_normal_map(kept, normal_map)
         else:
             name = f"{region.name} {number + 1}"
             material = create_material(name, image, normal_map)
             set_shading(material, shading_of(old[0] if old else None) or "LIT")
             mesh.materials.append(material)
-    for material in old[len(images) :]:
-        if shading_of(material) is None:
-            mesh.materials.append(material)
+    for further in old[len(images) :]:
+        if shading_of(further) is None:
+            mesh.materials.append(further)
 
 
 def _update_region(
@@ -236,7 +237,7 @@ def _update_region(
 
 
 def cameras_of(collection: bpy.types.Collection) -> bpy.types.Collection | None:
-    """Return the collection of the photo cameras of a result, if it is there."""
+    """Return the collection of the photo cameras of a result, or None."""
     return next((c for c in collection.children if c.name.startswith(CAMERAS_NAME)), None)
 
 
@@ -255,7 +256,7 @@ def _update_cameras(
         if thing is None:
             if folder is None:
                 folder = bpy.data.collections.new(CAMERAS_NAME)
-                folder.hide_viewport = True  # a hundred cameras would hide what was wrapped
+                folder.hide_viewport = True  # a hundred cameras would hide the mesh
                 collection.children.link(folder)
             thing = create_camera(camera, photo, _CAMERA_SIZE_SHARE * files.radius, folder)
             thing.parent = frame

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Estimating a training and continuing a finished one."""
+"""Estimate of a training, and continuation of a finished one."""

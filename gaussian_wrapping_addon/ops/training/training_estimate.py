@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ask the worker in the background what a training will need."""
+"""Estimate time and memory of a training by the worker, in the background."""
 
 from __future__ import annotations
 
@@ -26,52 +26,52 @@ DEADLINE_S = 300.0
 MAX_LINES = 20
 MAX_TEXT = 300
 MAX_KNOWN = 20
-"""Answers kept, so that going back to a preset shows its estimate again."""
+"""Estimates kept, so that switching back to a preset shows its estimate again."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One answer, ready to draw."""
+    """An estimate, ready to draw."""
 
     lines: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    """What stands in the way, or may."""
+    """Warnings, or the reason of a failure."""
 
 
-_questions = Lane(of_file=True)
+_requests = Lane(of_file=True)
 _known: dict[tuple[object, ...], Estimate] = {}
 
 
 def is_busy() -> bool:
-    """Tell whether an answer is awaited."""
-    return _questions.busy
+    """Return whether an estimate is running."""
+    return _requests.busy
 
 
-def answer_for(scene: bpy.types.Scene) -> Estimate | None:
-    """Return the estimate for what a scene's panels ask for now; None where it is not known."""
+def estimate_for(scene: bpy.types.Scene) -> Estimate | None:
+    """Return the estimate for the current settings of a scene's panels, or None."""
     return _known.get(choices_key(scene))
 
 
 def answer_with(scene: bpy.types.Scene, error: WrapError) -> None:
-    """Show in place of an estimate why there is none."""
+    """Show the reason of a failure in place of an estimate."""
     _keep(choices_key(scene), estimate_of_failure(error))
 
 
-def _keep(key: tuple[object, ...], answer: Estimate) -> None:
+def _keep(key: tuple[object, ...], estimate: Estimate) -> None:
     _known.pop(key, None)
-    _known[key] = answer
+    _known[key] = estimate
     while len(_known) > MAX_KNOWN:
         del _known[next(iter(_known))]
 
 
 def forget() -> None:
-    """Forget all answers: the photos may be others under the same names."""
+    """Forget all estimates: photos may have been replaced under the same names."""
     stop()
     _known.clear()
 
 
 def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
-    """Begin an estimate for a scene's photos and choices.
+    """Start an estimate for a scene's photos and settings.
 
     Raises
     ------
@@ -85,65 +85,67 @@ def start(scene: bpy.types.Scene, choice: WorkerChoice) -> None:
     stop()
     key, child = choices_key(scene), Child()
 
-    def keep(answer: Estimate) -> None:
-        _keep(key, answer)
+    def keep(estimate: Estimate) -> None:
+        _keep(key, estimate)
         redraw()
 
-    _questions.submit(
-        lambda: estimate_of(*child.ask(command, DEADLINE_S)),
+    _requests.submit(
+        lambda: estimate_of(*child.run(command, DEADLINE_S)),
         keep,
         failed=lambda error: keep(estimate_of_failure(error)),
         end=child.end,
     )
 
 
-def estimate_of(said: list[dict[str, Any]], last_words: str = "") -> Estimate:
-    """Turn what the child said into lines for the panel.
+def estimate_of(messages: list[dict[str, Any]], last_words: str = "") -> Estimate:
+    """Convert the child's output into lines for the panel.
 
     Parameters
     ----------
-    said : list of dict
+    messages : list of dict
         ``{"line": text}`` for each line and ``{"warning": text}`` for each warning, or
         ``{"error": text, "hint": text}``.
     last_words : str
-        The end of what the child wrote to its terminal, in case it said nothing else.
+        The last line of the child's standard error, reported if there is no other output.
 
     Raises
     ------
     WorkerError
-        It said nothing.
+        There is no output.
     """
-    for values in said:
+    for values in messages:
         if values.get("error"):
             return Estimate((), (str(values["error"]), str(values.get("hint", ""))))
-    told = [values for values in said if values.get("line") or values.get("warning")][:MAX_LINES]
+    told = [values for values in messages if values.get("line") or values.get("warning")][
+        :MAX_LINES
+    ]
     if not told:
         raise WorkerError(
-            f"There is no estimate: {last_words or 'the worker said nothing'}.",
+            f"The estimate failed: {last_words or 'the worker wrote nothing'}.",
             "Check the worker in the add-on's preferences.",
         )
     return Estimate(_texts(told, "line"), _texts(told, "warning"))
 
 
-def _texts(said: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
+def _texts(messages: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
     """Return the texts of one kind, as sentences."""
-    texts = (str(values[kind])[:MAX_TEXT] for values in said if values.get(kind))
+    texts = (str(values[kind])[:MAX_TEXT] for values in messages if values.get(kind))
     return tuple(text[:1].upper() + text[1:] for text in texts)
 
 
 def estimate_of_failure(error: Exception) -> Estimate:
-    """Return what the panel shows where asking has failed."""
+    """Return what the panel shows if the estimate has failed."""
     if isinstance(error, WrapError):
         return Estimate((), (error.message, error.hint))
     return Estimate((), (f"{type(error).__name__}: {error}",))
 
 
 def get_ready() -> None:
-    """Start the threads of the next estimate ahead of it, where a timer begins it."""
-    _questions.start()
+    """Start the threads of the next estimate ahead of a timer that starts it."""
+    _requests.start()
     estimate_child.get_ready()
 
 
 def stop() -> None:
-    """Forget the question and end its process."""
-    _questions.cancel()
+    """Cancel the estimate and end its process."""
+    _requests.cancel()

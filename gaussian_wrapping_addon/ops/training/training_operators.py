@@ -8,9 +8,10 @@ import bpy
 
 from ...core.errors import UsageError
 from ..common import tags
-from ..common.error_reporting import ReportsErrors
+from ..common.addon import properties_of
+from ..common.error_reporting import OperatorResult, ReportsErrors
 from ..jobs import job_actions
-from ..jobs.job_guards import AsksAboutFolder, no_job_runs
+from ..jobs.job_guards import ConfirmsFolder, no_job_runs
 from ..worker import preferred_worker
 from . import training_estimate
 
@@ -22,28 +23,28 @@ def _frame(context: bpy.types.Context) -> bpy.types.Object | None:
 class GWRAP_OT_estimate(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.estimate"
     bl_label = "Estimate"
-    bl_description = "Say how long this training will take, and what memory and disk it needs"
+    bl_description = "Estimate the time, memory and disk space that this training needs"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not context.scene.gwrap.source:
+        if not properties_of(context.scene).source:
             cls.poll_message_set("Choose the folder of the photos first")
             return False
         if training_estimate.is_busy():
-            cls.poll_message_set("The estimate is under way; it takes seconds")
+            cls.poll_message_set("The estimate is running; it takes seconds")
             return False
         return True
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         training_estimate.start(context.scene, preferred_worker.worker_choice(context))
         return {"FINISHED"}
 
 
-class GWRAP_OT_train_more(AsksAboutFolder, bpy.types.Operator):
+class GWRAP_OT_train_more(ConfirmsFolder, bpy.types.Operator):
     bl_idname = "gwrap.train_more"
     bl_label = "Train More"
     bl_description = (
-        "Go on with the finished training for more iterations, then mesh and texture it again"
+        "Continue the finished training for more iterations, then mesh and texture again"
     )
 
     @classmethod
@@ -57,12 +58,12 @@ class GWRAP_OT_train_more(AsksAboutFolder, bpy.types.Operator):
         frame = _frame(context)
         return tags.result_folder(frame).parent if frame and frame.get(tags.RESULT) else None
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         frame = _frame(context)
         if frame is None:
-            raise UsageError("The scene holds no result.", "Wrap the scene or import a result.")
+            raise UsageError("The scene has no result.", "Wrap the scene or import a result.")
         job_actions.start_more(context.scene, frame, preferred_worker.worker_choice(context))
-        count = context.scene.gwrap.training.more_iterations
+        count = properties_of(context.scene).training.more_iterations
         self.report({"INFO"}, f"Training {count:,} iterations more")
         return {"FINISHED"}
 
@@ -70,15 +71,15 @@ class GWRAP_OT_train_more(AsksAboutFolder, bpy.types.Operator):
 class GWRAP_OT_reset_training(bpy.types.Operator):
     bl_idname = "gwrap.reset_training"
     bl_label = "Back to Preset"
-    bl_description = "Leave every choice of this panel to the preset and the photos again"
+    bl_description = "Reset every setting of this panel to that of the preset or to Auto"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's convention
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return no_job_runs(cls, context)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        training = context.scene.gwrap.training
+    def execute(self, context: bpy.types.Context) -> OperatorResult:
+        training = properties_of(context.scene).training
         for name in training.bl_rna.properties.keys():  # noqa: SIM118 - no mapping
             if name != "rna_type":
                 training.property_unset(name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the add-on's preferences say about workers."""
+"""Settings of the worker in the add-on's preferences."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..common.addon import addon_preferences
 
 @dataclass(frozen=True)
 class WorkerChoice:
-    """What the add-on's preferences say about workers. Never read from a .blend file."""
+    """Settings of the worker in the add-on's preferences; never read from a .blend file."""
 
     python: str = ""
     threads: int = 0
@@ -20,7 +20,7 @@ class WorkerChoice:
 
 
 def worker_choice(context: bpy.types.Context) -> WorkerChoice:
-    """Read the add-on's preferences; defaults where it is not enabled as an add-on."""
+    """Read the add-on's preferences; defaults if it is not enabled as an add-on."""
     preferences = addon_preferences(context)
     if preferences is None:
         return WorkerChoice()

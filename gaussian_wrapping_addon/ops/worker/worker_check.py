@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Examine the worker's Python in the background."""
+"""Check the worker's Python in the background."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _findings: list[Diagnosis] = []
 
 
 def findings() -> tuple[Diagnosis, ...]:
-    """Return what the last check has found."""
+    """Return the findings of the last check."""
     return tuple(_findings)
 
 
 def is_busy() -> bool:
-    """Tell whether a check runs."""
+    """Return whether a check is running."""
     return _checks.busy
 
 
@@ -33,7 +33,7 @@ def as_text() -> str:
 
 
 def start(preference: str) -> None:
-    """Begin a check of the interpreter that jobs would use."""
+    """Start a check of the interpreter that jobs would use."""
     stop()
     _findings.clear()
     _checks.submit(lambda: find_and_diagnose(preference), _keep, failed=_keep_failure)
@@ -49,5 +49,5 @@ def _keep_failure(error: Exception) -> None:
 
 
 def stop() -> None:
-    """Forget a check that is under way."""
+    """Cancel a running check."""
     _checks.cancel()

@@ -5,14 +5,14 @@ from typing import Final
 
 import bpy
 
-from ..common.error_reporting import ReportsErrors
+from ..common.error_reporting import OperatorResult, ReportsErrors
 from . import preferred_worker, worker_check
 
 
 class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.check_worker"
     bl_label = "Check Worker"
-    bl_description = "Look whether the worker's Python has what jobs need, in the background"
+    bl_description = "Check in the background that the worker's Python has all that jobs need"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -21,7 +21,7 @@ class GWRAP_OT_check_worker(ReportsErrors, bpy.types.Operator):
             return False
         return True
 
-    def work(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> OperatorResult:
         worker_check.start(preferred_worker.worker_choice(context).python)
         return {"FINISHED"}
 
@@ -38,7 +38,7 @@ class GWRAP_OT_copy_findings(bpy.types.Operator):
             return False
         return True
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> OperatorResult:
         context.window_manager.clipboard = worker_check.as_text()
         return {"FINISHED"}
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The worker's environment as Blender sees it: is it there, what does a set-up do just now.
+"""State of the worker's environment: readiness, search for Pythons, set-up and removal.
 
-Nothing here waits: threads look for Pythons, set up and remove, and one timer looks after them.
-The state outlives the preferences' window.
+Nothing here waits: Pythons are searched, set-ups and removals run in the background
+(``ops/common/background.py``). The state outlives the preferences' window.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,33 +24,36 @@ from ...core.processes.worker_requirements import requirements_file
 from ...core.setup.commands import SetupRequest, cuda_present
 from ...core.setup.install import SetupTask
 from ...core.setup.pythons import FoundPython, find_pythons
+from ..common import background
 from ..common.addon import addon_package
+from ..common.background import Lane
 from ..common.redrawing import redraw
 from . import worker_check
 from .preferred_worker import worker_choice
 
-POLL_S = 0.3
 READY_FOR_S = 2.0
-"""For so long an answer of :func:`worker_ready` is taken as it was."""
+"""Lifetime of a cached result of :func:`worker_problem`."""
 
 
 @dataclass
 class State:
-    """What was found, and what is at work in this session; others only read it."""
+    """Findings and running work of this session; other modules only read it."""
 
     pythons: list[FoundPython] | None = None
-    """None while they are not looked for yet."""
+    """None until the search has ended."""
     has_cuda: bool = False
-    search: threading.Thread | None = None
+    has_searched: bool = False
+    """Whether a search for Pythons has begun."""
     task: SetupTask | None = None
     is_busy: bool = False
-    """Whether the task's end is still to be dealt with."""
+    """Whether the end of the task is still to be handled."""
     problem: str = ""
     ready_key: tuple[str, str] | None = None
     ready_s: float = -1e9
 
 
 state = State()
+_searches, _setups, _endings = Lane(), Lane(), Lane()
 
 
 def environment() -> WorkerEnvironment:
@@ -63,12 +65,12 @@ def environment() -> WorkerEnvironment:
 
 
 def worker_ready() -> bool:
-    """Tell whether jobs have a Python to run in; cheap enough for every redraw."""
+    """Return whether jobs have a Python to run in; cheap enough for every redraw."""
     return not worker_problem()
 
 
 def worker_problem() -> str:
-    """Return why jobs have no Python to run in, and the next step; ``""`` where they have one."""
+    """Return why jobs have no Python to run in, and the next step; ``""`` if they have one."""
     preference = worker_choice(bpy.context).python
     key = (preference, os.environ.get(PYTHON_VARIABLE, ""))
     now_s = time.monotonic()
@@ -82,27 +84,26 @@ def worker_problem() -> str:
     return state.problem
 
 
-def forget_answer() -> None:
-    """Look anew at the next question whether a worker is there."""
+def forget_problem() -> None:
+    """Discard the cached result of :func:`worker_problem`."""
     state.ready_s = -1e9
 
 
-def look_around() -> None:
-    """Look for Pythons once, in a thread; drawing may call this."""
-    if state.search is None:
-        state.search = threading.Thread(target=_search, args=(sys.executable,), daemon=True)
-        state.search.start()
-        _start_timer()
+def search_pythons() -> None:
+    """Search for Pythons once, in the background; drawing may call this."""
+    if not state.has_searched:
+        state.has_searched = True
+        own = sys.executable
+        _searches.submit(lambda: (cuda_present(), find_pythons(own)), _keep_search)
 
 
-def _search(own: str) -> None:
-    """Thread: touches nothing of Blender."""
-    state.has_cuda = cuda_present()
-    state.pythons = find_pythons(own)
+def _keep_search(found: tuple[bool, list[FoundPython]]) -> None:
+    state.has_cuda, state.pythons = found
+    redraw("PREFERENCES", "VIEW_3D")
 
 
 def request_for(python: str, torch: str, wheel_folder: str) -> SetupRequest:
-    """Return what a set-up with these choices is.
+    """Return the request of a set-up with these choices.
 
     Raises
     ------
@@ -114,43 +115,44 @@ def request_for(python: str, torch: str, wheel_folder: str) -> SetupRequest:
 
 
 def start(request: SetupRequest, *, removes: bool = False) -> None:
-    """Begin a set-up or a removal.
+    """Start a set-up or a removal.
 
     Raises
     ------
     UsageError
-        One is at work.
+        One is running.
     """
     if state.task is not None and state.task.status.active:
         raise UsageError("A set-up is running.", "Cancel it or wait for it.")
     state.task, state.is_busy = SetupTask(request, removes=removes), True
-    state.task.start()
-    _start_timer()
+    _setups.submit(state.task.run)
+    _endings.start()  # now: cancelling starts no thread
+    background.watch(tick)
 
 
-def _start_timer() -> None:
-    if not bpy.app.timers.is_registered(tick):
-        bpy.app.timers.register(tick, first_interval=POLL_S, persistent=True)
+def cancel() -> None:
+    """Cancel a set-up; its process is ended in the background."""
+    if state.task is not None and state.task.status.active:
+        state.task.is_cancelling = True
+        _endings.submit(state.task.cancel)
 
 
-def tick() -> float | None:
-    """Timer: redraw, and go on while something is at work."""
+def tick() -> bool:
+    """Redraw, and handle the end of a set-up; return whether one is still running."""
     if state.is_busy and state.task is not None and not state.task.status.active:
         state.is_busy = False
-        forget_answer()
+        forget_problem()
         if state.task.status.state == "DONE" and not state.task.removes:
             with contextlib.suppress(WrapError):
                 worker_check.start(worker_choice(bpy.context).python)
     redraw("PREFERENCES", "VIEW_3D")
-    searching = state.search is not None and state.search.is_alive()
-    return POLL_S if state.is_busy or searching else None
+    return state.is_busy
 
 
 def stop() -> None:
-    """Take the timer out and cancel a set-up."""
-    if bpy.app.timers.is_registered(tick):
-        bpy.app.timers.unregister(tick)
-    if state.task is not None:
-        state.task.cancel()
+    """Cancel a set-up and a search."""
+    cancel()
+    _searches.cancel()
+    state.has_searched = state.pythons is not None
     state.is_busy = False
-    forget_answer()
+    forget_problem()

@@ -10,7 +10,7 @@ from bpy.props import EnumProperty, StringProperty
 from ...core.errors import WrapError
 from ...core.setup.commands import all_commands, as_line
 from ..common.addon import addon_package, addon_preferences
-from ..common.error_reporting import ReportsErrors
+from ..common.error_reporting import OperatorResult, ReportsErrors
 from . import worker_setup
 from .worker_setup import state
 
@@ -42,9 +42,9 @@ def _python_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
 def _torch_items(_self: Any, _context: Any) -> list[tuple[str, str, str]]:
     cuda = ("cuda", "NVIDIA GPU (CUDA)", "Several GiB more; an NVIDIA driver was found")
     _items["torch"] = [
-        ("cpu", "Processor (Default)", "The small build; what jobs use today on every system"),
+        ("cpu", "Processor (Default)", "The small build, which jobs use today on every system"),
         *([cuda] if state.has_cuda else []),
-        ("index", "As in pip's Own Index",
+        ("index", "From pip's Index",
          "For mirrors. On Linux pip's index has the CUDA build, elsewhere the processor's"),
     ]  # fmt: skip
     return _items["torch"]
@@ -67,8 +67,8 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.set_up_worker"
     bl_label = "Set Up Worker"
     bl_description = (
-        "Make a private environment with torch and the other packages that jobs need, in place of "
-        "the one that is there; shows the commands first and changes nothing in Blender"
+        "Create a private environment with torch and the other packages that jobs need, replacing "
+        "an earlier one; shows the commands first and changes nothing in Blender"
     )
 
     python: EnumProperty(  # type: ignore[valid-type]
@@ -89,14 +89,14 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
                 "or choose a Wheel Folder"
             )
         elif state.pythons is None:
-            worker_setup.look_around()
-            reason = "Looking for Pythons"
+            worker_setup.search_pythons()
+            reason = "Searching for Python installations"
         elif not state.pythons:
             reason = "No Python 3.11 or newer was found: install one from python.org"
         cls.poll_message_set(reason)
         return not reason
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_props_dialog(self, width=_DIALOG_PX)
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -115,13 +115,14 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
                 line, _LINE_CHARACTERS, subsequent_indent="      ", break_on_hyphens=False
             ):
                 column.label(text=part, translate=False)
-        copy = layout.row().operator("gwrap.copy_setup_commands", icon="COPYDOWN")
+        copy: Any = layout.row().operator("gwrap.copy_setup_commands", icon="COPYDOWN")
         copy.text = "\n".join(lines)
         size = "About 2 GiB on the disk; several" if self.torch == "cpu" else "Up to 10 GiB; many"
-        layout.label(text=f"{size} minutes. Blender stays free meanwhile", icon="INFO")
+        layout.label(text=f"{size} minutes. Blender stays usable meanwhile", icon="INFO")
 
-    def work(self, context: bpy.types.Context) -> set[str]:
-        python = self.python or state.pythons[0].path
+    def work(self, context: bpy.types.Context) -> OperatorResult:
+        found = state.pythons or []
+        python = self.python or found[0].path
         request = worker_setup.request_for(python, self.torch or "cpu", wheel_folder(context))
         worker_setup.start(request)
         return {"FINISHED"}
@@ -130,11 +131,11 @@ class GWRAP_OT_set_up_worker(ReportsErrors, bpy.types.Operator):
 class GWRAP_OT_copy_setup_commands(bpy.types.Operator):
     bl_idname = "gwrap.copy_setup_commands"
     bl_label = "Copy Commands"
-    bl_description = "Copy the commands, to run them by hand or to ask somebody about them"
+    bl_description = "Copy the commands, to run them by hand or to ask for help"
 
     text: StringProperty(options={"SKIP_SAVE"})  # type: ignore[valid-type]
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def execute(self, context: bpy.types.Context) -> OperatorResult:
         context.window_manager.clipboard = self.text
         return {"FINISHED"}
 
@@ -142,7 +143,7 @@ class GWRAP_OT_copy_setup_commands(bpy.types.Operator):
 class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
     bl_idname = "gwrap.remove_worker"
     bl_label = "Remove"
-    bl_description = "Delete the worker's environment, which this add-on has made, and nothing else"
+    bl_description = "Delete the worker's environment that this add-on has made, and nothing else"
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -151,10 +152,10 @@ class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
         cls.poll_message_set(reason)
         return not reason
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> OperatorResult:
         return context.window_manager.invoke_confirm(self, event)
 
-    def work(self, _context: bpy.types.Context) -> set[str]:
+    def work(self, _context: bpy.types.Context) -> OperatorResult:
         worker_setup.start(worker_setup.request_for("", "cpu", ""), removes=True)
         return {"FINISHED"}
 
@@ -162,14 +163,18 @@ class GWRAP_OT_remove_worker(ReportsErrors, bpy.types.Operator):
 class GWRAP_OT_cancel_setup(bpy.types.Operator):
     bl_idname = "gwrap.cancel_setup"
     bl_label = "Cancel"
-    bl_description = "Stop the set-up and delete what it has begun"
+    bl_description = "Stop the set-up and delete its unfinished environment"
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        return state.is_busy and state.task is not None and not state.task.is_cancelling
+        reason = "" if state.is_busy else "No set-up is running"
+        if state.is_busy and state.task is not None and state.task.is_cancelling:
+            reason = "The set-up is being cancelled"
+        cls.poll_message_set(reason)
+        return not reason
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        state.task.cancel()
+    def execute(self, _context: bpy.types.Context) -> OperatorResult:
+        worker_setup.cancel()
         return {"FINISHED"}
 
 
@@ -178,7 +183,7 @@ class GWRAP_OT_open_preferences(bpy.types.Operator):
     bl_label = "Open Preferences"
     bl_description = "Show this add-on's preferences, where the worker is set up"
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
+    def execute(self, _context: bpy.types.Context) -> OperatorResult:
         package = addon_package()
         try:
             return bpy.ops.preferences.addon_show(module=package)

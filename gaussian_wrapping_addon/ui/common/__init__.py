@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What all panels share: their base, text for narrow columns, properties of settings."""
+"""Shared by the panels: base class, text for narrow columns, properties of settings."""

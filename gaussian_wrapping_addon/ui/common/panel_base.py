@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What all panels of the tab have in common: place, readiness in the header, the large button."""
+"""Base of the tab's panels: location, readiness in the header, the large button."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import bpy
 
@@ -15,16 +15,22 @@ LARGE: Final = 1.6
 """Height of the button that is the next step."""
 
 
+if TYPE_CHECKING:
+    _Panel = bpy.types.Panel
+else:
+    _Panel = object
+
+
 @dataclass(frozen=True)
 class Readiness:
-    """What a header says at its right, also while its panel is closed."""
+    """Text at the right of a header, shown also while its panel is closed."""
 
     text: str
     icon: str = "NONE"
-    """None stands for what is not there yet: the text is dimmed."""
+    """``"NONE"`` dims the text: nothing is there yet."""
 
 
-class TabPanel:
+class TabPanel(_Panel):
     """Mixin: a panel of our tab; :meth:`readiness` is drawn in its header."""
 
     bl_space_type = "VIEW_3D"
@@ -32,26 +38,26 @@ class TabPanel:
     bl_category = CATEGORY
 
     def readiness(self, context: bpy.types.Context) -> Readiness:
-        """Return how far the panel's part is; from memory alone."""
+        """Return the progress of the panel's part, from memory alone."""
         raise NotImplementedError
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
         """Draw at the right of the header; Blender calls this."""
         ready = self.readiness(context)
-        row = self.layout.row()  # type: ignore[attr-defined]
+        row: Any = self.layout.row()
         row.active = ready.icon != "NONE"
         row.label(text=ready.text, icon=ready.icon, translate=False)
         row.separator(factor=0.25)
 
 
 def plain(layout: Any) -> None:
-    """Names at the left, values at the right, no dots for animation."""
+    """Set the layout: names at the left, values at the right, no animation dots."""
     layout.use_property_split = True
     layout.use_property_decorate = False
 
 
 def button(layout: Any, context: bpy.types.Context, operator: str, **keywords: Any) -> Any:
-    """Draw an operator, large where it is the next step; return its properties."""
+    """Draw an operator, large if it is the next step; return its properties."""
     row = layout.row()
     if panel_state.primary_of(context) == operator:
         row.scale_y = LARGE

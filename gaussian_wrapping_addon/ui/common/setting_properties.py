@@ -23,7 +23,7 @@ def property_of(declared: Declaration, **changes: Any) -> Any:
     Parameters
     ----------
     changes : dict
-        Keywords of Blender's property that are other than declared.
+        Keywords of Blender's property that differ from the declaration.
     """
     panel = declared.panel
     assert panel is not None
@@ -85,7 +85,7 @@ def settings_in(panel_name: PanelName) -> list[Declaration]:
 
 
 def draw_settings(layout: Any, properties: Any, settings: Iterable[Declaration]) -> None:
-    """Draw a row for each setting that counts with the present choices.
+    """Draw a row for each setting that applies to the current choices.
 
     Parameters
     ----------

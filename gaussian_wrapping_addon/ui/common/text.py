@@ -31,7 +31,7 @@ def wrapped_label(layout: Any, text: str, characters: int, *, icon: str = "NONE"
 
 
 def time_span(seconds: float) -> str:
-    """Return a span of time as a person would say it."""
+    """Return a time span in words."""
     return duration(seconds)
 
 

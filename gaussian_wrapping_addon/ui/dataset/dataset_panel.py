@@ -5,6 +5,7 @@ from typing import Any, Final
 
 import bpy
 
+from ...ops.common.addon import properties_of
 from ...ops.dataset import photo_check
 from ...ops.jobs import panel_state, watched_jobs
 from ..common.panel_base import Readiness, TabPanel, button, plain
@@ -20,7 +21,7 @@ class GWRAP_PT_dataset(TabPanel, bpy.types.Panel):
 
     def readiness(self, context: bpy.types.Context) -> Readiness:
         scene = context.scene
-        if not scene.gwrap.source:
+        if not properties_of(scene).source:
             return Readiness("No photos")
         if photo_check.is_busy():
             return Readiness("Checking…", "SORTTIME")
@@ -28,17 +29,17 @@ class GWRAP_PT_dataset(TabPanel, bpy.types.Panel):
             return Readiness("Not checked")
         if panel_state.has_errors(scene):
             return Readiness("Cannot be used", "CANCEL")
-        warned = any(f.severity == "warning" for f in scene.gwrap.findings)
-        text = scene.gwrap.checked_text.partition(",")[0] or "Checked"
+        warned = any(f.severity == "warning" for f in properties_of(scene).findings)
+        text = properties_of(scene).checked_text.partition(",")[0] or "Checked"
         return Readiness(text, "ERROR" if warned else "CHECKMARK")
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, properties = self.layout, context.scene.gwrap
+        layout, properties = self.layout, properties_of(context.scene)
         plain(layout)
         characters = characters_of(context)
         draw_worker_missing(layout, characters)
         if not properties.source:
-            text = "Photos of one thing from all sides, in a folder of their own."
+            text = "Photos of one object from all sides, in a folder of their own."
             wrapped_label(layout, text, characters)
         column = layout.column()
         column.enabled = not watched_jobs.is_running(properties.job_folder)
@@ -57,7 +58,7 @@ class GWRAP_PT_dataset(TabPanel, bpy.types.Panel):
             self._findings(layout, context, characters)
 
     def _findings(self, layout: Any, context: bpy.types.Context, characters: int) -> None:
-        properties = context.scene.gwrap
+        properties = properties_of(context.scene)
         row = layout.row()
         row.label(text=properties.checked_text or "Checked", translate=False)
         row.operator("gwrap.check_photos", text="", icon="FILE_REFRESH", emboss=False)
@@ -84,11 +85,11 @@ class GWRAP_PT_dataset_details(TabPanel, bpy.types.Panel):
         return panel_state.is_checked(context.scene)
 
     def readiness(self, context: bpy.types.Context) -> Readiness:
-        count = len([f for f in context.scene.gwrap.findings if f.severity not in _ICONS])
+        count = len([f for f in properties_of(context.scene).findings if f.severity not in _ICONS])
         return Readiness(str(count))
 
     def draw(self, context: bpy.types.Context) -> None:
-        facts = [f for f in context.scene.gwrap.findings if f.severity not in _ICONS]
+        facts = [f for f in properties_of(context.scene).findings if f.severity not in _ICONS]
         for fact in facts[:_MAX_FINDINGS]:
             wrapped_label(self.layout, fact.message, characters_of(context) - 4, icon="DOT")
 

@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 
 from ...core.jobs.store.job_folder import JobStatus
+from ...ops.common.addon import properties_of
 from ...ops.jobs import watched_jobs
 from ...ops.jobs.panel_state import Stage, stage_of
 from ..common.panel_base import Readiness, button
@@ -16,8 +17,8 @@ from .live_view import draw_live
 
 
 def job_readiness(context: bpy.types.Context, command: str) -> Readiness | None:
-    """Return what a header says of the scene's job; None where it is not the panel's, or done."""
-    properties = context.scene.gwrap
+    """Return the header text of the scene's job; None if it is another panel's, or done."""
+    properties = properties_of(context.scene)
     if properties.job_command != command or not properties.job_folder:
         return None
     status = watched_jobs.status_of(properties.job_folder)
@@ -33,8 +34,8 @@ def job_readiness(context: bpy.types.Context, command: str) -> Readiness | None:
 
 
 def draw_job(layout: Any, context: bpy.types.Context, command: str) -> bool:
-    """Draw the scene's job where it belongs; tell whether it is running."""
-    properties = context.scene.gwrap
+    """Draw the scene's job in its panel; return whether it is running."""
+    properties = properties_of(context.scene)
     if properties.job_command != command or not properties.job_folder:
         return False
     status = watched_jobs.status_of(properties.job_folder)
@@ -68,7 +69,7 @@ def _draw_running(layout: Any, context: bpy.types.Context, status: JobStatus) ->
     column.enabled = not cancelling
     text = "Cancelling…" if cancelling else "Cancel"
     button(column, context, "gwrap.cancel_job", text=text, icon="X")
-    live = draw_live(layout, context.scene.gwrap.job_folder, status)
+    live = draw_live(layout, properties_of(context.scene).job_folder, status)
     if status.message and not live and not cancelling:
         message = status.message[:1].upper() + status.message[1:]
         wrapped_label(layout, message, characters_of(context))

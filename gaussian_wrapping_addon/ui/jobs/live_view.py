@@ -14,7 +14,7 @@ _PICTURE_SCALE = 9.0  # of an icon's size: about the width of the panel as Blend
 
 
 def draw_live(layout: Any, folder: str, status: JobStatus) -> bool:
-    """Draw figures and picture of the training at work; tell whether there was anything."""
+    """Draw figures and image of the running training; return whether there were any."""
     rows = live_rows(status)
     if not rows:
         return False

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The sub-panel "Mesh": how fine the selected regions are meshed, and the job that does it."""
+"""The sub-panel "Mesh": resolution of the selected regions, and the meshing job."""
 
 from typing import Final
 
 import bpy
 
 from ...ops.common import tags
+from ...ops.common.addon import properties_of
 from ...ops.jobs import watched_jobs
 from ...ops.jobs.job_guards import selected_regions
 from ..common.panel_base import CATEGORY, Readiness, TabPanel, button, plain
@@ -29,7 +30,7 @@ class GWRAP_PT_mesh(TabPanel, bpy.types.Panel):
         return Readiness("1 region" if count == 1 else f"{count} regions", "CHECKMARK")
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, properties = self.layout, context.scene.gwrap
+        layout, properties = self.layout, properties_of(context.scene)
         plain(layout)
         selected = selected_regions(context)
         column = layout.column()
@@ -61,7 +62,7 @@ class GWRAP_PT_mesh_advanced(bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - Blender's convention
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, properties = self.layout, context.scene.gwrap
+        layout, properties = self.layout, properties_of(context.scene)
         plain(layout)
         column = layout.column()
         column.enabled = not watched_jobs.is_running(properties.job_folder)

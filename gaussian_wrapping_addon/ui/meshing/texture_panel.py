@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The sub-panel "Texture": size, where its colours come from, further maps, coarser meshes."""
+"""The sub-panel "Texture": size, source of the colours, further maps, coarser meshes."""
 
 from typing import Final
 
 import bpy
 
+from ...ops.common.addon import properties_of
 from ...ops.jobs import watched_jobs
 from ..common.panel_base import Readiness, TabPanel, plain
 from ..common.setting_properties import draw_settings, settings_in
@@ -16,17 +17,17 @@ class GWRAP_PT_texture(TabPanel, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - Blender's convention
 
     def readiness(self, context: bpy.types.Context) -> Readiness:
-        properties = context.scene.gwrap
+        properties = properties_of(context.scene)
         size = f"{properties.texture_size} px" if properties.texture_size != "0" else "Automatic"
         return Readiness(f"{size}, {properties.texture_source.lower()}", "TEXTURE")
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, properties = self.layout, context.scene.gwrap
+        layout, properties = self.layout, properties_of(context.scene)
         plain(layout)
         column = layout.column()
         column.enabled = not watched_jobs.is_running(properties.job_folder)
         draw_settings(column, properties, settings_in("texture"))
-        text = "Counts for the next Wrap Scene or Mesh Region."
+        text = "Applies to the next Wrap Scene or Mesh Region."
         wrapped_label(layout, text, characters_of(context), icon="INFO")
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The panel "Scene Tools": photo cameras, true scale, ground and origin of a result."""
 
-from typing import Final
+from typing import Any, Final
 
 import bpy
 import numpy as np
@@ -46,9 +46,12 @@ class GWRAP_PT_scene_tools(bpy.types.Panel):
         if not cameras_under(frame):
             return
         row = self.layout.row(align=True)
-        row.operator("gwrap.view_photo", icon="CAMERA_DATA").step = 0
-        row.operator("gwrap.view_photo", text="", icon="TRIA_LEFT").step = -1
-        row.operator("gwrap.view_photo", text="", icon="TRIA_RIGHT").step = 1
+        selected: Any = row.operator("gwrap.view_photo", icon="CAMERA_DATA")
+        selected.step = 0
+        previous: Any = row.operator("gwrap.view_photo", text="", icon="TRIA_LEFT")
+        previous.step = -1
+        following: Any = row.operator("gwrap.view_photo", text="", icon="TRIA_RIGHT")
+        following.step = 1
 
     def _points(self, context: bpy.types.Context) -> None:
         layout, characters = self.layout, characters_of(context)

@@ -41,13 +41,13 @@ _drawing = _Drawing()
 
 
 def start() -> None:
-    """Draw from now on."""
+    """Start drawing."""
     stop()
     _drawing.handle = bpy.types.SpaceView3D.draw_handler_add(draw, (), "WINDOW", "POST_VIEW")
 
 
 def stop() -> None:
-    """Draw no more; shaders and batches are made anew next time."""
+    """Stop drawing; shaders and batches are recreated next time."""
     if _drawing.handle is not None:
         bpy.types.SpaceView3D.draw_handler_remove(_drawing.handle, "WINDOW")
     _drawing.handle, _drawing.shader, _drawing.failed = None, None, False
@@ -55,10 +55,10 @@ def stop() -> None:
 
 
 def draw() -> None:
-    """Draw the regions of one view; Blender calls this. What goes wrong is told once."""
+    """Draw the regions of one view; Blender calls this. An error is logged once."""
     try:
         _draw(bpy.context)
-    except Exception:  # an exception here would come with every redraw
+    except Exception:  # an exception here would recur at every redraw
         if not _drawing.failed:
             _logger.exception("regions cannot be drawn")
         _drawing.failed = True
@@ -94,7 +94,7 @@ def edges_of(thing: bpy.types.Object) -> np.ndarray | None:
 
 
 def _draw(context: bpy.types.Context) -> None:
-    space = context.space_data
+    space: Any = context.space_data
     if space is None or not space.overlay.show_overlays:
         return
     things = visible_regions(context.scene, context.view_layer, space)

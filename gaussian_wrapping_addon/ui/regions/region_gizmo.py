@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import bpy
 import numpy as np
@@ -31,14 +31,14 @@ _POLL_S: Final = 0.05
 
 @dataclass
 class _Drag:
-    """What is being dragged, for one undo step at its end."""
+    """State of a drag, for one undo step at its end."""
 
     name: str = ""
     before: Matrix | None = None
     cage: np.ndarray | None = None
     """As it was before the drag."""
     first: np.ndarray | None = None
-    """As Blender first wanted it."""
+    """As first set by Blender."""
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """Of the cage's frame, which stays while a cage is dragged."""
     regions: set[int] = field(default_factory=set)
@@ -66,7 +66,7 @@ def get_cage() -> list[float]:
 
 
 def set_cage(values: Any) -> None:
-    """Take a cage that is being dragged."""
+    """Apply a cage that is being dragged."""
     box = _box(bpy.context)
     if box is None:
         return
@@ -79,7 +79,7 @@ def set_cage(values: Any) -> None:
 
 
 def end_drag() -> None:
-    """Make one undo step of a drag that has ended, unless nothing has moved."""
+    """Make one undo step of a drag that has ended, if something has moved."""
     name, before = _drag.name, _drag.before
     _drag.name, _drag.before, _drag.cage, _drag.first = "", None, None, None
     box = bpy.context.view_layer.objects.get(name) if name else None
@@ -99,7 +99,7 @@ def _end_later() -> float | None:
 
 
 def stop() -> None:
-    """Forget a drag."""
+    """Cancel a drag."""
     _drag.name, _drag.before, _drag.cage, _drag.first = "", None, None, None
     _drag.regions.clear()
     if bpy.app.timers.is_registered(_end_later):
@@ -118,13 +118,14 @@ class GWRAP_GGT_region_box(bpy.types.GizmoGroup):
         box = context.view_layer.objects.active
         return (
             context.mode == "OBJECT"
+            and box is not None
             and is_editable_box(box)
             and box.select_get()
-            and box.visible_get(viewport=context.space_data)
+            and box.visible_get(viewport=cast(bpy.types.SpaceView3D, context.space_data))
         )
 
     def setup(self, _context: bpy.types.Context) -> None:
-        cage = self.gizmos.new("GIZMO_GT_cage_3d")
+        cage: Any = self.gizmos.new("GIZMO_GT_cage_3d")
         cage.transform = {"SCALE", "TRANSLATE"}
         cage.draw_style = "BOX"
         cage.dimensions = (2.0, 2.0, 2.0)

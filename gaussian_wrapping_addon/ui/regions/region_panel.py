@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The panel "Region": the list of regions, what is special about the active one, estimates."""
+"""The panel "Region": list of regions, settings of the active one, estimates."""
 
 from typing import Any, Final
 
 import bpy
 
 from ...ops.common import tags
+from ...ops.common.addon import properties_of
 from ...ops.meshing import region_estimate
 from ...ops.regions.region_resolution import edge_length_in_blender
 from ..common.panel_base import Readiness, TabPanel
@@ -39,15 +40,17 @@ class GWRAP_PT_region(TabPanel, bpy.types.Panel):
                 box.label(text=f"and {len(regions) - MOST_ROWS} more", translate=False)
         else:
             layout.label(text="No regions yet", icon="INFO")
-        if tags.kind_of(active) == "region":
+        if active is not None and tags.kind_of(active) == "region":
             _draw_active(layout, context, active)
-        checked = [region for region in regions if region.gwrap.checked]
+        checked = [region for region in regions if properties_of(region).checked]
         if checked:
             row = layout.row(align=True)
             text = f"Estimate {len(checked)} Checked"
-            row.operator("gwrap.estimate_regions", text=text, icon="TIME").checked = True
+            estimate: Any = row.operator("gwrap.estimate_regions", text=text, icon="TIME")
+            estimate.checked = True
             text = f"Mesh {len(checked)} Checked"
-            row.operator("gwrap.mesh_region", text=text, icon="MESH_DATA").checked = True
+            mesh: Any = row.operator("gwrap.mesh_region", text=text, icon="MESH_DATA")
+            mesh.checked = True
         if active is not None and active.type == "MESH" and not tags.kind_of(active):
             layout.operator("gwrap.use_as_region", icon="MESH_ICOSPHERE")
         row = layout.row(align=True)
@@ -57,7 +60,7 @@ class GWRAP_PT_region(TabPanel, bpy.types.Panel):
 
 def _draw_row(layout: Any, region: bpy.types.Object) -> None:
     row = layout.row(align=True)
-    row.prop(region.gwrap, "checked", text="")
+    row.prop(properties_of(region), "checked", text="")
     operator = row.operator(
         "gwrap.select_region",
         text=region.name,
@@ -77,9 +80,9 @@ def _draw_active(layout: Any, context: bpy.types.Context, region: bpy.types.Obje
     column.use_property_decorate = False
     column.prop(region, "name")
     scene = context.scene
-    own = region.gwrap
+    own = properties_of(region)
     row = column.row(align=True, heading="Edge Length")
-    row.enabled = scene.gwrap.method != "PIVOTS"
+    row.enabled = properties_of(scene).method != "PIVOTS"
     row.prop(own, "own_edge_length", text="")
     value = row.row(align=True)
     value.active = own.own_edge_length
@@ -91,10 +94,10 @@ def _draw_active(layout: Any, context: bpy.types.Context, region: bpy.types.Obje
 
 
 def _scene_resolution(scene: bpy.types.Scene, region: bpy.types.Object) -> str:
-    if scene.gwrap.method == "PIVOTS":
+    if properties_of(scene).method == "PIVOTS":
         return "none with pivots"
     length = edge_length_in_blender(scene, region)
-    return f"{length:.4g} (Mesh panel)" if length else _RESOLUTIONS[scene.gwrap.resolution]
+    return f"{length:.4g} (Mesh panel)" if length else _RESOLUTIONS[properties_of(scene).resolution]
 
 
 def _draw_estimate(layout: Any, context: bpy.types.Context, region: bpy.types.Object) -> None:
@@ -102,7 +105,7 @@ def _draw_estimate(layout: Any, context: bpy.types.Context, region: bpy.types.Ob
     if region_estimate.is_waiting(region):
         layout.label(text="Estimating…", icon="SORTTIME")
         return
-    estimate, holds = region_estimate.answer_for(context.scene, region)
+    estimate, holds = region_estimate.estimate_for(context.scene, region)
     if estimate is not None:
         column = layout.column(align=True)
         column.active = holds

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a region has of its own: ``Object.gwrap``, stored once it is changed."""
+"""Properties of a region: ``Object.gwrap``, stored once changed."""
 
 from typing import Final
 
@@ -18,7 +18,7 @@ class GWRAP_PG_region(bpy.types.PropertyGroup):
     )
     own_edge_length: BoolProperty(  # type: ignore[valid-type]
         name="Own Edge Length",
-        description="This region has an edge length of its own, whatever the Mesh panel says",
+        description="Mesh this region with its own edge length, not that of the Mesh panel",
         default=False,
     )
     edge_length: property_of(  # type: ignore[valid-type]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The sub-panel "Report" of the result: times, exactness, regions, warnings."""
+"""The sub-panel "Report" of the result: times, accuracy, regions, warnings."""
 
 from typing import Any, Final
 
@@ -38,7 +38,7 @@ class GWRAP_PT_report(bpy.types.Panel):
             table(box, report.stages)
         if report.decisions:
             box = layout.box()
-            box.label(text="What the Scene Needed", icon="OPTIONS")
+            box.label(text="Model Selection", icon="OPTIONS")
             table(box, report.decisions)
         for region in report.regions:
             box = layout.box()

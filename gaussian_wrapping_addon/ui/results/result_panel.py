@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The sub-panel "Result": shading, textures, export, the job's files."""
 
-from typing import Final
+from typing import Any, Final
 
 import bpy
 
@@ -30,7 +30,7 @@ class GWRAP_PT_result(TabPanel, bpy.types.Panel):
                 shading = shading_of(found[0])
                 row = layout.row(align=True)
                 for value, text in (("LIT", "Lit"), ("UNLIT", "Unlit")):
-                    operator = row.operator(
+                    operator: Any = row.operator(
                         "gwrap.set_shading", text=text, depress=shading == value
                     )
                     operator.shading = value
@@ -40,8 +40,10 @@ class GWRAP_PT_result(TabPanel, bpy.types.Panel):
         if images:
             packed = all(image.packed_file is not None for image in images)
             text = "Unpack Textures" if packed else "Pack Textures"
-            icon = "UGLYPACKAGE" if packed else "PACKAGE"
-            column.operator("gwrap.pack_images", text=text, icon=icon).pack = not packed
+            pack: Any = column.operator(
+                "gwrap.pack_images", text=text, icon="UGLYPACKAGE" if packed else "PACKAGE"
+            )
+            pack.pack = not packed
         column = layout.column(align=True)
         column.operator("gwrap.import_result", text="Import Result…", icon="IMPORT")
         if frame is not None:

@@ -6,6 +6,7 @@ from typing import Final
 import bpy
 
 from ...core.settings.declaration import JOB
+from ...ops.common.addon import properties_of
 from ...ops.jobs import watched_jobs
 from ...ops.jobs.panel_settings import preset_lines
 from ..common.panel_base import CATEGORY, plain
@@ -23,7 +24,7 @@ class GWRAP_PT_train_advanced(bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         plain(self.layout)
-        properties = context.scene.gwrap
+        properties = properties_of(context.scene)
         training = properties.training
         column = self.layout.column()
         column.enabled = not watched_jobs.is_running(properties.job_folder)

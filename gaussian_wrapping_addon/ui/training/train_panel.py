@@ -6,6 +6,7 @@ from typing import Any, Final
 import bpy
 
 from ...ops.common import tags
+from ...ops.common.addon import properties_of
 from ...ops.jobs import watched_jobs
 from ...ops.jobs.panel_state import Stage, primary_of, stage_of
 from ...ops.results.report_data import report_of
@@ -33,7 +34,7 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
         return Readiness(training.rpartition(", ")[2] or "Trained", "CHECKMARK")
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, properties = self.layout, context.scene.gwrap
+        layout, properties = self.layout, properties_of(context.scene)
         plain(layout)
         characters = characters_of(context)
         frame = tags.current_frame(context.scene, context.view_layer.objects.active)
@@ -60,29 +61,29 @@ class GWRAP_PT_train(TabPanel, bpy.types.Panel):
             row.operator("gwrap.train_more", icon="PLAY")
 
     def _estimate(self, layout: Any, context: bpy.types.Context, characters: int) -> None:
-        if not context.scene.gwrap.source:
+        if not properties_of(context.scene).source:
             return
         if training_estimate.is_busy():
             layout.operator("gwrap.estimate", text="Estimating…", icon="SORTTIME")
             return
-        answer = training_estimate.answer_for(context.scene)
-        if answer is None:
+        estimate = training_estimate.estimate_for(context.scene)
+        if estimate is None:
             if primary_of(context) == "gwrap.wrap_scene":
                 layout.operator("gwrap.estimate", text="Estimate Time and Memory", icon="TIME")
             return
-        rows, remarks = estimate_rows(answer.lines)
+        rows, remarks = estimate_rows(estimate.lines)
         if rows:
             table(layout.box(), rows)
         for text in remarks:
             wrapped_label(layout, text, characters)
         icon = "ERROR"
-        for text in filter(None, answer.warnings):
+        for text in filter(None, estimate.warnings):
             wrapped_label(layout, text, characters - 4, icon=icon)
             icon = "BLANK1"
 
 
 def estimate_rows(lines: tuple[str, ...]) -> tuple[tuple[tuple[str, str], ...], tuple[str, ...]]:
-    """Return the figures of an estimate as rows, and what else it says.
+    """Return the figures of an estimate as rows, and its other lines.
 
     The first line, the photos, is left out: the panel Dataset has it.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the sub-panel "Training" edits: ``Scene.gwrap.training``; no property has a callback."""
+"""Properties of the sub-panel "Train": ``Scene.gwrap.training``; no property has a callback."""
 
 from typing import Final
 

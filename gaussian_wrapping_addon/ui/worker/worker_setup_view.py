@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How the worker's set-up is drawn: in the preferences, and one line in the panel."""
+"""Draws the worker's set-up: in the preferences, and one line in the panel."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..common.text import characters_of, wrapped_label
 
 def draw_setup(layout: Any, context: Any) -> None:
     """Draw state, progress and buttons of the worker's environment."""
-    worker_setup.look_around()
+    worker_setup.search_pythons()
     characters = characters_of(context)
     environment = worker_setup.environment()
     if environment.is_ready():
@@ -72,7 +72,7 @@ def draw_doctor(layout: Any, context: Any) -> None:
 
 
 def draw_worker_missing(layout: Any, characters: int) -> None:
-    """Say in a panel that jobs have nothing to run in, and lead to where that changes."""
+    """Show in a panel that there is no worker, with a button to the preferences."""
     if worker_setup.worker_ready():
         return
     box = layout.box()
