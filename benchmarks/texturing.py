@@ -160,18 +160,21 @@ def _uneven(threads: int) -> list[str]:
         "| --- | --- | --- |",
     ]
     cameras = cameras_around(PHOTOS, WIDTH, HEIGHT)
-    solve = bake.solve_fields
+    solve = bake.solve_low_frequency_correction
     cases: tuple[tuple[str, Unevenness | None], ...] = (("even", None), ("uneven", uneven))
     for name, unevenness in cases:
         photos = photograph(spot(), _grey, cameras, 2, unevenness)
         steps = []
         for evened in (True, False):
             if not evened:
-                bake.solve_fields = lambda c, v, p, g: (np.ones((v.shape[1], 1, 1, 3)), 0.0)
+                bake.solve_low_frequency_correction = lambda c, v, p, g: (
+                    np.ones((v.shape[1], 1, 1, 3)),
+                    0.0,
+                )
             try:
                 steps.append(steps_between_texels(_baked(photos, 512, threads), 4))
             finally:
-                bake.solve_fields = solve
+                bake.solve_low_frequency_correction = solve
         lines.append(f"| {name} | {steps[0]:.1f} levels | {steps[1]:.1f} levels |")
     return lines
 

@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.core.render.raster.blend import (
     Images,
     RenderBuffers,
     blend,
-    pair_gradients,
+    write_intersection_gradients,
 )
 from gaussian_wrapping_addon.core.render.render import project_view
 from gaussian_wrapping_addon.core.render.simd.raster_math import ROW_VALUES
@@ -104,13 +104,13 @@ class Iteration:
             incoming.append(np.zeros_like(getattr(image, name)) if grad is None else grad)
         view = project_view(image.gaussians, self.camera, self.options)
         images, buffers = Images.allocate(self.camera, self.options), RenderBuffers()
-        pairs = np.zeros((len(view.lists.gaussian_ids), ROW_VALUES), np.float32)
+        intersections = np.zeros((len(view.lists.gaussian_ids), ROW_VALUES), np.float32)
         absolute = image.statistics is not None
 
         def run() -> None:
             blend(view, images, buffers)
-            pair_gradients(
-                view, images, incoming, buffers, pairs, depth=self.depth, absolute=absolute
+            write_intersection_gradients(
+                view, images, incoming, buffers, intersections, depth=self.depth, absolute=absolute
             )
 
         return run

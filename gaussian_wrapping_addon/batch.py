@@ -21,9 +21,9 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
 
     ``program`` is how help and usage call it.
     """
-    from .command_line.options.option_names import in_words_of_options
+    from .command_line.options.option_names import with_option_name
     from .command_line.parser import build_parser
-    from .core.errors import EXIT_OTHER, NO_ROOM, SettingError, WrapError, cannot_be_written
+    from .core.errors import DISK_FULL_ERRNOS, EXIT_OTHER, SettingError, WrapError, unwritable_error
     from .core.processes.worker_environment import interpreter_of, ready_worker
 
     _log_to_terminal()
@@ -31,7 +31,7 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
         options = build_parser(program).parse_args(arguments)
         return int(options.run(options))
     except SettingError as error:
-        _logger.error("error: %s", in_words_of_options(error))
+        _logger.error("error: %s", with_option_name(error))
         return error.exit_code
     except WrapError as error:
         _logger.error("error: %s", error)
@@ -44,8 +44,8 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
         _logger.error("error: This Python lacks %s. Use another one: %s", error.name, worker)
         return EXIT_OTHER
     except OSError as error:
-        if error.errno in NO_ROOM:
-            full = cannot_be_written(error.filename or "A file", error)
+        if error.errno in DISK_FULL_ERRNOS:
+            full = unwritable_error(error.filename or "A file", error)
             _logger.error("error: %s", full)
             return full.exit_code
         _logger.error("error: %s", error)

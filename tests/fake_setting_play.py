@@ -12,7 +12,7 @@ from pathlib import Path
 
 import gaussian_wrapping_addon
 from gaussian_wrapping_addon.command_line.options.meshing_options import region_settings
-from gaussian_wrapping_addon.command_line.options.option_names import in_words_of_options
+from gaussian_wrapping_addon.command_line.options.option_names import with_option_name
 from gaussian_wrapping_addon.command_line.options.training_options import training_settings
 from gaussian_wrapping_addon.command_line.parser import build_parser
 from gaussian_wrapping_addon.core.errors import SettingError
@@ -30,7 +30,7 @@ def refusal(settings: JobSettings) -> str:
     try:
         settings.validated()
     except SettingError as error:
-        return str(in_words_of_options(error))
+        return str(with_option_name(error))
     return ""
 
 

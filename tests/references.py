@@ -46,6 +46,10 @@ _ROLE = re.compile(r":(mod|func|class|meth|data|attr|exc):`([^`]+)`")
 _HEADING = re.compile(r"^(#{1,6})\s+(.*?)\s*#*$", re.MULTILINE)
 _FENCE = re.compile(r"^(```|~~~).*?^\1[^\n]*$", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\]\(<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\)|(?:src|href)=\"([^\"]+)\"")
+_ENTRY = re.compile(
+    r"^\|(?P<names>[^|\n]*)\|[^|\n]*\|(?P<files>(?: *`[\w/]+\.py`,?)+) *\|$", re.MULTILINE
+)
+_ENTRY_NAME = re.compile(r"`(\.?[A-Za-z_]\w*)(?=[(`])")
 _LINK_DEFINITION = re.compile(r"^\s{0,3}\[[^\]]+\]:\s+(\S+)", re.MULTILINE)
 
 
@@ -279,6 +283,40 @@ def check_places(text: str, near: str, files: Files, names: Names) -> list[str]:
     places = [m for m in _PLACE.findall(text) if not files.has_place(m)]
     places += [m for m in _DOTTED.findall(text) if not names.has(m, "")]
     return [f"{near}: there is no {mention}" for mention in sorted(set(places))]
+
+
+def check_entry_points(text: str, near: str, root: str, names: Names) -> list[str]:
+    """Return functions of a table that are not in the files of their row.
+
+    The first cell of a row has ``function(...)`` and ``.method(...)``, the third has the files.
+
+    Parameters
+    ----------
+    root : str
+        Dotted package that the paths of the table begin below.
+    """
+    complaints = []
+    for row in _ENTRY.finditer(text):
+        files = re.findall(r"`([\w/]+)\.py`", row["files"])
+        modules = [
+            names.modules.get(f"{root}.{file.replace('/', '.')}", Module()) for file in files
+        ]
+        known = {name for module in modules for name in module.names}
+        known |= {f".{member.split('.')[1]}" for module in modules for member in module.members}
+        complaints += [
+            f"{near}: there is no {name} in {', '.join(files)}"
+            for name in _ENTRY_NAME.findall(row["names"])
+            if name not in known
+        ]
+    return complaints
+
+
+def folders_of_map(text: str) -> list[str]:
+    """Return the folders that the fenced map of a page lists, ``""`` for the package's own."""
+    fences = [found[0] for found in _FENCE.finditer(text)]
+    rows = [re.findall(r"^([\w/]+/|\.)(?= {2,}\S)", fence, re.MULTILINE) for fence in fences]
+    longest = max(rows, key=len, default=[])
+    return [row.rstrip("/").replace(".", "") for row in longest]
 
 
 def check_citations(text: str, near: str, sections: set[str]) -> list[str]:

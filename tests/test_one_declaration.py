@@ -83,12 +83,12 @@ def test_panels_show_what_may_be_chosen(entry: Declaration) -> None:
     values = tuple(item.value for item in panel.items)
     if entry.choices == SWITCH:
         assert values == ()
-        assert [entry.in_panel(value) for value in SWITCH] == [False, True]
+        assert [entry.to_panel(value) for value in SWITCH] == [False, True]
     elif entry.choices:
         assert values == entry.choices
     for value in values or (entry.default,):
         assert entry.check is None or entry.check.holds(value)
-        assert entry.from_panel(entry.in_panel(value)) == value
+        assert entry.from_panel(entry.to_panel(value)) == value
     assert not panel.description.endswith(".")
 
 

@@ -17,17 +17,21 @@ from tests.references import (
     anchors,
     c_comments,
     check_citations,
+    check_entry_points,
     check_links,
     check_pages,
     check_places,
     check_roles,
     check_sources,
     comments_and_docstrings,
+    folders_of_map,
     section_numbers,
     without_fences,
 )
+from tests.test_layers import FOLDERS
 
 ROOT = Path(__file__).resolve().parents[1]
+ARCHITECTURE = "docs/architecture.md"
 CODE = ("gaussian_wrapping_addon", "tests", "benchmarks", "tools")
 PAGES = ("docs", "benchmarks", "examples", "README.md", "CONTRIBUTING.md")
 HISTORY = "CHANGELOG.md"
@@ -112,6 +116,15 @@ def test_sections_of_the_method_exist() -> None:
     sections = section_numbers(pages()[METHOD])
     assert {"1", "3.4", "10.3"} <= sections
     assert_none([c for p, text in spoken().items() for c in check_citations(text, p, sections)])
+
+
+def test_map_of_the_architecture_is_the_order_of_folders() -> None:
+    assert folders_of_map(pages()[ARCHITECTURE]) == list(FOLDERS)
+
+
+def test_entry_points_are_in_their_files() -> None:
+    package = "gaussian_wrapping_addon.core"
+    assert_none(check_entry_points(pages()[ARCHITECTURE], ARCHITECTURE, package, modules()[1]))
 
 
 def test_roles_name_something() -> None:
@@ -210,6 +223,26 @@ def test_missing_sections_are_noticed(text: str, wrong: int) -> None:
 def test_sections_within_the_method_are_checked_too() -> None:
     text = "as section 2 says, unlike sections 1 and 7"
     assert check_citations(text, METHOD, {"1", "2"}) == [f"{METHOD}: {METHOD} has no section 7"]
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("| `Ray(...)`: `.at(t)`, `LIMIT` | `no` | `render/ray.py` |", 0),
+        ("| `walk() -> Ray`, `Ray` | what | `trace.py`, `render/ray.py` |", 0),
+        ("| `Ray`: `.to(t)` | what | `render/ray.py` |", 1),
+        ("| `walk()` | what | `render/ray.py` |", 1),
+        ("| `walk()` | what | `tracer.py` |", 1),
+        ("| `walk()` | `trace.py` of the package |", 0),
+    ],
+)
+def test_missing_entry_points_are_noticed(text: str, wrong: int) -> None:
+    assert len(check_entry_points(text, "docs/guide.md", "pkg", NAMES)) == wrong
+
+
+def test_the_map_is_the_longest_list_of_folders() -> None:
+    page = "```\na/  one\n```\n\n```text\na/b/   two\na/     three\n.      four\n```\n"
+    assert folders_of_map(page) == ["a/b", "a", ""]
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def _panel(declared: Declaration) -> str:
     panel = declared.panel
     if panel is None:
         return ""
-    return f"{_PANELS[declared.place]}: {panel.drawn_label or panel.label}"
+    return f"{_PANELS[declared.panel_name]}: {panel.drawn_label or panel.label}"
 
 
 def _default(declared: Declaration) -> str:

@@ -23,7 +23,7 @@ from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
 from gaussian_wrapping_addon.core.mesh.simplification.decimation import decimate
 from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
 from gaussian_wrapping_addon.core.mesh.topology import normals_and_areas
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from gaussian_wrapping_addon.core.progress import Progress
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -119,7 +119,7 @@ def measure(name: str, mesh: Mesh, method: str, work: Method, share: float) -> D
     begun_s = time.process_time()
     result = work(*mesh, target)
     seconds = time.process_time() - begun_s
-    before, after = check_mesh(*mesh), check_mesh(*result)
+    before, after = validate_manifold(*mesh), validate_manifold(*result)
     genus = [sorted(str(part.genus) for part in check.parts) for check in (before, after)]
     distance = _distances(mesh, result)
     return Decimation(

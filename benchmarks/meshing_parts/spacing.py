@@ -27,7 +27,7 @@ from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
 from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth, read_truth
-from gaussian_wrapping_addon.core.field.depth_samples import find_sightings
+from gaussian_wrapping_addon.core.field.depth_samples import sample_depth_maps
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.files import read_json, write_json
@@ -76,7 +76,7 @@ class MeasuredScene:
         self.arrays = gaussians.arrays()
         self.vacancy = VacancyField(self.arrays, self.cameras, threads=threads)
         self.vectors = VectorField(self.arrays, threads=threads)
-        self.sightings = find_sightings(
+        self.depth_samples = sample_depth_maps(
             gaussians, self.cameras, lambda p: region.contains(p, 0.0), Progress(), threads=threads
         )
         self.truth, self.world_from_scene = truth, world_from_scene
@@ -87,7 +87,7 @@ class MeasuredScene:
         mesh = mesh_region(
             self.vacancy, self.vectors, self.arrays, self.cameras, self.region,
             MeshingSettings(points=points, spacing=spacing), Progress(), seed=0,
-            threads=self.threads, sightings=self.sightings,
+            threads=self.threads, depth_samples=self.depth_samples,
         )  # fmt: skip
         return mesh, time.monotonic() - begun_s, time.process_time() - cpu_s
 

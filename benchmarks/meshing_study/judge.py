@@ -19,15 +19,15 @@ import trimesh
 
 from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protocols
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
-from gaussian_wrapping_addon.core.field.isosurface_residual import level_errors
+from gaussian_wrapping_addon.core.field.isosurface_residual import isosurface_residuals
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
-from gaussian_wrapping_addon.core.files import finite, read_json, write_json
+from gaussian_wrapping_addon.core.files import finite_json, read_json, write_json
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
 from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 
 from ..speed_error.plan import THRESHOLD_SHARES
@@ -81,7 +81,7 @@ def solidity(mesh: SurfaceMesh) -> dict[str, Any]:
     other = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, validate=False)
     closed = bool(other.is_watertight and other.is_winding_consistent)
     return {
-        "check": check_mesh(mesh.vertices, mesh.faces).to_json(),
+        "check": validate_manifold(mesh.vertices, mesh.faces).to_json(),
         "trimesh_good": closed and float(other.volume) > 0.0,
     }
 
@@ -98,7 +98,7 @@ def against_truth(
         [share * diagonal for share in THRESHOLD_SHARES], count=SURFACE_SAMPLES, seed=0,
         threads=threads, protocols=("uniform",),
     )["uniform"]  # fmt: skip
-    euler = None if truth.mesh is None else check_mesh(*truth.mesh).euler
+    euler = None if truth.mesh is None else validate_manifold(*truth.mesh).euler
     return {"uniform": score.to_json(), "diagonal": diagonal, "euler": euler}
 
 
@@ -114,14 +114,14 @@ def judge(
     field = VacancyField(trained.gaussians.arrays(), trained.scene.cameras, threads=threads)
     points = mesh.vertices[inner(trained.region, mesh.vertices)]
     values: dict[str, Any] = {
-        "level": level_errors(field, points),
+        "level": isosurface_residuals(field, points),
         "distance": distances(mesh, reference, trained.region),
         "reference_vertices": len(reference.vertices),
         **solidity(mesh),
     }
     if (scene_folder / "truth.npz").is_file():
         values["truth"] = against_truth(mesh, trained, scene_folder, threads)
-    return dict(finite(values))
+    return dict(finite_json(values))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from gaussian_wrapping_addon.core.errors import MeshingError
-from gaussian_wrapping_addon.core.field.depth_samples import find_sightings
+from gaussian_wrapping_addon.core.field.depth_samples import sample_depth_maps
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
 from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.files import write_json
@@ -56,18 +56,25 @@ def make_mesh(trained: Trained, method: Method, *, threads: int, seed: int = 0) 
         return SurfaceMesh(vertices, faces.astype(np.int32))
     arrays, cameras, region = trained.gaussians.arrays(), trained.scene.cameras, trained.region
     vacancy = VacancyField(arrays, cameras, threads=threads)
-    sightings = find_sightings(
+    depth_samples = sample_depth_maps(
         trained.gaussians, cameras, lambda p: region.contains(p, 0.0), Progress(), threads=threads
     )
     if method.name == TETRAHEDRA:
         settings = MeshingSettings(method="pivots", pivots=method.size)
         return mesh_by_pivots(
-            vacancy, arrays, cameras, region, settings, Progress(), seed=seed, sightings=sightings
+            vacancy,
+            arrays,
+            cameras,
+            region,
+            settings,
+            Progress(),
+            seed=seed,
+            depth_samples=depth_samples,
         )
     settings = MeshingSettings(points=method.size, spacing=method.name)
     mesh = mesh_region(
         vacancy, VectorField(arrays, threads=threads), arrays, cameras, region, settings,
-        Progress(), seed=seed, threads=threads, sightings=sightings,
+        Progress(), seed=seed, threads=threads, depth_samples=depth_samples,
     )  # fmt: skip
     return clean_up(mesh, region, settings, vacancy, Progress()).mesh
 

@@ -32,7 +32,7 @@ from gaussian_wrapping_addon.core.evaluation.surface.scores import score_protoco
 from gaussian_wrapping_addon.core.evaluation.surface.truth import Truth, read_truth
 from gaussian_wrapping_addon.core.evaluation.views.mesh_rendering import render_views
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
-from gaussian_wrapping_addon.core.files import finite, read_json, write_json
+from gaussian_wrapping_addon.core.files import finite_json, read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.imaging.lpips import lpips_if_ready
@@ -174,7 +174,7 @@ def judge_stages(
         (vacancy, ("median", "median_offset")),
     ):
         for name in names:
-            values[name] = finite(values[name] * shares)
+            values[name] = finite_json(values[name] * shares)
     return {
         "gaussians": {
             "count": len(gaussians),

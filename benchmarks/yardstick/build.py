@@ -168,9 +168,16 @@ class Yardstick:
     ) -> np.ndarray:
         """Return the gradient on params (n, 24); ``grads`` as the kernels take them."""
         lists = view.lists
-        pairs = buffers.take_pairs(len(lists.gaussian_ids))
+        intersections = buffers.take_intersections(len(lists.gaussian_ids))
         shared = self._shared(view, rows, with_slots=True)
-        arrays = [images.color, images.normal, images.geometric, images.alpha, *grads[:4], pairs]
+        arrays = [
+            images.color,
+            images.normal,
+            images.geometric,
+            images.alpha,
+            *grads[:4],
+            intersections,
+        ]
         arguments = [_address(array) for array in arrays]
 
         def run(first: int, end: int) -> None:
@@ -178,13 +185,13 @@ class Yardstick:
 
         run_chunks(run, view.bounds, view.threads)
         gradients = np.zeros((len(view.screen), _VALUES), np.float32)
-        sums = [_address(a) for a in (pairs, lists.pair_offsets, gradients)]
+        sums = [_address(a) for a in (intersections, lists.intersection_offsets, gradients)]
 
         def combine(first: int, end: int) -> None:
             self._library.sum_pairs(*map(ctypes.c_int64, (first, end)), *sums)
 
         run_chunks(combine, even_bounds(len(view.screen), view.threads), view.threads)
-        buffers.pairs.append(pairs)
+        buffers.intersections.append(intersections)
         return gradients
 
     @staticmethod
@@ -194,7 +201,7 @@ class Yardstick:
         assert rows.dtype == np.uint8
         assert rows.shape == (len(lists.gaussian_ids), 2)
         arrays = [view.screen.params, lists.start, lists.gaussian_ids]
-        arrays += [lists.pair_slots] if with_slots else []
+        arrays += [lists.intersection_slots] if with_slots else []
         arrays += [lists.pixel_ranges, rows]
         sizes = (lists.tiles_x, view.camera.width, view.camera.height)
         return [*map(_address, arrays), *map(ctypes.c_int64, sizes)]

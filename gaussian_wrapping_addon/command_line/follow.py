@@ -42,9 +42,9 @@ def require_bpy(job: JobFile, options: Namespace) -> None:
 def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     """Show progress until the worker ends; then write the Blender files. Return the exit code."""
     from ..core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
-    from ..core.jobs.store.blend_file import shown_result
+    from ..core.jobs.store.blend_file import result_state
 
-    before = shown_result(client.folder.result)  # the worker writes it last
+    before = result_state(client.folder.result)  # the worker writes it last
     shown_s, shown, interrupted_s = 0.0, ("", ""), 0.0
     while True:
         try:
@@ -82,7 +82,7 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     if status.state != "DONE":
         _logger.error("error: %s %s", status.error, status.hint)
         if client.folder.read_status().state == "DONE":
-            same = shown_result(client.folder.result) == before
+            same = result_state(client.folder.result) == before
             _logger.info(
                 "the job and its result are as they were before: %s" if same
                 else "the job is as it was before, its result is not; mesh it again: %s",
@@ -94,17 +94,17 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
 
 def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Namespace) -> int:
     """Write the Blender files; one that shows the result ``before`` does not stay."""
-    from ..core.jobs.store.blend_file import NAME, set_aside_stale
+    from ..core.jobs.store.blend_file import NAME, back_up_stale_blend
 
     if options.no_blend:
-        set_aside_stale(result, before)
+        back_up_stale_blend(result, before)
     else:
         from ..ops.results.blend_writer import write_blend
 
         try:
             write_blend(result, result / NAME)
         except BaseException:
-            set_aside_stale(result, before)
+            back_up_stale_blend(result, before)
             raise
     if "usd" in job.settings.export:
         from ..ops.results.blend_writer import export_usd

@@ -11,12 +11,12 @@ from .evaluate_command import add_evaluate
 from .export_command import add_export
 from .meshing_commands import add_estimate_mesh, add_mesh, add_work_tiles
 from .setup_command import add_set_up_worker
-from .training_commands import add_estimate, add_more, add_resume, add_wrap
+from .training_commands import add_continue_training, add_estimate, add_resume, add_wrap
 
 _COMMANDS = (
     add_wrap,
     add_mesh,
-    add_more,
+    add_continue_training,
     add_resume,
     add_estimate_mesh,
     add_work_tiles,

@@ -49,24 +49,24 @@ def _wrap(options: Namespace) -> int:
     return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 
 
-def add_more(commands: Commands) -> None:
+def add_continue_training(commands: Commands) -> None:
     """Add ``more``."""
     parser = commands.add_parser("more", help="train a finished job further, and mesh it again")
     add_out(parser)
     entry = declared("training.extra_iterations")
     add_option(parser, entry, dest="iterations", required=True)
     add_no_blend(parser)
-    parser.set_defaults(run=_more)
+    parser.set_defaults(run=_continue_training)
 
 
-def _more(options: Namespace) -> int:
+def _continue_training(options: Namespace) -> int:
     from ..core.jobs.client import JobClient, worker_python
-    from ..core.jobs.store.continue_training import job_with_more
+    from ..core.jobs.store.continue_training import continue_training_job
     from ..core.jobs.store.job_folder import JobFolder
     from ..core.jobs.store.rollback import finished_job
 
     folder = JobFolder(options.out.resolve())
-    job = job_with_more(folder, finished_job(folder), options.iterations)
+    job = continue_training_job(folder, finished_job(folder), options.iterations)
     require_bpy(job, options)
     return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Typed errors: every one says what is wrong, where, and what to do next."""
+"""Exception types: each states what is wrong, where, and the next step."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ EXIT_BAD_DATA = 3
 EXIT_RESOURCES = 4
 EXIT_CANCELLED = 5
 
-NO_ROOM = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
-"""What systems say of a disk or a quota that is full."""
+DISK_FULL_ERRNOS = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
+"""Error numbers of a full disk or an exhausted quota."""
 
 
 class WrapError(Exception):
-    """Base of every error that a user is shown.
+    """Base of all errors that are shown to users.
 
     Parameters
     ----------
     message : str
         One sentence: what is wrong and where.
     hint : str
-        The next step a person can take.
+        The next step for the user.
     """
 
     exit_code = EXIT_OTHER
@@ -40,20 +40,20 @@ class WrapError(Exception):
 
 
 class UsageError(WrapError):
-    """A command line, setting or job file that asks for something impossible."""
+    """An invalid command line, setting or job file."""
 
     exit_code = EXIT_USAGE
 
 
 class SettingError(UsageError):
-    """A setting out of range; who knows by which option it was given may name that instead.
+    """A setting out of range; ``called`` names the option that set it, if known.
 
     Parameters
     ----------
     setting : str
         Path in the job's settings, such as ``"meshing.tiles"``.
     wanted : str
-        What may be given.
+        The allowed values.
     """
 
     def __init__(self, setting: str, wanted: str, *, called: str = "") -> None:
@@ -69,20 +69,20 @@ class DatasetError(WrapError):
 
 
 class ParseError(DatasetError):
-    """A file does not hold what its format promises.
+    """A file violates its format.
 
     Parameters
     ----------
     path : path-like
         The file.
-    place : str
-        Where in it, such as ``"byte 120"``, ``"line 7"`` or ``"frames[3].file_path"``.
+    location : str
+        Location in the file, such as ``"byte 120"``, ``"line 7"`` or ``"frames[3].file_path"``.
     """
 
-    def __init__(self, path: str | Path, place: str, message: str, hint: str = "") -> None:
-        super().__init__(f"{Path(path).name}, {place}: {message}", hint)
+    def __init__(self, path: str | Path, location: str, message: str, hint: str = "") -> None:
+        super().__init__(f"{Path(path).name}, {location}: {message}", hint)
         self.path = Path(path)
-        self.place = place
+        self.location = location
 
 
 class ResourceError(WrapError):
@@ -91,8 +91,8 @@ class ResourceError(WrapError):
     exit_code = EXIT_RESOURCES
 
 
-class Cancelled(WrapError):  # noqa: N818 - a request that was obeyed, not an error
-    """The user asked to stop."""
+class Cancelled(WrapError):  # noqa: N818 - a request, not an error
+    """The user cancelled."""
 
     exit_code = EXIT_CANCELLED
 
@@ -101,18 +101,18 @@ class Cancelled(WrapError):  # noqa: N818 - a request that was obeyed, not an er
 
 
 class WorkerError(WrapError):
-    """A worker or helper process failed; the message carries its last words."""
+    """A worker or helper process failed; the message contains its last output."""
 
 
 class MeshingError(WrapError):
-    """The field holds no surface in the region, or a mesh cannot be made of it."""
+    """The field has no surface in the region, or no mesh can be extracted."""
 
     exit_code = EXIT_BAD_DATA
 
 
-def cannot_be_written(path: str | Path, error: OSError) -> ResourceError:
-    """Return the error of a place that cannot be written, whatever command meets it."""
-    if error.errno in NO_ROOM:
+def unwritable_error(path: str | Path, error: OSError) -> ResourceError:
+    """Return the error for a path that cannot be written; the same for all commands."""
+    if error.errno in DISK_FULL_ERRNOS:
         return ResourceError(
             f"No room is left on the disk: {path} could not be written.", "Make room there."
         )
@@ -123,6 +123,6 @@ def cannot_be_written(path: str | Path, error: OSError) -> ResourceError:
 
 
 class DeviceError(WrapError):
-    """The GPU, its driver or the compiler for it cannot do what was asked."""
+    """The GPU, its driver or its compiler failed or lacks a required feature."""
 
     exit_code = EXIT_RESOURCES

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The formats in which results leave: one table for jobs, command line and Blender.
+"""Table of export formats for jobs, command line and Blender.
 
 Standard library only, so that the command line's help needs no numpy.
 """
@@ -13,31 +13,31 @@ SHADINGS = ("auto", "lit", "unlit")
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """What a format is called, who writes it, and what its files can hold."""
+    """Names, writer and capabilities of an export format."""
 
     name: str
-    """As options and job files call it."""
+    """Identifier in options and job files."""
     label: str
-    """As Blender's panel calls it."""
+    """Label in Blender's panel."""
     help: str
-    """What it holds, for the panel's tooltip."""
+    """Content, for the panel's tooltip."""
     suffix: str
     needs_blender: bool = False
-    """Whether only Blender's exporter writes it; the others are written by the worker."""
+    """Whether only Blender's exporter writes it; the worker writes the others."""
     in_jobs: bool = True
     """Whether a job can write it with its result (``--export``)."""
     of_mesh: bool = True
-    """Whether it holds a mesh, else the Gaussians."""
+    """Whether it contains a mesh; otherwise the Gaussians."""
     textures: str = "beside"
-    """``"inside"`` the file, ``"beside"`` it, ``"either"`` as asked, or ``"none"``."""
+    """``"inside"`` the file, ``"beside"`` it, ``"either"`` (an option), or ``"none"``."""
     packed_suffix: str = ""
-    """Suffix with textures inside where they may lie beside it; empty: the same."""
+    """Suffix of a file with packed textures, if it differs from ``suffix``."""
     y_up: bool = False
-    """Whether its readers take Y for up; else Z is."""
+    """Whether its up axis is Y; otherwise Z."""
     doubles: bool = False
-    """Whether coordinates are double precision, so that they need no offset."""
+    """Whether coordinates are double precision and need no offset."""
     unlit: str = "lit"
-    """What becomes of an unlit material in Blender: ``"keep"``, ``"emission"`` or ``"lit"``."""
+    """Export of an unlit material in Blender: ``"keep"``, ``"emission"`` or ``"lit"``."""
 
     def file_suffix(self, *, pack: bool) -> str:
         """Return the suffix of a file, with textures packed into it or not."""
@@ -77,7 +77,7 @@ WORKER_FORMATS = tuple(f.name for f in EXPORT_FORMATS.values() if not f.needs_bl
 BLENDER_FORMATS = tuple(f.name for f in EXPORT_FORMATS.values() if f.needs_blender)
 JOB_FORMATS = tuple(f.name for f in EXPORT_FORMATS.values() if f.in_jobs)
 MESH_FORMATS = tuple(f.name for f in EXPORT_FORMATS.values() if f.of_mesh)
-"""What **Export Meshes** of Blender writes."""
+"""Formats of **Export Meshes** in Blender."""
 RESULT_FORMATS = tuple(name for name in JOB_FORMATS if name in WORKER_FORMATS)
-"""What the worker writes into a result."""
+"""Formats that the worker writes to a result."""
 PACKABLE_FORMATS = tuple(f.name for f in EXPORT_FORMATS.values() if f.textures == "either")

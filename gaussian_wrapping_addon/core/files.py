@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bounded, atomic file access: JSON in and out, names that stay inside a folder."""
+"""Atomic file writing, JSON with size limits, and safe relative paths."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from .names import is_reserved_name
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Write JSON so that a reader sees the old file or the new one, never a half."""
+    """Write JSON atomically: a reader sees the old file or the new one."""
     write_bytes(path, json.dumps(values, indent=1, allow_nan=False).encode())
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write bytes atomically beside the target, then replace it."""
+    """Write bytes atomically: to a temporary file beside the target, which then replaces it."""
     partial = path.with_name(f"{path.name}.writing.{uuid.uuid4().hex[:8]}")
     try:
         with partial.open("wb") as stream:
@@ -30,7 +30,7 @@ def write_bytes(path: Path, data: bytes) -> None:
             os.fsync(stream.fileno())
         os.replace(partial, path)
     except OSError as error:
-        # A full disk is met while writing: the system then names no file, or the partial one.
+        # If the disk is full, the system names no file, or the temporary one.
         error.filename, error.filename2 = str(path), None
         raise
     finally:
@@ -38,9 +38,9 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def overwrite_json(path: Path, values: Any) -> None:
-    """Write JSON into the room that a file has already: where the disk has none for another.
+    """Overwrite a JSON file in place, for a disk without room for a second file.
 
-    A reader may see a half of it; blanks fill what was longer before.
+    Not atomic; padded with blanks if the previous content was longer.
     """
     data = json.dumps(values, allow_nan=False).encode()
     with path.open("r+b") as stream:
@@ -49,27 +49,27 @@ def overwrite_json(path: Path, values: Any) -> None:
         os.fsync(stream.fileno())
 
 
-def finite(values: Any) -> Any:
-    """Return JSON values with ``None`` for every number that is not finite: JSON has none.
+def finite_json(values: Any) -> Any:
+    """Return JSON values with ``None`` instead of non-finite numbers, which JSON lacks.
 
-    Tuples become lists and keys text, as JSON would read them back.
+    Tuples become lists and keys strings, as JSON would read them back.
     """
     if isinstance(values, dict):
-        return {str(key): finite(value) for key, value in values.items()}
+        return {str(key): finite_json(value) for key, value in values.items()}
     if isinstance(values, (list, tuple)):
-        return [finite(value) for value in values]
+        return [finite_json(value) for value in values]
     if isinstance(values, float) and not math.isfinite(values):
         return None
     return values
 
 
 def read_json(path: Path) -> Any:
-    """Read JSON with bounds on size and depth; NaN and infinities are refused.
+    """Read JSON with limits on size and depth; NaN and infinities are rejected.
 
     Raises
     ------
     ParseError
-        Names the line, or says which bound was passed.
+        Names the line, or the limit that was exceeded.
     """
     size_bytes = path.stat().st_size
     if size_bytes > limits.MAX_JSON_BYTES:
@@ -104,9 +104,9 @@ def _check_depth(path: Path, values: Any, depth: int) -> None:
 
 
 def resolve_inside(root: Path, name: str) -> Path | None:
-    """Return the path of ``name`` under ``root``, or ``None`` when the name is not safe.
+    """Return the path of ``name`` under ``root``, or ``None`` if the name is unsafe.
 
-    Refused: absolute names, drives, UNC, ``..``, NUL, reserved Windows names, and links that
+    Rejected: absolute names, drives, UNC, ``..``, NUL, reserved Windows names, and links that
     lead out of the folder.
     """
     clean = name.replace("\\", "/")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Caps on what is accepted from files and asked of the machine."""
+"""Limits on input files and on resources."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ MAX_MESH_POINTS = 5_000_000
 MAX_TILES = 4096
 MAX_TEXTURE_SIDE_PX = 8192
 MAX_ATLASES = 16
-"""Textures of one mesh that may be asked for: each is a material and an image for its readers."""
+"""Largest number of textures per mesh: each is a material and an image for readers."""
 MAX_AUTOMATIC_ATLASES = 4
-"""Textures of one mesh that are made unasked, where one of the largest would not do."""
+"""Largest automatic number of textures per mesh, used if one of maximum size is not enough."""
 MIN_IMAGES = 3
 RENDER_BUDGET_BYTES = 512 * 1024 * 1024
-"""What lists and gradients of (tile, Gaussian) pairs may take in one rendering: with it, a million
+"""Memory for lists and gradients of tile intersections in one rendering: with it, a million
 Gaussians train at 1600 x 1200 pixels within 4 GB."""
 
 HELPER_DEADLINE_S = 3600.0
 CANCEL_ALONE_S = 7.0
-"""After which a cancelled worker whose main thread asks for nothing ends itself."""
+"""Time after which a cancelled worker exits if its main thread does not poll for cancellation."""
 CANCEL_GRACE_S = 9.0
-"""After which others end a cancelled worker: with the time to terminate it, within 12 s."""
+"""Time after which other processes end a cancelled worker; including termination, within 12 s."""

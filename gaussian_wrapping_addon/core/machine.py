@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What this machine is and has: memory with the limits of containers, processors, versions.
+"""Properties of this machine: memory (container limits included), processors, versions.
 
-Standard library only. Linux tells a container's memory in its control groups (cgroup v1 and v2):
-the files of the group of this process and of those above it count, the smallest limit holds.
+Standard library only. On Linux a container's memory limit is read from its control groups (cgroup
+v1 and v2): the group of this process and its ancestors are read, the smallest limit applies.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ _GROUPS = Path("/sys/fs/cgroup")
 
 @dataclass(frozen=True)
 class _GroupFiles:
-    """Names of a control group's files, of one version."""
+    """File names of a control group, for one cgroup version."""
 
     limit: str
     used: str
     reclaimable: str
-    """Key in ``memory.stat`` of file pages that the system drops before it refuses memory."""
+    """Key in ``memory.stat`` of file pages that the system drops before memory runs out."""
 
 
 _V1 = _GroupFiles("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 _V2 = _GroupFiles("memory.max", "memory.current", "inactive_file")
 
 
-def processors() -> int:
-    """Return the number of processors that this process may use, at least 1."""
+def processor_count() -> int:
+    """Return the number of processors available to this process, at least 1."""
     if hasattr(os, "sched_getaffinity"):
         return max(1, len(os.sched_getaffinity(0)))
     return max(1, os.cpu_count() or 1)
 
 
 def processor_name() -> str:
-    """Return the processor's name; ``"unknown"`` where the system does not tell it."""
+    """Return the processor's name, or ``"unknown"``."""
     try:
         for line in (_PROC / "cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -57,13 +57,13 @@ def processor_name() -> str:
 
 
 def total_memory_bytes() -> int:
-    """Return the memory of this machine, or of its container; 0 where it is not known."""
+    """Return the total memory of this machine or its container; 0 if unknown."""
     installed = _installed_bytes()
     return min([installed, *(limit for limit, _ in _groups())]) if installed else 0
 
 
 def available_memory_bytes() -> int:
-    """Return what can be taken without swapping; 0 where it is not known.
+    """Return the memory available without swapping; 0 if unknown.
 
     In a container, at most what its limit leaves.
     """
@@ -89,7 +89,7 @@ def _installed_bytes() -> int:
 
 
 def _groups() -> Iterator[tuple[int, int]]:
-    """Give (limit, bytes in use that cannot be dropped) of each control group with a limit."""
+    """Yield (limit, bytes in use that cannot be dropped) of each control group with a limit."""
     for folder, files in _group_folders():
         limit = _number(folder / files.limit)
         # Version 1 writes "no limit" as the largest number of pages.
@@ -100,10 +100,10 @@ def _groups() -> Iterator[tuple[int, int]]:
 
 
 def _group_folders() -> Iterator[tuple[Path, _GroupFiles]]:
-    """Give the folder of this process's memory group and of all above it, of both versions.
+    """Yield the folder of this process's memory group and of its ancestors, of both versions.
 
-    Inside a container the group may be named by its path outside, of which nothing but the top,
-    which is the container's own group, is seen.
+    Inside a container the group may be named by its path outside, of which only the root, the
+    container's own group, is visible.
     """
     try:
         lines = (_PROC / "self" / "cgroup").read_text().splitlines()

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rules for names of regions, folders and files; standard library only.
+"""Names of regions, folders and files; standard library only.
 
-A region has the name that its file gives it. Its result lies in a folder of a simpler name
-(:func:`region_name`), so that two regions may ask for one folder; exported files have a stem that
-is made of the folder's or the object's name (:func:`file_stem`).
+A region is named by its file. Its result is stored in a folder with a sanitised name
+(:func:`region_name`), so that two regions may map to one folder; exported files have a stem made
+from the name of the folder or object (:func:`file_stem`).
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from . import limits
 from .errors import UsageError
 
 AUTOMATIC_REGIONS = ("auto", "all")
-"""What a job may ask for in place of a region file."""
+"""Values that a job accepts instead of a region file."""
 REPORT_FOLDER = "report"
-"""Folder of a result in which the report's pictures lie: no region's."""
+"""Folder of the report's pictures in a result; reserved, no region may use it."""
 MAX_REGION_CHARACTERS = 40
 MAX_STEM_BYTES = 120
-"""With endings, and what atomic writing adds, it stays below the 255 bytes of file systems."""
+"""With suffixes, and those of atomic writing, names stay below the 255 bytes of file systems."""
 SPLAT_STEM = "gaussians.splat"
-"""Of the splat that lies beside the meshes."""
+"""Stem of the splat file beside the meshes."""
 _DIGITS = 8
 
 _RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{d}{i}" for d in ("COM", "LPT") for i in range(1, 10))}
 
 
 def is_reserved_name(name: str) -> bool:
-    """Tell whether Windows keeps a name for itself, whatever its ending."""
+    """Return whether Windows reserves a name, with any suffix."""
     return name.split(".")[0].rstrip(" ").upper() in _RESERVED
 
 
 def printable_name(name: Any) -> str:
-    """Return a name that fits into any text file and its bound in bytes; empty without one.
+    """Return a name that can be written to any text file, limited in bytes; empty if there is none.
 
-    JSON may hold half of a surrogate pair, which no encoding writes; it becomes a question mark.
-    NUL ends names in Blender and in file systems, so it is left out.
+    JSON may contain a lone surrogate, which no encoding can write; it becomes a question mark. NUL
+    terminates names in Blender and in file systems, so it is removed.
     """
     text = name.replace("\0", "") if isinstance(name, str) else ""
     if not text.strip():
@@ -63,8 +63,8 @@ def region_name(request: str, body: Any) -> str:
     """
     if request in AUTOMATIC_REGIONS:
         return request
-    text = _wanted_name(request, body)
-    clean = _replaced(text, r"A-Za-z0-9_-").strip("_")[:MAX_REGION_CHARACTERS]
+    text = _requested_name(request, body)
+    clean = _sanitise(text, r"A-Za-z0-9_-").strip("_")[:MAX_REGION_CHARACTERS]
     if not clean or clean.lower() in AUTOMATIC_REGIONS:
         text = json.dumps([request], separators=(",", ":"))
         return f"region_{hashlib.sha256(text.encode()).hexdigest()[:6]}"
@@ -72,7 +72,7 @@ def region_name(request: str, body: Any) -> str:
     return f"region_{clean}" if taken else clean
 
 
-def _wanted_name(request: str, body: Any) -> str:
+def _requested_name(request: str, body: Any) -> str:
     wanted = body.get("blender_object_name") if isinstance(body, dict) else None
     return wanted if isinstance(wanted, str) and wanted.strip() else Path(request).stem
 
@@ -88,17 +88,16 @@ def region_names(requests: Sequence[str], bodies: Mapping[str, Any]) -> list[str
     Raises
     ------
     UsageError
-        Two have one name, or names that are one where case does not count: the result of one
-        would replace that of the other.
+        If two have the same name, ignoring case: one result would overwrite the other.
     """
     names = [region_name(request, bodies.get(request)) for request in requests]
     first: dict[str, str] = {}
     for request, name in zip(requests, names, strict=True):
-        wanted = _wanted_name(request, bodies.get(request))
+        wanted = _requested_name(request, bodies.get(request))
         other = first.get(name.lower())
         first[name.lower()] = wanted
         if other is not None:
-            same = "" if other == wanted else f": {other!r} and {wanted!r} are kept in one folder"
+            same = "" if other == wanted else f": {other!r} and {wanted!r} use the same folder"
             raise UsageError(
                 f"Two regions have the same name, {name}{same}.", "Give each region its own name."
             )
@@ -106,43 +105,43 @@ def region_names(requests: Sequence[str], bodies: Mapping[str, Any]) -> list[str
 
 
 def file_stem(region: str, level: int) -> str:
-    """Return the name, without its ending, of the files of a region's level.
+    """Return the file name, without suffix, of a region's level of detail.
 
-    No spaces, which OBJ readers do not agree on, and none of the names that Windows keeps for
-    itself. What is too long is cut and ends with a number made of the whole.
+    Without spaces, which OBJ readers treat differently, and never a name reserved by Windows. Long
+    names are truncated and end with a hash of the full name.
     """
-    clean = _replaced(region, r"\w.-").strip("._") or "mesh"
+    clean = _sanitise(region, r"\w.-").strip("._") or "mesh"
     if is_reserved_name(clean):
         clean = f"mesh_{clean}"
     if len(clean.encode()) > MAX_STEM_BYTES:
         room = MAX_STEM_BYTES - _DIGITS - 1
-        clean = f"{clean.encode()[:room].decode(errors='ignore')}-{_number(region)}"
+        clean = f"{clean.encode()[:room].decode(errors='ignore')}-{_digest(region)}"
     return f"{clean}-lod{level}" if level else clean
 
 
 def file_stems(meshes: Iterable[tuple[str, int]]) -> dict[tuple[str, int], str]:
-    """Return the stems of all meshes of a result, none alike, also where case does not count.
+    """Return the stems of all meshes of a result, unique even if case is ignored.
 
-    Those that would have one stem all end with a number made of their own name: it does not depend
-    on which of them are written, so that an export at another time replaces none of the others.
+    Colliding stems all end with a hash of their own name, which does not depend on which of them
+    are written, so that a later export overwrites none of the others.
 
     Parameters
     ----------
     meshes : iterable of (region, level)
-        All that the result holds, not those to be written alone.
+        All meshes of the result, not only those to be written.
     """
-    plain = {mesh: file_stem(*mesh) for mesh in meshes}
-    count = Counter([SPLAT_STEM, *(stem.casefold() for stem in plain.values())])
+    stems = {mesh: file_stem(*mesh) for mesh in meshes}
+    count = Counter([SPLAT_STEM, *(stem.casefold() for stem in stems.values())])
     return {
-        mesh: stem if count[stem.casefold()] == 1 else f"{stem}-{_number(f'{mesh[1]} {mesh[0]}')}"
-        for mesh, stem in plain.items()
+        mesh: stem if count[stem.casefold()] == 1 else f"{stem}-{_digest(f'{mesh[1]} {mesh[0]}')}"
+        for mesh, stem in stems.items()
     }
 
 
-def _replaced(text: str, kept: str) -> str:
-    """Return a text with an underscore for each run of characters that are not kept."""
+def _sanitise(text: str, kept: str) -> str:
+    """Replace each run of characters outside ``kept`` by an underscore."""
     return re.sub(f"[^{kept}]+", "_", text)
 
 
-def _number(name: str) -> str:
+def _digest(name: str) -> str:
     return hashlib.sha256(name.encode(errors="surrogatepass")).hexdigest()[:_DIGITS]

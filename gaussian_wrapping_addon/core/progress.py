@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Progress with time left, and cooperative cancelling, passed down to every long function."""
+"""Progress reports with remaining time, and cooperative cancellation."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 from .errors import Cancelled
 
 COMPILING = "compiling"
-"""Phase in which kernels are compiled: no Python runs that could ask for cancelling, and nothing is
-lost where the process ends at once."""
+"""Phase in which kernels are compiled: no Python code runs that could poll for cancellation, and
+nothing is lost if the process ends at once."""
 
 
 @dataclass(frozen=True)
 class ProgressEvent:
-    """One report: fraction in [0, 1] of the stage, a short message, optional figures."""
+    """One progress report: fraction in [0, 1] of the stage, a short message, optional figures."""
 
     stage: str
     fraction: float
@@ -24,11 +24,11 @@ class ProgressEvent:
     figures: dict[str, float] = field(default_factory=dict)
     seconds_left: float | None = None
     phase: str = ""
-    """What programs must know of the moment, such as :data:`COMPILING`."""
+    """Phase for programs, such as :data:`COMPILING`."""
 
 
 class Progress:
-    """A span of one stage; ``span`` gives a part of it to a callee.
+    """Progress of a span of one stage; :meth:`span` returns a sub-span for a callee.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Progress:
     sink : callable or None
         Receives a :class:`ProgressEvent`; ``None`` drops them.
     is_cancelled : callable or None
-        Polled by :meth:`check`; returning true raises :class:`Cancelled` there.
+        Polled by :meth:`check`, which raises :class:`Cancelled` if it returns true.
     """
 
     def __init__(
@@ -70,20 +70,20 @@ class Progress:
         )
 
     def cancelled(self) -> bool:
-        """Tell whether the user asked to stop, without raising."""
+        """Return whether the user cancelled, without raising."""
         return self._is_cancelled is not None and self._is_cancelled()
 
     def check(self) -> None:
-        """Raise :class:`Cancelled` when the user asked to stop."""
+        """Raise :class:`Cancelled` if the user cancelled."""
         if self.cancelled():
             raise Cancelled()
 
     def update(self, fraction: float, message: str = "", **figures: float) -> None:
-        """Report ``fraction`` of this span as done, then check for cancelling."""
+        """Report ``fraction`` of this span as done, then check for cancellation."""
         self._report(fraction, message, figures)
 
     def enter(self, phase: str, message: str) -> None:
-        """Report the beginning of a phase, which lasts to the next report; check for cancelling."""
+        """Report the start of a phase, lasting until the next report; check for cancellation."""
         self._report(0.0, message, {}, phase)
 
     def _report(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Warnings of the stages: made where a fact is known, written to the report as they are."""
+"""Structured warnings of the stages, written to the report."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ UNREADABLE_HINT = "Save these photos again as JPEG or PNG."
 
 @dataclass(frozen=True)
 class ReportWarning:
-    """What a person must know before using a result."""
+    """A warning about a result: code, text and hint."""
 
     code: str
-    """Stable identifier for programs, such as ``"photos-not-placed"``; empty where a text of
-    version 0.1.0 was read."""
+    """Stable identifier for programs, such as ``"photos-not-placed"``; empty for texts read from
+    version 0.1.0."""
     text: str
-    """One sentence or more, for people."""
+    """One or more sentences for the user."""
     hint: str = ""
-    """What the person can do; empty where nothing is known to help."""
+    """What the user can do; empty if nothing is known to help."""
 
     def to_json(self) -> dict[str, str]:
         """Return plain JSON values."""
@@ -28,12 +28,12 @@ class ReportWarning:
 
 
 def read_warnings(values: Any) -> tuple[ReportWarning, ...]:
-    """Return the warnings of a list from JSON; entries that are none are passed over.
+    """Return the warnings of a JSON list; invalid entries are skipped.
 
     Parameters
     ----------
     values : any
-        List of :meth:`ReportWarning.to_json`, or of plain texts as version 0.1.0 wrote them.
+        List of :meth:`ReportWarning.to_json` values, or of strings as written by version 0.1.0.
     """
     found = []
     for value in values if isinstance(values, list) else []:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Numerical tolerances and the constants of the method, in one place.
+"""Numerical tolerances and constants of the method.
 
 Lengths are in scene units unless a name says otherwise (camera centres' mean at 0,
 radius :data:`SCENE_RADIUS`).
@@ -8,7 +8,7 @@ radius :data:`SCENE_RADIUS`).
 from __future__ import annotations
 
 SCENE_RADIUS = 5.0
-"""Scenes are scaled so that 1.1 x the largest camera distance to their mean is this."""
+"""Scenes are scaled so that 1.1 x the largest distance of a camera from their mean equals this."""
 
 NEAR_Z = 0.04 * SCENE_RADIUS
 """Gaussians whose centre is nearer than this (z-depth) are not rendered.
@@ -26,8 +26,8 @@ DEPTH_VALID_TRANSMITTANCE = 0.45
 """A pixel has an isosurface depth only where the final transmittance is at most this."""
 
 SLOPE_FLOOR = 1e-3
-"""Floor of -d(log T)/dt in the depth's gradient, in shares of 1/sigma along the ray
-of the Gaussian at which the blending crosses 0.5 (docs/method.md, section 2.5)."""
+"""Floor of -d(log T)/dt in the depth's gradient, relative to 1/sigma along the ray of the Gaussian
+at which the blending crosses 0.5 (docs/method.md, section 2.5)."""
 
 TILE_PX = 16
 
@@ -36,25 +36,26 @@ DIRECTION_MIN_NORM = 1e-12
 ORIENTED_MIN_NORM = 0.05
 """Normals shorter than this are treated as not oriented (docs/method.md, section 5.2)."""
 
-# What a row of screen parameters may be (docs/architecture.md, "Screen Gaussians"): a Gaussian
-# outside of these limits is not visible, in the definition as in every kernel. Within them no
-# product that rendering forms overflows float32 (3.4e38).
+# Limits of a row of screen parameters (docs/architecture.md, "Screen Gaussians"): a Gaussian
+# outside them is not visible, in the definition and in every kernel. Within them no product that
+# rendering computes overflows float32 (3.4e38).
 FINITE_OFFSET_PX = 2.0**24
-"""Farthest offset of a pixel from the projected mean: float32 numbers single pixels up to here."""
+"""Largest offset of a pixel from the projected mean: float32 resolves single pixels up to here."""
 FINITE_NUM = 1e21
 FINITE_DEN = 1e16
-"""Largest ``num`` and ``den`` in the image, as sums of absolute terms. ``num`` over the least
-``den`` is 1e37. Gaussians of 1e-4 in a distance of 1e5 reach 1e18, discs of 1e6 : 1 reach 1e13."""
+"""Largest ``num`` and ``den`` in the image, as sums of absolute terms. ``num`` over the
+smallest ``den`` is 1e37. Gaussians of 1e-4 at a distance of 1e5 reach 1e18, discs of 1e6 : 1
+reach 1e13."""
 FINITE_SPREAD = 1e16
-"""Largest ``a0 sigma_z^2``. Its inverse is the least ``den`` of any ray, which is why kernels may
-take ``den`` as at least :data:`DENOMINATOR_MIN`. A disc of 1e8 : 1 reaches it."""
+"""Largest ``a0 sigma_z^2``. Its inverse is the smallest ``den`` of any ray, so that kernels may
+clamp ``den`` to :data:`DENOMINATOR_MIN`. A disc of 1e8 : 1 reaches it."""
 DENOMINATOR_MIN = 1.0 / FINITE_SPREAD
 FINITE_PULL = 1e18
-"""Largest z-depth times sharpness (1 / sigma^2) of any ray: the depth squares it."""
+"""Largest z-depth times sharpness (1 / sigma^2) of any ray: the depth solver squares it."""
 FINITE_Z_MIN, FINITE_Z_MAX = 1e-9, 1e12
-"""Range of z-depths. The farther one, over the least ``den`` and times the largest ``1 + p.d``
+"""Range of z-depths. The larger, over the smallest ``den`` and times the largest ``1 + p.d``
 (1e8, the root of the largest ``den``), is 1e36; gradients contain 1 / z."""
 FINITE_SIGMA_Z = 1e15
-"""Largest sigma_z: its inverse square, the least a0, is a normal float32."""
+"""Largest sigma_z: its inverse square, the smallest a0, is a normal float32."""
 FINITE_COLOR = 2.0**24
-"""Beyond, a float32 sum no longer holds a share of white beside it."""
+"""Beyond, a float32 sum no longer resolves white added to it."""

@@ -20,7 +20,7 @@ from benchmarks.meshing_study.judge import distances, inner, solidity
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ResourceError
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from gaussian_wrapping_addon.core.meshing.points.candidate_surface import MARGIN_SHARE
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 
@@ -68,7 +68,7 @@ def test_both_checks_see_a_hole_and_an_inverted_solid() -> None:
         found = solidity(SurfaceMesh(ball.vertices, np.ascontiguousarray(faces)))
         assert not found["check"]["good"]
         assert not found["trimesh_good"]
-    assert check_mesh(ball.vertices, ball.faces).euler == 2
+    assert validate_manifold(ball.vertices, ball.faces).euler == 2
 
 
 def eyes(count: int) -> list[Camera]:

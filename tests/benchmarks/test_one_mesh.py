@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from tests.core.field.field_scenes import cameras_around, shell_arrays
 from tests.core.meshing.meshing_scenes import cube
 
@@ -53,7 +53,7 @@ def trained() -> Trained:
 def test_method_makes_a_closed_ball(method: Method, trained: Trained, tmp_path: Path) -> None:
     figures = measure(trained, method, tmp_path, threads=1)
     mesh = load_mesh(tmp_path / MESH)
-    check = check_mesh(mesh.vertices, mesh.faces)
+    check = validate_manifold(mesh.vertices, mesh.faces)
     assert check.good, check.defects()
     assert max(check.parts, key=lambda part: part.faces).euler == 2
     assert np.median(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1.0)) < 0.02

@@ -38,7 +38,7 @@ from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.region import read_region
 
@@ -285,7 +285,7 @@ def test_the_inside_of_the_cup_is_photographed() -> None:
 def test_torus_and_plate_are_what_they_say() -> None:
     content = torus_content(12, 4, (64, 48))
     vertices, faces = content.truth
-    checked = check_mesh(vertices, faces)
+    checked = validate_manifold(vertices, faces)
     assert checked.good
     assert sorted(part.euler for part in checked.parts) == [0, 2]
     ring, tube = RING_RADIUS, TUBE_RADIUS

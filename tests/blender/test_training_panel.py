@@ -21,9 +21,9 @@ from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobSta
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS
 from gaussian_wrapping_addon.core.regions.region_file import region_to_json
 from gaussian_wrapping_addon.core.settings import (
-    DECISIONS,
     MASK_MODES,
     MODEL_SELECTION,
+    SELECTION_MODES,
     preset,
     to_json,
 )
@@ -72,7 +72,7 @@ def test_untouched_choices_are_the_preset() -> None:
         bpy.context.scene.gwrap.preset = name.upper()
         assert panel_settings.job_settings(bpy.context.scene, 3) == preset(name, threads=3)
     for name in MODEL_SELECTION:
-        assert choices_of(name) == set(DECISIONS)
+        assert choices_of(name) == set(SELECTION_MODES)
     assert choices_of("mask_mode") == set(MASK_MODES)
 
 

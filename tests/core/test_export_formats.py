@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The table of export formats, and that nobody keeps a list beside it."""
+"""The table of export formats is the only list of them."""
 
 from __future__ import annotations
 

@@ -10,14 +10,14 @@ import pytest
 
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.files import finite, read_json, resolve_inside, write_json
+from gaussian_wrapping_addon.core.files import finite_json, read_json, resolve_inside, write_json
 
 
 def test_what_is_not_finite_becomes_null(tmp_path: Path) -> None:
     values = {"a": (1.5, float("nan"), [float("-inf"), True, "x"]), 3: {"b": float("inf")}}
-    write_json(tmp_path / "a.json", finite(values))
+    write_json(tmp_path / "a.json", finite_json(values))
     expected = {"a": [1.5, None, [None, True, "x"]], "3": {"b": None}}
-    assert finite(values) == read_json(tmp_path / "a.json") == expected
+    assert finite_json(values) == read_json(tmp_path / "a.json") == expected
 
 
 @pytest.mark.parametrize(

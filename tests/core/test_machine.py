@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Memory of machines and containers, as the system's files tell it."""
+"""Memory of machines and containers, from the system's files."""
 
 from __future__ import annotations
 
@@ -89,13 +89,13 @@ def test_other_systems_have_no_such_files(system: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(machine, "_installed_bytes", lambda: 0)
     assert machine.available_memory_bytes() == machine.total_memory_bytes() == 0
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    assert machine.processors() == os.cpu_count()
+    assert machine.processor_count() == os.cpu_count()
 
 
 def test_this_machine_is_described() -> None:
     found = machine.describe_machine(3)
     assert found["threads"] == 3
-    assert 1 <= machine.processors() <= found["cores"]
+    assert 1 <= machine.processor_count() <= found["cores"]
     assert found["packages"]["numpy"][0].isdigit()
     assert set(found["packages"]) == set(machine.PACKAGES)
     assert 0 < machine.available_memory_bytes() <= machine.total_memory_bytes()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Progress spans and cancelling."""
+"""Progress spans and cancellation."""
 
 from __future__ import annotations
 

@@ -62,7 +62,12 @@ LEFT_OUT_ENTRIES = (
     LeftOut(r"^machine\.", "the machine"),
     LeftOut(r"(^|\.)estimate\.speed$", "speed of the machine"),
     LeftOut(r"(^|\.)(evidence|note|lpips_note|unwrap_fallback_reason)$", "wording"),
-    LeftOut(r"(^|\.)(warnings|notes)\[\d+\]$", "wording; the number of texts is compared"),
+    LeftOut(
+        r"(^|\.)(warnings|notes)\[\d+\](\.(stage|code|text|hint|next_step))?$",
+        "wording; texts in 0.1.0, codes with text and hint since",
+    ),
+    LeftOut(r"\.measured$", "new after 0.1.0: whether a decision rests on a measurement"),
+    LeftOut(r"^(phase|put_back)$", "new after 0.1.0", "status.json"),
     LeftOut(r"gwrap_stamp$", "dates of files", "*.usdc"),
     LeftOut(r"gwrap_figures$", "times; the figures are those of report.json", "*.usdc"),
     LeftOut(r"^(message|hint|error)$", "wording", "status.json"),
@@ -159,7 +164,11 @@ def _items_of(path: Path) -> Iterator[tuple[str, Item]]:
     if suffix == ".npz":
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             for name in arrays.files:
-                yield name, _array(arrays[name], "array")
+                values = _json_in(arrays[name])
+                if values is None:
+                    yield name, _array(arrays[name], "array")
+                else:
+                    yield from ((e, Item("json", text)) for e, text in _entries(values, name))
     elif suffix in (".png", ".jpg", ".jpeg"):
         with Image.open(io.BytesIO(data)) as image:
             yield f"pixels ({image.mode})", _array(np.asarray(image), "image")
@@ -189,6 +198,23 @@ def _usd_items(paths: list[Path]) -> dict[Path, list[tuple[str, Item]]]:
         path: [(entry, Item("usd", text)) for entry, text in values.items()]
         for path, values in zip(paths, lines, strict=True)
     }
+
+
+def _json_in(array: np.ndarray) -> dict[str, Any] | None:
+    """Return the JSON object that an array of bytes or a text holds, ``None`` of other arrays."""
+    if array.dtype == np.uint8 and array.ndim == 1:
+        text = array.tobytes().decode(errors="replace")
+    elif array.dtype.kind == "U" and array.ndim == 0:
+        text = str(array)
+    else:
+        return None
+    if not text.startswith("{"):
+        return None
+    try:
+        values = json.loads(text)
+    except ValueError:
+        return None
+    return values if isinstance(values, dict) else None
 
 
 def _array(array: np.ndarray, kind: str) -> Item:

@@ -10,7 +10,7 @@ from ...core.errors import UsageError
 from ...core.settings import JobSettings, MeshingSettings, with_values
 from .setting_options import add_options, declared_options, given_settings, option_of
 
-_NOT_OF_PIVOTS: dict[str, tuple[Any, ...]] = {
+_IGNORED_BY_PIVOTS: dict[str, tuple[Any, ...]] = {
     "edge_length": (0.0,),
     "points": (0,),
     "spacing": (),
@@ -39,8 +39,8 @@ def method_settings(options: Namespace) -> dict[str, Any]:
     given = {path.removeprefix("meshing."): value for path, value in values.items()}
     method = given.get("method", MeshingSettings().method)
     if method == "pivots":
-        for name, idle in _NOT_OF_PIVOTS.items():
-            if name in given and given[name] not in idle:
+        for name, no_effect in _IGNORED_BY_PIVOTS.items():
+            if name in given and given[name] not in no_effect:
                 option = option_of(f"meshing.{name}")
                 raise UsageError(
                     f"{option} {given[name]} does not go with --method pivots, which is as fine "

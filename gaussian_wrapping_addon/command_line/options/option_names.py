@@ -7,6 +7,6 @@ from ...core.errors import SettingError
 from .setting_options import option_of
 
 
-def in_words_of_options(error: SettingError) -> SettingError:
+def with_option_name(error: SettingError) -> SettingError:
     """Return the same error, naming the option where a setting is named."""
     return SettingError(error.setting, error.wanted, called=option_of(error.setting))

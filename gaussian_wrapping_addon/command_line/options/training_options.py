@@ -8,7 +8,7 @@ from argparse import ArgumentParser, Namespace
 from ...core.settings import MODEL_SELECTION, JobSettings, preset, with_values
 from .setting_options import add_options, given_settings, option_of
 
-_NEEDS = {"auto": "auto", "all": "on", "none": "off"}
+_SELECTION_VALUES = {"auto": "auto", "all": "on", "none": "off"}
 """Words of ``--needs`` and what they set."""
 
 
@@ -18,7 +18,7 @@ def add_training_options(parser: ArgumentParser) -> None:
     names = ", ".join(option_of(f"training.{name}") for name in MODEL_SELECTION)
     parser.add_argument(
         "--needs",
-        choices=tuple(_NEEDS),
+        choices=tuple(_SELECTION_VALUES),
         help=f"model selection: sets {names}, each of which wins over this option; "
         "auto: by what the photos show; all: on; none: off",
     )
@@ -31,7 +31,9 @@ def training_settings(options: Namespace) -> JobSettings:
     """
     values = given_settings(options, "training")
     if options.needs is not None:
-        selected = {f"training.{name}": _NEEDS[options.needs] for name in MODEL_SELECTION}
+        selected = {
+            f"training.{name}": _SELECTION_VALUES[options.needs] for name in MODEL_SELECTION
+        }
         values = {**selected, **values}
     chosen = preset(values.pop("preset", JobSettings().preset))
     return with_values(chosen, values)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How good a result is: against a ground truth, against photos, and the job's report.
+"""Evaluation of results: against a ground truth, against photos, and the report of a job.
 
-``command.py`` judges one mesh against one truth.
+``command.py`` evaluates one mesh against one ground truth.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Judge one mesh against one ground truth: what ``evaluate`` of the command line does."""
+"""Evaluate one mesh against one ground truth: the command ``evaluate``."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from .surface.truth import TRUTH_FILE, Truth, read_truth
 LAYOUTS = ("auto", "scene", "mesh", "tanks", "dtu")
 ALIGNMENTS = ("none", "cameras", "icp")
 SHARES = (0.0025, 0.005, 0.01)
-"""Thresholds as shares of the truth's diagonal, where none are given."""
+"""Default thresholds as shares of the truth's diagonal."""
 SAMPLES = 200_000
-ELSEWHERE_SHARE = 0.01
-"""Cameras further than this share of their spread from the true ones stand in another frame, where
-an alignment brings them nearer: the largest of :data:`SHARES`."""
+FRAME_MISMATCH_SHARE = 0.01
+"""Cameras farther than this share of their spread from the true ones are in another frame if an
+alignment brings them nearer; equal to the largest of :data:`SHARES`."""
 ICP_REACH = (0.05, 0.01)
-"""Largest distance of pairs in the two stages of ``--align icp``, shares of the diagonal."""
+"""Maximum distance of pairs in the two stages of ``--align icp``, shares of the diagonal."""
 
 
 @dataclass(frozen=True)
 class EvaluationRequest:
-    """What was asked for; ``None`` means the layout's own habit."""
+    """Options of an evaluation; ``None`` means the default of the layout."""
 
     truth: Path
     layout: str = "auto"
@@ -55,44 +55,46 @@ class EvaluationRequest:
     threads: int = 1
 
     def checked(self) -> EvaluationRequest:
-        """Return itself.
+        """Validate the options and return the request itself.
 
         Raises
         ------
         UsageError
-            An option has a value that means nothing.
+            An option has an invalid value.
         """
         for name, value, known in (
             ("--layout", self.layout, LAYOUTS),
             ("--align", self.align, ALIGNMENTS),
         ):
             if value is not None and value not in known:
-                raise UsageError(f"{name} {value} is not known.", f"Use {', '.join(known)}.")
+                raise UsageError(f"{name} {value} is unknown.", f"Use {', '.join(known)}.")
         if self.protocols is not None and not self.protocols:
-            raise UsageError("--protocols names none.", f"Use {', '.join(PROTOCOLS)}.")
+            raise UsageError("--protocols is empty.", f"Use {', '.join(PROTOCOLS)}.")
         for protocol in self.protocols or ():
             if protocol not in PROTOCOLS:
                 raise UsageError(
-                    f"Protocol {protocol!r} is not known.", f"Use {', '.join(PROTOCOLS)}."
+                    f"Protocol {protocol!r} is unknown.", f"Use {', '.join(PROTOCOLS)}."
                 )
         for name, values in (("--thresholds", self.shares), ("--distances", self.distances)):
             good = values is None or (values and all(0 < v < float("inf") for v in values))
             if not good:
-                raise UsageError(f"{name} holds no positive numbers.", "Give them with commas.")
+                raise UsageError(f"{name} needs positive numbers.", "Separate them by commas.")
         if self.shares is not None and self.distances is not None:
-            raise UsageError("--thresholds and --distances were both given.", "Give one of them.")
+            raise UsageError(
+                "--thresholds and --distances were both given.", "Give only one of them."
+            )
         if self.samples is not None and self.samples < 1:
             raise UsageError(f"--samples {self.samples} is too few.", "Give at least 1.")
         return self
 
 
 def find_layout(request: EvaluationRequest) -> str:
-    """Return the layout of the truth: as asked for, or by what lies there.
+    """Return the layout of the truth: as requested, or detected from the files.
 
     Raises
     ------
     DatasetError
-        The path does not exist, or is none of the layouts.
+        The path does not exist, or matches none of the layouts.
     """
     path = request.truth
     if not path.exists():
@@ -108,7 +110,7 @@ def find_layout(request: EvaluationRequest) -> str:
     if is_dtu_folder(path):
         return "dtu"
     raise DatasetError(
-        f"{path.name} is no ground truth that is known.",
+        f"{path.name} is not a known ground truth.",
         f"Give a mesh or cloud, a folder with {TRUTH_FILE}, a scene of Tanks and Temples "
         "(NAME_trans.txt and the files beside it), or a DTU folder (Points/stl, ObsMask).",
     )
@@ -117,8 +119,8 @@ def find_layout(request: EvaluationRequest) -> str:
 def read_cameras(path: Path) -> list[Camera]:
     """Read the cameras of a COLMAP project or transforms.json, in the frame of the file.
 
-    Of a lens with distortion its focal length and centre are taken: enough for alignment and for
-    the virtual scan, which asks only what is in sight.
+    Lens distortion is ignored; focal length and principal point suffice for alignment and for the
+    virtual scan, which only needs visibility.
 
     Raises
     ------
@@ -149,7 +151,7 @@ def evaluate_mesh(
     ----------
     vertices, faces : (v, 3), (f, 3)
     cameras : sequence of Camera
-        Those of the reconstruction, in the mesh's frame; empty where not known.
+        Cameras of the reconstruction, in the mesh's frame; empty if unknown.
 
     Returns
     -------
@@ -181,7 +183,7 @@ def _require_cameras(cameras: Sequence[Camera], what: str) -> None:
 
 
 def _protocols(request: EvaluationRequest, cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """Return the protocols asked for, or all that can be followed."""
+    """Return the requested protocols, or all that are possible."""
     if request.protocols is not None:
         return request.protocols
     return tuple(p for p in PROTOCOLS if p != "scan" or cameras)
@@ -221,7 +223,7 @@ def _surface(
             {"fitness": s.fitness, "rmse": s.rmse, "iterations": s.iterations} for s in stages
         ]
     if poses is None and cameras and true_cameras:
-        # Nobody asked for these: where they cannot be told, the scores still can.
+        # Not requested: if they cannot be measured, the scores still can.
         try:
             poses = pose_errors(cameras, true_cameras)
         except DatasetError as error:
@@ -273,7 +275,7 @@ def _mesh_truth(request: EvaluationRequest) -> tuple[Truth, float]:
     else:
         mesh = read_mesh(path)
         count = request.samples or SAMPLES
-        # Another seed than the prediction's: equal samples would flatter equal meshes.
+        # Another seed than for the prediction: identical samples would favour identical meshes.
         truth = Truth(sample_uniformly(*mesh, count, seed=request.seed + 1), *mesh)
         points = mesh[0][np.unique(mesh[1])]
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
@@ -290,7 +292,7 @@ def _icp(
     diagonal: float,
     request: EvaluationRequest,
 ) -> tuple[Similarity, list[IcpResult]]:
-    """Two stages of ICP with scale on even samples, from far pairs to near ones."""
+    """Run two stages of ICP with scale on uniform samples, from distant pairs to near ones."""
     points = sample_uniformly(
         vertices, faces, min(request.samples or SAMPLES, SAMPLES), seed=request.seed
     ).points
@@ -322,7 +324,7 @@ def _tanks(
 ) -> dict[str, Any]:
     if request.shares is not None or len(request.distances or (0.0,)) > 1:
         raise UsageError(
-            "Tanks and Temples judges at one distance.", "Give it with --distances, or leave it."
+            "Tanks and Temples uses a single distance.", "Give one with --distances, or none."
         )
     progress.update(0.0, "reading the truth")
     scene = read_tanks(request.truth, request.distances[0] if request.distances else None)
@@ -366,10 +368,10 @@ def _dtu(
     progress: Progress,
 ) -> dict[str, Any]:
     if request.scan is None:
-        raise UsageError("A DTU folder holds many scans.", "Say which: --scan 24.")
+        raise UsageError("A DTU folder holds many scans.", "Choose one: --scan 24.")
     if request.shares or request.distances or request.protocols or request.samples:
         raise UsageError(
-            "DTU has its own protocol.", "Leave --thresholds, --distances, --protocols, --samples."
+            "DTU has its own protocol.", "Omit --thresholds, --distances, --protocols, --samples."
         )
     align = request.align or "cameras"
     if align == "icp":
@@ -397,7 +399,7 @@ def _dtu(
 
 
 def table(result: dict[str, Any]) -> list[str]:
-    """Return the scores as lines for a terminal; recall of thin parts where there are such."""
+    """Return the scores as lines for a terminal, with the recall of thin parts if there are any."""
     align = result["alignment"]["method"]
     lines = [f"layout {result['layout']}, alignment {align}, seed {result['seed']}"]
     if result["layout"] == "dtu":
@@ -431,7 +433,7 @@ def table(result: dict[str, Any]) -> list[str]:
 
 
 def _pose_lines(result: dict[str, Any], align: str) -> list[str]:
-    """Return what is known of the cameras; a warning where the mesh may stand elsewhere too."""
+    """Return the pose errors, with a warning if the mesh may be in another frame."""
     poses = result.get("pose_errors")
     if not poses:
         note = result.get("pose_note")
@@ -443,10 +445,11 @@ def _pose_lines(result: dict[str, Any], align: str) -> list[str]:
         f"{poses['cameras']}, after their own best alignment)"
     )
     lines = [text]
-    if align == "none" and given > max(ELSEWHERE_SHARE, 2.0 * aligned):
+    if align == "none" and given > max(FRAME_MISMATCH_SHARE, 2.0 * aligned):
         lines.append(
-            f"poses     the cameras lie elsewhere (scale {poses['transform']['scale']:.4g}, shift "
-            f"{given * poses['spread']:.4g} in the truth's units): try --align cameras"
+            f"poses     the cameras are in another frame (scale "
+            f"{poses['transform']['scale']:.4g}, shift {given * poses['spread']:.4g} in the "
+            "truth's units): try --align cameras"
         )
     return lines
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fields of the trained Gaussians: vector field, isosurface, depth-map samples.
+"""Fields of trained Gaussians: vacancy, vector field, isosurface projection, depth-map samples.
 
 In: points and Gaussians. Out: values, and points moved onto the isosurface vacancy = 0.5.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A grid of several cell sizes that lists, for a point, the boxes that may contain it."""
+"""Multi-level hash grid of boxes: lists, for a point, the boxes that may contain it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from ..kernels.compiled import inline, kernel
 
 COORDINATE_MASK = (1 << 21) - 1
-"""Cells 2^21 apart on one axis share a list: harmless, as callers test each box anyway."""
+"""Cells 2^21 apart on an axis share a list: harmless, as callers test each box anyway."""
 MAX_LEVELS = 48
 EMPTY_KEY = -1
 
@@ -67,9 +67,9 @@ def _fill_table(keys, values, slot_keys, slot_values, mask):  # type: ignore[no-
 class BoxGrid:
     """Lists of boxes per cell, for each level; see :func:`build_box_grid`.
 
-    ``kernels`` find the list of a point at level ``k`` by probing the hash table part
-    ``[table_begin[k], table_begin[k] + table_mask[k]]`` for :func:`cell_key`; its value ``c`` names
-    ``owners[cell_begin[c] : cell_begin[c + 1]]``.
+    Kernels find the list of a point at level ``k`` by probing the hash table slots
+    ``[table_begin[k], table_begin[k] + table_mask[k]]`` for :func:`cell_key`; for its value ``c``
+    the list is ``owners[cell_begin[c] : cell_begin[c + 1]]``.
     """
 
     origin: np.ndarray  # (3,) float64 subtracted from points before cells are found
@@ -79,16 +79,16 @@ class BoxGrid:
     slot_keys: np.ndarray  # (slots,) int64, -1 where empty
     slot_cells: np.ndarray  # (slots,) int32
     cell_begin: np.ndarray  # (cells + 1,) int64
-    owners: np.ndarray  # (pairs,) int32
+    owners: np.ndarray  # (entries,) int32
 
 
 def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
-    """Sort boxes into cells of about their own size.
+    """Build a grid that lists boxes in cells of about their own size.
 
     Each box is listed in the cells that it touches (at most 27) of the level whose cell edge is
-    between half and all of its longest side; so a query reads one cell a level, and neither huge
-    nor tiny boxes lengthen the lists of others. Cells twice as large make vector field queries
-    40 % slower, cells half as large need four times the memory and gain nothing.
+    between half and all of its longest side; so a query reads one cell per level, and neither huge
+    nor tiny boxes lengthen the lists of others. Cells twice as large make vector field queries 40 %
+    slower, cells half as large need four times the memory without any gain.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
     low, high = low - origin, high - origin
     longest = (high - low).max(1) if count else np.zeros(0)
     top = float(longest.max()) if count else 1.0
-    # Level k has cells of top / 2^k; boxes much smaller than the last level's cells go there too.
+    # Level k has cells of top / 2^k; boxes much smaller than the last level's cells are put there.
     with np.errstate(divide="ignore"):
         depth = np.floor(np.log2(top / longest)) if top > 0.0 else np.zeros(count)
     level = np.clip(depth + 1, 0, MAX_LEVELS - 1).astype(np.int64)  # (n,)
@@ -109,7 +109,7 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
 
     table_begin, table_mask, slot_key_parts, slot_cell_parts = [], [], [], []
     begin_parts, owner_parts = [np.zeros(1, np.int64)], []
-    slots = cells = pairs = 0
+    slots = cells = entries = 0
     for size, number in zip(level_size.tolist(), used.tolist(), strict=True):
         rows = np.flatnonzero(level == number)
         sizes = np.full(len(rows), size)
@@ -130,10 +130,10 @@ def build_box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
         table_mask.append(capacity - 1)
         slot_key_parts.append(slot_keys)
         slot_cell_parts.append(slot_cells)
-        ends = np.concatenate([first[1:], [len(keys)]]) + pairs
+        ends = np.concatenate([first[1:], [len(keys)]]) + entries
         begin_parts.append(ends.astype(np.int64))
         owner_parts.append(rows[owners[order]].astype(np.int32))
-        slots, cells, pairs = slots + capacity, cells + len(unique_keys), pairs + len(keys)
+        slots, cells, entries = slots + capacity, cells + len(unique_keys), entries + len(keys)
     return BoxGrid(
         origin,
         level_size,

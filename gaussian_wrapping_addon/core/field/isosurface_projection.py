@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Moving points onto the surface ``vacancy = 0.5``: safeguarded Newton, then a kept bracket."""
+"""Project points onto the surface ``vacancy = 0.5`` by safeguarded Newton and bracketing."""
 
 from __future__ import annotations
 
@@ -17,49 +17,48 @@ from .vacancy.vacancy import SETTLED, VacancyResult
 from .vector_field import MIN_SLOPE, VectorFieldResult
 
 TOLERANCE = 0.01
-"""Points no further than this from 0.5 are on the surface: about the error that dropped tails of
-Gaussians leave in the field."""
-AIM = 0.002
-"""Points move on until they are this close, where the field is smooth enough. Those that a bracket
-brings there end anywhere below it, so it bounds the median of any scene. On trained scenes the
-median is 0.0003 to 0.0004, for an eighth to a sixth more evaluations than with 0.005 (0.0009 to
-0.0012)."""
+"""Largest residual of a point on the surface: about the error of the field due to truncated tails
+of Gaussians."""
+TARGET_RESIDUAL = 0.002
+"""Residual at which iterations stop, where the field is smooth enough. Bracketing ends anywhere
+below it, so it bounds the median of any scene. On trained scenes the median is 0.0003 to 0.0004,
+for an eighth to a sixth more evaluations than with 0.005 (0.0009 to 0.0012)."""
 MAX_ROUNDS = 40
 MAX_TRAVEL_SIGMAS = 16.0
 MAX_HALVINGS = 1
 MAX_NEWTON_STEPS = 3
-"""Where Newton does not converge at once, V is not the slope (it knows nothing of the camera), and
-the search for a bracket is the shorter way: with four halvings and any number of steps more points
+"""Where Newton does not converge quickly, V differs from the slope (it does not depend on the
+camera), and a search for a bracket is faster: with four halvings and unlimited steps more points
 ran out of rounds. The exact gradient of the arg-max camera saves 3 % of the evaluations and takes
 longer than that to compute."""
 MAX_STEP_SIGMAS = 1.0
 MAX_INWARD_MARCH = 8
 BRACKET_END_SIGMAS = 1e-3
-"""A bracket this short is not cut any further (docs/method.md, section 5.6)."""
+"""Brackets this short are not shortened further (docs/method.md, section 5.6)."""
 SLOPE_RATIO = 4.0
-"""Newton trusts V's length within this factor, and corrects it by what the last step showed."""
+"""Largest factor by which the slope |V| is corrected from the last Newton step."""
 RESOLVED = (1e-4, SETTLED)
-"""Outside this range the field does not resolve vacancy, so there is no slope to follow."""
+"""Outside this range vacancy is not resolved, so that there is no slope for Newton."""
 
 
 class ProjectionStatus(IntEnum):
-    """How a point ended."""
+    """Outcome for a point."""
 
     CONVERGED = 0
     """Newton steps reached the tolerance."""
     BISECTED = 1
-    """A bracket was found and shortened until the tolerance was reached."""
+    """A bracket was found and shortened to the tolerance."""
     DROPPED = 2
-    """Not on the surface: no camera sees the point, or there is no crossing in its neighbourhood,
-    or vacancy jumps over the tolerance there."""
+    """Not on the surface: no camera sees the point, there is no crossing in its neighbourhood, or
+    vacancy is discontinuous there."""
 
 
 @dataclass(frozen=True)
 class ProjectionResult:
-    """Where the points ended; every point has a status and a residual."""
+    """Projected points with status and residual."""
 
     points: np.ndarray
-    """(n, 3) float64 scene frame: the closest to the surface that was seen on the way."""
+    """(n, 3) float64 scene frame: the evaluated position of smallest residual."""
     vacancy: np.ndarray
     """(n,) float32 there."""
     status: np.ndarray
@@ -71,7 +70,7 @@ class ProjectionResult:
     vacancy_rounds: int
     """Batches of vacancy evaluations."""
     vacancy_evaluations: int
-    """Points summed over the batches: what the projection cost."""
+    """Total number of points evaluated."""
 
     @property
     def on_surface(self) -> np.ndarray:
@@ -80,7 +79,7 @@ class ProjectionResult:
 
 
 class HasVacancy(Protocol):
-    """What is needed of a vacancy field."""
+    """Interface of a vacancy field."""
 
     @property
     def cameras(self) -> Sequence[Camera]:
@@ -91,7 +90,7 @@ class HasVacancy(Protocol):
 
 
 class HasVectors(Protocol):
-    """What is needed of a vector field."""
+    """Interface of a vector field."""
 
     def evaluate(self, points: np.ndarray) -> VectorFieldResult:
         """Evaluate at (n, 3) points."""
@@ -110,16 +109,16 @@ def project_to_isosurface(
     max_steps: int = MAX_ROUNDS,
     max_travel_sigmas: float = MAX_TRAVEL_SIGMAS,
 ) -> ProjectionResult:
-    """Move points onto the surface ``vacancy = 0.5`` (docs/method.md, section 5.6).
+    """Project points onto the surface ``vacancy = 0.5`` (docs/method.md, section 5.6).
 
-    Newton steps on ``log v`` along V, at most one local sigma long, are taken while they lessen
-    ``|v - 0.5|`` and are halved once where they do not. As soon as two points on
-    opposite sides are known, the segment between them is cut (false position, every third time in
-    the middle) until the tolerance is reached. Where Newton fails or the field is flat, a bracket
-    is searched along the outward direction of the vector field (occupied points outwards, by
-    doubling distances; empty ones inwards, by steps of one sigma), and if that fails along the
-    ray of the camera that sees the point best, on which transmittance must rise to 1. All lengths
-    are in local sigmas, so the result scales with the scene.
+    Newton steps on ``log v`` along V, at most one local sigma long, are taken while they reduce
+    ``|v - 0.5|`` and are halved once where they do not. As soon as a bracket, two points on
+    opposite sides, is known, it is shortened (false position, every third time bisection) until the
+    tolerance is reached. Where Newton fails or the field is flat, a bracket is searched along the
+    outward direction of the vector field (from occupied points outwards, by doubling distances;
+    from empty ones inwards, by steps of one sigma), and if that fails along the ray to the camera
+    that sees the point best, on which transmittance must rise to 1. All lengths are in local
+    sigmas, so the result scales with the scene.
 
     Parameters
     ----------
@@ -129,12 +128,12 @@ def project_to_isosurface(
     vector_field : VectorField
     progress : Progress, optional
     tolerance : float
-        Largest ``|v - 0.5|`` of a point that is kept; 1e-3 to 2e-2 make sense. Points that get
-        there move on until they are within :data:`AIM`, or can not.
+        Largest ``|v - 0.5|`` of accepted points; sensible values are 1e-3 to 2e-2. Iterations
+        continue to :data:`TARGET_RESIDUAL` where possible.
     max_steps : int
-        Batches of vacancy evaluations at most; points still under way then are dropped.
+        Largest number of batches of vacancy evaluations; points still active then are dropped.
     max_travel_sigmas : float
-        No point is ever moved further from its start than this many local sigmas.
+        Largest distance of a point from its start, in local sigmas.
 
     Returns
     -------
@@ -144,27 +143,27 @@ def project_to_isosurface(
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
     centers = np.array([camera.center for camera in vacancy_field.cameras]).reshape(-1, 3)
     vectors = vector_field.evaluate(points)
-    answer = vacancy_field.vacancy(points)
-    walk = _Walk(points, answer, vectors, centers, tolerance, max_travel_sigmas)
+    evaluated = vacancy_field.vacancy(points)
+    search = _Search(points, evaluated, vectors, centers, tolerance, max_travel_sigmas)
     rounds, evaluations = 1, len(points)
-    while len(walk.rows) and rounds < max_steps:
-        share = 1.0 - len(walk.rows) / max(1, len(points))
-        progress.update(share, "Moving points onto the surface")
-        trial = walk.next_trials()
+    while len(search.rows) and rounds < max_steps:
+        share = 1.0 - len(search.rows) / max(1, len(points))
+        progress.update(share, "Projecting points onto the surface")
+        trial = search.next_trials()
         if len(trial) == 0:
             break
-        answer = vacancy_field.vacancy(trial)
+        evaluated = vacancy_field.vacancy(trial)
         rounds, evaluations = rounds + 1, evaluations + len(trial)
-        accepted = walk.judge(trial, answer)
+        accepted = search.update(trial, evaluated)
         if len(accepted):
-            fresh = vector_field.evaluate(walk.x[accepted])
-            walk.V[accepted], walk.outward[accepted] = fresh.V, fresh.outward
-    progress.update(1.0, "Points are on the surface")
-    return walk.result(rounds, evaluations)
+            fresh = vector_field.evaluate(search.x[accepted])
+            search.V[accepted], search.outward[accepted] = fresh.V, fresh.outward
+    progress.update(1.0, "Projected points onto the surface")
+    return search.result(rounds, evaluations)
 
 
-class _Walk:
-    """State of every point (full-length arrays) and ``rows``, the points still under way."""
+class _Search:
+    """State of every point (full-length arrays) and ``rows``, the active points."""
 
     def __init__(
         self,
@@ -178,17 +177,17 @@ class _Walk:
         n = len(points)
         self.centers = centers
         self.tolerance = tolerance
-        self.aim = min(AIM, tolerance)
+        self.target = min(TARGET_RESIDUAL, tolerance)
         self.sigma = vectors.sigma_local
         self.max_travel = max_travel_sigmas * self.sigma
         self.start = points
-        # Newton's current point; the march starts from it.
+        # Newton's current point, from which the march starts.
         self.x = points.copy()
         self.v = first.vacancy.astype(np.float64)
         self.V = vectors.V.copy()
         self.outward = vectors.outward.copy()
         self.camera = first.camera.copy()
-        self.slope = np.ones(n)  # how much of |V| the last step showed to be true
+        self.slope = np.ones(n)  # ratio of the true slope to |V|, from the last step
         self.halvings = np.zeros(n, np.int64)
         self.steps = np.zeros(n, np.int64)
         # The march's last point and its direction.
@@ -197,7 +196,7 @@ class _Walk:
         self.march_x = np.zeros((n, 3))
         self.march_v = np.zeros(n)
         self.direction = np.zeros((n, 3))
-        # The bracket's occupied and empty end, and v - 0.5 there as false position weighs it.
+        # The bracket's occupied and empty end, and v - 0.5 there, weighted by the Illinois rule.
         self.ends = np.zeros((n, 2, 3))
         self.weights = np.zeros((n, 2))
         self.cuts = np.zeros(n, np.int64)
@@ -209,13 +208,13 @@ class _Walk:
         self.phase = np.full(n, _NEWTON, np.int8)
         self.status = np.full(n, ProjectionStatus.DROPPED, np.uint8)
         seen = first.camera >= 0
-        done = seen & (np.abs(self.v - tolerances.ISO_LEVEL) <= self.aim)
+        done = seen & (np.abs(self.v - tolerances.ISO_LEVEL) <= self.target)
         self.status[done] = ProjectionStatus.CONVERGED
-        # Unseen points have no vacancy of their own; without Gaussians there is no length.
+        # Unseen points have no vacancy; without Gaussians there is no length scale.
         self.rows = np.flatnonzero(seen & ~done & (self.sigma > 0.0))
 
     def result(self, rounds: int, evaluations: int) -> ProjectionResult:
-        """Return where all points are now."""
+        """Return the best position of every point."""
         residual = np.abs(self.best_v - tolerances.ISO_LEVEL)
         close = (self.status == ProjectionStatus.DROPPED) & (residual <= self.tolerance)
         close &= self.best_camera >= 0
@@ -232,10 +231,10 @@ class _Walk:
             evaluations,
         )
 
-    # -- where to look next -----------------------------------------------------------------------
+    # -- next positions ---------------------------------------------------------------------------
 
     def next_trials(self) -> np.ndarray:
-        """Return the next point of each row; rows that have none are dropped."""
+        """Return the next trial position of each row; drop rows without one."""
         rows = self.rows
         newton = rows[self.phase[rows] == _NEWTON]
         length = np.linalg.norm(self.V[newton], axis=1)
@@ -249,14 +248,16 @@ class _Walk:
         alive = np.ones(len(rows), bool)
         phase = self.phase[rows]
         trial[phase == _NEWTON] = self._newton(rows[phase == _NEWTON])
-        trial[phase == _BRACKET], alive[phase == _BRACKET] = self._cut(rows[phase == _BRACKET])
+        trial[phase == _BRACKET], alive[phase == _BRACKET] = self._false_position(
+            rows[phase == _BRACKET]
+        )
         march = np.flatnonzero(phase == _MARCH)
         trial[march] = self._march(rows[march])
-        spent = self._is_spent(rows[march], trial[march])
-        again = march[spent & ~self.along_ray[rows[march]]]
+        exhausted = self._is_exhausted(rows[march], trial[march])
+        again = march[exhausted & ~self.along_ray[rows[march]]]
         self._begin_march(rows[again], along_ray=True)
         trial[again] = self._march(rows[again])
-        alive[march] = ~self._is_spent(rows[march], trial[march])
+        alive[march] = ~self._is_exhausted(rows[march], trial[march])
         alive &= self._travel(rows, trial) <= self.max_travel[rows]
         self.rows = rows[alive]
         return trial[alive]
@@ -264,16 +265,16 @@ class _Walk:
     def _travel(self, rows: np.ndarray, trial: np.ndarray) -> np.ndarray:
         return np.linalg.norm(trial - self.start[rows], axis=1)
 
-    def _is_spent(self, rows: np.ndarray, trial: np.ndarray) -> np.ndarray:
+    def _is_exhausted(self, rows: np.ndarray, trial: np.ndarray) -> np.ndarray:
         inward = self.v[rows] > tolerances.ISO_LEVEL
         too_far = self._travel(rows, trial) > self.max_travel[rows]
         too_far |= inward & (self.marched[rows] > MAX_INWARD_MARCH)
         # Outwards, the last step ends at the limit itself.
         before = np.where(self.marched[rows] > 1, 2.0 ** (self.marched[rows] - 2), 0.0)
-        return too_far | (~inward & (before >= self._room(rows)))
+        return too_far | (~inward & (before >= self._remaining_sigmas(rows)))
 
-    def _room(self, rows: np.ndarray) -> np.ndarray:
-        """Sigmas that a march from the current point may go in any direction."""
+    def _remaining_sigmas(self, rows: np.ndarray) -> np.ndarray:
+        """Return the length, in sigmas, that a march from the current point may go."""
         gone = self._travel(rows, self.x[rows])
         return (1.0 - 1e-9) * (self.max_travel[rows] - gone) / self.sigma[rows]
 
@@ -302,11 +303,11 @@ class _Walk:
         count = self.marched[rows]
         # Inwards, longer steps could miss a thin wall.
         occupied = self.v[rows] < tolerances.ISO_LEVEL
-        outward = np.minimum(2.0 ** (count - 1), self._room(rows))
+        outward = np.minimum(2.0 ** (count - 1), self._remaining_sigmas(rows))
         reach = np.where(occupied, outward, count) * self.sigma[rows]
         return self.x[rows] + reach[:, None] * self.direction[rows]
 
-    def _cut(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _false_position(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         self.cuts[rows] += 1
         at = self.weights[rows, 0] / (self.weights[rows, 0] - self.weights[rows, 1])
         at = np.where(self.cuts[rows] % 3 == 0, 0.5, np.clip(at, 0.02, 0.98))
@@ -315,20 +316,20 @@ class _Walk:
         trial = occupied + at[:, None] * (empty - occupied)
         return trial, span > BRACKET_END_SIGMAS * self.sigma[rows]
 
-    # -- what the answer means --------------------------------------------------------------------
+    # -- evaluated positions ----------------------------------------------------------------------
 
-    def judge(self, trial: np.ndarray, answer: VacancyResult) -> np.ndarray:
-        """Digest the vacancy of the trials; return the rows where Newton moved on."""
+    def update(self, trial: np.ndarray, evaluated: VacancyResult) -> np.ndarray:
+        """Update the state by the vacancy of the trials; return rows where Newton advanced."""
         rows = self.rows
-        v = answer.vacancy.astype(np.float64)
-        seen = answer.camera >= 0
+        v = evaluated.vacancy.astype(np.float64)
+        seen = evaluated.camera >= 0
         error = np.abs(v - tolerances.ISO_LEVEL)
         better = seen & (error < np.abs(self.best_v[rows] - tolerances.ISO_LEVEL))
         self.best_x[rows[better]] = trial[better]
         self.best_v[rows[better]] = v[better]
-        self.best_camera[rows[better]] = answer.camera[better]
+        self.best_camera[rows[better]] = evaluated.camera[better]
 
-        done = seen & (error <= self.aim)
+        done = seen & (error <= self.target)
         newton = self.phase[rows] == _NEWTON
         march = self.phase[rows] == _MARCH
         cut = self.phase[rows] == _BRACKET
@@ -336,21 +337,21 @@ class _Walk:
         self.status[rows[done & ~newton]] = ProjectionStatus.BISECTED
 
         crossed = (v > tolerances.ISO_LEVEL) != (self.v[rows] > tolerances.ISO_LEVEL)
-        # A long march may step over the surface into the unseen; a Newton step is halved there.
+        # A long march may cross the surface into unseen space; a Newton step is halved there.
         crossed &= seen | march
         opened = newton & crossed & ~done
         self._open_bracket(rows[opened], self.x, self.v, trial[opened], v[opened])
         opened = march & crossed & ~done
         self._open_bracket(rows[opened], self.march_x, self.march_v, trial[opened], v[opened])
 
-        # A lower error on the same side: Newton goes on from there, knowing the true slope.
+        # A smaller residual on the same side: Newton continues there with the corrected slope.
         taken = newton & better & ~crossed & ~done
         now = rows[taken]
         expected = np.einsum("ni,ni->n", self.V[now], trial[taken] - self.x[now])
         shown = np.log(v[taken] / self.v[now]) / np.where(expected == 0.0, 1.0, expected)
         shown = np.where(np.isfinite(shown), shown, 1.0)
         self.slope[now] = np.clip(shown, 1.0 / SLOPE_RATIO, SLOPE_RATIO)
-        self.x[now], self.v[now], self.camera[now] = trial[taken], v[taken], answer.camera[taken]
+        self.x[now], self.v[now], self.camera[now] = trial[taken], v[taken], evaluated.camera[taken]
         self.halvings[now] = 0
         self.steps[now] += 1
         self.halvings[rows[newton & ~taken & ~crossed & ~done]] += 1
@@ -375,7 +376,7 @@ class _Walk:
         side = (v > tolerances.ISO_LEVEL).astype(np.int64)
         self.ends[rows, side] = x
         self.weights[rows, side] = v - tolerances.ISO_LEVEL
-        # Illinois rule: an end that stays twice loses half its weight, or it would stay for ever.
+        # Illinois rule: halve the weight of an end retained twice, or it would stay for ever.
         again = side == self.last_side[rows]
         self.weights[rows[again], 1 - side[again]] *= 0.5
         self.last_side[rows] = side

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far vertices are from the isosurface, in vacancy."""
+"""Residuals of vertices with respect to the isosurface, in vacancy."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ import numpy as np
 from .. import tolerances
 
 
-def level_errors(vacancy: Any, points: np.ndarray) -> dict[str, Any]:
-    """Measure ``|v - 0.5|`` at points that should lie on the isosurface; nothing without points.
+def isosurface_residuals(vacancy: Any, points: np.ndarray) -> dict[str, Any]:
+    """Measure ``|v - 0.5|`` at points that should lie on the isosurface; empty without points.
+
+    The keys ``level_error_*`` are those of reports.
 
     Parameters
     ----------
     vacancy : VacancyField
-        Or anything with ``vacancy(points)``.
+        Or any object with ``vacancy(points)``.
     points : (n, 3) float64
         Scene frame.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Splats of other programs: any 3D Gaussian splatting PLY as oriented Gaussians.
+"""Read 3D Gaussian splatting PLY files of other programs as oriented Gaussians.
 
 Formats: that of the original code, gsplat and nerfstudio exports (with or without normals,
 or with plain colours), 2D Gaussian splatting (two scales), files with Mip-Splatting's
@@ -24,27 +24,27 @@ from ..report_warning import LEFT_OUT_HINT, ReportWarning
 from ..tolerances import QUATERNION_MIN_NORM
 from .initialisation import SH_C0
 from .model import OrientedGaussians
-from .splat_ply import MAX_LOG_SCALE, MOST_OPAQUE_LOGIT, harmonics_of
+from .splat_ply import MAX_LOG_SCALE, MAX_OPACITY_LOGIT, harmonics_of
 
 _logger = logging.getLogger(__name__)
 
 MAX_DEGREE = 3
-"""Higher degrees of the harmonics are left out: the renderer has none."""
+"""Higher degrees of the harmonics are dropped: the renderer does not support them."""
 
 SURFEL_THICKNESS = 0.02
-"""Third axis of a surfel, which has none, over its shorter one: flat to the eye, and far from the
-discs of 1e8 : 1 that float32 cannot render."""
+"""Thickness given to surfels, relative to their shorter axis: visually flat, and far from the discs
+of 1e8 : 1 that float32 cannot render."""
 
 THINNEST_AXIS = 1e-5
-"""An axis is made at least this share of the longest one."""
+"""Minimum length of an axis relative to the longest one."""
 
 _ACTIVATED_SHARE = 0.999
-"""A file where this share of all opacities and scales could be activated values likely has them."""
+"""If this share of opacities and scales could be activated values, the file likely has them."""
 
 
 @dataclass(frozen=True)
 class ForeignSplat:
-    """A splat of any program."""
+    """A splat file of any program."""
 
     gaussians: OrientedGaussians
     """In the frame of the file. float64 where the file has doubles, else float32; the orientation
@@ -52,20 +52,20 @@ class ForeignSplat:
     oriented: bool
     """Whether the file has orientations."""
     dropped: int
-    """Gaussians left out because a value was not finite or senseless."""
+    """Gaussians dropped because of non-finite or invalid values."""
     warnings: tuple[ReportWarning, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
 
 
 def read_foreign_splat(path: Path) -> ForeignSplat:
-    """Read a 3D Gaussian splatting PLY: properties in any order and type, others beside them.
+    """Read a 3D Gaussian splatting PLY with properties of any order and type, and extra ones.
 
     Raises
     ------
     ParseError
-        Not a splat, cut, or without a single sensible Gaussian; names place and next step.
+        If the file is no splat, truncated, or has no valid Gaussian; names location and next step.
     DatasetError
-        A splat in a format that is not read.
+        If the splat format is not supported.
     """
     header = read_splat_header(path)
     rows = read_vertices(path, header.ply, EXPECTED)
@@ -89,19 +89,19 @@ def read_foreign_splat(path: Path) -> ForeignSplat:
         "orientation": columns(*features) if oriented else np.zeros((count, 4), dtype),
         "filter_3d": columns("filter_3D")[:, 0] if "filter_3D" in names else np.zeros(count, dtype),
     }
-    good = _sensible(arrays)
-    dropped = count - int(good.sum())
-    if not good.any():
+    valid = _is_valid(arrays)
+    dropped = count - int(valid.sum())
+    if not valid.any():
         raise ParseError(
-            path, "body", f"none of the {count} Gaussians has sensible values.",
+            path, "body", f"none of the {count} Gaussians has valid values.",
             "Export the splat again.",
         )  # fmt: skip
-    arrays = {name: array[good] for name, array in arrays.items()}
+    arrays = {name: array[valid] for name, array in arrays.items()}
     warnings = _warnings(header, arrays, dropped, count)
     _normalise(arrays, header.axes)
     tensors = {k: torch.from_numpy(np.ascontiguousarray(v, dtype)) for k, v in arrays.items()}
     facts = {
-        "splat_gaussians": int(good.sum()),
+        "splat_gaussians": int(valid.sum()),
         "splat_dropped": dropped,
         "splat_degree": header.degree,
         "splat_surfels": header.axes == 2,
@@ -126,14 +126,14 @@ def _harmonics(header: SplatHeader, columns: Any) -> np.ndarray:
     return harmonics_of(constant, rest)
 
 
-def _sensible(arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """(n,) bool: finite, a rotation, a size that can be meant."""
-    good = np.ones(len(arrays["means"]), np.bool_)
+def _is_valid(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """(n,) bool: finite, with a valid rotation and a plausible size."""
+    valid = np.ones(len(arrays["means"]), np.bool_)
     for array in arrays.values():
-        good &= np.isfinite(array.reshape(len(array), -1)).all(axis=1)
-    good &= np.abs(arrays["quats"]).max(axis=1) > QUATERNION_MIN_NORM
-    good &= np.abs(arrays["log_scales"].max(axis=1)) < MAX_LOG_SCALE  # the longest axis
-    return good & (arrays["filter_3d"] >= 0)
+        valid &= np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+    valid &= np.abs(arrays["quats"]).max(axis=1) > QUATERNION_MIN_NORM
+    valid &= np.abs(arrays["log_scales"].max(axis=1)) < MAX_LOG_SCALE  # the longest axis
+    return valid & (arrays["filter_3d"] >= 0)
 
 
 def _warnings(
@@ -141,7 +141,7 @@ def _warnings(
 ) -> list[ReportWarning]:
     out = []
     if dropped:
-        text = f"{dropped} of {count} Gaussians with senseless values were left out."
+        text = f"{dropped} of {count} Gaussians with invalid values were left out."
         out.append(ReportWarning("gaussians-left-out", text, LEFT_OUT_HINT))
     if header.degree > MAX_DEGREE:
         text = (
@@ -150,10 +150,10 @@ def _warnings(
         )
         out.append(ReportWarning("harmonics-left-out", text, LEFT_OUT_HINT))
     opacity, scales = arrays["opacity_logits"], arrays["log_scales"]
-    plain = (opacity >= 0) & (opacity <= 1) & (scales > 0).all(axis=1)
-    if plain.mean() > _ACTIVATED_SHARE and np.ptp(opacity) > 0:
+    activated = (opacity >= 0) & (opacity <= 1) & (scales > 0).all(axis=1)
+    if activated.mean() > _ACTIVATED_SHARE and np.ptp(opacity) > 0:
         text = (
-            "Opacities and scales look like plain values; logits and logarithms are expected. "
+            "Opacities and scales look activated; logits and logarithms are expected. "
             "If the mesh looks wrong, export the splat again in Inria's convention."
         )
         out.append(ReportWarning("values-look-activated", text))
@@ -161,14 +161,14 @@ def _warnings(
 
 
 def _normalise(arrays: dict[str, np.ndarray], axes: int) -> None:
-    """Give surfels a third axis, and bring extreme values to where float32 can render them."""
+    """Give surfels a third axis; clamp extreme values to what float32 can render."""
     log_scales = arrays["log_scales"]
     if axes == 2:
         third = log_scales.min(axis=1, keepdims=True) + math.log(SURFEL_THICKNESS)
         log_scales = np.concatenate([log_scales, third.astype(log_scales.dtype)], axis=1)
     least = log_scales.max(axis=1, keepdims=True) + math.log(THINNEST_AXIS)
     arrays["log_scales"] = np.maximum(log_scales, least.astype(log_scales.dtype))
-    limit = MOST_OPAQUE_LOGIT
+    limit = MAX_OPACITY_LOGIT
     arrays["opacity_logits"] = np.clip(arrays["opacity_logits"], -limit, limit)
     quats = arrays["quats"]
     largest = np.abs(quats).max(axis=1, keepdims=True)  # (n, 1)

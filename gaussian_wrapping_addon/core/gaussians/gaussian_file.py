@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussians on disk between stages: a compressed-free npz of the raw parameters."""
+"""Store Gaussians between stages: an uncompressed npz of the raw parameters."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def load_gaussians(path: Path) -> OrientedGaussians:
         with np.load(path, allow_pickle=False) as arrays:
             loaded = {name: arrays[name] for name in (*_SHAPES, "sh")}
     except (OSError, ValueError, KeyError, EOFError) as error:
-        raise ParseError(path, "whole file", f"not a file of Gaussians ({error}).", hint) from None
+        raise ParseError(path, "whole file", f"not a Gaussian file ({error}).", hint) from None
     count = len(loaded["means"])
     for name, array in loaded.items():
         good = array.shape[1:] == _SHAPES[name] if name != "sh" else array.ndim == 3
         if not good or len(array) != count or not np.isfinite(array).all():
-            raise ParseError(path, name, "wrong shape or values that are not finite.", hint)
+            raise ParseError(path, name, "wrong shape or non-finite values.", hint)
     return OrientedGaussians(**{name: torch.from_numpy(array) for name, array in loaded.items()})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The first Gaussians: from sparse points, more along the cameras' rays where these are few."""
+"""Initial Gaussians: from sparse points, and along camera rays if these are few."""
 
 from __future__ import annotations
 
@@ -16,37 +16,38 @@ from ..dataset.scene import Scene
 from ..errors import DatasetError
 from .model import OrientedGaussians
 
-Photograph = Callable[[int], tuple[Camera, np.ndarray, np.ndarray | None]]
-"""Gives camera, (h, w, 3) uint8 photo and (h, w) bool mask or ``None``, at a small size."""
+PhotoLoader = Callable[[int], tuple[Camera, np.ndarray, np.ndarray | None]]
+"""Returns camera, (h, w, 3) uint8 photo and (h, w) bool mask or ``None``, at a small size."""
 
-FIRST_OPACITY = 0.1
+INITIAL_OPACITY = 0.1
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 
-FEW_POINTS = 5000
+MIN_START_POINTS = 5000
 """With fewer sparse points, more are added until there are this many."""
 
 MAX_DISTANCE = 20.0 * tolerances.SCENE_RADIUS
-"""Points farther from the cameras' middle are pulled in along their direction, which hardly moves
-them on any photo: outliers of the reconstruction reach 1e6 units and would waste float32."""
+"""Points farther from the cameras' centroid are moved to this distance along their direction, which
+hardly changes their projections: outliers of the reconstruction reach 1e6 units and would waste
+float32 precision."""
 
 MIN_SPACING_SQ = 1e-7
 """Squared distances between neighbours are clamped to this (docs/method.md, section 1.3)."""
 
 MAX_SPACING_SHARE = 0.1
-"""A first Gaussian is no larger than this share of its distance to the nearest camera."""
+"""Largest size of an initial Gaussian relative to its distance to the nearest camera."""
 
 _DEPTH_NEIGHBOURS = 4
 _DEPTH_JITTER = 0.05
-"""Spread of the filled-up points around the depth of the nearest sparse points, share of it."""
+"""Relative standard deviation of added points around the depth of the nearest sparse points."""
 
-_TRIES = 8
+_DEPTH_TRIALS = 8
 
 
 def initial_gaussians(
     scene: Scene,
     view_indices: list[int],
-    photograph: Photograph,
+    load_photo: PhotoLoader,
     *,
     max_gaussians: int,
     sh_degree: int,
@@ -55,21 +56,21 @@ def initial_gaussians(
     """Return the Gaussians that training starts from (docs/method.md, section 1.3).
 
     One per sparse point: round, as large as the mean distance to its three nearest neighbours,
-    opacity 0.1, orientation zero. Where there are fewer than :data:`FEW_POINTS`, random pixels are
-    lifted to the depth of the nearest sparse points; where there are none, to a random depth,
-    keeping the positions that most cameras see.
+    opacity 0.1, orientation zero. Where there are fewer than :data:`MIN_START_POINTS`, random
+    pixels are lifted to the depth of the nearest sparse points; where there are none, to a random
+    depth, keeping the positions that most cameras see.
 
     Parameters
     ----------
     scene : Scene
     view_indices : list of int
-        Views that may be looked at (not the held-out ones).
-    photograph : callable
-        Gives camera, photo and mask of a view; only called where points are few.
+        Views to use (without held-out ones).
+    load_photo : callable
+        Returns camera, photo and mask of a view; only called if points are few.
     max_gaussians : int
-        Never exceeded; a random choice of the points is taken.
+        Upper bound; a random subset of the points is used if there are more.
     sh_degree : int
-        Of the harmonics to make room for.
+        Degree of the harmonics to allocate.
     seed : int
 
     Returns
@@ -80,7 +81,7 @@ def initial_gaussians(
     Raises
     ------
     DatasetError
-        If there is no view, or points are few and masks leave nothing of all photos.
+        If there is no view, or points are few and the masks exclude all pixels.
     """
     if not view_indices:
         raise DatasetError("There is no view to train on.", "Add photos.")
@@ -92,23 +93,25 @@ def initial_gaussians(
     if len(points) > max_gaussians:
         chosen = np.sort(random.choice(len(points), max_gaussians, replace=False))
         points, colors = points[chosen], colors[chosen]
-    wanted = min(FEW_POINTS, max_gaussians) - len(points)
+    wanted = min(MIN_START_POINTS, max_gaussians) - len(points)
     if wanted > 0:
-        more_points, more_colors = _fill_up(points, wanted, view_indices, photograph, random)
+        more_points, more_colors = _points_along_rays(
+            points, wanted, view_indices, load_photo, random
+        )
         points = np.concatenate([points, more_points])
         colors = np.concatenate([colors, more_colors])
-    points = pull_in(points)
+    points = clamp_distances(points)
     return _gaussians_at(points, colors, _spacing(points, cameras), sh_degree)
 
 
-def pull_in(points: np.ndarray) -> np.ndarray:
-    """Return points with their distance from the scene's middle capped at :data:`MAX_DISTANCE`."""
+def clamp_distances(points: np.ndarray) -> np.ndarray:
+    """Return points with their distance from the scene centre clamped to :data:`MAX_DISTANCE`."""
     distance = np.linalg.norm(points, axis=1, keepdims=True)
     return points * np.minimum(1.0, MAX_DISTANCE / np.maximum(distance, MAX_DISTANCE))
 
 
 def _spacing(points: np.ndarray, cameras: list[Camera]) -> np.ndarray:
-    """(n,) root mean squared distance to the three nearest neighbours, capped by what is seen."""
+    """(n,) RMS distance to the three nearest neighbours, capped by the distance to the cameras."""
     neighbours = min(3, len(points) - 1)
     if neighbours > 0:
         distance, _ = cKDTree(points).query(points, k=neighbours + 1)
@@ -129,7 +132,7 @@ def _gaussians_at(
     sh[:, 0] = (colors - 0.5) / SH_C0
     quats = np.zeros((count, 4), np.float32)
     quats[:, 0] = 1.0
-    logit = math.log(FIRST_OPACITY / (1.0 - FIRST_OPACITY))
+    logit = math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))
     arrays = {
         "means": points,
         "log_scales": np.repeat(np.log(spacing)[:, None], 3, axis=1),
@@ -144,18 +147,18 @@ def _gaussians_at(
     )
 
 
-def _fill_up(
+def _points_along_rays(
     points: np.ndarray,
     wanted: int,
     view_indices: list[int],
-    photograph: Photograph,
+    load_photo: PhotoLoader,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``wanted`` more points with colours in [0, 1], taken from pixels of the photos."""
-    views = [photograph(i) for i in view_indices]
+    """Return ``wanted`` additional points with colours in [0, 1], from pixels of the photos."""
+    views = [load_photo(i) for i in view_indices]
     views = [view for view in views if view[2] is None or view[2].any()]
     if not views:
-        raise DatasetError("The masks leave nothing of any photo.", "Check the masks.")
+        raise DatasetError("The masks exclude all pixels of all photos.", "Check the masks.")
     cameras = [camera for camera, _, _ in views]
     share = np.full(len(views), wanted // len(views))
     share[: wanted - int(share.sum())] += 1
@@ -182,7 +185,7 @@ def _fill_up(
 def _depth_near_points(
     points: np.ndarray, camera: Camera, pixels: np.ndarray, random: np.random.Generator
 ) -> np.ndarray | None:
-    """(m,) depth of one of the sparse points nearest on the photo, or ``None`` without points."""
+    """(m,) depth of one of the sparse points nearest in the image; ``None`` without points."""
     if len(points) == 0:
         return None
     where, depth = camera.project(points)
@@ -201,7 +204,7 @@ def _depth_near_points(
 def _most_seen_depth(
     camera: Camera, pixels: np.ndarray, cameras: list[Camera], random: np.random.Generator
 ) -> np.ndarray:
-    """(m,) of several random depths the one whose position most cameras see."""
+    """(m,) out of several random depths, that of the position most cameras see."""
     near, far = 0.1 * tolerances.SCENE_RADIUS, 4.0 * tolerances.SCENE_RADIUS
     best = np.zeros(len(pixels))
     most = np.full(len(pixels), -1)
@@ -213,13 +216,13 @@ def _most_seen_depth(
         ],
         axis=1,
     )
-    for _ in range(_TRIES):
-        # Uniform in inverse depth: as many positions near the cameras as a photo can tell apart.
+    for _ in range(_DEPTH_TRIALS):
+        # Uniform in inverse depth, which matches the depth resolution of the photos.
         depth = 1.0 / random.uniform(1.0 / far, 1.0 / near, len(pixels))
-        places = (rays * depth[:, None]) @ camera.rotation + camera.center
+        positions = (rays * depth[:, None]) @ camera.rotation + camera.center
         seen = np.zeros(len(pixels), int)
         for other in cameras:
-            where, z = other.project(places)
+            where, z = other.project(positions)
             seen += (
                 (z > tolerances.NEAR_Z)
                 & (where >= 0).all(axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The 3D filter: no Gaussian is smaller than what the closest camera can resolve."""
+"""The 3D smoothing filter: no Gaussian is smaller than the closest camera can resolve."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from ..kernels.parallel import default_threads, even_bounds, run_chunks
 
 FILTER_VARIANCE_PX = 0.05
 """Variance of the filter in squared pixels of the closest camera. The usual 0.2 (docs/method.md,
-section 1.5) was measured to cost thin parts their opacity: a Gaussian as narrow as 0.4 pixels in
-two directions keeps 44 % of it, and spokes of three pixels stay half transparent; with this it
-keeps 76 %."""
+section 1.5) was found to reduce the opacity of thin parts: a Gaussian as narrow as 0.4 pixels in
+two directions keeps 44 % of it, and spokes of three pixels stay half transparent; with this value
+it keeps 76 %."""
 
 IMAGE_MARGIN = 0.15
-"""The image is enlarged by this share on each side when asking which camera sees a Gaussian."""
+"""Share by which the image is enlarged on each side in the visibility test of Gaussians."""
 
 
 @kernel(fast=False)
@@ -50,22 +50,22 @@ def mip_filter(
 ) -> np.ndarray:
     """Return the filter's standard deviation of each Gaussian (docs/method.md, section 1.5).
 
-    ``f = z_min / focal_max * sqrt(0.2)``, with ``z_min`` the smallest z-depth over the cameras
-    whose image, enlarged by 15 % on each side, holds the mean.
+    ``f = z_min / focal_max * sqrt(FILTER_VARIANCE_PX)``, with ``z_min`` the smallest z-depth over
+    the cameras whose image, enlarged by 15 % on each side, contains the mean.
 
     Parameters
     ----------
     means : (n, 3)
         Scene units.
     cameras : sequence of Camera
-        Training cameras at the resolution that is trained on, scene frame.
+        Training cameras at the training resolution, scene frame.
     near_z : float
-        Smaller z-depths do not count, scene units.
+        Smaller z-depths are ignored, scene units.
 
     Returns
     -------
     (n,) float64
-        Scene units. Gaussians that no camera sees receive the largest filter of the others.
+        Scene units. Gaussians that no camera sees get the largest value of the others.
     """
     if len(cameras) == 0 or len(means) == 0:
         return np.zeros(len(means))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Oriented Gaussians: trained parameters, activations, and the plain arrays kernels read."""
+"""Oriented Gaussians: trained parameters, activations, and activated arrays for kernels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .. import tolerances
 class GaussianArrays:
     """Activated Gaussians as C-contiguous float64 numpy arrays, mip filter applied.
 
-    What every non-differentiable consumer reads (fields, pivots, export).
+    Input of all non-differentiable code (fields, pivots, export).
     """
 
     means: np.ndarray  # (n, 3) scene units
@@ -63,11 +63,11 @@ class OrientedGaussians:
             yield item.name, getattr(self, item.name)
 
     def replaced(self, **tensors: Tensor) -> OrientedGaussians:
-        """Return a copy with some tensors exchanged."""
+        """Return a copy with some tensors replaced."""
         return replace(self, **tensors)
 
     def select(self, index: Tensor) -> OrientedGaussians:
-        """Return the Gaussians of an index or mask tensor."""
+        """Return the Gaussians selected by an index or mask tensor."""
         return OrientedGaussians(**{name: value[index] for name, value in self.tensors()})
 
     def detached(self) -> OrientedGaussians:
@@ -82,7 +82,7 @@ class OrientedGaussians:
         return torch.sqrt(torch.exp(2.0 * self.log_scales) + filter_sq)
 
     def log_opacities(self) -> Tensor:
-        """(n,) log of the effective opacity, in stable form (docs/method.md, section 5.4)."""
+        """(n,) log of the effective opacity, numerically stable (docs/method.md, section 5.4)."""
         loss = self.log_scales - torch.log(self.scales())  # (n, 3), <= 0
         return -torch.nn.functional.softplus(-self.opacity_logits) + loss.sum(1)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussians as PLY files: our native one, one for viewers, and a bounded reader of the native one.
+"""Gaussians as PLY files: native format (write and read) and viewer format (write).
 
 The order of the properties is that of the original 3D Gaussian splatting code:
 positions, zero normals, harmonics channel by channel, opacity logit, log scales, quaternion wxyz;
@@ -28,10 +28,11 @@ from .model import OrientedGaussians
 _logger = logging.getLogger(__name__)
 
 MAX_LOG_SCALE = 40.0
-"""Scales beyond e^40 cannot be meant; such Gaussians are dropped."""
+"""Gaussians with scales beyond e^40, which are implausible, are dropped."""
 
-MOST_OPAQUE_LOGIT = 30.0
-"""Opacity logits of viewers' files end here and at its negative: sigmoid is 1 or 0 to 13 digits."""
+MAX_OPACITY_LOGIT = 30.0
+"""Opacity logits in viewer files are clamped to this and its negative: sigmoid is 1 or 0 to 13
+digits."""
 
 _FRAME_COMMENT = "world_from_scene"
 _HINT = "Write the file again with this program."
@@ -39,17 +40,17 @@ _HINT = "Write the file again with this program."
 
 @dataclass(frozen=True)
 class SplatFile:
-    """What a native file holds."""
+    """Content of a native file."""
 
     gaussians: OrientedGaussians
     world_from_scene: Similarity | None
-    """Frame of the input, where the header names it."""
+    """Frame of the input, if the header has it."""
     dropped: int
-    """Gaussians left out because a value was not finite or senseless."""
+    """Gaussians dropped because of non-finite or invalid values."""
 
 
 def write_splat_ply(path: Path, gaussians: OrientedGaussians, world_from_scene: Similarity) -> None:
-    """Write the native file: raw parameters, scene frame, the frame in a header comment."""
+    """Write a native file: raw parameters, scene frame; a header comment defines the frame."""
     arrays = {name: t.detach().cpu().numpy() for name, t in gaussians.tensors()}
     names = [*standard_names(arrays["sh"].shape[1]), "filter_3D"]
     names += [f"gaussian_features_{i}" for i in range(4)]
@@ -64,30 +65,30 @@ def write_viewer_ply(path: Path, gaussians: OrientedGaussians) -> None:
     Raises
     ------
     MeshingError
-        A Gaussian is not finite, also in single precision: viewers show nothing then, or crash.
+        If a Gaussian is not finite in single precision: viewers would show nothing, or crash.
     """
     wide = OrientedGaussians(**{n: t.detach().cpu().double() for n, t in gaussians.tensors()})
     log_opacity = wide.log_opacities()
     # logit = log(a / (1 - a)), from log a without losing a close to 1
     logit = log_opacity - torch.log(-torch.expm1(log_opacity.clamp_max(-1e-12)))
-    logit = logit.clamp(-MOST_OPAQUE_LOGIT, MOST_OPAQUE_LOGIT)
+    logit = logit.clamp(-MAX_OPACITY_LOGIT, MAX_OPACITY_LOGIT)
     baked = wide.replaced(log_scales=torch.log(wide.scales()), opacity_logits=logit)
     arrays = {name: t.numpy() for name, t in baked.tensors()}
-    good = np.ones(len(arrays["means"]), np.bool_)
+    valid = np.ones(len(arrays["means"]), np.bool_)
     for name in ("means", "sh", "opacity_logits", "log_scales", "quats"):
         with np.errstate(over="ignore"):
-            single = arrays[name].reshape(len(good), -1).astype(np.float32)
-        good &= np.isfinite(single).all(axis=1)
-    if not good.all():
+            single = arrays[name].reshape(len(valid), -1).astype(np.float32)
+        valid &= np.isfinite(single).all(axis=1)
+    if not valid.all():
         raise MeshingError(
-            f"Gaussian {int(np.argmin(good))} of the splat to write is not finite.",
+            f"Gaussian {int(np.argmin(valid))} of the splat to write is not finite.",
             "Train the scene again.",
         )
     _write(path, standard_names(arrays["sh"].shape[1]), _standard_columns(arrays), [])
 
 
 def standard_names(coefficients: int) -> list[str]:
-    """Return the properties of the original code's files, in its order."""
+    """Return the properties of the original code's files, in their order."""
     rest = 3 * (coefficients - 1)
     return [
         *("x", "y", "z", "nx", "ny", "nz"),
@@ -124,16 +125,16 @@ def _write(path: Path, names: list[str], columns: list[np.ndarray], comments: li
 
 
 def read_splat_ply(path: Path) -> SplatFile:
-    """Read a native file; properties may come in any order, be double, and have extra ones beside.
+    """Read a native file; properties may be in any order, be double, and include extra ones.
 
-    Gaussians with a value that is not finite, a zero quaternion or a senseless scale are dropped
-    and counted.
+    Gaussians with a non-finite value, a zero quaternion or an implausible scale are dropped and
+    counted.
 
     Raises
     ------
     ParseError
-        Not such a file; names the line or property. Nothing is allocated before the file's size
-        is known to hold what the header promises.
+        If the file is invalid; names the line or property. Nothing is allocated before the file
+        size is checked against the header.
     """
     header = read_ply_header(path, _HINT)
     if header.encoding != "<":
@@ -149,7 +150,7 @@ def read_splat_ply(path: Path) -> SplatFile:
 
 
 def harmonics_of(constant: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return (n, k, 3) of (n, 3) f_dc and (n, 3 (k - 1)) f_rest, which is channel by channel."""
+    """Return (n, k, 3) from (n, 3) f_dc and (n, 3 (k - 1)) f_rest, which is channel by channel."""
     count = len(constant)
     higher = rest.reshape(count, 3, rest.shape[1] // 3)
     return np.concatenate([constant[:, None], higher.transpose(0, 2, 1)], axis=1)
@@ -173,14 +174,14 @@ def _gaussians_of(path: Path, table: np.ndarray, comments: Sequence[str]) -> Spl
     at = {name: i for i, name in enumerate(wanted)}
     quats = values[:, at["rot_0"] : at["rot_0"] + 4]
     log_scales = values[:, at["scale_0"] : at["scale_0"] + 3]
-    good = np.isfinite(values).all(axis=1) & (quats != 0).any(axis=1)
-    good &= (log_scales < MAX_LOG_SCALE).all(axis=1) & (values[:, at["filter_3D"]] >= 0)
-    dropped = int(len(values) - good.sum())
+    valid = np.isfinite(values).all(axis=1) & (quats != 0).any(axis=1)
+    valid &= (log_scales < MAX_LOG_SCALE).all(axis=1) & (values[:, at["filter_3D"]] >= 0)
+    dropped = int(len(values) - valid.sum())
     if dropped:
-        _logger.warning("%s: %d Gaussians with senseless values were dropped", path.name, dropped)
-    if not good.any():
-        raise ParseError(path, "body", "no Gaussian has sensible values.", _HINT)
-    values, quats, log_scales = values[good], quats[good], log_scales[good]
+        _logger.warning("%s: %d Gaussians with invalid values were dropped", path.name, dropped)
+    if not valid.any():
+        raise ParseError(path, "body", "no Gaussian has valid values.", _HINT)
+    values, quats, log_scales = values[valid], quats[valid], log_scales[valid]
     first = at["f_dc_0"]
     sh = harmonics_of(values[:, first : first + 3], values[:, first + 3 : first + 3 + rest])
     orientation = values[:, at["gaussian_features_0"] : at["gaussian_features_0"] + 4]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Resample photos at fractional pixels with a compiled bicubic kernel."""
+"""Bicubic resampling of photos at fractional pixel positions, compiled."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..kernels.parallel import even_bounds, run_chunks
 
 
 def sample_bicubic(photo: np.ndarray, where: np.ndarray, threads: int = 1) -> np.ndarray:
-    """Sample a photo with Catmull-Rom weights; the border pixel is repeated outside.
+    """Sample a photo with Catmull-Rom weights; coordinates are clamped at the border.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def sample_bicubic(photo: np.ndarray, where: np.ndarray, threads: int = 1) -> np
 
 @functools.lru_cache(maxsize=1)
 def _rows_kernel() -> Callable[..., Any]:
-    # numba is imported on use: the readers of this package must load without it.
+    # numba is imported on first use: the package's readers must load without it.
     from ..kernels.compiled import kernel
 
     return kernel(fast=True)(_sample_rows)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""LPIPS, a learned perceptual distance of two pictures, where its weights lie on this machine.
+"""LPIPS, a learned perceptual distance between images, if its weights are installed.
 
 The network is that of Zhang et al., "The Unreasonable Effectiveness of Deep Features as a
 Perceptual Metric" (CVPR 2018), variant AlexNet, version 0.1. Nothing is ever downloaded: the
-package ``lpips`` would fetch the backbone when it is missing, and needs torchvision, so only its
-file of linear heads is read.
+package ``lpips`` would download a missing backbone and needs torchvision, so only its file of
+linear heads is read.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 
-PLACES_VARIABLE = "GAUSSIAN_WRAPPING_LPIPS"
-"""Files, or folders that hold them, separated like PATH; looked through first."""
+WEIGHTS_VARIABLE = "GAUSSIAN_WRAPPING_LPIPS"
+"""Files, or folders that contain them, separated as in PATH; searched first."""
 BACKBONE_PATTERN = "alexnet-owt-*.pth"
-"""How torchvision names the weights of AlexNet in torch's hub cache."""
+"""Name of torchvision's AlexNet weights in torch's hub cache."""
 HEADS_PATTERN = "alex.pth"
 MAX_FILE_BYTES = 1 << 30
-"""The backbone with its unused classifier is a quarter of this."""
+"""The backbone, including its unused classifier, is a quarter of this."""
 
 MIN_SIDE_PX = 31
-"""Below, the last layers of AlexNet have no pixel."""
+"""For smaller images, the last layers of AlexNet have no pixel."""
 
-# Of torchvision's AlexNet: index in ``features``, channels in, channels out, kernel, stride,
-# padding, whether 3 x 3 maxima at stride 2 come before. Each is followed by a ReLU.
+# Convolutions of torchvision's AlexNet: index in ``features``, channels in, channels out, kernel,
+# stride, padding, whether preceded by 3 x 3 max pooling with stride 2. Each is followed by a ReLU.
 _LAYERS = (
     (0, 3, 64, 11, 4, 2, False),
     (3, 64, 192, 5, 1, 2, True),
@@ -47,12 +47,12 @@ _LAYERS = (
     (10, 256, 256, 3, 1, 1, False),
 )
 _MEAN, _SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of the colours that AlexNet was trained on (ImageNet), white = 1."""
+"""Mean and standard deviation of ImageNet colours, white = 1."""
 _LENGTH_FLOOR = 1e-10
 
 
 def lpips_ready() -> tuple[bool, str]:
-    """Tell whether both files of weights are there; otherwise the reason, with what to do."""
+    """Return whether both weight files are installed; if not, the reason and the next step."""
     try:
         _find_files()
     except ResourceError as error:
@@ -61,10 +61,10 @@ def lpips_ready() -> tuple[bool, str]:
 
 
 def lpips_if_ready() -> tuple[Lpips | None, str]:
-    """Return the metric, or ``None`` and why it cannot be measured (absent or broken weights).
+    """Return the metric, or ``None`` and the reason (missing or damaged weights).
 
-    For measures that accompany other work: a broken file of weights is logged and named in the
-    reason, and does not end that work.
+    For metrics that accompany other work: a damaged weight file is logged and named in the reason,
+    without aborting that work.
     """
     try:
         return Lpips.load(), ""
@@ -77,14 +77,14 @@ def lpips_if_ready() -> tuple[Lpips | None, str]:
 
 @dataclass(frozen=True)
 class Lpips:
-    """The distance with its weights, float32 on the processor."""
+    """The metric with its weights; float32, on the CPU."""
 
     filters: tuple[torch.Tensor, ...]
     """(out, in, k, k) of each convolution."""
     biases: tuple[torch.Tensor, ...]
     """(out,) of each convolution."""
     heads: tuple[torch.Tensor, ...]
-    """(1, out, 1, 1), not negative: importance of each channel."""
+    """(1, out, 1, 1), non-negative: weight of each channel."""
 
     @classmethod
     def load(cls) -> Lpips:
@@ -93,9 +93,9 @@ class Lpips:
         Raises
         ------
         ResourceError
-            If a file is not there: see :func:`lpips_ready`.
+            If a file is missing: see :func:`lpips_ready`.
         ParseError
-            If a file is damaged or holds something else.
+            If a file is damaged or has other content.
         """
         backbone_path, heads_path = _find_files()
         backbone, heads = _read_state(backbone_path), _read_state(heads_path)
@@ -114,11 +114,11 @@ class Lpips:
 
     @staticmethod
     def fits(shape: tuple[int, ...]) -> bool:
-        """Tell whether pictures of this shape are large enough for the network."""
+        """Return whether images of this shape are large enough for the network."""
         return min(shape[:2]) >= MIN_SIDE_PX
 
     def distance(self, image: np.ndarray, photo: np.ndarray) -> float:
-        """Return the distance: 0 for equal pictures, about 0.7 for unrelated ones.
+        """Return the distance: 0 for equal images, about 0.7 for unrelated ones.
 
         At each layer, the features of a pixel are scaled to unit length; the squared differences
         are weighted by channel, summed, and averaged over the pixels; layers are added (equation 1
@@ -127,7 +127,7 @@ class Lpips:
         Parameters
         ----------
         image, photo : (h, w, 3)
-            sRGB, uint8 or floats whose white is 1; clamped to [0, 1] as a display would.
+            sRGB, uint8 or floats with white = 1; clamped to [0, 1] as by a display.
 
         Raises
         ------
@@ -140,8 +140,8 @@ class Lpips:
         check_sizes(pair[0], pair[1], None)
         if not self.fits(pair[0].shape):
             raise UsageError(
-                f"LPIPS needs pictures of at least {MIN_SIDE_PX} pixels a side.",
-                "Compare larger pictures.",
+                f"LPIPS needs images of at least {MIN_SIDE_PX} pixels per side.",
+                "Compare larger images.",
             )
         mean, spread = np.array(_MEAN, np.float32), np.array(_SPREAD, np.float32)
         scaled = (np.stack(pair) - mean) / spread  # (2, h, w, 3)
@@ -168,7 +168,7 @@ def _find_files() -> tuple[Path, Path]:
     """Return the files of the backbone and of the heads."""
     import torch
 
-    given = [Path(p) for p in os.environ.get(PLACES_VARIABLE, "").split(os.pathsep) if p]
+    given = [Path(p) for p in os.environ.get(WEIGHTS_VARIABLE, "").split(os.pathsep) if p]
     cache = Path(torch.hub.get_dir()) / "checkpoints"
     package = importlib.util.find_spec("lpips")
     package_folder = Path(package.origin).parent if package and package.origin else None
@@ -183,14 +183,14 @@ def _find_files() -> tuple[Path, Path]:
     if backbone is None or heads is None:
         raise ResourceError(
             f"LPIPS is not measured: {', and '.join(missing)}.",
-            f"Put the files in a folder and name it in {PLACES_VARIABLE}; nothing is downloaded.",
+            f"Put the files in a folder and name it in {WEIGHTS_VARIABLE}; nothing is downloaded.",
         )
     return backbone, heads
 
 
-def _first_file(places: list[Path], pattern: str) -> Path | None:
-    for place in places:
-        files = sorted(place.glob(pattern)) if place.is_dir() else [place]
+def _first_file(folders: list[Path], pattern: str) -> Path | None:
+    for path in folders:
+        files = sorted(path.glob(pattern)) if path.is_dir() else [path]
         for file in files:
             if file.is_file() and file.match(pattern):
                 return file
@@ -204,13 +204,13 @@ def _read_state(path: Path) -> dict[str, Any]:
     if size_bytes > MAX_FILE_BYTES:
         raise ParseError(path, "whole file", f"{size_bytes} bytes are too many.", _REPLACE)
     try:
-        # Only tensors and plain containers: with weights_only no code of the file can run.
+        # Only tensors and plain containers: with weights_only no code in the file can run.
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged file makes torch raise nearly anything
+    except Exception as error:  # torch can raise almost anything for a damaged file
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ParseError(path, "whole file", f"not weights: {reason}", _REPLACE) from error
     if not isinstance(state, dict):
-        raise ParseError(path, "whole file", "holds no named weights.", _REPLACE)
+        raise ParseError(path, "whole file", "contains no named weights.", _REPLACE)
     return state
 
 
@@ -222,5 +222,5 @@ def _tensor(state: dict[str, Any], path: Path, name: str, shape: tuple[int, ...]
         raise ParseError(path, name, f"no weights of the shape {shape}.", _REPLACE)
     value = value.to(torch.float32)
     if not bool(torch.isfinite(value).all()):
-        raise ParseError(path, name, "weights that are not finite.", _REPLACE)
+        raise ParseError(path, name, "weights are not finite.", _REPLACE)
     return value

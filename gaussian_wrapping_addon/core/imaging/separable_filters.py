@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Filters on explicit vectors, for the separable window of the structural similarity.
+"""Vectorised separable filters for the SSIM window.
 
-Indices are not checked: a run reads and writes :data:`LANES` neighbouring values. Weights come as a
-tuple, so that they stay in registers: a loop over an array of them would load them again for each
+Indices are not checked: a run reads and writes :data:`LANES` neighbouring values. Weights are
+passed as a tuple so that they stay in registers: a loop over an array would reload them for each
 run, as LLVM cannot prove that the target is another array.
 """
 
@@ -16,18 +16,18 @@ from numba.core.errors import RequireLiteralValue
 from numba.extending import intrinsic
 
 LANES = 16
-"""Values of a run. LLVM splits it into as many registers as the processor needs."""
+"""Values per run. LLVM splits a run into as many registers as needed."""
 
 TAPS = 11
 HALF = TAPS // 2 + 1
 RING = TAPS + 1
-"""Rows that two neighbouring windows reach."""
+"""Rows covered by two neighbouring windows."""
 
 _WORD = ir.IntType(32)
 
 
 class _Runs:
-    """Emits loads, sums and stores of runs of one function."""
+    """Emits loads, sums and stores of runs within one function."""
 
     def __init__(self, context: Any, builder: Any, kind: Any) -> None:
         self.context, self.builder = context, builder
@@ -45,14 +45,14 @@ class _Runs:
         lanes = ir.Constant(ir.VectorType(_WORD, LANES), [0] * LANES)
         return self.builder.shuffle_vector(first, nothing, lanes)
 
-    def place(self, at: Any, step: Any, count: int) -> Any:
+    def tap_index(self, at: Any, step: Any, count: int) -> Any:
         return self.builder.add(at, self.builder.mul(step, ir.Constant(step.type, count)))
 
     def load(self, array_type: Any, array: Any, at: Any) -> Any:
         return self.builder.load(self.pointer(array_type, array, at), align=self.align)
 
     def weighted(self, weights: list[Any], runs: list[Any]) -> Any:
-        """Return the sum of 11 runs by the symmetric weights whose first six are given."""
+        """Return the sum of 11 runs with symmetric weights, of which the first six are given."""
         b, total = self.builder, None
         for tap, weight in enumerate(weights):
             mirrored = len(runs) - 1 - tap
@@ -77,8 +77,8 @@ def filter_run(typingctx, target, target_at, source, source_at, step, weights): 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         runs = _Runs(context, builder, sig.args[0].dtype)
         taps = [runs.splat(builder.extract_value(args[5], tap)) for tap in range(HALF)]
-        places = [runs.place(args[3], args[4], tap) for tap in range(TAPS)]
-        loaded = [runs.load(sig.args[2], args[2], place) for place in places]
+        indices = [runs.tap_index(args[3], args[4], tap) for tap in range(TAPS)]
+        loaded = [runs.load(sig.args[2], args[2], tap_index) for tap_index in indices]
         runs.store(runs.weighted(taps, loaded), sig.args[0], args[0], args[1])
         return context.get_dummy_value()
 
@@ -90,10 +90,10 @@ def filter_run(typingctx, target, target_at, source, source_at, step, weights): 
 def filter_two_runs(  # type: ignore[no-untyped-def]
     typingctx, target, target_at, apart, source, source_at, step, weights, first
 ):
-    """Filter a ring of 12 rows for two windows that begin in neighbouring rows, loading it once.
+    """Filter a ring of 12 rows for two windows that start in neighbouring rows, loading it once.
 
     ``first``: the slot of the first window's first row, a constant, so that all 12 addresses are
-    one register and constants. The second window's result goes to ``target_at + apart``.
+    one register plus constants. The second window's result is written to ``target_at + apart``.
     """
     if not isinstance(first, types.IntegerLiteral):
         raise RequireLiteralValue("the first slot is no constant")
@@ -102,8 +102,8 @@ def filter_two_runs(  # type: ignore[no-untyped-def]
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         runs = _Runs(context, builder, sig.args[0].dtype)
         taps = [runs.splat(builder.extract_value(args[6], tap)) for tap in range(HALF)]
-        places = [runs.place(args[4], args[5], slot) for slot in slots]
-        loaded = [runs.load(sig.args[3], args[3], place) for place in places]
+        indices = [runs.tap_index(args[4], args[5], slot) for slot in slots]
+        loaded = [runs.load(sig.args[3], args[3], tap_index) for tap_index in indices]
         upper, lower = runs.weighted(taps, loaded[:TAPS]), runs.weighted(taps, loaded[1:])
         runs.store(upper, sig.args[0], args[0], args[1])
         runs.store(lower, sig.args[0], args[0], builder.add(args[1], args[2]))

@@ -13,7 +13,7 @@ WINDOW = TAPS
 RADIUS = WINDOW // 2
 SIGMA_PX = 1.5
 REACH = WINDOW - 1
-"""Rows or columns that a window reaches beyond its first."""
+"""Rows or columns of a window after its first."""
 
 _taps = [np.exp(-0.5 * ((i - RADIUS) / SIGMA_PX) ** 2) for i in range(WINDOW)]
 WEIGHTS = tuple(float(tap / sum(_taps)) for tap in _taps)
@@ -22,13 +22,13 @@ C1 = 0.01**2
 C2 = 0.03**2
 
 BLOCK_PX = 512
-"""Columns that are walked down at once: what is kept of their last rows fits a cache of 1 MB."""
+"""Width of a column block: the buffered last rows of one fit a cache of 1 MB."""
 
-_AVERAGED = 4  # x, y, x^2 + y^2, x y: SSIM needs no more of the two variances than their sum
+_AVERAGED = 4  # x, y, x^2 + y^2, x y: SSIM only needs the sum of the two variances
 _MAPS = 3  # derivatives of SSIM with respect to E[x], E[x^2] and E[x y] of its window
 _MARGIN = 3 * REACH
 STRIDE = (3 * (BLOCK_PX + 2 * REACH) + 2 * _MARGIN + 2 * LANES) // LANES * LANES
-"""Values between two rows of scratch; constant, so that LLVM sees that they do not overlap."""
+"""Offset between two scratch rows; constant, so that LLVM can rule out overlap."""
 
 
 @part(fast=True)
@@ -152,12 +152,12 @@ def _gradient_row(count, x_row, y_row, scale_y, keep, maps, step, scale, out):  
 def compare_rows(  # type: ignore[no-untyped-def]
     begin, end, image, photo, scale_photo, mask, weight_absolute, weight_similar, sums, gradient
 ):
-    """Compare the rows [begin, end) of two images, in one walk from top to bottom.
+    """Compare the rows [begin, end) of two images in one pass from top to bottom.
 
-    The window is separable: each row is filtered along itself as it comes, and the last 11 are
-    kept in a ring to be filtered across. SSIM's derivatives go the same way: along their row, into
-    a ring, across. A strip computes the 10 rows above it anew, so that nothing depends on where
-    strips begin. Two windows are filtered across at once, which halves the loads from the ring.
+    The window is separable: each row is filtered horizontally, and the last 11 are kept in a ring
+    buffer to be filtered vertically. SSIM's derivatives are filtered in the same way. A strip
+    recomputes the 10 rows above it, so that results do not depend on where strips begin. Two
+    windows are filtered vertically at once, which halves the loads from the ring.
 
     Parameters
     ----------
@@ -165,9 +165,9 @@ def compare_rows(  # type: ignore[no-untyped-def]
         Interleaved colours in [0, 1].
     photo : (h, 3 w) float or uint8
     scale_photo : float
-        What the photo's values are multiplied by.
+        Factor of the photo's values.
     mask : (h, w) bool, or (0, 0) for none
-        Both images count as black where it is false, and windows centred there not at all.
+        Where it is false both images count as black, and windows centred there are ignored.
     weight_absolute, weight_similar : float
         ``gradient`` is that of ``weight_absolute`` x the sum of absolute errors +
         ``weight_similar`` x the sum of SSIM over all windows and colours.
@@ -217,7 +217,7 @@ def compare_rows(  # type: ignore[no-untyped-def]
                     for q in range(_AVERAGED):
                         at = ((i % RING) * _AVERAGED + q) * STRIDE
                         _filter_along(count, ring, at, rows, q * STRIDE, weights)
-            row = 2 * pair - reach  # the windows and the gradient of two rows are due now
+            row = 2 * pair - reach  # the windows and the gradient of two rows are complete now
             if row < top:
                 continue
             if has_windows:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Image pyramids in one array, and trilinear look-ups for kernels."""
+"""Image pyramids stored in one array, and trilinear interpolation for kernels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_LEVELS = 8
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Levels of an image, each half the size of the one before, in one flat array."""
+    """Image levels in one flat array, each half the size of the previous one."""
 
     pixels: np.ndarray
     """(n, 3) uint8 pixels of all levels, row by row."""
@@ -24,13 +24,13 @@ class Pyramid:
 
 
 def pyramid(image: np.ndarray, max_levels: int = MAX_LEVELS) -> Pyramid:
-    """Average 2 x 2 pixels again and again; odd borders are repeated, so scales are exact.
+    """Build a pyramid by averaging 2 x 2 pixels; odd borders are repeated, so scales are exact.
 
     Parameters
     ----------
     image : (h, w, 3) uint8
     max_levels : int
-        Upper bound; it also ends at one pixel.
+        Upper bound; the pyramid also ends at one pixel.
     """
     parts, levels, begin = [], [], 0
     current = image
@@ -53,7 +53,7 @@ def pyramid(image: np.ndarray, max_levels: int = MAX_LEVELS) -> Pyramid:
 def bilinear(
     pixels: Any, begin: int, width: int, height: int, x: float, y: float
 ) -> tuple[float, float, float]:
-    """Look up three channels at pixel coordinates (centres at + 0.5), clamped at the border."""
+    """Interpolate three channels at pixel coordinates (centres at + 0.5), clamped at the border."""
     fx = min(max(x - 0.5, 0.0), width - 1.0)
     fy = min(max(y - 0.5, 0.0), height - 1.0)
     ix, iy = int(fx), int(fy)
@@ -73,7 +73,7 @@ def bilinear(
 def trilinear(
     pixels: Any, levels: Any, level: float, x: float, y: float
 ) -> tuple[float, float, float]:
-    """Blend two levels; x and y are pixel coordinates of level 0."""
+    """Interpolate between two levels; x and y are pixel coordinates of level 0."""
     top = len(levels) - 1
     clamped = min(max(level, 0.0), float(top))
     low = min(int(clamped), top)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How close a rendered view is to its photo: PSNR, SSIM and LPIPS, over the pixels of a mask."""
+"""PSNR, SSIM and LPIPS between a rendered view and its photo, over the pixels of a mask."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from .lpips import Lpips
 
 PSNR_CAP_DB = 100.0
-"""Stands for the infinite PSNR of equal images wherever figures are averaged or written."""
+"""Replaces the infinite PSNR of equal images in averages and reports."""
 
 _NO_MASK = np.zeros((0, 0), np.bool_)
 
 
 @dataclass(frozen=True)
 class ViewScores:
-    """How close an image is to its photo."""
+    """Metrics between an image and its photo."""
 
     psnr: float
     """dB, at most :data:`PSNR_CAP_DB`."""
@@ -40,14 +40,14 @@ class ViewScores:
 
 @dataclass(frozen=True)
 class Comparison:
-    """How an image differs from a photo, over the pixels of a mask, and what would change that."""
+    """Errors and SSIM of an image over the pixels of a mask, and their gradient."""
 
     absolute: float
-    """Mean absolute error over pixels and colours; 0 where the mask leaves none."""
+    """Mean absolute error over pixels and colours; 0 if there are none."""
     squared: float
     """Mean squared error."""
     similarity: float
-    """Mean SSIM over windows and colours; 1 where there are none."""
+    """Mean SSIM over windows and colours; 1 if there are none."""
     windows: int
     gradient: np.ndarray | None
     """(h, w, 3), of the image's type: derivative of ``weights[0] absolute + weights[1] similarity``
@@ -96,7 +96,7 @@ def score_images(
     lpips: Lpips | None = None,
     threads: int = 1,
 ) -> ViewScores:
-    """Return all figures of an image beside its photo.
+    """Return all metrics of an image and its photo.
 
     Parameters
     ----------
@@ -104,10 +104,10 @@ def score_images(
         uint8, or floats whose white is 1. The image is clamped to [0, 1] as a display would.
     mask : (h, w) bool, optional
         Pixels to compare. PSNR is over these; SSIM over the windows centred on them, both images
-        black elsewhere (1 where there are none: see :func:`has_windows`); LPIPS is of the whole
-        picture, the photo standing in both elsewhere.
+        black elsewhere (1 if there are none: see :func:`has_windows`); LPIPS is of the whole image,
+        with the photo's pixels in both elsewhere.
     lpips : Lpips, optional
-        Without it, or where the picture is too small for it, LPIPS is not measured.
+        Without it, or if the image is too small for it, LPIPS is not measured.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def score_images(
 
 
 def has_windows(shape: tuple[int, ...], mask: np.ndarray | None = None) -> bool:
-    """Tell whether SSIM has any window in an image of a shape, centred in the mask."""
+    """Return whether an image of this shape has any SSIM window centred in the mask."""
     if min(shape[:2]) < WINDOW:
         return False
     return mask is None or bool(mask[RADIUS : shape[0] - RADIUS, RADIUS : shape[1] - RADIUS].any())
@@ -140,22 +140,22 @@ def compare(
     threads: int = 1,
     out: np.ndarray | None = None,
 ) -> Comparison:
-    """Return the mean errors and the mean SSIM, with their gradient where weights are given.
+    """Return the mean errors and the mean SSIM, with their gradient if weights are given.
 
     The window of SSIM is 11 x 11, Gaussian with sigma 1.5, "valid" padding. With a mask, both
-    images are black outside of it, and only windows centred inside it are counted.
+    images are black outside it, and only windows centred inside it are counted.
 
     Parameters
     ----------
     image : (h, w, 3) float32 or float64
-        Colours in [0, 1]. All is computed in its type.
+        Colours in [0, 1]. Computation is in its type.
     photo : (h, w, 3) uint8, or floats whose white is 1
     mask : (h, w) bool, optional
         Pixels to compare.
     weights : (float, float), optional
-        Of the mean absolute error and of the mean SSIM in the scalar to differentiate.
+        Weights of the mean absolute error and the mean SSIM in the scalar to differentiate.
     out : (h, w, 3), C-contiguous, of the image's type, optional
-        Where the gradient is written; by default a new array.
+        Receives the gradient; by default a new array.
 
     Returns
     -------

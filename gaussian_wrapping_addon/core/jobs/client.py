@@ -14,18 +14,18 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, cannot_be_written
+from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, unwritable_error
 from ..processes.helper_process import child_command
 from ..processes.spawn import kill_group, spawn
 from ..processes.worker_environment import ready_worker
 from .stages.oom_retry import killed_hint, killed_mesh_hint
-from .store.job_file import JobFile, read_job, refuse_replacing, write_job
+from .store.job_file import JobFile, read_job, reject_region_conflicts, write_job
 from .store.job_folder import JobFolder, JobStatus, process_alive
-from .store.rollback import keep_finished
+from .store.rollback import save_rollback
 
 WORKER_MODULE = "jobs.worker"
 PYTHON_VARIABLE = "GAUSSIAN_WRAPPING_PYTHON"
-LAST_WORDS_BYTES = 2000
+OUTPUT_TAIL_BYTES = 2000
 KILLED_CODES = (-9, 137)
 """Of a process that SIGKILL ended, itself or under a shell: what the kernel does for memory."""
 
@@ -33,7 +33,7 @@ CODE_WAIT_S = 0.5
 """For the exit code of a worker that has ended; longer only where a launcher stands between."""
 KILL_GRACE_S = 2.0
 KILL_POLL_S = 0.05
-AFTER_TRAINING = ("mesh", "texture", "export")
+STAGES_AFTER_TRAINING = ("mesh", "texture", "export")
 """Stages of a job whose training is finished."""
 
 
@@ -77,7 +77,7 @@ def _writing(root: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise cannot_be_written(error.filename2 or error.filename or root, error) from None
+        raise unwritable_error(error.filename2 or error.filename or root, error) from None
 
 
 class JobClient:
@@ -86,7 +86,7 @@ class JobClient:
     def __init__(self, folder: JobFolder, process: subprocess.Popen[bytes] | None) -> None:
         self.folder = folder
         self._process = process
-        self._seen_at_work = process is not None
+        self._seen_active = process is not None
         self._gone_since_s: float | None = None
 
     @classmethod
@@ -120,9 +120,9 @@ class JobClient:
         target.create()
         if target.locked():
             raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
-        refuse_replacing(target.result, job)
+        reject_region_conflicts(target.result, job)
         with _writing(target.root):
-            keep_finished(target, job)
+            save_rollback(target, job)
             write_job(target.job_path, job)
         return cls._launch(target, python, keep_running)
 
@@ -172,8 +172,8 @@ class JobClient:
         if status.result:
             # Where it is now: the job may have been moved, and one from elsewhere may name any.
             status = replace(status, result=str(self.folder.result))
-        self._seen_at_work = self._seen_at_work or status.active
-        if self._seen_at_work and status.state == "DONE" and status.put_back:
+        self._seen_active = self._seen_active or status.active
+        if self._seen_active and status.state == "DONE" and status.put_back:
             return replace(status, state="FAILED")
         return status
 
@@ -197,7 +197,7 @@ class JobClient:
             if code in KILLED_CODES:
                 return self._killed(status)
             reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
-            return self._failed(status, f"The worker {reason}. {self.last_words()}".strip())
+            return self._failed(status, f"The worker {reason}. {self.output_tail()}".strip())
         return status
 
     def _killed(self, status: JobStatus) -> JobStatus:
@@ -210,7 +210,7 @@ class JobClient:
             job = read_job(self.folder.job_path)
         except (UsageError, ParseError, OSError):
             return failed
-        if job.command != "mesh" and status.stage not in AFTER_TRAINING:
+        if job.command != "mesh" and status.stage not in STAGES_AFTER_TRAINING:
             return replace(failed, hint=killed_hint(job.settings.training))
         kept = job.command == "mesh" and (self.folder.result / "report.json").is_file()
         return replace(failed, hint=killed_mesh_hint(job.settings.meshing, kept=kept))
@@ -223,13 +223,13 @@ class JobClient:
             hint=f"See {self.folder.log_path.name} in the job folder, then resume.",
         )
 
-    def last_words(self) -> str:
+    def output_tail(self) -> str:
         """Return the end of what the worker wrote to its terminal."""
         try:
             with (self.folder.root / "worker-output.txt").open("rb") as output:
                 length = output.seek(0, os.SEEK_END)
-                output.seek(max(length - LAST_WORDS_BYTES, 0))
-                data = output.read(LAST_WORDS_BYTES)
+                output.seek(max(length - OUTPUT_TAIL_BYTES, 0))
+                data = output.read(OUTPUT_TAIL_BYTES)
         except OSError:
             return ""
         lines = data.decode(errors="replace").strip().splitlines()

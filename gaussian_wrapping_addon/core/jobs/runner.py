@@ -20,7 +20,7 @@ from ..processes.peak_memory import peak_memory_bytes
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
 from .stages.mesh_keys import mesh_key
-from .store.job_file import JobFile, refuse_replacing
+from .store.job_file import JobFile, reject_region_conflicts
 from .store.job_folder import JobFolder
 from .store.stage_folder import (
     STAGE_VERSIONS,
@@ -34,7 +34,7 @@ from .store.stage_folder import (
 _logger = logging.getLogger(__name__)
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
-SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
+STAGE_SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
 
 DENSE_MESH = "dense.npz"
 """In a mesh stage whose mesh was decimated: the mesh before, for the texture stage's maps."""
@@ -48,7 +48,7 @@ class _Span:
     end: float
 
 
-class _Overall:
+class _JobProgress:
     """Maps the fraction of each stage onto the whole job, with the time left of the whole."""
 
     def __init__(
@@ -91,24 +91,26 @@ def run_job(
         Any typed failure of a stage; stages finished so far stay.
     """
     threads = job.settings.threads or default_threads()
-    overall = _Overall(sink, is_cancelled)
+    overall = _JobProgress(sink, is_cancelled)
     begun_s = time.time()
-    refuse_replacing(folder.result, job)
+    reject_region_conflicts(folder.result, job)
     names = region_names(job.settings.regions, job.region_bodies)
 
     cameras = _run_cameras(folder, job, overall, threads)
     if cameras.reused:
-        overall.skip_to(SHARES["cameras"])
+        overall.skip_to(STAGE_SHARES["cameras"])
     trained = _run_training(folder, job, cameras, overall, threads)
     if trained.reused:
-        overall.skip_to(SHARES["cameras"] + SHARES["train"])
+        overall.skip_to(STAGE_SHARES["cameras"] + STAGE_SHARES["train"])
 
-    begin = SHARES["cameras"] + SHARES["train"]
-    share = (1.0 - SHARES["export"] - begin) / len(names)
+    begin = STAGE_SHARES["cameras"] + STAGE_SHARES["train"]
+    share = (1.0 - STAGE_SHARES["export"] - begin) / len(names)
     regions: list[tuple[str, Stage, Stage]] = []
     for index, (request, name) in enumerate(zip(job.settings.regions, names, strict=True)):
         start = begin + index * share
-        cut = start + share * SHARES["mesh"] / (SHARES["mesh"] + SHARES["texture"])
+        cut = start + share * STAGE_SHARES["mesh"] / (
+            STAGE_SHARES["mesh"] + STAGE_SHARES["texture"]
+        )
         meshed = _run_meshing(
             folder, job, request, name, cameras, trained, overall.stage("mesh", _Span(start, cut)),
             threads,
@@ -119,7 +121,7 @@ def run_job(
         )  # fmt: skip
         regions.append((name, meshed, textured))
 
-    progress = overall.stage("export", _Span(1.0 - SHARES["export"], 1.0))
+    progress = overall.stage("export", _Span(1.0 - STAGE_SHARES["export"], 1.0))
     from .stages.export_stage import export_results
 
     summary = {
@@ -135,7 +137,7 @@ def run_job(
     progress.update(1.0, "finished")
 
 
-def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: int) -> Stage:
+def _run_cameras(folder: JobFolder, job: JobFile, overall: _JobProgress, threads: int) -> Stage:
     from ..dataset.loading.load import load_scene
     from ..dataset.scene_file import save_scene
     from .stages.splat_scene import is_splat, make_splat_scene
@@ -145,7 +147,7 @@ def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: in
         STAGE_VERSIONS["cameras"], job.source, source_fingerprint(source), job.settings.seed
     )
     if job.command == "mesh" and read_done(folder.stages / f"cameras-{key}") is None:
-        earlier = _trained_before(folder, job)
+        earlier = _cameras_of_finished_training(folder, job)
         if earlier is not None:
             _logger.warning(
                 "%s has changed since the training, or its files have new dates: the mesh is of "
@@ -168,11 +170,11 @@ def _run_cameras(folder: JobFolder, job: JobFile, overall: _Overall, threads: in
             "facts": scene.facts,
         }
 
-    span = _Span(0.0, SHARES["cameras"])
+    span = _Span(0.0, STAGE_SHARES["cameras"])
     return run_stage(folder.stages, "cameras", key, overall.stage("cameras", span), work)
 
 
-def _trained_before(folder: JobFolder, job: JobFile) -> Stage | None:
+def _cameras_of_finished_training(folder: JobFolder, job: JobFile) -> Stage | None:
     """Return the newest finished cameras that the job's training was finished on."""
     from .stages.training_stage import training_keys
 
@@ -188,11 +190,11 @@ def _trained_before(folder: JobFolder, job: JobFile) -> Stage | None:
 
 
 def _run_training(
-    folder: JobFolder, job: JobFile, cameras: Stage, overall: _Overall, threads: int
+    folder: JobFolder, job: JobFile, cameras: Stage, overall: _JobProgress, threads: int
 ) -> Stage:
     from .stages.training_stage import run_training
 
-    span = _Span(SHARES["cameras"], SHARES["cameras"] + SHARES["train"])
+    span = _Span(STAGE_SHARES["cameras"], STAGE_SHARES["cameras"] + STAGE_SHARES["train"])
     progress = overall.stage("train", span)
     version = STAGE_VERSIONS["train"]
     return run_training(folder, job, cameras, progress, version=version, threads=threads)
@@ -216,14 +218,14 @@ def _run_meshing(
         import numpy as np
 
         from ..dataset.scene_file import load_saved_scene
-        from ..field.depth_samples import find_sightings
+        from ..field.depth_samples import sample_depth_maps
         from ..field.vector_field import VectorField
         from ..gaussians.gaussian_file import load_gaussians
         from ..mesh.mesh_file import save_mesh
-        from ..meshing.checks.mesh_check import check_mesh
+        from ..meshing.checks.manifold_check import validate_manifold
         from ..meshing.checks.mesh_statistics import mesh_statistics
         from ..meshing.cleanup.clean_up import clean_up
-        from ..meshing.cleanup.open_boundary import opened
+        from ..meshing.cleanup.open_boundary import without_caps
         from ..regions.region import write_region
         from .stages.region_field import field_figures, region_field, requested_region
         from .stages.region_meshing import (
@@ -241,7 +243,7 @@ def _run_meshing(
             scene, arrays, region, job.settings.training, meshing, threads=threads,
             device=str(gaussians.means.device),
         )  # fmt: skip
-        sightings = find_sightings(
+        depth_samples = sample_depth_maps(
             gaussians, scene.cameras, lambda points: region.contains(points, 0.0),
             progress.span(0.0, 0.15), threads=threads,
         )  # fmt: skip
@@ -249,22 +251,22 @@ def _run_meshing(
             mesh, expected = mesh_by_pivots_in_stage(
                 stage_folder, vacancy, arrays, scene.cameras, region, meshing,
                 progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
-                sightings=sightings,
+                depth_samples=depth_samples,
             )  # fmt: skip
         else:
             mesh, expected = mesh_in_stage(
                 stage_folder, vacancy, VectorField(arrays, threads=threads), arrays, scene.cameras,
                 region, meshing, progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
                 edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
-                sightings=sightings,
+                depth_samples=depth_samples,
                 origin=tiles_origin(cameras.folder, trained.folder, job.settings),
             )  # fmt: skip
         mesh, dense = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
         open_at = region if meshing.boundary == "open" else None
         if open_at is not None:
-            mesh = opened(mesh, open_at, meshing.min_component_share)
+            mesh = without_caps(mesh, open_at, meshing.min_component_share)
             if dense is not None:
-                dense = opened(dense, open_at, meshing.min_component_share)
+                dense = without_caps(dense, open_at, meshing.min_component_share)
         mesh.provenance.update(field_figures(vacancy))
         if not np.isfinite(mesh.vertices).all():
             raise MeshingError(
@@ -279,7 +281,7 @@ def _run_meshing(
         progress.update(0.97, "measuring the mesh")
         return {
             "statistics": mesh_statistics(mesh).to_json(),
-            "check": check_mesh(mesh.vertices, mesh.faces, open_at).to_json(),
+            "check": validate_manifold(mesh.vertices, mesh.faces, open_at).to_json(),
             "provenance": mesh.provenance,
             "edge_length_world": meshing.edge_length,
             "estimate": expected,

@@ -17,19 +17,19 @@ from types import FrameType
 
 from .. import limits
 from ..errors import (
+    DISK_FULL_ERRNOS,
     EXIT_DONE,
     EXIT_OTHER,
     EXIT_RESOURCES,
-    NO_ROOM,
     Cancelled,
     WrapError,
-    cannot_be_written,
+    unwritable_error,
 )
-from ..processes.helper_process import end_helpers
+from ..processes.helper_process import kill_helpers
 from ..progress import COMPILING, ProgressEvent
 from .store.job_file import read_job
 from .store.job_folder import JobFolder, JobStatus, process_start_ticks
-from .store.rollback import forget_finished, put_back
+from .store.rollback import discard_rollback, roll_back
 
 _logger = logging.getLogger(__name__)
 
@@ -51,8 +51,8 @@ class _Reporter:
         self._written_s = 0.0
         self._logged_s = 0.0
         self._stop = threading.Event()
-        self._last_word = threading.Lock()
-        self.stop_asked = False
+        self._final_status = threading.Lock()
+        self.stop_requested = False
 
     def event(self, event: ProgressEvent) -> None:
         """Take one report of the runner; fraction and time left are of the whole job."""
@@ -83,22 +83,22 @@ class _Reporter:
 
     def cancelled(self) -> bool:
         """Whether a cancel file lies there or the process was asked to terminate."""
-        return self.stop_asked or self.folder.cancel_path.exists()
+        return self.stop_requested or self.folder.cancel_path.exists()
 
-    def beat(self, parent: int) -> None:
+    def keep_heartbeat(self, parent: int) -> None:
         """Keep the heartbeat; ask for a stop when the parent has gone. Runs in a thread."""
-        asked_s = math.inf
+        requested_s = math.inf
         while not self._stop.wait(PARENT_POLL_S):
             if parent and os.getppid() != parent:
-                self.stop_asked = True
+                self.stop_requested = True
             if self.cancelled():
-                asked_s = min(asked_s, time.monotonic())
+                requested_s = min(requested_s, time.monotonic())
             if self.cancelled() and self.status.phase == COMPILING:
-                self._end_at_once()
+                self._exit_immediately()
                 continue
-            if time.monotonic() - asked_s > limits.CANCEL_ALONE_S:
+            if time.monotonic() - requested_s > limits.CANCEL_ALONE_S:
                 _logger.warning("busy with %r: ended without waiting", self.status.message)
-                self._end_at_once()
+                self._exit_immediately()
             # On a full disk the main thread ends the job, with words.
             with contextlib.suppress(OSError):
                 if self.cancelled() and self.status.state == "RUNNING":
@@ -106,16 +106,16 @@ class _Reporter:
                 elif time.time() - self.status.heartbeat_s > HEARTBEAT_S:
                     self.write()
 
-    def _end_at_once(self) -> None:
+    def _exit_immediately(self) -> None:
         """Leave while the main thread is in a long native call, such as a compilation.
 
         What it is making is lost, as after a kill: a stage counts once ``done.json`` is there.
         """
-        self._last_word.acquire()
+        self._final_status.acquire()
         if self._stop.is_set():
             return  # the main thread was quicker, and says how it ended
         _logger.info("cancelled")
-        end_helpers()
+        kill_helpers()
         with contextlib.suppress(OSError):  # on a full disk, leaving is all that is left to do
             self.write(state="CANCELLED", error="", hint=RESUME_HINT, exit_code=Cancelled.exit_code)
             self.folder.unlock()
@@ -124,7 +124,7 @@ class _Reporter:
 
     def end(self) -> None:
         """Stop the heartbeat; what the caller writes then is the last word."""
-        with self._last_word:
+        with self._final_status:
             self._stop.set()
 
 
@@ -152,10 +152,10 @@ def parent_to_watch(caller: str) -> int:
     return os.getppid() if int(caller) else 0
 
 
-def _put_back(folder: JobFolder) -> JobStatus | None:
+def _roll_back(folder: JobFolder) -> JobStatus | None:
     """Make the folder what it was before a mesh that has failed; that is told all the same."""
     try:
-        return put_back(folder)
+        return roll_back(folder)
     except OSError:
         _logger.exception("the earlier job cannot be put back")
         return None
@@ -174,11 +174,11 @@ def main(arguments: list[str]) -> int:
         JobStatus(state="RUNNING", pid=os.getpid(), pid_started=process_start_ticks(os.getpid())),
     )
 
-    def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
-        reporter.stop_asked = True
+    def request_stop(_number: int, _frame: FrameType | None) -> None:
+        reporter.stop_requested = True
 
-    signal.signal(signal.SIGTERM, ask_to_stop)
-    signal.signal(signal.SIGINT, ask_to_stop)
+    signal.signal(signal.SIGTERM, request_stop)
+    signal.signal(signal.SIGINT, request_stop)
     try:
         folder.lock()
     except WrapError as refused:
@@ -188,7 +188,7 @@ def main(arguments: list[str]) -> int:
         return refused.exit_code
     try:
         reporter.write()
-        threading.Thread(target=reporter.beat, args=(parent,), daemon=True).start()
+        threading.Thread(target=reporter.keep_heartbeat, args=(parent,), daemon=True).start()
         from .runner import run_job
 
         run_job(folder, read_job(folder.job_path), reporter.event, reporter.cancelled)
@@ -199,12 +199,12 @@ def main(arguments: list[str]) -> int:
     except WrapError as failure:
         _logger.error("%s", failure)
         code, state, error, hint = failure.exit_code, "FAILED", failure.message, failure.hint
-        if isinstance(failure.__cause__, OSError) and failure.__cause__.errno in NO_ROOM:
+        if isinstance(failure.__cause__, OSError) and failure.__cause__.errno in DISK_FULL_ERRNOS:
             hint = FULL_DISK_HINT
     except OSError as failure:
         _logger.exception("a file could not be read or written")
-        if failure.errno in NO_ROOM:
-            full = cannot_be_written(failure.filename or folder.root, failure)
+        if failure.errno in DISK_FULL_ERRNOS:
+            full = unwritable_error(failure.filename or folder.root, failure)
             code, state, error = full.exit_code, "FAILED", full.message
             hint = FULL_DISK_HINT
         else:
@@ -224,8 +224,8 @@ def main(arguments: list[str]) -> int:
     reporter.end()
     result = str(folder.result) if folder.result.is_dir() else ""
     if state == "DONE":
-        forget_finished(folder)
-    earlier = _put_back(folder) if state == "FAILED" else None
+        discard_rollback(folder)
+    earlier = _roll_back(folder) if state == "FAILED" else None
     finished = {"fraction": 1.0, "seconds_left": 0.0, "message": ""} if state == "DONE" else {}
     last = {**finished, "state": state, "phase": "", "result": result}
     if earlier is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The decorators for numba kernels: flags, on-disk cache, and life without a cache."""
+"""Decorators for numba kernels: compiler flags and the on-disk cache."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from .kernel_cache import KernelCache, warn_without_cache
 
 # Everything except what would let NaN tests be folded away in code that relies on them.
 FAST_MATH = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
-# Fused multiply-adds and nothing else: NaN tests and the order of operations stand.
+# Fused multiply-adds only: NaN tests and the order of operations are preserved.
 FUSED_MATH = {"contract"}
 
 
 def kernel(*, fast: bool, fused: bool = False) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function on first call, with the GIL released.
 
-    Kernels are called from Python and call one another never: see :func:`part`.
+    Kernels are called from Python and never call one another: see :func:`part`.
 
     Parameters
     ----------
     fast : bool
-        Allow reassociation and fused operations (float32 raster loops). Geometry that needs exact
-        comparisons passes ``False``.
+        Allow reassociation and fused operations (float32 raster loops). ``False`` for geometry that
+        needs exact comparisons.
     fused : bool
-        With ``fast=False``: let a product and a sum become one fused operation.
+        With ``fast=False``: allow fused multiply-adds.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
         compiled = numba.njit(nogil=True, **_options(fast, fused))(function)
         try:
-            compiled._cache = KernelCache(function)  # what njit(cache=True) does with its own
+            compiled._cache = KernelCache(function)  # as njit(cache=True) does with its own
         except RuntimeError:
-            warn_without_cache("no folder for them can be written")
+            warn_without_cache("no cache folder is writable")
         return compiled
 
     return decorate
 
 
 def is_ready(compiled: Any) -> bool:
-    """Tell whether calling a kernel will not compile it: it was called, or lies in the cache."""
+    """Return whether a kernel was called or is in the cache, so that a call does not compile it."""
     if compiled.signatures:
         return True
     cache = compiled._cache
@@ -52,12 +52,12 @@ def is_ready(compiled: Any) -> bool:
 def part(*, fast: bool, fused: bool = False) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator for a large helper of kernels: compiled alone, then inlined into each.
 
-    Optimised before its caller is, which keeps long loops packed that LLVM would not recognise
-    amid the caller's other arrays; parameters are those of :func:`kernel`. A kernel that was called
-    by kernels would round differently from run to run. LLVM puts a copy of it, optimised once more,
-    into each caller's machine code, under the same name; which of the copies all callers then
-    reach depends on what was compiled or loaded first in the process. A part leaves no function
-    behind that could be called, and is never taken from the cache itself.
+    It is optimised before its caller, so that long loops are vectorised which LLVM would not
+    recognise amid the caller's other arrays; parameters are those of :func:`kernel`. Kernels called
+    by kernels would round differently from run to run: LLVM puts a copy, optimised once more, into
+    each caller's machine code under the same name, and which copy all callers use depends on what
+    was compiled or loaded first in the process. A part leaves no callable function behind and is
+    never loaded from the cache itself.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -75,5 +75,5 @@ def _options(fast: bool, fused: bool) -> dict[str, Any]:
 
 
 def inline(function: Callable[..., Any]) -> Any:
-    """Compile a small helper that is inlined into every kernel that calls it."""
+    """Compile a small helper that is inlined into every kernel calling it."""
     return numba.njit(inline="always", error_model="numpy", fastmath=FAST_MATH)(function)

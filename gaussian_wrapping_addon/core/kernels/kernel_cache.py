@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where compiled kernels are kept on disk, and when what is kept there has become stale.
+"""On-disk cache of compiled kernels, invalidated by changes of any imported source file.
 
-numba keeps the machine code of a kernel in the first folder that can be written of
-``NUMBA_CACHE_DIR``, ``__pycache__`` beside the kernel's file and the user's cache folder. Left to
-itself it compiles anew where the kernel's own file has changed. Helpers and constants of other
-files are compiled into a kernel too, so here a kernel is stale as soon as any file changes that its
-file imports, directly or not. numba itself tells apart processors, Pythons and its own versions.
+numba stores the machine code of a kernel in the first writable folder of ``NUMBA_CACHE_DIR``,
+``__pycache__`` beside the kernel's file and the user's cache folder. By default it recompiles only
+if the kernel's own file has changed. Helpers and constants of other files are compiled into a
+kernel too, so here a kernel is stale as soon as any file changes that its file imports, directly or
+indirectly. numba itself distinguishes processors, Python versions and its own versions.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def _source(path: Path) -> bytes:
 
 @functools.cache
 def _imported(path: Path) -> frozenset[Path]:
-    """Return the package's files that a file imports itself, relative imports only."""
+    """Return the package's files that a file imports directly (relative imports only)."""
     return frozenset(p for p in _named(path) if p.is_file() and p.is_relative_to(_ROOT))
 
 
@@ -51,9 +51,9 @@ def _named(path: Path) -> Iterator[Path]:
 
 @functools.cache
 def source_stamp(path: Path) -> str:
-    """Return a hash of a file of the package and of all files that it imports, directly or not.
+    """Return a hash of a file of the package and of all files that it imports, transitively.
 
-    Files are read once a process: later changes need a new process, as they do for Python.
+    Files are read once per process: later changes need a new process, as for Python modules.
     """
     found, waiting = {path}, [path]
     while waiting:
@@ -66,73 +66,73 @@ def source_stamp(path: Path) -> str:
     return state.hexdigest()
 
 
-class _WatchesImports:
-    """A place for the cache whose content follows from :func:`source_stamp`."""
+class _ImportStamp:
+    """A cache locator that uses :func:`source_stamp` as its source stamp."""
 
     _py_file: str
 
     def get_source_stamp(self) -> str:
-        """Return what numba compares with the stamp it has kept beside the machine code."""
+        """Return the stamp that numba compares with the one stored with the machine code."""
         return source_stamp(Path(self._py_file).resolve())
 
 
-class _ChosenFolder(_WatchesImports, caching.UserProvidedCacheLocator):
+class _ChosenFolder(_ImportStamp, caching.UserProvidedCacheLocator):
     """``NUMBA_CACHE_DIR``."""
 
 
-class _BesideSource(_WatchesImports, caching.InTreeCacheLocator):
+class _BesideSource(_ImportStamp, caching.InTreeCacheLocator):
     """``__pycache__`` beside the kernel's file."""
 
 
-class _UserFolder(_WatchesImports, caching.UserWideCacheLocator):
+class _UserFolder(_ImportStamp, caching.UserWideCacheLocator):
     """The user's cache folder."""
 
 
-class _Places(caching.CompileResultCacheImpl):
-    """The places in order; raises ``RuntimeError`` where none can be written."""
+class _CacheLocators(caching.CompileResultCacheImpl):
+    """The locators in order; raises ``RuntimeError`` if none is writable."""
 
     _locator_classes = [_ChosenFolder, _BesideSource, _UserFolder]  # noqa: RUF012 - as its base
 
 
 class KernelCache(caching.FunctionCache):
-    """The cache of one kernel; where it cannot be read or written any more, they work without."""
+    """The cache of one kernel; if it becomes unreadable or unwritable, kernels work without it."""
 
-    _impl_class = _Places
+    _impl_class = _CacheLocators
 
     def is_empty(self) -> bool:
-        """Tell whether no machine code is kept that fits the present sources."""
+        """Return whether no machine code is stored for the current sources."""
         try:
             return not self._cache_file._load_index()
-        except Exception as error:  # as in load_overload: it will be compiled anew
+        except Exception as error:  # as in load_overload: it will be recompiled
             warn_without_cache(f"{type(error).__name__}: {error}")
             return True
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return machine code that was kept, or ``None``."""
+        """Return stored machine code, or ``None``."""
         try:
             return super().load_overload(sig, target_context)
-        except Exception as error:  # whatever a damaged file makes of unpickling
+        except Exception as error:  # unpickling a damaged file can raise anything
             warn_without_cache(f"{type(error).__name__}: {error}")
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep machine code that was just compiled."""
+        """Store newly compiled machine code."""
         try:
             super().save_overload(sig, data)
         except OSError as error:
             warn_without_cache(f"{type(error).__name__}: {error}")
 
 
-_told = threading.Event()
+_warned = threading.Event()
 
 
 def warn_without_cache(reason: str) -> None:
-    """Tell once, not once a kernel, that kernels are not kept."""
-    if _told.is_set():
+    """Warn once per process that kernels are not cached."""
+    if _warned.is_set():
         return
-    _told.set()
+    _warned.set()
     _logger.warning(
-        "Compiled kernels cannot be kept on disk, so each run compiles them anew, about a minute: "
-        "%s. Set NUMBA_CACHE_DIR to a folder that can be written.",
+        "Compiled kernels cannot be cached on disk, so each run recompiles them (about a minute): "
+        "%s. Set NUMBA_CACHE_DIR to a writable folder.",
         reason,
     )

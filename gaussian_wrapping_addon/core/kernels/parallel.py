@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Threads of our own for compiled kernels that release the GIL.
+"""Thread pool for compiled kernels that release the GIL.
 
-numba's ``parallel=True`` is not used: with its default layer, two Python threads that launch at
-once can abort the process, which inside Blender would lose the user's scene.
+numba's ``parallel=True`` is not used: with its default threading layer, two Python threads that
+launch at once can abort the process, which inside Blender would lose the user's scene.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from ..machine import processors
+from ..machine import processor_count
 
 CHUNKS_PER_THREAD = 16
 
 
 def default_threads() -> int:
-    """Return the number of processors that this process may use."""
-    return processors()
+    """Return the number of processors available to this process."""
+    return processor_count()
 
 
 @functools.lru_cache(maxsize=4)
@@ -37,7 +37,7 @@ def balanced_bounds(costs: np.ndarray, chunks: int) -> np.ndarray:
     costs : (n,) array
         Cost of each item, >= 0.
     chunks : int
-        Number of runs wanted.
+        Desired number of runs.
 
     Returns
     -------
@@ -59,8 +59,9 @@ def even_bounds(count: int, threads: int, chunks_per_thread: int = 4) -> np.ndar
 def run_chunks(function: Callable[[int, int], object], bounds: np.ndarray, threads: int) -> None:
     """Call ``function(begin, end)`` for each run of ``bounds`` on ``threads`` threads.
 
-    The calling thread is one of them; the others are asked once, not once a run. An exception is
-    raised here: on one thread at once, on several that of the first failing run, after all others.
+    The calling thread is one of them; each of the others is one submitted task that takes run after
+    run. An exception is raised here: with one thread at once, with several that of the first
+    failing run, after all others.
     """
     begins, ends = bounds[:-1].tolist(), bounds[1:].tolist()
     if threads <= 1 or len(begins) <= 1:
@@ -85,8 +86,8 @@ def run_chunks(function: Callable[[int, int], object], bounds: np.ndarray, threa
     futures = [pool.submit(work) for _ in range(helpers)]
     work()
     for future in futures:
-        # One that has not started has nothing left to do; waiting for it could be for ever where
-        # all of the pool's threads are callers themselves.
+        # A task that has not started has nothing left to do; waiting for it could deadlock if all
+        # of the pool's threads are callers themselves.
         if not future.cancel():
             future.result()
     if failures:

@@ -13,9 +13,9 @@ from .topology import half_edges, normals_and_areas
 
 
 def face_components(vertex_count: int, faces: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of connected parts and the part of each face, (f,) int64.
+    """Return the number of connected components and the component of each face, (f,) int64.
 
-    Faces that share a vertex belong to one part.
+    Faces that share a vertex belong to one component.
     """
     if len(faces) == 0:
         return 0, np.zeros(0, np.int64)
@@ -30,9 +30,9 @@ def face_components(vertex_count: int, faces: np.ndarray) -> tuple[int, np.ndarr
 def volumes_and_areas(
     vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the signed volume and the area of each part, (count,) each.
+    """Return the signed volume and the area of each component, (count,) each.
 
-    The volume is that of a closed part; a cavity inside a solid has a negative one.
+    The volume is meaningful for closed components; a cavity inside a solid has a negative one.
     """
     center = vertices[faces.reshape(-1)].mean(0) if len(faces) else np.zeros(3)
     a, b, c = (vertices[faces[:, k]] - center for k in range(3))
@@ -45,32 +45,32 @@ def volumes_and_areas(
 
 
 @dataclass(frozen=True)
-class Floaters:
-    """What :func:`without_floaters` did."""
+class FloaterRemoval:
+    """Result of :func:`without_floaters`."""
 
     faces: np.ndarray
-    """(g, 3) faces that stay."""
+    """(g, 3) remaining faces."""
     kept: int
     removed_solids: int
     removed_cavities: int
     removed_area_share: float
-    """Area of all removed parts, of the total."""
+    """Area of the removed components, as a share of the total."""
 
     @property
     def removed(self) -> int:
-        """All removed parts: of open ones the volume tells no solid from a cavity."""
+        """All removed components: the volume of open ones does not tell solids from cavities."""
         return self.removed_solids + self.removed_cavities
 
 
 LONG_FACTOR = 3.0
-"""A part this many times longer than its share of the area allows is no floater: a piece of wire
-has little area and may be all that is left of it."""
+"""A component longer than this many times its least share of the longest is no floater: a piece of
+wire has little area and may be all that is left of it."""
 LONG_FACES = 30
-"""With fewer faces a long part is a sliver between a few vertices, not a piece of anything."""
+"""With fewer faces a long component is a sliver between a few vertices, not a structure."""
 
 
 def extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: int) -> np.ndarray:
-    """Return the diagonal of the bounding box of each part, (count,)."""
+    """Return the diagonal of the bounding box of each component, (count,)."""
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     corners = vertices[faces]  # (f, 3, 3)
     np.minimum.at(low, part, corners.min(1))
@@ -78,13 +78,13 @@ def extents(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, count: in
     return np.asarray(np.linalg.norm(np.maximum(high - low, 0.0), axis=1))
 
 
-def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> Floaters:
-    """Remove parts that are small: in area and in length.
+def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> FloaterRemoval:
+    """Remove components that are small both in area and in length.
 
-    The area is below ``min_share`` of the largest part's, and the length below
-    :data:`LONG_FACTOR` times that share of the longest part's, or it has fewer than
-    :data:`LONG_FACES` faces. Small cavities go as well, which
-    fills them. A cavity whose solid goes is small itself.
+    A component is removed if its area is below ``min_share`` of the largest one's, and its length
+    is below :data:`LONG_FACTOR` times that share of the longest one's or it has fewer than
+    :data:`LONG_FACES` faces. Small cavities are removed as well, which fills them; a cavity of a
+    removed solid is always small.
     """
     count, part = face_components(len(vertices), faces)
     volume, area = volumes_and_areas(vertices, faces, part, count)
@@ -93,7 +93,7 @@ def without_floaters(vertices: np.ndarray, faces: np.ndarray, min_share: float) 
     long = length >= LONG_FACTOR * min_share * length.max(initial=0.0)
     keep |= long & (np.bincount(part, minlength=count) >= LONG_FACES)
     removed = float(area[~keep].sum() / max(area.sum(), 1e-300))
-    return Floaters(
+    return FloaterRemoval(
         faces[keep[part]],
         int(keep.sum()),
         int((~keep & (volume >= 0)).sum()),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Depth buffer of a mesh seen from a camera: which face each pixel's centre meets first."""
+"""Depth buffer of a mesh: rasterise depth and face indices as seen from a camera."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ..kernels.parallel import even_bounds, run_chunks
 from ..tolerances import SCENE_RADIUS
 
 NEAR_DEPTH = 1e-3 * SCENE_RADIUS
-"""Surfaces nearer than this are cut away, so that a camera inside of a mesh sees past it; scene
-units, other frames give their own."""
+"""Near plane in scene units, so that a camera inside a mesh sees past it; callers in other frames
+pass their own."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def depth_buffer(
     threads: int = 1,
     near: float = NEAR_DEPTH,
 ) -> DepthBuffer:
-    """Rasterise a mesh; front and back sides alike hide what lies behind them.
+    """Rasterise a mesh; front and back faces both occlude.
 
     Parameters
     ----------
@@ -44,11 +44,11 @@ def depth_buffer(
         In the camera's world frame.
     faces : (f, 3) int32
     camera : Camera
-        Decides the size of the buffer.
+        Determines the size of the buffer.
     threads : int
         Threads to use; the result does not depend on it (ties go to the lower face).
     near : float
-        z-depth > 0 below which nothing is seen, in units of the camera's world frame.
+        z-depth > 0 of the near plane, in units of the camera's world frame.
     """
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
     face = np.full((camera.height, camera.width), -1, np.int32)
@@ -70,7 +70,7 @@ def depth_buffer(
 
 
 def _in_front(local: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return (t, 3, 3) triangles beyond the near plane, cut where they cross it, and faces."""
+    """Clip triangles to the near plane; return them (t, 3, 3) and their faces."""
     ids = np.arange(len(faces), dtype=np.int32)
     front = local[:, 2] > near
     inside = front[faces].sum(axis=1)
@@ -122,7 +122,7 @@ def _raster_rows(screen: Any, ids: Any, begin: int, end: int, depth: Any, face: 
                 i = x - left
                 l0, l1 = a + i * step0, b + i * step1
                 l2 = 1.0 - l0 - l1
-                # The margin closes cracks that rounding would leave between neighbours.
+                # The margin closes cracks between neighbours that rounding would leave.
                 if l0 < -1e-9 or l1 < -1e-9 or l2 < -1e-9:
                     continue
                 z = np.float32(1.0 / (l0 * w0 + l1 * w1 + l2 * w2))

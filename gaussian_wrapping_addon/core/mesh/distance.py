@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Distances of points to a mesh and to a cloud, precise at huge coordinates."""
+"""Distances from points to a mesh or a point cloud, precise at large coordinates."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from scipy.spatial import cKDTree
 def distances_to_mesh(
     points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Measure from each point to the nearest point of a triangle mesh.
+    """Return the distance of each point to a triangle mesh, with the nearest face and point.
 
     Parameters
     ----------
     points : (n, 3) float64
     vertices : (v, 3) float64
     faces : (f, 3) int
-        Degenerate faces count as the segment or point that they are. libigl takes as many threads
-        as it finds cores.
+        Degenerate faces count as the segment or point that they are. libigl uses as many threads
+        as there are cores.
 
     Returns
     -------
@@ -28,7 +28,7 @@ def distances_to_mesh(
     face : (n,) int64
         The face of the nearest point, -1 without faces.
     closest : (n, 3) float64
-        The nearest point itself, infinite without faces.
+        The nearest point, infinite without faces.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     count = len(points)
@@ -37,7 +37,7 @@ def distances_to_mesh(
     vertices = np.asarray(vertices, np.float64)
     used, inverse = np.unique(faces, return_inverse=True)
     corners = vertices[used]
-    # Measured where the mesh is: nearest points would be rounded to the last digit of 4e6.
+    # Relative to the mesh: at coordinates of 4e6 nearest points would be rounded to the last digit.
     origin = (corners.min(0) + corners.max(0)) / 2
     local = np.ascontiguousarray(points - origin)
     triangles = np.ascontiguousarray(inverse.reshape(-1, 3), np.int64)
@@ -50,14 +50,14 @@ def distances_to_mesh(
 def distances_to_cloud(
     points: np.ndarray, cloud: np.ndarray, *, threads: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Measure from each point to the nearest point of a cloud.
+    """Return the distance of each point to the nearest point of a cloud.
 
     Parameters
     ----------
     points : (n, 3) float64
     cloud : (m, 3) float64
     threads : int
-        Of the search; the result does not depend on it.
+        Threads of the search; the result does not depend on it.
 
     Returns
     -------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which faces of a triangle mesh touch, their normals and areas, and the UV charts they form."""
+"""Face adjacency of a triangle mesh, face normals and areas, and UV charts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .topology import area_vectors, edge_keys, half_edges, normals_and_areas
 
 @dataclass(frozen=True)
 class FaceGraph:
-    """Neighbourhood and measures of the faces of one mesh."""
+    """Adjacency and measures of the faces of a mesh."""
 
     opposite: np.ndarray
     """(f, 3) int32: half-edge ``3 * g + j`` across the edge from corner k to k + 1, or -1."""
@@ -27,7 +27,7 @@ class FaceGraph:
 
 
 def face_graph(vertices: np.ndarray, faces: np.ndarray) -> FaceGraph:
-    """Build the graph; an edge that does not have exactly two faces is a border."""
+    """Build the graph; edges that do not have exactly two faces are borders."""
     vertices = np.asarray(vertices, np.float64)
     normals, areas = normals_and_areas(vertices, faces)
     return FaceGraph(_opposite(faces), normals, areas, vertices[faces].mean(axis=1))
@@ -47,12 +47,12 @@ def _opposite(faces: np.ndarray) -> np.ndarray:
 
 
 def components(graph: FaceGraph, joined: np.ndarray) -> np.ndarray:
-    """Label connected faces.
+    """Label the connected components of faces.
 
     Parameters
     ----------
     joined : (f, 3) bool
-        Whether the edge of that corner connects; must hold from both sides.
+        Whether the edge at that corner connects its faces; must agree on both sides.
 
     Returns
     -------
@@ -62,8 +62,8 @@ def components(graph: FaceGraph, joined: np.ndarray) -> np.ndarray:
     count = len(graph.opposite)
     face, corner = np.nonzero(joined & (graph.opposite >= 0))
     other = graph.opposite[face, corner] // 3
-    links = coo_matrix((np.ones(len(face), np.int8), (face, other)), shape=(count, count))
-    labels = connected_components(links, directed=False)[1]
+    adjacency = coo_matrix((np.ones(len(face), np.int8), (face, other)), shape=(count, count))
+    labels = connected_components(adjacency, directed=False)[1]
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int32)
     rank[np.argsort(first, kind="stable")] = np.arange(len(first), dtype=np.int32)
@@ -71,7 +71,7 @@ def components(graph: FaceGraph, joined: np.ndarray) -> np.ndarray:
 
 
 def uv_charts(graph: FaceGraph, faces: np.ndarray, corner_uvs: np.ndarray) -> np.ndarray:
-    """Label the charts: faces joined by edges whose UVs agree on both sides.
+    """Label UV charts: faces joined by edges whose UVs agree on both sides.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def uv_charts(graph: FaceGraph, faces: np.ndarray, corner_uvs: np.ndarray) -> np
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (v, 3) float64 area-weighted unit normals; zero where none is defined."""
+    """Return (v, 3) float64 area-weighted unit normals; zero where undefined."""
     cross = area_vectors(np.asarray(vertices, np.float64), faces)
     total = np.stack(
         [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes on disk between stages."""
+"""Read and write meshes between stages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def save_mesh(path: Path, mesh: SurfaceMesh) -> None:
 
 
 def load_mesh(path: Path) -> SurfaceMesh:
-    """Read what :func:`save_mesh` wrote; :class:`ParseError` where the file is not that."""
+    """Read a file of :func:`save_mesh`; :class:`ParseError` if it is none."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
             provenance = json.loads(arrays["provenance"].tobytes())

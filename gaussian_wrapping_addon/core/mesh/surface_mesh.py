@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SurfaceMesh:
-    """Triangles with shared vertices; normals of the faces point to the empty side."""
+    """Triangles with shared vertices; face normals point to the empty side."""
 
     vertices: np.ndarray
     """(v, 3) float64, scene frame."""
@@ -20,4 +20,4 @@ class SurfaceMesh:
     colors: np.ndarray | None = None
     """(v, 3) uint8, optional."""
     provenance: dict[str, Any] = field(default_factory=dict)
-    """How it was made and what was measured, plain JSON values."""
+    """How the mesh was made and what was measured, plain JSON values."""

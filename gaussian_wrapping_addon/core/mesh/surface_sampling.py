@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Points spread evenly over triangles: uniform samples, Poisson thinning."""
+"""Sample points on triangles: uniform by area, and Poisson-disk thinning."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from ..kernels.compiled import kernel, part
 from .topology import normals_and_areas
 
 POINTS_PER_SQUARE = 0.56
-"""Points that thinning leaves per squared radius of area, with the numbers of candidates that
-surface_points uses (measured on a sphere; the densest random packing has 0.70)."""
+"""Points per squared radius of area after thinning, with as many candidates as surface_points uses
+(measured on a sphere; the densest random packing has 0.70)."""
 
 EDGE_PER_RADIUS = 1.5
-"""Mean edge of the triangulated rest, in radii (measured with it)."""
+"""Mean edge of the triangulated points, in radii (same measurement)."""
 
 SAME_SIDE_COSINE = -0.2
 OTHER_SIDE_SHARE = 0.1
-"""Two points on opposite sides of a thin wall do not crowd each other, unless they are closer
-than this share of the radius."""
+"""Two points on opposite sides of a thin wall do not conflict, unless they are closer than this
+share of the radius."""
 
 LEVEL_STEP = 2.0
-"""Between the cell sides of the levels of thinning."""
+"""Ratio between the cell sides of successive levels of thinning."""
 
 
 def sample_triangles(
@@ -31,7 +31,7 @@ def sample_triangles(
     rng: np.random.Generator,
     density: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw ``count`` points evenly over the area (stratified along the list of faces).
+    """Draw ``count`` points uniformly by area (stratified along the list of faces).
 
     Parameters
     ----------
@@ -55,18 +55,18 @@ def sample_triangles(
 def thin(
     points: np.ndarray, normals: np.ndarray, radii: np.ndarray, priority: np.ndarray
 ) -> np.ndarray:
-    """Keep a subset whose points are at least a radius apart, greedily in order of priority.
+    """Select points that are at least a radius apart, greedily in order of priority.
 
-    Two points conflict where they are closer than the smaller of their radii and lie on the same
+    Two points conflict if they are closer than the smaller of their radii and lie on the same
     side of a wall (their normals agree).
 
     Parameters
     ----------
     points, normals : (n, 3) float64
-        Normals may be zero: such a point conflicts with all.
+        Points with zero normals can conflict with any other.
     radii : (n,) float64
     priority : (n,) float64
-        Smaller comes first; ties by index.
+        Smaller values come first, ties by index.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def thin(
     kept = np.zeros(len(points), np.bool_)
     finest = float(radii.min())
     level = np.floor(np.log(radii / finest) / np.log(LEVEL_STEP) + 1e-9).astype(np.int64)  # (n,)
-    # A radius is at most the side of its level's cells, so 27 cells hold all that is in conflict.
+    # A radius is at most the side of its level's cells, so conflicts lie within 27 cells.
     sides = finest * LEVEL_STEP ** (1.0 + 1e-6 + np.arange(level.max() + 1))
     _thin_kernel(
         np.argsort(priority, kind="stable"), points - points.min(0), normals, radii, level, sides,
@@ -88,7 +88,7 @@ def thin(
 
 @part(fast=False)
 def _bucket(level, x, y, z, mask):  # type: ignore[no-untyped-def]
-    """Hash of a cell. Cells that share a bucket cost time only: distances decide."""
+    """Hash a cell. Collisions only cost time, since distances are compared."""
     key = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791) ^ (level * 50331653)
     key ^= key >> 17
     return key & mask
@@ -98,7 +98,7 @@ def _bucket(level, x, y, z, mask):  # type: ignore[no-untyped-def]
 def _thin_kernel(  # type: ignore[no-untyped-def]
     sequence, points, normals, radii, level, sides, mask, same, share, kept
 ):
-    # Accepted points of each cell, as linked lists: the others need not be looked at again.
+    # Accepted points of each cell, as linked lists; rejected points need not be visited again.
     head = np.full(mask + 1, -1, np.int64)
     following = np.full(len(points), -1, np.int64)
     filled = np.zeros(len(sides), np.bool_)
@@ -107,7 +107,7 @@ def _thin_kernel(  # type: ignore[no-untyped-def]
         for other in range(len(sides)):
             if not filled[other]:
                 continue
-            # Only what is closer than both radii is in conflict.
+            # Only points closer than both radii conflict.
             reach = min(radii[i], sides[other])
             low0 = int(np.floor((points[i, 0] - reach) / sides[other]))
             low1 = int(np.floor((points[i, 1] - reach) / sides[other]))

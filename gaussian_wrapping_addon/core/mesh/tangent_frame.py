@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The frame in which a tangent-space normal map is told: smooth normals, tangents at corners.
+"""Tangent frames for normal maps (MikkTSpace): smooth vertex normals and corner tangents.
 
-What reads the map must have the same frame, to the degree. Blender and glTF both name MikkTSpace
-(Mikkelsen, "Simulation of wrinkled surfaces revisited", 2008): each face's direction of growing u,
-averaged by corner angles over neighbours that share a vertex, its UV and the UVs' orientation, in
-the plane of the vertex's normal. Normals and tangents are interpolated as they are, not to unit
-length, and the bitangent is ``sign * cross(normal, tangent)``.
+A reader of the map must use the same frame. Blender and glTF both specify MikkTSpace (Mikkelsen,
+"Simulation of wrinkled surfaces revisited", 2008): each face's direction of increasing u, averaged
+by corner angle over neighbours that share a vertex, its UV and the UVs' orientation, in the plane
+of the vertex normal. Normals and tangents are interpolated without renormalisation, and the
+bitangent is ``sign * cross(normal, tangent)``.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ class TangentFrames:
     normals: np.ndarray
     """(v, 3) float64 unit normals of the vertices."""
     tangents: np.ndarray
-    """(f, 3, 3) float64 unit tangents of the corners, at right angles to their normals."""
+    """(f, 3, 3) float64 unit tangents of the corners, orthogonal to their normals."""
     signs: np.ndarray
-    """(f,) float64: 1, or -1 where the UVs are a mirror image of the surface."""
+    """(f,) float64: 1, or -1 where the UVs are mirrored."""
 
 
 def shading_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (v, 3) float64 unit normals, weighted by angle, as Blender's smooth shading has them.
+    """Return (v, 3) float64 angle-weighted unit normals, as in Blender's smooth shading.
 
-    A vertex without a face with area has (0, 0, 1): files ask for unit length everywhere.
+    Vertices without a face of non-zero area get (0, 0, 1): file formats require unit length.
     """
     corners = np.asarray(vertices, np.float64)[faces]  # (f, 3, 3)
     face_normals = _unit(area_vectors(np.asarray(vertices, np.float64), faces))
@@ -56,12 +56,12 @@ def tangent_frames(
     vertices : (v, 3) float64
     faces : (f, 3) int32
     corner_uvs : (f, 3, 2) float32
-        v upwards. Corners of one vertex with equal UVs share their tangent.
+        v points up. Corners of one vertex with equal UVs share their tangent.
 
     Notes
     -----
-    Faces without area, on the surface or in the atlas, add nothing to their neighbours; they hold
-    no texel, and their own tangents are any that are at right angles to the normals.
+    Faces without area, on the surface or in the atlas, do not contribute to their neighbours; they
+    hold no texel, and their own tangents are arbitrary vectors orthogonal to the normals.
     """
     faces = np.asarray(faces, np.int64)
     normals = shading_normals(vertices, faces)
@@ -90,10 +90,10 @@ def tangent_frames(
 
 
 def _groups(faces: np.ndarray, uvs: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """(3 f,) int64: one number for corners that average their tangents.
+    """Label groups of corners that average their tangents, (3 f,) int64.
 
-    They have the same vertex, UV and orientation, and their faces are joined by edges around the
-    vertex: pieces of a chart that touch in a point alone have tangents of their own.
+    Corners of a group have the same vertex, UV and orientation, and their faces are joined by edges
+    around the vertex: parts of a chart that touch in a single point have separate tangents.
     """
     key = np.empty(faces.size, np.dtype([("vertex", "<i8"), ("uv", "<u8")]))
     key["vertex"] = 2 * faces.ravel() + np.repeat(signs > 0, 3)
@@ -108,17 +108,17 @@ def _groups(faces: np.ndarray, uvs: np.ndarray, signs: np.ndarray) -> np.ndarray
     same = np.flatnonzero(edge[order[1:]] == edge[order[:-1]])
     one, other = order[same], order[same + 1]
     rows, columns = np.r_[low[one], high[one]], np.r_[low[other], high[other]]
-    links = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (faces.size, faces.size))
-    return connected_components(links, directed=False)[1].astype(np.int64)
+    adjacency = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (faces.size, faces.size))
+    return connected_components(adjacency, directed=False)[1].astype(np.int64)
 
 
 def _flattened(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Project vectors onto the planes of normals."""
+    """Project vectors onto the planes orthogonal to normals."""
     return vectors - (vectors * normals).sum(axis=-1, keepdims=True) * normals
 
 
 def _angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Angles between unit vectors; 0 where one of them has no length."""
+    """Return angles between unit vectors; 0 where one of them is zero."""
     cosine = (one * other).sum(axis=-1).clip(-1.0, 1.0)
     return np.arccos(cosine) * (one.any(axis=-1) & other.any(axis=-1))
 
@@ -128,7 +128,7 @@ def _summed(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Scale to unit length; what has none, or is not more than rounding, becomes 0."""
+    """Normalise vectors; those of zero or negligible length become 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     tiny = length <= 1e-300
     return np.where(tiny, 0.0, vectors / np.where(tiny, 1.0, length))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mesh with UVs per face corner, its texture image, and how much of it photos have seen."""
+"""A mesh with UVs per face corner, its texture maps and their coverage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .surface_mesh import SurfaceMesh
 
 @dataclass(frozen=True)
 class AtlasMaps:
-    """The images of one atlas; as the fields of the same names of :class:`TexturedMesh`."""
+    """The maps of one atlas; see the fields of the same names of :class:`TexturedMesh`."""
 
     albedo: np.ndarray
     normal_map: np.ndarray | None = None
@@ -24,9 +24,9 @@ class AtlasMaps:
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """UVs live on face corners, so that the mesh itself stays closed along UV seams.
+    """A mesh with UVs on face corners, so that the mesh stays closed along UV seams.
 
-    The maps named here are of the first atlas, mostly the only one; ``further`` has the others.
+    The maps here belong to the first atlas, usually the only one; ``further`` holds the others.
     """
 
     mesh: SurfaceMesh
@@ -35,15 +35,15 @@ class TexturedMesh:
     albedo: np.ndarray
     """(h, w, 3) uint8 sRGB; row 0 is the top of the image (v = 1)."""
     statistics: dict[str, Any] = field(default_factory=dict)
-    """Coverage: texels used, seen, filled; number of charts, utilisation."""
+    """Coverage: texels used, seen and filled; number of charts; utilisation."""
     normal_map: np.ndarray | None = None
-    """(h, w, 3) uint8 tangent-space normals, +Y, no sRGB; rows as in ``albedo``."""
+    """(h, w, 3) uint8 tangent-space normals, +Y, linear; rows as in ``albedo``."""
     occlusion: np.ndarray | None = None
-    """(k, k) uint8: 255 where nothing is near, 0 where nothing of the surroundings is seen."""
+    """(k, k) uint8 ambient occlusion: 255 where unoccluded, 0 where fully occluded."""
     views: np.ndarray | None = None
     """(h, w) uint8 photos blended into each texel, 0 where unseen or between charts."""
     face_atlas: np.ndarray | None = None
-    """(f,) uint8 the atlas of each face, from 0; None where there is one."""
+    """(f,) uint8 the atlas of each face, from 0; None if there is only one."""
     further: tuple[AtlasMaps, ...] = ()
     """Atlases 1, 2, ...: of the same size, with the same maps."""
 
@@ -56,7 +56,7 @@ class TexturedMesh:
         maps: Sequence[AtlasMaps],
         statistics: dict[str, Any],
     ) -> TexturedMesh:
-        """Put a mesh together from its atlases."""
+        """Build a mesh from its atlases."""
         first, *further = maps
         return cls(
             mesh, corner_uvs, first.albedo, statistics, first.normal_map, first.occlusion,

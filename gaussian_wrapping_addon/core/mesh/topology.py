@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Basic measures and tables of triangle meshes: normals, areas, half-edges, edges.
+"""Basic quantities of triangle meshes: normals, areas, half-edges, edges.
 
 Half-edge ``3 f + k`` leads from corner k of face f to the next corner.
 """
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (f, 3) normals as long as twice the area, in the vertices' dtype."""
+    """Return (f, 3) normals with a length of twice the area, in the vertices' dtype."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a)
 
@@ -56,8 +56,8 @@ def faces_per_edge(faces: np.ndarray, vertex_count: int) -> np.ndarray:
     return count[index]
 
 
-def ends_of(chosen: np.ndarray, faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """Return (v,) bool: the vertices at the half-edges chosen, (3f,) bool."""
+def vertices_of_half_edges(chosen: np.ndarray, faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """Return the vertices at the chosen half-edges, (v,) bool; ``chosen`` is (3f,) bool."""
     begin, end = half_edges(faces)
     result = np.zeros(vertex_count, np.bool_)
     result[begin[chosen]] = True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A closed mesh of a region: primal adaptive meshing, or marching tetrahedra on pivots.
+"""Extract a closed mesh of a region: primal adaptive meshing or marching tetrahedra on pivots.
 
-``primal_adaptive.py`` and ``pivot_meshing.py`` are the two methods; the folders hold the steps.
+``primal_adaptive.py`` and ``pivot_meshing.py`` are the two methods; the folders hold their steps.
 """

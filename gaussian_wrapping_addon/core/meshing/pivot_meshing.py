@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshing by pivots: marching tetrahedra on the pivots of a region's Gaussians.
+"""Pivot meshing: marching tetrahedra on the Delaunay triangulation of the Gaussians' pivots.
 
 See docs/method.md, section 6.
 """
@@ -14,8 +14,8 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import MeshingError
-from ..field.depth_samples import Sightings
-from ..field.isosurface_residual import level_errors
+from ..field.depth_samples import DepthSamples
+from ..field.isosurface_residual import isosurface_residuals
 from ..gaussians.model import GaussianArrays
 from ..mesh.components import compacted, without_floaters
 from ..mesh.surface_mesh import SurfaceMesh
@@ -26,23 +26,23 @@ from ..regions.convex_region import Region
 from ..report_warning import ReportWarning
 from ..settings import MeshingSettings
 from .cleanup.degenerate import remove_degenerate
-from .points.candidate_surface import no_surface, pivot_cloud
+from .points.candidate_surface import no_surface_error, pivot_cloud
 from .points.pivots import PIVOTS
 from .points.spacing import footprints
 from .tetrahedra.boundary_faces import tetrahedron_neighbours
-from .tetrahedra.delaunay import delaunay, far_points
+from .tetrahedra.delaunay import bounding_points, delaunay
 from .tetrahedra.marching_tetrahedra import bisect, marching_closed
 from .tetrahedra.tetrahedron_cut import cut_to_region
 
 _logger = logging.getLogger(__name__)
 
 BRACKET_SHARE = 0.02
-"""A vertex is bracketed to this share of a pixel at its place, or of its edge where that is
-shorter: finer is below what the photos tell (docs/method.md, section 6.4)."""
+"""Vertices are bracketed to this share of the local pixel footprint, or of their edge where that is
+shorter: the photos resolve nothing finer (docs/method.md, section 6.4)."""
 
 DEGENERATE_SHARE = 1e-3
-"""Faces narrower than this share of the median edge are removed: the level passes close by some
-points, and cuts slivers."""
+"""Faces narrower than this share of the median edge are removed: where the isosurface passes close
+to a point, it cuts slivers."""
 
 
 def mesh_by_pivots(
@@ -54,29 +54,29 @@ def mesh_by_pivots(
     progress: Progress,
     *,
     seed: int,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> SurfaceMesh:
-    """Mesh the surface ``vacancy = 0.5`` inside a region, as finely as the Gaussians lie.
+    """Mesh the surface ``vacancy = 0.5`` inside a region at the resolution of the Gaussians.
 
-    The tetrahedra of the pivots are cut by the region's planes before signs are asked for, so that
-    the solid ends on these planes exactly, with sharp edges; every tetrahedron stays, hence the
-    mesh is closed and manifold (docs/method.md, section 6.5).
+    The tetrahedra are clipped to the region's planes before the field is evaluated, so that the
+    solid ends exactly on these planes, with sharp edges. No tetrahedron is dropped, hence the mesh
+    is closed and manifold (docs/method.md, section 6.5).
 
     Parameters
     ----------
     vacancy : VacancyField
-        Or anything with ``vacancy(points)`` and ``is_empty(points)``.
+        Or any object with ``vacancy(points)`` and ``is_empty(points)``.
     arrays : GaussianArrays
         Scene frame.
     cameras : sequence of Camera
-        Of the field; must not be empty. Their pixels decide how finely vertices are bracketed.
+        The field's cameras; must not be empty. Their pixel footprints set the bracket tolerance.
     region : Region
         Scene frame.
     settings : MeshingSettings
-        ``pivots``, the number for each Gaussian, and ``min_component_share`` are read. An edge
-        length or a number of points does not apply; the provenance says so.
-    sightings : Sightings, optional
-        Where the cameras see the isosurface in the region (:mod:`.depth_samples`).
+        ``pivots`` (per Gaussian) and ``min_component_share`` are used. An edge length or a number
+        of points does not apply; the provenance notes that.
+    depth_samples : DepthSamples, optional
+        Depth-map samples of the isosurface in the region (:mod:`.depth_samples`).
 
     Returns
     -------
@@ -89,18 +89,18 @@ def mesh_by_pivots(
         The region holds no surface, or no Gaussian reaches it.
     """
     if len(cameras) == 0:
-        raise MeshingError("There are no cameras to look from.", "Check the scene.")
+        raise MeshingError("The scene has no cameras.", "Check the scene.")
     cloud = pivot_cloud(
-        arrays, region, vacancy.is_empty, seed, sightings, pivots_of=PIVOTS[settings.pivots]
+        arrays, region, vacancy.is_empty, seed, depth_samples, pivots_of=PIVOTS[settings.pivots]
     )
-    points = np.concatenate([cloud.points, far_points(cloud.points, seed)])
+    points = np.concatenate([cloud.points, bounding_points(cloud.points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
     cut = cut_to_region(points, tetrahedra, region)
     inside = _inside(vacancy, cut.points, cut.tetrahedra, progress.span(0.3, 0.5))
-    pairs, faces = marching_closed(cut.tetrahedra, tetrahedron_neighbours(cut.tetrahedra), inside)
+    edges, faces = marching_closed(cut.tetrahedra, tetrahedron_neighbours(cut.tetrahedra), inside)
     if len(faces) == 0:
-        raise no_surface(region)
-    begin, end = cut.points[pairs[:, 0]], cut.points[pairs[:, 1]]
+        raise no_surface_error(region)
+    begin, end = cut.points[edges[:, 0]], cut.points[edges[:, 1]]
     pixel = footprints((begin + end) / 2, cameras)  # (e,)
     limit = np.linalg.norm(end - begin, axis=1)
     limit = np.where(pixel > 0.0, np.minimum(limit, pixel), limit)
@@ -118,7 +118,7 @@ def mesh_by_pivots(
         "pivots_each": settings.pivots,
         "gaussians_in_region": cloud.gaussians,
         "pivots": len(cloud.points),
-        "sightings": 0 if sightings is None else len(sightings),
+        "sightings": 0 if depth_samples is None else len(depth_samples),
         "tetrahedra": len(cut.tetrahedra),
         "notes": _notes(settings, cloud.gaussians, cloud.chosen),
         "seed": seed,
@@ -129,7 +129,7 @@ def mesh_by_pivots(
         "degenerate_faces_left": degenerate,
         "vertices_on_surface": int((~capped).sum()),
         "vertices_on_region_boundary": int(capped.sum()),
-        **level_errors(vacancy, vertices[~capped]),
+        **isosurface_residuals(vacancy, vertices[~capped]),
     }
     progress.update(1.0, f"{len(kept)} faces")
     _logger.info("Meshed region %s by pivots: %d faces", region.name, len(kept))
@@ -139,7 +139,7 @@ def mesh_by_pivots(
 def _inside(
     vacancy: Any, points: np.ndarray, tetrahedra: np.ndarray, progress: Progress
 ) -> np.ndarray:
-    """Ask for the side of the points that tetrahedra use; the others count as empty, (n,) bool."""
+    """Classify the points that tetrahedra use; the others count as empty, (n,) bool."""
     used = np.unique(tetrahedra)
     progress.update(0.0, f"evaluating {len(used)} pivots")
     inside = np.zeros(len(points), np.bool_)
@@ -150,9 +150,9 @@ def _inside(
 def _notes(settings: MeshingSettings, gaussians: int, chosen: int) -> list[dict[str, str]]:
     notes = []
     if settings.edge_length > 0 or settings.points > 0:
-        text = "The pivots decide the resolution; no edge length or number of points applies."
+        text = "The pivots set the resolution; no edge length or number of points applies."
         notes.append(ReportWarning("resolution-not-applied", text))
     if chosen < gaussians:
-        text = f"{chosen} of {gaussians} Gaussians stand for all: memory is limited."
+        text = f"{chosen} of {gaussians} Gaussians were used, to limit memory."
         notes.append(ReportWarning("some-gaussians-chosen", text))
     return [note.to_json() for note in notes]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Primal adaptive meshing: a closed mesh of a region at any resolution.
+"""Primal adaptive meshing: extract a closed mesh of a region at any resolution.
 
 See docs/method.md, section 7.
 """
@@ -14,8 +14,8 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from ..errors import MeshingError
-from ..field.depth_samples import Sightings
-from ..field.isosurface_residual import level_errors
+from ..field.depth_samples import DepthSamples
+from ..field.isosurface_residual import isosurface_residuals
 from ..gaussians.model import GaussianArrays
 from ..mesh.components import compacted, without_floaters
 from ..mesh.simplification.edge_flips import flip_edges
@@ -29,20 +29,20 @@ from .cleanup.degenerate import remove_degenerate
 from .cleanup.repair import split_nonmanifold
 from .cleanup.small_handles import without_small_handles
 from .points.candidate_surface import candidate_surface
-from .points.resolution import Dense, checked_request, dense_request, nominal_edge
+from .points.resolution import DenseRequest, checked_request, dense_request, nominal_edge
 from .points.surface_points import KIND_CAP, KIND_JUMP, KIND_SURFACE, SurfacePoints, SurfaceSampler
 from .tetrahedra.boundary_faces import boundary_faces, tetrahedron_neighbours
 from .tetrahedra.classification import classify, on_one_sheet
-from .tetrahedra.delaunay import delaunay, far_points
+from .tetrahedra.delaunay import bounding_points, delaunay
 
 _logger = logging.getLogger(__name__)
 
 KIND_SPLIT = 3
-"""Moved slightly off the isosurface, to keep parts apart that would touch."""
+"""Moved slightly off the isosurface to separate parts that would touch."""
 
 DEGENERATE_SHARE = 1e-3
 """Faces narrower than this share of the spacing are removed: collinear points on the region's edges
-have them, of either orientation."""
+form such faces, in either orientation."""
 
 LONGEST_EDGE_SHARE = 1 / 8
 """Edges of the adaptive mesh are at most this share of the region's diagonal."""
@@ -60,42 +60,42 @@ def mesh_region(
     seed: int,
     threads: int,
     edge_length_scene: float = 0.0,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> SurfaceMesh:
-    """Mesh the surface ``vacancy = 0.5`` inside a region; the boundary closes the solid.
+    """Mesh the surface ``vacancy = 0.5`` inside a region, closed by caps on the region's boundary.
 
-    With adaptive spacing a denser mesh is made, and of its vertices those stay that the shape needs
-    (:mod:`..mesh.simplification.vertex_selection`). What stands where no camera looks, ``vacancy``
-    says. With neither an edge length nor a number of points the mesh gets about 50 thousand faces.
+    With adaptive spacing a denser mesh is extracted and simplified to the vertices that its shape
+    needs (:mod:`..mesh.simplification.vertex_selection`). ``vacancy`` decides about space that no
+    camera sees. Without an edge length or a number of points the mesh has about 50 thousand faces.
 
     Parameters
     ----------
     vacancy : VacancyField
-        Or anything with ``vacancy(points)`` and ``is_empty(points)``.
+        Or any object with ``vacancy(points)`` and ``is_empty(points)``.
     vectors : VectorField
-        Or anything with ``evaluate(points)``.
+        Or any object with ``evaluate(points)``.
     arrays : GaussianArrays
         Scene frame.
     cameras : sequence of Camera
-        Of the field; must not be empty.
+        The field's cameras; must not be empty.
     region : Region
         Scene frame.
     settings : MeshingSettings
-        ``points``, ``spacing`` and ``min_component_share`` are read; the edge length is passed in
-        scene units. Smoothing, fewer faces and an open boundary are steps of their own, on the
-        finished mesh; ``unseen`` is the field's.
+        ``points``, ``spacing`` and ``min_component_share`` are used; the edge length is passed in
+        scene units. Smoothing, decimation and an open boundary are separate steps on the finished
+        mesh; ``unseen`` concerns the field.
     seed : int
         The same seed gives the same mesh, for any number of threads.
     edge_length_scene : float
-        Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices
-        as that one. 0 leaves it to ``settings.points``.
-    sightings : Sightings, optional
-        Where the cameras see the isosurface in the region (:mod:`.depth_samples`).
+        Edge length of a uniform mesh, in scene units; an adaptive mesh has half as many vertices.
+        0 means that ``settings.points`` applies.
+    depth_samples : DepthSamples, optional
+        Depth-map samples of the isosurface in the region (:mod:`.depth_samples`).
 
     Returns
     -------
     SurfaceMesh
-        Closed, 2-manifold, oriented outward. ``provenance`` tells counts and ``|v - 0.5|`` of the
+        Closed, 2-manifold, oriented outward. ``provenance`` holds counts, and ``|v - 0.5|`` at the
         vertices on the isosurface.
 
     Raises
@@ -103,41 +103,43 @@ def mesh_region(
     MeshingError
         The region holds no surface.
     UsageError, ResourceError
-        The request makes no sense, or needs more points than the cap.
+        The request is invalid, or needs more points than the limit.
     """
     if len(cameras) == 0:
-        raise MeshingError("There are no cameras to look from.", "Check the scene.")
+        raise MeshingError("The scene has no cameras.", "Check the scene.")
     request = checked_request(edge_length_scene, settings.points, region)
     rng = np.random.default_rng(seed)
     surface = candidate_surface(
         arrays, region, vacancy.is_empty, 0.5 * request.edge_length, seed, progress.span(0.0, 0.3),
-        sightings,
+        depth_samples,
     )  # fmt: skip
     adaptive = settings.spacing == "adaptive"
     sampler = SurfaceSampler(
         vacancy, vectors, region, surface, threads, cameras=cameras if adaptive else ()
     )
-    wanted = dense_request(request, sampler.area, region) if adaptive else Dense(request, 0, 1.0)
-    cloud = sampler.sample(wanted.request, rng, progress.span(0.3, 0.6))
+    dense = (
+        dense_request(request, sampler.area, region) if adaptive else DenseRequest(request, 0, 1.0)
+    )
+    cloud = sampler.sample(dense.request, rng, progress.span(0.3, 0.6))
     vertices, faces, kind, figures = _connect(cloud, vacancy, region, settings, seed, rng, progress)
     figures["dense_vertices"] = len(vertices)
-    vertices, faces, kind = selected(vertices, faces, kind, wanted.target, wanted.share, region)
-    vertices, faces, kind, handles = tidied(vertices, faces, kind)
-    figures |= handles | counts(kind)
+    vertices, faces, kind = simplified(vertices, faces, kind, dense.target, dense.share, region)
+    vertices, faces, kind, handles = small_handles_closed(vertices, faces, kind)
+    figures |= handles | vertex_counts(kind)
     provenance = {
         "method": "primal adaptive meshing",
         "region": region.name,
         "edge_length_scene": nominal_edge(request, sampler.area, region),
         "gaussians_in_region": surface.gaussians,
         "pivots": surface.pivots,
-        "sightings": 0 if sightings is None else len(sightings),
+        "sightings": 0 if depth_samples is None else len(depth_samples),
         "candidate_area": sampler.area,
         "spacing": settings.spacing,
-        "notes": [note.to_json() for note in (*wanted.request.notes, *cloud.notes)],
+        "notes": [note.to_json() for note in (*dense.request.notes, *cloud.notes)],
         "seed": seed,
         **cloud.figures,
         **figures,
-        **distance_to_level(vacancy, vertices, kind),
+        **residuals_on_surface(vacancy, vertices, kind),
     }
     progress.update(1.0, f"{len(faces)} faces")
     _logger.info("Meshed region %s: %d faces", region.name, len(faces))
@@ -153,14 +155,14 @@ def _connect(
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Turn points into a closed manifold: Delaunay, labels, boundary faces, repair."""
+    """Connect points to a closed manifold: Delaunay, labels, boundary faces, repair."""
     hint = "Draw the region around something that was photographed."
     if len(cloud.points) < 4:
         raise MeshingError(f"Region {region.name!r} holds no surface.", hint)
-    points = np.concatenate([cloud.points, far_points(cloud.points, seed)])
+    points = np.concatenate([cloud.points, bounding_points(cloud.points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.6, 0.65))
     neighbours = tetrahedron_neighbours(tetrahedra)
-    # Points lie in a convex body: only tetrahedra with a far corner reach beyond it.
+    # The points lie in a convex body: only tetrahedra with a bounding point reach beyond it.
     outer = (tetrahedra >= len(cloud.points)).any(1)
     labels = classify(
         points,
@@ -179,11 +181,11 @@ def _connect(
         "undecided_tetrahedra": labels.undecided,
         "relabelled_tetrahedra": labels.flipped,
     }
-    vertices, faces, kind, repairs = finished(points, faces, cloud, region, settings, progress)
+    vertices, faces, kind, repairs = made_manifold(points, faces, cloud, region, settings, progress)
     return vertices, faces, kind, {**figures, **repairs}
 
 
-def finished(
+def made_manifold(
     points: np.ndarray,
     faces: np.ndarray,
     cloud: SurfacePoints,
@@ -191,13 +193,14 @@ def finished(
     settings: MeshingSettings,
     progress: Progress,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Make closed faces a manifold, without floaters and faces of no area.
+    """Repair closed faces to a manifold; remove floaters and degenerate faces.
 
     Parameters
     ----------
     points : (n, 3) float64
         The cloud's points first.
     faces : (f, 3) int64
+        Closed: every edge has as many faces in one direction as in the other.
 
     Returns
     -------
@@ -209,7 +212,7 @@ def finished(
     Raises
     ------
     MeshingError
-        There is no face.
+        There are no faces.
     """
     hint = "Draw the region around something that was photographed."
     if len(faces) == 0:
@@ -238,7 +241,7 @@ def finished(
     return vertices, kept, kind, figures
 
 
-def selected(
+def simplified(
     vertices: np.ndarray,
     faces: np.ndarray,
     kind: np.ndarray,
@@ -246,16 +249,16 @@ def selected(
     share: float,
     region: Region,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Keep the vertices that the shape needs, of a closed 2-manifold, and their kinds.
+    """Simplify a closed 2-manifold to the vertices that its shape needs; return their kinds too.
 
-    Edges between those that stay run where they keep closest to the given mesh.
+    Edges between the remaining vertices are flipped to stay closest to the given mesh.
 
     Parameters
     ----------
     target : int
-        So many stay at least.
+        Least number of vertices to keep.
     share : float
-        Share that stays where that is more; with 1, as for uniform spacing, all do.
+        Share of the vertices to keep where that is more; 1, for uniform spacing, keeps all.
     """
     target = max(target, round(share * len(vertices)))
     if len(vertices) <= target:
@@ -266,10 +269,10 @@ def selected(
     return kept, flip_edges(kept, coarse, vertices, faces, longest), kind[chosen]
 
 
-def tidied(
+def small_handles_closed(
     vertices: np.ndarray, faces: np.ndarray, kind: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, int]]:
-    """Close handles that are smaller than the edges of the mesh resolve, of a closed 2-manifold."""
+    """Close the handles of a closed 2-manifold that are too small for its edges to resolve."""
     edge_length = float(np.median(edge_lengths(vertices, faces)))
     closed = without_small_handles(vertices, faces, edge_length)
     vertices, faces, chosen = compacted(vertices, closed.faces)
@@ -277,8 +280,8 @@ def tidied(
     return vertices, faces, kind[chosen], figures
 
 
-def counts(kind: np.ndarray) -> dict[str, int]:
-    """Return how many vertices there are of each kind, for the report."""
+def vertex_counts(kind: np.ndarray) -> dict[str, int]:
+    """Count the vertices of each kind, for the report."""
     return {
         "vertices_on_surface": int((kind == KIND_SURFACE).sum()),
         "vertices_on_region_boundary": int((kind == KIND_CAP).sum()),
@@ -287,6 +290,6 @@ def counts(kind: np.ndarray) -> dict[str, int]:
     }
 
 
-def distance_to_level(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:
+def residuals_on_surface(vacancy: Any, vertices: np.ndarray, kind: np.ndarray) -> dict[str, Any]:
     """Measure ``|v - 0.5|`` at the vertices that should lie on the isosurface."""
-    return level_errors(vacancy, vertices[kind == KIND_SURFACE])
+    return isosurface_residuals(vacancy, vertices[kind == KIND_SURFACE])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""PLY files: one bounded reader of headers and vertex tables.
+"""PLY files: bounded readers of headers and vertex tables.
 
-In: a file that nobody has checked. Out: columns of numbers, or a typed error.
+In: an untrusted file. Out: columns of numbers, or a typed error.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bounded reader of a PLY's header: the only one."""
+"""Parse PLY headers of bounded size; the only such parser in the package."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ _TYPES = {
 _ENCODINGS = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 LIST = "list"
-"""Type of a property whose length differs from row to row; only elements after the vertices may
-have one."""
+"""Type of a list property; only elements after the vertices may have one."""
 
 
 @dataclass(frozen=True)
@@ -41,17 +40,17 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What stands in a header."""
+    """A parsed header."""
 
     encoding: str
     """``"ascii"``, or the byte order ``"<"`` or ``">"``."""
     elements: tuple[PlyElement, ...]
     comments: tuple[str, ...]
     begin: int
-    """Byte at which the body begins."""
+    """Offset of the body in bytes."""
 
     def count(self, element: str) -> int:
-        """Return how many of an element are announced, 0 where it is not named."""
+        """Return the declared count of an element, 0 if it is not declared."""
         return next((found.count for found in self.elements if found.name == element), 0)
 
 
@@ -62,12 +61,12 @@ def read_ply_header(path: Path, hint: str) -> PlyHeader:
     ----------
     path : Path
     hint : str
-        Next step of every error.
+        Hint of every error.
 
     Raises
     ------
     ParseError
-        Not a PLY, or a header line that is none; names the line.
+        The file is no PLY, or a header line is invalid; names the line.
     """
     try:
         with path.open("rb") as stream:
@@ -84,25 +83,25 @@ def read_ply_header(path: Path, hint: str) -> PlyHeader:
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
     for number, raw in enumerate(head[: end.start()].splitlines()[1:], start=2):
         words = raw.decode("ascii", "replace").split()
-        place = f"line {number}"
+        location = f"line {number}"
         if not words or words[0] == "obj_info":
             continue
         if words[0] == "comment":
             comments.append(" ".join(words[1:]))
         elif words[0] == "format":
             if len(words) < 2 or words[1] not in _ENCODINGS:
-                raise ParseError(path, place, f"format {' '.join(words[1:])!r}.", hint)
+                raise ParseError(path, location, f"format {' '.join(words[1:])!r}.", hint)
             encoding = _ENCODINGS[words[1]]
         elif words[0] == "element":
             if len(words) != 3 or not re.fullmatch(r"\d{1,18}", words[2]):
-                raise ParseError(path, place, "an element without a count.", hint)
+                raise ParseError(path, location, "an element without a count.", hint)
             elements.append((words[1], int(words[2]), []))
         elif words[0] == "property":
             if not elements:
-                raise ParseError(path, place, "a property before any element.", hint)
-            elements[-1][2].append(_property(path, place, words, elements[-1][2], hint))
+                raise ParseError(path, location, "a property before any element.", hint)
+            elements[-1][2].append(_property(path, location, words, elements[-1][2], hint))
         else:
-            raise ParseError(path, place, f"unknown header line {words[0][:40]!r}.", hint)
+            raise ParseError(path, location, f"unknown header line {words[0][:40]!r}.", hint)
     if not encoding:
         raise ParseError(path, "header", "the format line is missing.", hint)
     found = tuple(PlyElement(name, count, tuple(kinds)) for name, count, kinds in elements)
@@ -110,7 +109,7 @@ def read_ply_header(path: Path, hint: str) -> PlyHeader:
 
 
 def _property(
-    path: Path, place: str, words: list[str], before: list[tuple[str, str]], hint: str
+    path: Path, location: str, words: list[str], before: list[tuple[str, str]], hint: str
 ) -> tuple[str, str]:
     """Return (name, type) of a property line."""
     is_list = len(words) == 5 and words[1] == "list"
@@ -119,7 +118,7 @@ def _property(
     elif len(words) == 3 and words[1] in _TYPES:
         name, kind = words[2], _TYPES[words[1]]
     else:
-        raise ParseError(path, place, f"property {' '.join(words[1:])[:60]!r}.", hint)
+        raise ParseError(path, location, f"property {' '.join(words[1:])[:60]!r}.", hint)
     if name in dict(before):
-        raise ParseError(path, place, f"property {name} comes twice.", hint)
+        raise ParseError(path, location, f"property {name} comes twice.", hint)
     return name, kind

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The vertices of a PLY as a table of numbers."""
+"""Read the vertices of a PLY file as a table of numbers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .header import LIST, PlyHeader
 def vertex_layout(
     path: Path, header: PlyHeader, hint: str, most: int = limits.MAX_GAUSSIANS
 ) -> np.dtype:
-    """Return how the vertices lie in a file; parameters and errors of :func:`read_vertices`."""
+    """Return the row layout of the vertices; parameters and errors as for :func:`read_vertices`."""
     if not header.elements or header.elements[0].name != "vertex":
         raise ParseError(path, "header", "the first element is not named vertex.", hint)
     vertex = header.elements[0]
@@ -31,13 +31,13 @@ def vertex_layout(
     text = header.encoding == "ascii"
     order = "=" if text else header.encoding
     layout = np.dtype([(n, order + ("f8" if text else kind)) for n, kind in vertex.properties])
-    # A number and its separator take two bytes; the last line may lack its end.
+    # A number and its separator take two bytes; the last line may lack a newline.
     smallest = vertex.count * (2 * len(vertex.properties) if text else layout.itemsize)
     need_bytes = header.begin + smallest - text
     size_bytes = path.stat().st_size
     if size_bytes < need_bytes:
         raise ParseError(
-            path, f"byte {size_bytes}", f"cut off: the header promises {need_bytes} bytes.", hint
+            path, f"byte {size_bytes}", f"cut off: the header declares {need_bytes} bytes.", hint
         )
     return layout
 
@@ -47,27 +47,27 @@ def read_vertices(
 ) -> np.ndarray:
     """Read the vertices, the first element of a file.
 
-    Nothing is allocated before the file is known to be as long as the header promises.
+    Nothing is allocated before the file is known to be as long as its header declares.
 
     Parameters
     ----------
     path : Path
     header : PlyHeader
-        Of that file.
+        Header of the file.
     hint : str
-        Next step of every error.
+        Hint of every error.
     most : int
-        Number of vertices that a header may announce.
+        Greatest number of vertices that is accepted.
 
     Returns
     -------
     (n,) structured array
-        One field per property; of an ASCII file all are float64.
+        One field per property; for ASCII files all are float64.
 
     Raises
     ------
     ParseError
-        Vertices do not come first, are too many, have lists, or the body is cut.
+        The vertices do not come first, are too many or have lists, or the body is truncated.
     """
     layout = vertex_layout(path, header, hint, most)
     vertex, text = header.elements[0], header.encoding == "ascii"
@@ -84,7 +84,7 @@ def read_vertices(
     if table.shape != (vertex.count, len(vertex.properties)):
         raise ParseError(
             path, "body", f"{table.shape[0]} lines of {table.shape[1]} numbers; the header "
-            f"promises {vertex.count} of {len(vertex.properties)}.", hint,
+            f"declares {vertex.count} of {len(vertex.properties)}.", hint,
         )  # fmt: skip
     rows = np.empty(vertex.count, layout)
     for column, name in enumerate(vertex.names):

@@ -26,10 +26,10 @@ def main(arguments: list[str]) -> int:
 
         resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
     parent = os.getppid()
-    _ask_to_end_with_parent()
-    threading.Thread(target=_end_with_parent, args=(parent,), daemon=True).start()
+    _request_parent_death_signal()
+    threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
     try:
-        package = __name__.rsplit(".", 1)[0]
+        package = __name__.rpartition(".processes.")[0]
         importlib.import_module(f"{package}.{module}").main(folder)
     except WrapError as error:
         emit(error=error.message, hint=error.hint)
@@ -39,7 +39,7 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _ask_to_end_with_parent() -> None:
+def _request_parent_death_signal() -> None:
     """Let Linux end us with the thread that started us: while a native call holds the GIL, no
     thread of ours can look."""
     if not sys.platform.startswith("linux"):
@@ -50,7 +50,7 @@ def _ask_to_end_with_parent() -> None:
     ctypes.CDLL(None).prctl(set_parent_death_signal, int(signal.SIGKILL), 0, 0, 0)
 
 
-def _end_with_parent(parent: int) -> None:
+def _exit_with_parent(parent: int) -> None:
     """A helper must not outlive the worker that waits for it."""
     while os.getppid() == parent:
         time.sleep(_PARENT_POLL_S)

@@ -26,7 +26,7 @@ from typing import IO, Any
 from .. import limits
 from ..errors import DatasetError, ResourceError, WorkerError
 from ..progress import Progress
-from .peak_memory import note_helper
+from .peak_memory import record_helper_peak
 from .spawn import kill_group, spawn
 from .worker_environment import PACKAGES_OPTION, interpreter_of
 
@@ -34,7 +34,7 @@ _logger = logging.getLogger(__name__)
 
 _POLL_S = 0.1
 _running: set[subprocess.Popen[bytes]] = set()
-_LAST_WORDS_LINES = 8
+_OUTPUT_TAIL_LINES = 8
 
 
 def child_command(module: str, *arguments: str, python: str | None = None) -> list[str]:
@@ -51,8 +51,8 @@ def child_command(module: str, *arguments: str, python: str | None = None) -> li
         interpreter, packages = interpreter_of(python)
     else:
         interpreter, packages = sys.executable, str(sys._xoptions.get(PACKAGES_OPTION) or "")
-    given = ["-X", f"{PACKAGES_OPTION}={packages}"] if packages else []
-    return [interpreter, "-I", *given, "-u", str(entry), module, *arguments]
+    options = ["-X", f"{PACKAGES_OPTION}={packages}"] if packages else []
+    return [interpreter, "-I", *options, "-u", str(entry), module, *arguments]
 
 
 def emit(**values: Any) -> None:
@@ -61,7 +61,7 @@ def emit(**values: Any) -> None:
     sys.stdout.flush()
 
 
-def end_helpers() -> None:
+def kill_helpers() -> None:
     """Kill the helpers that run now; for a process that is about to leave without unwinding."""
     for process in list(_running):
         with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -106,7 +106,7 @@ def run_helper(
         reader.start()
     begun_s = time.monotonic()
     failure: dict[str, Any] = {}
-    last_words: list[str] = []
+    output_tail: list[str] = []
     try:
         while process.poll() is None or any(r.is_alive() for r in readers) or not lines.empty():
             progress.check()
@@ -120,12 +120,12 @@ def run_helper(
                 continue
             values = _parse(line) if source == "out" else None
             if values is None:
-                last_words = [*last_words, line.rstrip()][-_LAST_WORDS_LINES:]
+                output_tail = [*output_tail, line.rstrip()][-_OUTPUT_TAIL_LINES:]
                 _logger.debug("%s: %s", module, line.rstrip())
             elif "error" in values:
                 failure = values
             elif "peak_bytes" in values:
-                note_helper(int(values["peak_bytes"]))
+                record_helper_peak(int(values["peak_bytes"]))
             else:
                 progress.update(float(values.get("fraction", 0.0)), str(values.get("message", "")))
     finally:
@@ -138,7 +138,7 @@ def run_helper(
         raise DatasetError(str(failure["error"]), str(failure.get("hint", "")))
     if code != 0:
         reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
-        raise WorkerError(f"{module} {reason}: {' | '.join(last_words)[-500:]}", "See the log.")
+        raise WorkerError(f"{module} {reason}: {' | '.join(output_tail)[-500:]}", "See the log.")
 
 
 def _drain(stream: IO[bytes], name: str, lines: queue.Queue[tuple[str, str]]) -> None:

@@ -38,7 +38,7 @@ def peak_memory_bytes() -> dict[str, int]:
     return {"worker": own_bytes, "largest_helper": largest_helper_bytes()} if own_bytes else {}
 
 
-def note_helper(peak_bytes: int) -> None:
+def record_helper_peak(peak_bytes: int) -> None:
     """Keep what a helper process says of itself, where it is the largest so far."""
     global _largest_helper_bytes
     _largest_helper_bytes = max(_largest_helper_bytes, peak_bytes)

@@ -90,11 +90,15 @@ def run_to_end(command: list[str], deadline_s: float) -> tuple[int, str, str]:
     """
     process = spawn(command)
     try:
-        output, words = process.communicate(timeout=deadline_s)
+        output, error_output = process.communicate(timeout=deadline_s)
     except BaseException:  # a group of its own: nobody else would end it
         kill_group(process)
         raise
-    return process.returncode, output.decode(errors="replace"), words.decode(errors="replace")
+    return (
+        process.returncode,
+        output.decode(errors="replace"),
+        error_output.decode(errors="replace"),
+    )
 
 
 def kill_group(process: subprocess.Popen[Any], grace_s: float = 2.0) -> None:

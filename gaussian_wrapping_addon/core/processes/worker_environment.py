@@ -75,7 +75,7 @@ class WorkerEnvironment:
 
     def marker(self) -> dict[str, Any]:
         """Return what the marker says; nothing where there is none."""
-        return _object(self.marker_path, "made_by", _ADDON)
+        return _read_object(self.marker_path, "made_by", _ADDON)
 
     def worker(self) -> str:
         """Return what :func:`~.helper_process.child_command` starts; ``""`` where it is not there.
@@ -95,7 +95,7 @@ def venv_python(folder: Path) -> Path:
     return folder / "Scripts" / "python.exe" if windows else folder / "bin" / "python"
 
 
-def _object(path: Path, key: str, value: str | None = None) -> dict[str, Any]:
+def _read_object(path: Path, key: str, value: str | None = None) -> dict[str, Any]:
     try:
         values = read_json(path)
     except (OSError, ParseError):
@@ -146,24 +146,28 @@ def default_root() -> Path:
     return installed_root() or user_data() / "worker"
 
 
-def remember(root: Path) -> None:
+def register_environment(root: Path) -> None:
     """Note where an environment was made, so that every later call finds it."""
     pointer = user_data() / _POINTER
     pointer.parent.mkdir(parents=True, exist_ok=True)
     write_json(pointer, {"root": str(root)})
 
 
-def forget(root: Path) -> None:
+def unregister_environment(root: Path) -> None:
     """Drop the note of an environment that is being removed."""
     pointer = user_data() / _POINTER
-    if _object(pointer, "root", str(root)):
+    if _read_object(pointer, "root", str(root)):
         pointer.unlink(missing_ok=True)
 
 
 def known_environments() -> list[WorkerEnvironment]:
     """Return the environments that may be there, the nearest first."""
-    noted = _object(user_data() / _POINTER, "root").get("root")
-    roots = [installed_root(), Path(noted) if isinstance(noted, str) else None, default_root()]
+    registered = _read_object(user_data() / _POINTER, "root").get("root")
+    roots = [
+        installed_root(),
+        Path(registered) if isinstance(registered, str) else None,
+        default_root(),
+    ]
     return [WorkerEnvironment(root) for root in dict.fromkeys(roots) if root is not None]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The automatic first region: a robust box around what the cameras look at."""
+"""Automatic region: a robust bounding box of what the cameras look at."""
 
 from __future__ import annotations
 
@@ -17,42 +17,42 @@ from .convex_region import Region
 _logger = logging.getLogger(__name__)
 
 MIN_POINTS = 24
-"""Fewer weighted points than this say nothing about an extent."""
+"""Least number of weighted points from which an extent is estimated."""
 
 WEIGHT_THAT_COUNTS = 1e-3
 
 WELL_SEEN_SHARE = 0.6
-"""Points in fewer than this share of the most-seen point's views hardly count."""
+"""Points in fewer than this share of the most-seen point's views have little weight."""
 
 VOXEL_SHARE = 0.06
-"""Side, in frame sizes, of the cells that balance the density of keypoints."""
+"""Side, in frame sizes, of the voxels that balance the density of keypoints."""
 
 TAIL_SHARE = 0.01
-"""Weight left out at each end of each axis."""
+"""Share of the weight trimmed at each end of each axis."""
 
 PADDING_SHARE = 0.08
-"""Room around the points: keypoints lie on the surface, seldom at its outermost places."""
+"""Margin around the points: keypoints lie on the surface, but seldom at its extremes."""
 
 HEADROOM = 0.15
 HEAD_TAIL_DIVISOR = 5.0
-"""The top of the box: this share of the height more, and a tail this many times smaller."""
+"""At the top of the box: extra share of the height, and divisor of the trimmed tail."""
 
 ROTATED_GAIN = 0.9
-"""A turned box must be this much smaller than an upright one to be preferred."""
+"""A rotated box is preferred only below this share of the axis-aligned box's footprint."""
 
 WHOLE_TAIL_SHARE = 0.005
 WHOLE_MIN_ALPHA = 0.1
 WHOLE_MIN_VIEWS = 2
 WHOLE_REACH = 6.0
-"""The whole scene ends at this multiple of the median camera-to-centre distance."""
+"""Reach of the whole scene, in median distances from the cameras to the centre."""
 
 
 def automatic_region(scene: Scene) -> Region:
-    """Return a Z-up box, possibly turned about Z, around what the cameras look at.
+    """Return a Z-up box, possibly rotated about Z, around what the cameras look at.
 
-    Sparse points are weighted by the share of views whose frame holds them and by their closeness
-    to the point where the optical axes converge, measured in the size of the frame there; the box
-    spans robust quantiles of the weight. Outlying cameras and points carry none.
+    Sparse points are weighted by the share of views whose frame contains them and by their
+    closeness to the point where the optical axes converge, in units of the frame size there; the
+    box spans robust quantiles of the weight. Outlying cameras and points have no weight.
 
     Parameters
     ----------
@@ -75,33 +75,33 @@ def automatic_region(scene: Scene) -> Region:
     points = scene.points[np.isfinite(scene.points).all(1)] if len(scene.points) else scene.points
     if len(points) >= MIN_POINTS:
         seen = _views_of(points, cameras) / len(cameras)  # (n,) share of views
-        steady = _ramp(seen / max(seen.max(), 1e-12)) * _thinned(points, VOXEL_SHARE * frame_size)
+        support = _ramp(seen / max(seen.max(), 1e-12)) * _thinned(points, VOXEL_SHARE * frame_size)
         for _ in range(3):
             offset = np.linalg.norm(points - focus, axis=1) / frame_size  # (n,)
-            weight = np.exp(-2.0 * offset**2) * steady
+            weight = np.exp(-2.0 * offset**2) * support
             if (weight > WEIGHT_THAT_COUNTS).sum() < MIN_POINTS:
                 break
             focus = _weighted_quantiles(points, weight, np.array([0.5]))[0]
         if (weight > WEIGHT_THAT_COUNTS).sum() >= MIN_POINTS:
             return _box_around("auto", points, weight, TAIL_SHARE, PADDING_SHARE)
-    _logger.warning("Too few sparse points for an automatic region: using the cameras alone")
+    _logger.warning("Too few sparse points for an automatic region: using only the cameras")
     half = np.full(3, 0.6 * frame_size)
     return Region.box("auto", focus - half, focus + half)
 
 
 def whole_region(scene: Scene, arrays: GaussianArrays) -> Region:
-    """Return the robust box of everything that at least two photos see.
+    """Return a robust bounding box of all that at least two photos see.
 
     Parameters
     ----------
     scene : Scene
     arrays : GaussianArrays
-        Trained Gaussians, scene frame; faint ones do not count.
+        Trained Gaussians, scene frame; faint ones are ignored.
 
     Raises
     ------
     MeshingError
-        No Gaussian is seen.
+        No Gaussian is seen by enough photos.
     """
     cameras = _usable_cameras(scene.cameras)
     focus, distance = _focus(cameras, scene.points)
@@ -119,7 +119,7 @@ def whole_region(scene: Scene, arrays: GaussianArrays) -> Region:
 
 
 def _usable_cameras(cameras: Sequence[Camera]) -> list[Camera]:
-    """Leave out cameras that are not finite or lie absurdly far from the others."""
+    """Drop cameras that are not finite or lie far from the others."""
     good = [c for c in cameras if np.isfinite(c.cam_from_world).all()]
     if not good:
         raise MeshingError("The scene has no usable camera.", "Check the camera poses.")
@@ -130,15 +130,15 @@ def _usable_cameras(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def _half_frame(cameras: Sequence[Camera]) -> float:
-    """Median tangent of half the narrower field of view."""
+    """Return the median tangent of half the narrower field of view."""
     return float(np.median([min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]))
 
 
 def _focus(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the point that the optical axes approach best, and its median camera distance.
+    """Return the point closest to the optical axes, and its median distance to the cameras.
 
-    Along each axis a weak prior pulls towards the depth of the sparse points, so that near-parallel
-    axes (one camera, a forward-facing row) still give a sensible place.
+    A weak prior at the depth of the sparse points along each axis gives a sensible point even for
+    near-parallel axes (one camera, a forward-facing row).
     """
     centers = np.array([c.center for c in cameras])  # (c, 3)
     forwards = np.array([c.forward for c in cameras])  # (c, 3)
@@ -149,18 +149,18 @@ def _focus(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, f
     for _ in range(20):
         miss = np.linalg.norm(np.einsum("cij,cj->ci", across, focus - centers), axis=1)  # (c,)
         weight = 1.0 / np.maximum(miss, 1e-3 * np.median(depth))
-        pull = 0.01 * weight
-        matrix = np.einsum("c,cij->ij", weight, across) + np.eye(3) * pull.sum()
-        right = np.einsum("c,cij,cj->i", weight, across, centers) + pull @ prior
+        prior_weight = 0.01 * weight
+        matrix = np.einsum("c,cij->ij", weight, across) + np.eye(3) * prior_weight.sum()
+        right = np.einsum("c,cij,cj->i", weight, across, centers) + prior_weight @ prior
         focus = np.linalg.solve(matrix, right)
     in_front = ((focus - centers) * forwards).sum(1) > 0
-    if in_front.mean() < 0.5:  # cameras that look outwards: take what lies before them
+    if in_front.mean() < 0.5:  # outward-facing cameras: use the points in front of them
         focus = np.median(prior, 0)
     return focus, float(np.median(np.linalg.norm(focus - centers, axis=1)))
 
 
 def _median_depth(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """(c,) median depth of the sparse points in each frame; their median where there are none."""
+    """Return the median depth of the points in each frame, (c,); their median where too few."""
     centers = np.array([c.center for c in cameras])
     spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
     result = np.full(len(cameras), np.nan)
@@ -181,7 +181,7 @@ def _in_frame(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarra
 
 
 def _views_of(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """(n,) number of cameras whose frame holds the point."""
+    """Count the cameras whose frame contains each point, (n,)."""
     count = np.zeros(len(points))
     for camera in cameras:
         count += _in_frame(points, camera)[0]
@@ -189,9 +189,9 @@ def _views_of(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def _thinned(points: np.ndarray, side: float) -> np.ndarray:
-    """(n,) weights that balance cells of very different density, 0 for points alone in a cell.
+    """Return weights that balance voxels of different density, (n,); 0 for points alone in one.
 
-    A smooth thing on a textured carpet has few keypoints; without this the carpet decides.
+    A smooth object on a textured carpet has few keypoints; without this the carpet would dominate.
     """
     cells = np.floor((points - points.min(0)) / side).astype(np.int64)  # (n, 3)
     _, index, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
@@ -200,21 +200,21 @@ def _thinned(points: np.ndarray, side: float) -> np.ndarray:
 
 
 def _ramp(share: np.ndarray) -> np.ndarray:
-    """0 below half of :data:`WELL_SEEN_SHARE`, 1 above it."""
+    """Return a linear ramp: 0 below half of :data:`WELL_SEEN_SHARE`, 1 above it."""
     return np.clip(2.0 * share / WELL_SEEN_SHARE - 1.0, 0.0, 1.0)
 
 
 def _weighted_quantiles(values: np.ndarray, weight: np.ndarray, shares: np.ndarray) -> np.ndarray:
     """Return weighted quantiles of each column of (n, k) values, (len(shares), k).
 
-    Nothing is interpolated: the gap to an outlier of hardly any weight would count.
+    Values are not interpolated: the gap to an outlier of little weight would count.
     """
     result = np.empty((len(shares), values.shape[1]))
     for column in range(values.shape[1]):
         order = np.argsort(values[:, column], kind="stable")
         total = np.cumsum(weight[order])
-        place = np.searchsorted(total, shares * total[-1])
-        result[:, column] = values[order[np.minimum(place, len(order) - 1)], column]
+        position = np.searchsorted(total, shares * total[-1])
+        result[:, column] = values[order[np.minimum(position, len(order) - 1)], column]
     return result
 
 
@@ -235,8 +235,8 @@ def _box_around(
     assert best is not None
     _, rotation, low, high = best
     size = high - low
-    pad = padding * size + 0.25 * padding * size.max()  # flat scenes need room as well
-    # Air above costs nothing, and tips (a stem, a finial) have few keypoints.
+    pad = padding * size + 0.25 * padding * size.max()  # flat scenes need a margin as well
+    # Empty space above costs nothing, and tips (a stem, a finial) have few keypoints.
     head = _weighted_quantiles(points[:, 2:], weight, np.array([1.0 - tail / HEAD_TAIL_DIVISOR]))
     high[2] = max(high[2], float(head[0, 0])) + HEADROOM * size[2]
     return Region.box(name, low - pad, high + pad, rotation)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Boxes as plain arrays, and the edges of a hull that are drawn."""
+"""Detection of boxes among convex bodies, and the visible edges of a convex hull."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ CUBE_TRIANGLES = (
     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
 )  # fmt: skip
 
-# Neighbouring faces of a hull count as one where the cosine of their angle differs from 1 by less.
+# Adjacent faces of a hull count as one if the cosine of their angle differs from 1 by less.
 FLAT_EDGE = 1e-6
 # Share of the diagonal by which corners of a box may be off (float32 matrices of Blender).
 BOX_TOLERANCE = 1e-5
 
 
 def hull_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the edges of a convex hull that are seen: not those within its flat faces.
+    """Return the visible edges of a convex hull: those not within its flat faces.
 
     Parameters
     ----------
@@ -43,13 +43,13 @@ def hull_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     order = np.argsort(which.ravel(), kind="stable")
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])  # (k,)
     one, other = normals[owners[order[first]]], normals[owners[order[first + counts - 1]]]
-    # The sign of a normal follows the triangle's winding, which hulls of meshes leave open.
+    # The sign of a normal follows the triangle's winding, which is not defined for these hulls.
     flat = (counts == 2) & (np.abs((one * other).sum(1)) > 1.0 - FLAT_EDGE)
     return np.asarray(edges[~flat])
 
 
 def box_matrix(vertices: np.ndarray) -> np.ndarray | None:
-    """Return the matrix that maps :data:`CUBE_CORNERS` onto a box, or None where it is no box.
+    """Return the matrix that maps :data:`CUBE_CORNERS` onto a box, or None if it is no box.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def box_matrix(vertices: np.ndarray) -> np.ndarray | None:
     Returns
     -------
     matrix : (4, 4) float64 or None
-        Rotation, positive scale and translation, with axes as near to x, y, z as they can be.
+        Rotation, positive scale and translation, with axes as close to x, y, z as possible.
     """
     if vertices.shape != (8, 3):
         return None
@@ -81,7 +81,7 @@ def box_matrix(vertices: np.ndarray) -> np.ndarray | None:
 
 
 def _nearest_axes(center: np.ndarray, edges: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Name the edges x, y, z so that the rotation is as small as it can be."""
+    """Assign the edges to x, y, z such that the rotation is smallest."""
     best, best_trace = np.eye(4), -np.inf
     for order in itertools.permutations(range(3)):
         rotation = (edges / lengths[:, None])[list(order)].T  # (3, 3), one axis a column

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which vertices lie on the boundary of a region, so that later steps leave them there."""
+"""Find the vertices on the boundary planes of a region, so that later steps keep them there."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 from .convex_region import Region
 
 ON_PLANE_SHARE = 1e-9
-"""Vertices so close to a face's plane lie on it, in diagonals of the region: caps are made on the
-planes, to the last digits."""
+"""Tolerance for a vertex on a face's plane, in diagonals of the region: caps are made on the planes
+up to rounding."""
 
 MAX_PLANES = 3
 
 
 @dataclass(frozen=True)
 class CapPlanes:
-    """Planes of a region's boundary, in coordinates of the caller, and the vertices on them."""
+    """Planes of a region's boundary, in the caller's coordinates, and the vertices on them."""
 
     normals: np.ndarray
     """(k, 3) float64, outward."""
@@ -27,7 +27,7 @@ class CapPlanes:
     planes: np.ndarray
     """(v, 3) int64: planes that each vertex lies on, -1 for none."""
     fixed: np.ndarray
-    """(v,) bool: vertices on more planes than that, which cannot move at all."""
+    """(v,) bool: vertices on more than three planes, which cannot move."""
 
 
 def cap_planes(vertices: np.ndarray, region: Region | None) -> CapPlanes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A region of interest: a convex body given by its vertices."""
+"""Region of interest: a convex body given by its vertices."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from ..dataset.similarity import Similarity
-from .volume import check_volume, flat_region
+from .volume import check_volume, flat_region_error
 
 COPLANAR_COSINE = 1.0 - 1e-9
-"""Hull triangles whose normals agree this well are one face."""
+"""Hull triangles whose normals have at least this cosine belong to one face."""
 
 _UNIT_CORNERS = np.array(
     [[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
@@ -22,7 +22,7 @@ _UNIT_CORNERS = np.array(
 
 @dataclass(frozen=True)
 class Region:
-    """A convex body. The frame is the caller's: world in files, scene inside the program.
+    """A convex body, in the caller's frame: world in files, scene inside the program.
 
     Raises
     ------
@@ -40,7 +40,7 @@ class Region:
         vertices.setflags(write=False)
         object.__setattr__(self, "vertices", vertices)
         if not self._has_hull():
-            raise flat_region(self.name)
+            raise flat_region_error(self.name)
 
     def _has_hull(self) -> bool:
         try:
@@ -67,7 +67,7 @@ class Region:
 
     @cached_property
     def _hull(self) -> ConvexHull:
-        # Centred and scaled: a body of 1 m at UTM coordinates would lose seven digits.
+        # Centred and scaled: a 1 m body at UTM coordinates would lose seven digits.
         low, high = self.bounds
         diagonal = np.linalg.norm(high - low)
         return ConvexHull((self.vertices - (low + high) / 2) / diagonal)
@@ -131,7 +131,7 @@ class Region:
         return equations[:, :3].copy(), -equations[:, 3] * self.diagonal
 
     def faces(self) -> list[np.ndarray]:
-        """Return for each row of :attr:`half_spaces` its triangles' corners, (t, 3, 3) each."""
+        """Return the triangles' corners for each row of :attr:`half_spaces`, (t, 3, 3) each."""
         count = len(self.half_spaces[1])
         corners = self.vertices[self.simplices]  # (t, 3, 3)
         return [corners[self._faces_of_simplices == index] for index in range(count)]
@@ -147,7 +147,7 @@ class Region:
         return self.vertices[pairs[first[sharp]]]
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the largest signed half-space distance of (n, 3) points, < 0 inside, (n,)."""
+        """Return the largest signed half-space distance of (n, 3) points, (n,); < 0 inside."""
         normals, offsets = self.half_spaces
         local = np.asarray(points, np.float64) - self.center
         result = np.full(len(local), -np.inf)
@@ -156,7 +156,7 @@ class Region:
         return result
 
     def contains(self, points: np.ndarray, tolerance: float = 0.0) -> np.ndarray:
-        """Tell which of (n, 3) points lie inside, or outside by at most ``tolerance``, (n,)."""
+        """Return which of (n, 3) points lie inside, or outside by at most ``tolerance``, (n,)."""
         return self.distance(points) <= tolerance
 
     def transformed(self, target_from_source: Similarity) -> Region:

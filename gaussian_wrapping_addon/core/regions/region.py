@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Regions of interest: the body, from and to its file, and the automatic choices."""
+"""Read and write regions; re-exports the region class and the automatic regions."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def read_region(path: Path) -> Region:
 
 
 def parse_region(values: Any, path: Path) -> Region:
-    """Build a region from JSON values; ``path`` is only named in errors.
+    """Build a region from JSON values; ``path`` is used in errors only.
 
     Raises
     ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bounding-volume JSON, version 1 (docs/file-formats.md): the only reader and writer of regions."""
+"""Read and write region files: bounding-volume JSON, version 1 (docs/file-formats.md)."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ MAX_COORDINATE = 1e12
 
 @dataclass(frozen=True)
 class RegionFile:
-    """What a region file says; the region is the convex hull of its corners."""
+    """Contents of a region file; the region is the convex hull of its vertices."""
 
     name: str
     """Not empty, encodable, within :data:`limits.MAX_NAME_BYTES`."""
     vertices: np.ndarray
-    """(n, 3) float64, world frame, finite; they enclose a volume."""
+    """(n, 3) float64, world frame, finite, enclosing a volume."""
 
 
 def read_region_file(path: Path) -> RegionFile:
-    """Read and check a region file.
+    """Read and validate a region file.
 
     Raises
     ------
     DatasetError
         There is no file, or it cannot be read.
     ParseError
-        Names the file, the entry and what to do; nothing is guessed.
+        Names the file, the entry and what to do; no values are guessed.
     """
     return parse_region_file(read_region_body(path), path)
 
 
 def read_region_body(path: Path) -> Any:
-    """Read the JSON values of a region file, which :func:`parse_region_file` checks.
+    """Read the JSON values of a region file; :func:`parse_region_file` validates them.
 
     Raises
     ------
@@ -66,10 +66,9 @@ def read_region_body(path: Path) -> Any:
 
 
 def parse_region_file(values: Any, path: Path) -> RegionFile:
-    """Check JSON values; ``path`` is only named in errors, and names a region without a name.
+    """Validate JSON values; ``path`` is used in errors, and as the name of an unnamed region.
 
-    ``hull_simplices`` is not read: whoever needs the hull computes it, so that the two cannot
-    disagree.
+    ``hull_simplices`` is not read: users of the hull compute it, so that the two cannot disagree.
 
     Raises
     ------
@@ -101,7 +100,7 @@ def _parse_vertices(rows: Any, path: Path, hint: str) -> np.ndarray:
         raise ParseError(
             path,
             "vertices",
-            f"holds {len(rows)} corners; {limits.MAX_REGION_VERTICES} is the most.",
+            f"holds {len(rows)} corners; the limit is {limits.MAX_REGION_VERTICES}.",
             "Use a simpler body, such as a box.",
         )
     for index, row in enumerate(rows):

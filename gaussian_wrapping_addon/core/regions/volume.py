@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which corners enclose a volume that can be meshed."""
+"""Validate that the corners of a region enclose a volume."""
 
 from __future__ import annotations
 
@@ -9,41 +9,41 @@ from .. import limits
 from ..errors import MeshingError
 
 FLAT_SHARE = 1e-6
-"""A body thinner than this share of its diagonal has no usable volume."""
+"""A body thinner than this share of its diagonal counts as flat."""
 
 
 def check_volume(vertices: np.ndarray, name: str) -> None:
-    """Refuse corners that enclose no volume.
+    """Raise an error for corners that enclose no volume.
 
     Parameters
     ----------
     vertices : (n, 3) float64
     name : str
-        Of the region, for messages.
+        Name of the region, for messages.
 
     Raises
     ------
     MeshingError
-        Fewer than four corners, too many, one that is not finite, or all in one plane.
+        Fewer than four corners, too many, not finite, or all in one plane.
     """
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < 4:
         raise MeshingError(
-            f"Region {name!r} needs at least four corners.", "Draw a box around the thing."
+            f"Region {name!r} needs at least four corners.", "Draw a box around the object."
         )
     if len(vertices) > limits.MAX_REGION_VERTICES:
         raise MeshingError(
-            f"Region {name!r} has {len(vertices)} corners; {limits.MAX_REGION_VERTICES} is the "
-            "most.",
+            f"Region {name!r} has {len(vertices)} corners; the limit is "
+            f"{limits.MAX_REGION_VERTICES}.",
             "Use a simpler body, such as a box.",
         )
     if not np.isfinite(vertices).all():
         raise MeshingError(f"Region {name!r} has a corner that is not finite.", "Draw it again.")
     if not _is_thick(vertices):
-        raise flat_region(name)
+        raise flat_region_error(name)
 
 
-def flat_region(name: str) -> MeshingError:
-    """Return the error of a region without a volume."""
+def flat_region_error(name: str) -> MeshingError:
+    """Return the error for a region without volume."""
     return MeshingError(f"Region {name!r} is flat: it encloses no volume.", "Give it some height.")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The fast renderer: Gaussians and a camera in, images and their gradients out."""
+"""Differentiable rendering of Gaussians: the fast renderer behind a torch autograd function."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .tiling.tiles import TileBinning
 from .types.gradients import ImageGradients
 from .types.images import Render, RenderStatistics
 from .types.options import RenderOptions
-from .view_renderer import ViewPass, ViewRenderer, band_view, take_screen
+from .view_renderer import ViewPass, ViewRenderer, allocate_screen, band_view
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 
@@ -39,7 +39,7 @@ def render(
     options: RenderOptions | None = None,
     buffers: RenderBuffers | None = None,
 ) -> Render:
-    """Render by the definition of :func:`~.reference.reference.render_reference`, in float32.
+    """Render as defined by :func:`~.reference.reference.render_reference`, in float32.
 
     Differentiable with respect to every tensor of ``gaussians`` except ``filter_3d``. Images and
     gradients are bitwise the same for any number of threads.
@@ -47,25 +47,25 @@ def render(
     Parameters
     ----------
     gaussians : OrientedGaussians
-        Scene frame. CPU tensors, or float32 CUDA tensors: then all of it runs on the GPU.
+        Scene frame. CPU tensors, or float32 CUDA tensors, which are rendered on the GPU.
     camera : Camera
         In the scene frame; any image size.
     options : RenderOptions, optional
     buffers : RenderBuffers, optional
-        Scratch to reuse; by default one set is shared by the process.
+        Scratch memory to reuse; by default one set is shared by the process.
 
     Returns
     -------
     Render
         float32 images. With ``options.statistics`` the weights are filled at once, ``grad_px`` and
-        ``grad_abs_px`` when ``backward`` runs.
+        ``grad_abs_px`` by the backward pass.
 
     Raises
     ------
     ResourceError
         If the tile lists or the contributor lists grow beyond what can be addressed.
     DeviceError
-        If the Gaussians are on a GPU that compiler or driver cannot serve.
+        If the Gaussians are on a GPU that the compiler or driver does not support.
     """
     if gaussians.means.is_cuda:
         return render_cuda(gaussians, camera, options)
@@ -100,7 +100,7 @@ class _Rasterize(torch.autograd.Function):
         images = Images.allocate(camera, options)
         view = _render_view(RawArrays.from_gaussians(gaussians), camera, options, images, buffers)
         if view.statistics is not None:
-            collected.append(_own(view.statistics))
+            collected.append(_copy_statistics(view.statistics))
         ctx.view, ctx.collected = view, collected
         ctx.camera, ctx.options = camera, options
         ctx.set_materialize_grads(False)
@@ -114,8 +114,8 @@ class _Rasterize(torch.autograd.Function):
                 images.depth,
             )
         )
-        # The backward pass reads their memory; saved, so that autograd refuses to run it after
-        # one of them was changed in place.
+        # The backward pass reads their memory; saved so that autograd refuses to run after one of
+        # them was modified in place.
         ctx.save_for_backward(means, log_scales, quats, opacity_logits, sh, orientation, *outputs)
         return outputs
 
@@ -144,7 +144,7 @@ def _render_view(
     images: Images,
     buffers: RenderBuffers,
 ) -> ViewPass:
-    """Render with an idle renderer, which is idle again when the view is gone."""
+    """Render with an idle renderer, which is returned to the pool with the view."""
     try:
         renderer = buffers.renderers.pop()
     except IndexError:
@@ -154,8 +154,8 @@ def _render_view(
     return view
 
 
-def _own(statistics: RenderStatistics) -> RenderStatistics:
-    """Return statistics that stay when the renderer's memory is used again."""
+def _copy_statistics(statistics: RenderStatistics) -> RenderStatistics:
+    """Return a copy that stays valid when the renderer's memory is reused."""
     copies = {
         item.name: getattr(statistics, item.name).copy()
         for item in dataclasses.fields(statistics)
@@ -165,9 +165,9 @@ def _own(statistics: RenderStatistics) -> RenderStatistics:
 
 
 def project_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> ScreenView:
-    """Project and bin: everything of a view that comes before the pixels."""
+    """Project and bin: everything of a view that precedes rasterisation."""
     threads, store = options.threads or default_threads(), ArrayStore()
-    screen = project_gaussians(gaussians, camera, options, take_screen(len(gaussians), store))
+    screen = project_gaussians(gaussians, camera, options, allocate_screen(len(gaussians), store))
     binning = TileBinning(screen, camera.width, camera.height, threads, store)
     band = (0, binning.tiles_x * binning.tiles_y)
     return band_view(gaussians, camera, options, screen, binning.lists(*band), band, store)

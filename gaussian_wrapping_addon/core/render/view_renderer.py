@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rendering without autograd: images in reused memory, gradients of the seen Gaussians only.
+"""Rendering without autograd: images in reused memory, gradients of visible Gaussians only.
 
-What grows with the (tile, Gaussian) pairs exists for one band of tiles at a time:
-its lists, and on the way back the gradients of its pairs, which are added to the Gaussians' rows
-before the next band. The bands follow from the scene and the budget alone, so gradients do not
-depend on the number of threads.
+Data that grows with the number of tile intersections exists for one band of tiles at a time: the
+tile lists and, in the backward pass, the gradients of the intersections, which are added to the
+Gaussians' rows before the next band. The bands depend on the scene and the memory budget alone, so
+gradients do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -27,8 +27,13 @@ from .projection.projection import (
     project_backward_visible,
     project_gaussians,
 )
-from .raster.blend import Images, RenderBuffers, ScreenView, blend, pair_gradients
-from .raster.pair_sums import add_pair_gradients, add_pair_weights, mark_seen, take_screen_gradients
+from .raster.blend import Images, RenderBuffers, ScreenView, blend, write_intersection_gradients
+from .raster.intersection_sums import (
+    add_intersection_gradients,
+    add_intersection_weights,
+    mark_visible,
+    write_screen_gradients,
+)
 from .simd.raster_math import ROW_VALUES, vector_lanes
 from .tiling.block_masks import mask_kernel
 from .tiling.tiles import TileBinning, TileLists
@@ -36,16 +41,16 @@ from .types.gradients import ImageGradients, VisibleGradients
 from .types.images import RenderStatistics
 from .types.options import RenderOptions
 
-PAIR_BYTES = 4 * ROW_VALUES + 32
-"""Of one pair: its gradient, its place in the lists, which pixels it reaches, blending weights."""
+INTERSECTION_BYTES = 4 * ROW_VALUES + 32
+"""Memory of one intersection: gradient, list entry, block mask, blending weights."""
 
-# What a tile costs besides its pairs, in pairs: clearing and writing its pixels.
+# Fixed cost of a tile, in intersections: clearing and writing its pixels.
 _TILE_COST = 16
 _MAX_ZERO_IMAGES = 4
 
 
-def take_screen(count: int, store: ArrayStore) -> ScreenGaussians:
-    """Return room for the projection of Gaussians, with any content."""
+def allocate_screen(count: int, store: ArrayStore) -> ScreenGaussians:
+    """Return uninitialised arrays for the projection of ``count`` Gaussians."""
     return ScreenGaussians(
         store.take("params", (count, ROW_VALUES), np.float32),
         store.take("boxes", (count, 4), np.float32),
@@ -64,7 +69,7 @@ def band_view(
     band: tuple[int, int],
     store: ArrayStore,
 ) -> ScreenView:
-    """Return the view of a band of tiles, all tiles of other bands left out."""
+    """Return the view of a band of tiles, without the tiles of other bands."""
     threads = options.threads or default_threads()
     first, end = band
     costs = np.diff(lists.start[first : end + 1]) + _TILE_COST
@@ -82,7 +87,7 @@ def _block_masks(
     threads: int,
     store: ArrayStore,
 ) -> np.ndarray:
-    """Return the blocks of its tile that each pair reaches (:class:`ScreenView`)."""
+    """Return the blocks of its tile that each intersection reaches (:class:`ScreenView`)."""
     masks = store.take("masks", len(lists.gaussian_ids), np.uint32)
     mask_range = mask_kernel(lanes)
 
@@ -103,20 +108,20 @@ def _block_masks(
 
 
 class ViewPass:
-    """One rendered view. Its arrays are valid until its renderer renders again.
+    """One rendered view. Its arrays are valid until its renderer is used again.
 
     Attributes
     ----------
     color, normal, geometric_normal : (h, w, 3) float32
     alpha, depth : (h, w) float32
-        The images of :class:`~.types.images.Render`. They must not be written to before
+        The images of :class:`~.types.images.Render`. They must not be modified before
         :meth:`backward`.
     gaussians, screen : RawArrays, ScreenGaussians
         What was rendered, and its projection.
     ids : (v,) int32
         The Gaussians that reach a tile of the image, increasing.
     bands : int
-        Parts in which the image was rendered.
+        Number of bands in which the image was rendered.
     statistics : RenderStatistics or None
         With ``options.statistics`` or ``options.screen_gradients``; ``grad_px`` and
         ``grad_abs_px`` are filled by :meth:`backward`.
@@ -143,25 +148,25 @@ class ViewPass:
         self.ids = binning.ids
         self.statistics: RenderStatistics | None = None
         self._threads = options.threads or default_threads()
-        self._most_pairs = max(1, options.budget_bytes // PAIR_BYTES)
-        self._bands = binning.bands(self._most_pairs)
+        self._max_intersections = max(1, options.budget_bytes // INTERSECTION_BYTES)
+        self._bands = binning.bands(self._max_intersections)
         self._listed: tuple[tuple[int, int], ScreenView] | None = None
 
     @property
     def bands(self) -> int:
-        """Parts in which the image is rendered."""
+        """Number of bands in which the image is rendered."""
         return len(self._bands)
 
     def _view(self, band: tuple[int, int]) -> ScreenView:
-        """Return the view of a band; the lists of one band exist at a time."""
+        """Return the view of a band; only one band's lists exist at a time."""
         if self._listed is None or self._listed[0] != band:
-            lists = self._binning.lists(*band, most_pairs=self._most_pairs)
+            lists = self._binning.lists(*band, max_intersections=self._max_intersections)
             gaussians, camera, options = self.gaussians, self._camera, self._options
             view = band_view(gaussians, camera, options, self.screen, lists, band, self._store)
             self._listed = band, view
         return self._listed[1]
 
-    def _over_seen(self) -> np.ndarray:
+    def _visible_bounds(self) -> np.ndarray:
         return even_bounds(len(self.ids), self._threads, 4 if self._threads > 1 else 1)
 
     def forward(self) -> None:
@@ -170,14 +175,16 @@ class ViewPass:
             self.statistics = self._first_statistics()
         for band in self._bands:
             view = self._view(band)
-            pairs = len(view.lists.gaussian_ids) if self._options.statistics else 0
-            weights = self._store.take("pair weights", (pairs, 2), np.float32, self._most_pairs)
+            intersections = len(view.lists.gaussian_ids) if self._options.statistics else 0
+            weights = self._store.take(
+                "intersection weights", (intersections, 2), np.float32, self._max_intersections
+            )
             blend(view, self._images, self._renderer.buffers, weights)
             if self._options.statistics:
                 self._add_weights(view.lists, weights)
 
     def _first_statistics(self) -> RenderStatistics:
-        """Return statistics of what binning knows, all else 0."""
+        """Return statistics with what binning determines; all others are 0."""
         count, weighed = len(self.gaussians), self._options.statistics
         zeros = self._store.zeros
         statistics = RenderStatistics(
@@ -191,11 +198,11 @@ class ViewPass:
         )
 
         def mark(begin: int, end: int) -> None:
-            mark_seen(
+            mark_visible(
                 begin, end, self.ids, self.screen.boxes, statistics.visible, statistics.radii_px
             )
 
-        run_chunks(mark, self._over_seen(), self._threads)
+        run_chunks(mark, self._visible_bounds(), self._threads)
         return statistics
 
     def _add_weights(self, lists: TileLists, weights: np.ndarray) -> None:
@@ -203,20 +210,20 @@ class ViewPass:
         assert statistics is not None
 
         def add(begin: int, end: int) -> None:
-            add_pair_weights(
+            add_intersection_weights(
                 begin,
                 end,
                 self.ids,
                 weights,
-                lists.pair_offsets,
+                lists.intersection_offsets,
                 statistics.weight_sum,
                 statistics.weight_max,
             )
 
-        run_chunks(add, self._over_seen(), self._threads)
+        run_chunks(add, self._visible_bounds(), self._threads)
 
     def backward(self, grads: ImageGradients) -> VisibleGradients:
-        """Return the gradient with respect to the raw parameters of the seen Gaussians.
+        """Return the gradient with respect to the raw parameters of the visible Gaussians.
 
         Parameters
         ----------
@@ -226,14 +233,14 @@ class ViewPass:
         Returns
         -------
         VisibleGradients
-            Rows for every Gaussian that reaches a tile of the image, valid until the renderer is
+            One row for every Gaussian that reaches a tile of the image; valid until the renderer is
             used again.
 
         Raises
         ------
         UsageError
-            If the shape of a gradient is not that of its image, or if the renderer has rendered
-            another view since.
+            If the shape of a gradient differs from that of its image, or if the renderer has
+            rendered another view since.
         """
         grad_params = self.params_gradient(grads)
         gaussians, count = self.gaussians, len(self.ids)
@@ -256,10 +263,10 @@ class ViewPass:
         )
 
     def params_gradient(self, grads: ImageGradients) -> np.ndarray:
-        """Return the gradient on the screen's params, (n, 24) float32; only rows ``ids`` count."""
+        """Return the (n, 24) float32 gradient on the screen params; only rows ``ids`` are valid."""
         if self._renderer.rendered != self._number:
             raise UsageError(
-                "The memory of this view holds another one by now.",
+                "The memory of this view was reused by a later rendering.",
                 "Run backward before the next rendering, or use another renderer.",
             )
         incoming = self._incoming(grads)
@@ -267,45 +274,52 @@ class ViewPass:
         absolute = self.statistics is not None
         store = self._store
         grad_params = store.take("grad params", (len(self.gaussians), ROW_VALUES), np.float32)
-        # The lists of the last band are still there.
+        # The lists of the last band still exist.
         for band in reversed(self._bands):
             view = self._view(band)
             lists = view.lists
-            pairs = store.take(
-                "pairs", (len(lists.gaussian_ids), ROW_VALUES), np.float32, self._most_pairs
+            intersections = store.take(
+                "intersections",
+                (len(lists.gaussian_ids), ROW_VALUES),
+                np.float32,
+                self._max_intersections,
             )
-            pair_gradients(
+            write_intersection_gradients(
                 view,
                 self._images,
                 incoming,
                 self._renderer.buffers,
-                pairs,
+                intersections,
                 depth=depth,
                 absolute=absolute,
             )
-            self._add_pairs(lists, pairs, grad_params, band == self._bands[-1])
+            self._add_intersections(lists, intersections, grad_params, band == self._bands[-1])
         if self.statistics is not None:
-            self._take_screen_gradients(self.statistics, grad_params)
+            self._write_screen_gradients(self.statistics, grad_params)
         return grad_params
 
-    def _add_pairs(
-        self, lists: TileLists, pairs: np.ndarray, grad_params: np.ndarray, fresh: bool
+    def _add_intersections(
+        self, lists: TileLists, intersections: np.ndarray, grad_params: np.ndarray, fresh: bool
     ) -> None:
         def add(begin: int, end: int) -> None:
-            add_pair_gradients(begin, end, self.ids, pairs, lists.pair_offsets, fresh, grad_params)
+            add_intersection_gradients(
+                begin, end, self.ids, intersections, lists.intersection_offsets, fresh, grad_params
+            )
 
-        run_chunks(add, self._over_seen(), self._threads)
+        run_chunks(add, self._visible_bounds(), self._threads)
 
-    def _take_screen_gradients(self, statistics: RenderStatistics, grad_params: np.ndarray) -> None:
+    def _write_screen_gradients(
+        self, statistics: RenderStatistics, grad_params: np.ndarray
+    ) -> None:
         def take(begin: int, end: int) -> None:
-            take_screen_gradients(
+            write_screen_gradients(
                 begin, end, self.ids, grad_params, statistics.grad_px, statistics.grad_abs_px
             )
 
-        run_chunks(take, self._over_seen(), self._threads)
+        run_chunks(take, self._visible_bounds(), self._threads)
 
     def _incoming(self, grads: ImageGradients) -> list[np.ndarray]:
-        """Return the five gradients, zeros where there is none."""
+        """Return the five image gradients, zeros for those that are ``None``."""
         incoming = []
         for name in ("color", "normal", "geometric_normal", "alpha", "depth"):
             image, grad = getattr(self, name), getattr(grads, name)
@@ -321,22 +335,22 @@ class ViewPass:
 
 
 class ViewRenderer:
-    """Renders one view after the other in the same memory; for one thread at a time.
+    """Renders one view after the other in the same memory; not thread-safe.
 
-    Once it has rendered a view of the largest size and number of Gaussians, nothing that grows
-    with Gaussians, pixels or pairs is allocated any more.
+    After a view of the largest image and number of Gaussians, no memory that grows with Gaussians,
+    pixels or intersections is allocated any more.
 
     Parameters
     ----------
     buffers : RenderBuffers, optional
-        Scratch of the threads; by default its own.
+        Scratch memory of the threads; by default its own.
     """
 
     def __init__(self, buffers: RenderBuffers | None = None) -> None:
         self.store = ArrayStore()
         self.buffers = RenderBuffers() if buffers is None else buffers
         self.rendered = 0
-        """Views so far; the memory is that of the last."""
+        """Number of views rendered; the memory holds the last one."""
         self._zero_images: dict[tuple[int, ...], np.ndarray] = {}
 
     def render(
@@ -348,8 +362,8 @@ class ViewRenderer:
     ) -> ViewPass:
         """Render like :func:`~.render.render`, without autograd.
 
-        The parameters must stay as they are until :meth:`ViewPass.backward` has run. What the
-        previous call returned is overwritten.
+        The parameters must not change before :meth:`ViewPass.backward` has run. The result of the
+        previous call is overwritten.
 
         Parameters
         ----------
@@ -359,7 +373,7 @@ class ViewRenderer:
             In the scene frame; any image size.
         options : RenderOptions, optional
         images : Images, optional
-            Where the images are written; by default memory of the renderer.
+            Receives the images; by default memory of the renderer.
 
         Raises
         ------
@@ -370,7 +384,9 @@ class ViewRenderer:
         threads = options.threads or default_threads()
         store = self.store
         self.rendered += 1
-        screen = project_gaussians(gaussians, camera, options, take_screen(len(gaussians), store))
+        screen = project_gaussians(
+            gaussians, camera, options, allocate_screen(len(gaussians), store)
+        )
         binning = TileBinning(screen, camera.width, camera.height, threads, store)
         if images is None:
             images = Images.allocate(camera, options, store.take)
@@ -379,7 +395,7 @@ class ViewRenderer:
         return view
 
     def zero_image(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Return an image that stays 0."""
+        """Return a shared image of zeros; read-only by convention."""
         if shape not in self._zero_images:
             if len(self._zero_images) >= _MAX_ZERO_IMAGES:
                 self._zero_images.clear()

@@ -8,12 +8,12 @@ Standard library only, so that Blender can load it.
 from .choices import (
     BOUNDARIES,
     CORRELATIONS,
-    DECISIONS,
     MASK_MODES,
     MAX_LODS,
     MESH_METHODS,
     PIVOT_COUNTS,
     PRESETS,
+    SELECTION_MODES,
     SPACINGS,
     SWITCH,
     TEXTURE_SOURCES,
@@ -24,19 +24,19 @@ from .job import JobSettings, declared, preset
 from .json_values import from_json, to_json
 from .meshing import MeshingSettings
 from .texture import TextureSettings
-from .training import MODEL_SELECTION, RESULT_FREE, TrainingSettings
+from .training import MODEL_SELECTION, RESULT_INDEPENDENT, TrainingSettings
 
 __all__ = [
     "BOUNDARIES",
     "CORRELATIONS",
-    "DECISIONS",
     "MASK_MODES",
     "MAX_LODS",
     "MESH_METHODS",
     "MODEL_SELECTION",
     "PIVOT_COUNTS",
     "PRESETS",
-    "RESULT_FREE",
+    "RESULT_INDEPENDENT",
+    "SELECTION_MODES",
     "SPACINGS",
     "SWITCH",
     "TEXTURE_SOURCES",

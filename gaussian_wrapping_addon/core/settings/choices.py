@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 PRESETS = ("draft", "standard", "fine")
-DECISIONS = ("auto", "on", "off")
+SELECTION_MODES = ("auto", "on", "off")
 """Of a part of the model: ``"auto"`` selects it where the photos give evidence for it."""
 SWITCH = ("off", "on")
 

@@ -35,14 +35,14 @@ command ``more``."""
 Owner = Literal["scene", "training", "preferences"]
 """Who has a property in Blender: ``Scene.gwrap``, ``Scene.gwrap.training``, or the add-on."""
 
-Place = Literal["train", "train_advanced", "mesh", "mesh_advanced", "texture", "preferences"]
+PanelName = Literal["train", "train_advanced", "mesh", "mesh_advanced", "texture", "preferences"]
 """A panel in Blender."""
 
 JOB = "job"
 """Group of the settings that stand directly in the job's settings."""
 
 _SCOPES: Mapping[str, Scope] = {"training": "training", "meshing": "region", "texture": "region"}
-_PLACES: Mapping[str, Place] = {
+_PANEL_NAMES: Mapping[str, PanelName] = {
     "training": "train_advanced", "meshing": "mesh_advanced", "texture": "texture",
 }  # fmt: skip
 
@@ -106,7 +106,7 @@ class PanelProperty:
     """Blender's subtype and unit, such as ``"DISTANCE"`` and ``"LENGTH"``."""
     owner: Owner | None = None
     """``None``: by the setting's group."""
-    place: Place | None = None
+    panel_name: PanelName | None = None
     """The panel; ``None``: by the setting's group."""
     order: int = 100
     """Place within the panel; equal numbers stand in the order of declaration."""
@@ -181,12 +181,12 @@ class Declaration:
         return self.panel.owner or ("training" if self.group == "training" else "scene")
 
     @property
-    def place(self) -> Place:
+    def panel_name(self) -> PanelName:
         """The panel that shows it."""
         assert self.panel is not None
-        return self.panel.place or _PLACES[self.group]
+        return self.panel.panel_name or _PANEL_NAMES[self.group]
 
-    def in_panel(self, value: Any) -> Any:
+    def to_panel(self, value: Any) -> Any:
         """Return what a property holds for a value of the setting."""
         assert self.panel is not None
         if self.is_switch:
@@ -206,7 +206,7 @@ class Declaration:
             return "on" if stored else "off"
         if not self.panel.items:
             return stored
-        return {self.in_panel(item.value): item.value for item in self.panel.items}[stored]
+        return {self.to_panel(item.value): item.value for item in self.panel.items}[stored]
 
 
 def setting(

@@ -56,7 +56,7 @@ class JobSettings:
                     "Larger images and more Gaussians; needs several times as long",
                 ),
             ),
-            place="train",
+            panel_name="train",
             expand=True,
         ),
     )
@@ -76,7 +76,7 @@ class JobSettings:
             "Threads",
             "Processor threads for jobs; 0 uses all",
             owner="preferences",
-            place="preferences",
+            panel_name="preferences",
         ),
     )
     regions: tuple[str, ...] = setting(
@@ -119,7 +119,7 @@ class JobSettings:
             "empty starts from the points of the cameras",
             subtype="FILE_PATH",
             owner="training",
-            place="train_advanced",
+            panel_name="train_advanced",
         ),
     )
     training: TrainingSettings = field(default_factory=TrainingSettings)

@@ -15,7 +15,7 @@ def to_json(settings: Any) -> dict[str, Any]:
     return dataclasses.asdict(settings)
 
 
-def from_json(kind: type, values: Any, place: str = "settings") -> Any:
+def from_json(kind: type, values: Any, location: str = "settings") -> Any:
     """Build a settings dataclass from JSON values; unknown keys and wrong types are refused.
 
     Raises
@@ -24,16 +24,16 @@ def from_json(kind: type, values: Any, place: str = "settings") -> Any:
         Names the place and what was expected.
     """
     if not isinstance(values, dict):
-        raise UsageError(f"{place} must be an object.", "Write it as {...}.")
+        raise UsageError(f"{location} must be an object.", "Write it as {...}.")
     hints = typing.get_type_hints(kind)
     fields = {f.name for f in dataclasses.fields(kind)}
     unknown = sorted(set(values) - fields)
     if unknown:
-        raise UsageError(f"{place} has an unknown entry {unknown[0]!r}.", "Remove it.")
+        raise UsageError(f"{location} has an unknown entry {unknown[0]!r}.", "Remove it.")
     arguments = {}
     for name, value in values.items():
         wanted = hints[name]
-        where = f"{place}.{name}"
+        where = f"{location}.{name}"
         if dataclasses.is_dataclass(wanted):
             arguments[name] = from_json(typing.cast(type, wanted), value, where)
         elif wanted is float and isinstance(value, (int, float)) and not isinstance(value, bool):

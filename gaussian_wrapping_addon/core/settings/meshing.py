@@ -41,7 +41,7 @@ class MeshingSettings:
             "Edge Length",
             "Length of triangle edges, as seen in Blender",
             default=0.05, low=1e-5, soft_high=1.0, precision=4, subtype="DISTANCE", unit="LENGTH",
-            place="mesh", shown_if=("resolution", "EDGE_LENGTH"), default_if_hidden=True,
+            panel_name="mesh", shown_if=("resolution", "EDGE_LENGTH"), default_if_hidden=True,
         ),
     )  # fmt: skip
     points: int = setting(
@@ -61,7 +61,7 @@ class MeshingSettings:
             "Points",
             "Number of points on the surface of a region",
             default=50_000, low=100, soft_high=500_000,
-            place="mesh", shown_if=("resolution", "POINTS"), default_if_hidden=True,
+            panel_name="mesh", shown_if=("resolution", "POINTS"), default_if_hidden=True,
         ),
     )  # fmt: skip
     spacing: str = setting(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ..errors import UsageError
 from ..limits import MAX_ATLASES
 from .checks import Choices, Range
-from .choices import DECISIONS, MAX_LODS, SWITCH, TEXTURE_SOURCES
+from .choices import MAX_LODS, SELECTION_MODES, SWITCH, TEXTURE_SOURCES
 from .declaration import Item, Option, PanelProperty, setting
 
 
@@ -57,7 +57,7 @@ class TextureSettings:
         "auto",
         help="Normal map with the detail of the dense mesh. auto: where decimation removed faces; "
         "on: always, flat where none were removed; off: none.",
-        check=Choices(DECISIONS),
+        check=Choices(SELECTION_MODES),
         option=Option(
             "--normal-map",
             help="normal map with the dense mesh's detail; auto: where --faces removed faces",

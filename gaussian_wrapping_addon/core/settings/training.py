@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from .checks import Choices, Range
-from .choices import CORRELATIONS, DECISIONS, MASK_MODES
+from .choices import CORRELATIONS, MASK_MODES, SELECTION_MODES
 from .declaration import Item, Option, PanelProperty, declarations, setting
 
 _COUNT = Range(1, 10**6)
@@ -127,7 +127,7 @@ class TrainingSettings:
         "auto",
         help="View-dependent colour. auto: only degrees that lower the error of held-out photos; "
         "on: all of them; off: degree 0.",
-        check=Choices(DECISIONS),
+        check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option("--harmonics", help="colour that depends on the direction"),
         panel=PanelProperty(
@@ -143,7 +143,7 @@ class TrainingSettings:
     exposure: str = setting(
         "auto",
         help="Gain and offset per photo.",
-        check=Choices(DECISIONS),
+        check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option("--exposure", help="gain and offset per photo"),
         panel=PanelProperty(
@@ -159,7 +159,7 @@ class TrainingSettings:
     multi_view: str = setting(
         "auto",
         help="Loss terms that compare neighbouring photos.",
-        check=Choices(DECISIONS),
+        check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option("--multi-view", help="terms that compare neighbouring photos"),
         panel=PanelProperty(
@@ -175,7 +175,7 @@ class TrainingSettings:
     wrapping: str = setting(
         "auto",
         help="Orientation of the Gaussians, its loss, and clones of opposite orientation.",
-        check=Choices(DECISIONS),
+        check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option("--wrapping", help="orientation, and clones of opposite orientation"),
         panel=PanelProperty(
@@ -193,7 +193,7 @@ class TrainingSettings:
         help="Densification. auto: it stops where more Gaussians gain little, and Gaussians that "
         "contribute little are kept small (`overlap_price`) and pruned (`prune_share`); on: only "
         "the cap stops it; off: none are added.",
-        check=Choices(DECISIONS),
+        check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option(
             "--growth", help="more Gaussians: while they lower the error, up to the cap, or none"
@@ -212,7 +212,7 @@ class TrainingSettings:
         "auto",
         help="Training image size. auto: photos that show nothing finer than half their size are "
         "trained on at half size; on: always full size; off: half size.",
-        check=Choices(DECISIONS),
+        check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option(
             "--full-size", help="photos at their full size, also where half size shows as much"
@@ -332,5 +332,5 @@ class TrainingSettings:
 MODEL_SELECTION = tuple(d.name for d in declarations(TrainingSettings) if d.model_selection)
 """Settings that switch a part of the model; ``"auto"`` decides by what the photos show."""
 
-RESULT_FREE = tuple(d.name for d in declarations(TrainingSettings) if not d.affects_result)
+RESULT_INDEPENDENT = tuple(d.name for d in declarations(TrainingSettings) if not d.affects_result)
 """Settings that the result does not depend on."""

@@ -29,7 +29,7 @@ from ..errors import (
     UsageError,
     WorkerError,
     WrapError,
-    cannot_be_written,
+    unwritable_error,
 )
 from ..files import write_json
 from ..jobs.store.job_folder import JobFolder, JobStatus
@@ -41,8 +41,8 @@ from ..processes.worker_environment import (
     PACKAGES,
     VENV,
     WorkerEnvironment,
-    forget,
-    remember,
+    register_environment,
+    unregister_environment,
 )
 from ..processes.worker_requirements import read_requirements
 from .commands import CUDA, Command, SetupRequest, all_commands, as_line, check_folders
@@ -57,8 +57,10 @@ _TEMPORARY = "tmp"
 _SEE_LOG = "See log.txt in the worker's folder, then press Set Up Worker."
 
 # Settings of pip that would send packages somewhere else than into the environment.
-_STEERING = ("PIP_USER", "PIP_TARGET", "PIP_PREFIX", "PIP_ROOT", "PIP_REQUIREMENT", "PIP_LOG",
-             "PIP_REQUIRE_VIRTUALENV", "PIP_NO_DEPS", "PIP_DRY_RUN")  # fmt: skip
+_IGNORED_VARIABLES = (
+    "PIP_USER", "PIP_TARGET", "PIP_PREFIX", "PIP_ROOT", "PIP_REQUIREMENT", "PIP_LOG",
+    "PIP_REQUIRE_VIRTUALENV", "PIP_NO_DEPS", "PIP_DRY_RUN",
+)  # fmt: skip
 # What pip says, what it means, and the next step; the first that matches is told.
 _FAILURES = (
     (r"No space left|not enough space|quota exceeded", "The disk is full.",
@@ -81,7 +83,7 @@ class SetupTask(threading.Thread):
         self.is_cancelling = False
         self.status = JobStatus("RUNNING", "remove" if removes else "environment")
         self._process: subprocess.Popen[bytes] | None = None
-        self._named = 0
+        self._package_count = 0
         """Packages that pip has named so far."""
 
     def run(self) -> None:
@@ -95,13 +97,15 @@ class SetupTask(threading.Thread):
         except WrapError as error:
             self._end("CANCELLED" if isinstance(error, Cancelled) else "FAILED", error)
         except OSError as error:
-            self._end("FAILED", cannot_be_written(error.filename or self.request.root, error))
+            self._end("FAILED", unwritable_error(error.filename or self.request.root, error))
         except Exception as error:  # without an end, its user would wait for ever
             _logger.exception("set-up")
             self._end("FAILED", WorkerError(f"{type(error).__name__}: {error}.", _SEE_LOG))
 
-    def _end(self, state: str, told: WrapError) -> None:
-        self.status = JobStatus(state, error=told.message, hint=told.hint, exit_code=told.exit_code)
+    def _end(self, state: str, failure: WrapError) -> None:
+        self.status = JobStatus(
+            state, error=failure.message, hint=failure.hint, exit_code=failure.exit_code
+        )
 
     def cancel(self) -> None:
         """Ask it to stop; it deletes what it has begun."""
@@ -144,7 +148,7 @@ class SetupTask(threading.Thread):
             versions = {d.metadata["Name"]: d.version for d in found}
             write_json(environment.marker_path, marker)
             write_json(environment.ready_path, versions)
-            remember(environment.root)
+            register_environment(environment.root)
         finally:
             with contextlib.suppress(OSError):  # the next set-up deletes what is left
                 _delete_unused(environment)
@@ -171,10 +175,10 @@ class SetupTask(threading.Thread):
                 log.write(line + "\n")
                 log.flush()
                 last.append(line)
-                self._named += line.startswith(("Collecting ", "Processing "))
-                stage = "install" if self._named else "environment"
+                self._package_count += line.startswith(("Collecting ", "Processing "))
+                stage = "install" if self._package_count else "environment"
                 self.status = JobStatus(
-                    "RUNNING", stage, min(self._named / expected, 0.9), line.strip()[:160]
+                    "RUNNING", stage, min(self._package_count / expected, 0.9), line.strip()[:160]
                 )
         finally:
             process.stdin.close()
@@ -183,7 +187,7 @@ class SetupTask(threading.Thread):
         if self.is_cancelling:
             raise Cancelled("The set-up was cancelled.", "Press Set Up Worker to start again.")
         if process.returncode != 0:
-            raise failure_of(process.returncode, list(last))
+            raise error_from_output(process.returncode, list(last))
 
 
 def _check_disk(root: Path, needed_gib: int) -> None:
@@ -203,14 +207,16 @@ def start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes
     WorkerError
         It does not start.
     """
-    kept = {k: v for k, v in child_environment().items() if k.upper() not in _STEERING}
-    places = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
+    inherited = {
+        k: v for k, v in child_environment().items() if k.upper() not in _IGNORED_VARIABLES
+    }
+    temporary_variables = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
     try:
         return spawn(
             command,
             stdin=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            environment={**kept, **places, "PIP_USER": "0"},
+            environment={**inherited, **temporary_variables, "PIP_USER": "0"},
             folder=temporary,
         )
     except OSError as error:
@@ -233,7 +239,7 @@ def main(arguments: list[str]) -> int:
     return process.wait()
 
 
-def failure_of(code: int, last: list[str]) -> WrapError:
+def error_from_output(code: int, last: list[str]) -> WrapError:
     """Return the typed error for what a command said before it failed."""
     for pattern, message, hint in _FAILURES:
         match = re.search(pattern, "\n".join(last))
@@ -274,7 +280,7 @@ def remove(environment: WorkerEnvironment) -> None:
     if JobFolder(root).locked():
         raise UsageError(f"A set-up is running in {root}.", "Cancel it or wait for it.")
     environment.ready_path.unlink(missing_ok=True)
-    forget(root)
+    unregister_environment(root)
     _delete_unused(environment)
     for name in ("status.json", "log.txt", "output.txt", "cancel", "lock.json", MARKER):
         (root / name).unlink(missing_ok=True)

@@ -40,7 +40,7 @@ _BUNDLED_PIP = (
     "runpy.run_module('pip', run_name='__main__')"
 )
 """Runs the pip that ensurepip carries without installing it anywhere."""
-_MAC_PLACES = (
+_MAC_PATTERNS = (
     "/Library/Frameworks/Python.framework/Versions/3.*/bin/python3",
     "/opt/homebrew/bin/python3.[1-9][0-9]",
     "/usr/local/bin/python3.[1-9][0-9]",
@@ -91,20 +91,20 @@ def probe(path: str) -> FoundPython:
             [path, "-I", "-c", _PROBE], stdin=subprocess.DEVNULL, capture_output=True, check=False,
             timeout=PROBE_DEADLINE_S, env=child_environment(),
         )  # fmt: skip
-        said = json.loads(done.stdout.decode("utf-8", "replace"))
-        major, minor, micro = (int(n) for n in said["version"])
+        answers = json.loads(done.stdout.decode("utf-8", "replace"))
+        major, minor, micro = (int(n) for n in answers["version"])
     except (OSError, subprocess.TimeoutExpired, ValueError, KeyError, TypeError):
         raise UsageError(f"{path} is no Python that runs.", other) from None
-    if (major, minor) < OLDEST or not said["is_64_bit"]:
+    if (major, minor) < OLDEST or not answers["is_64_bit"]:
         wrong = "which is too old" if (major, minor) < OLDEST else "but a 32-bit one"
         raise UsageError(f"{path} is Python {major}.{minor}.{micro}, {wrong}.", other)
-    bundled = ("-c", _BUNDLED_PIP) if said["ensurepip"] else ()
+    bundled = ("-c", _BUNDLED_PIP) if answers["ensurepip"] else ()
     return FoundPython(
         # What a venv was made from stays where it is; the venv may be thrown away.
-        said["base"] if Path(said["base"]).exists() else path,
+        answers["base"] if Path(answers["base"]).exists() else path,
         (major, minor, micro),
-        bool(said["venv"]),
-        ("-m", "pip") if said["pip"] else bundled,
+        bool(answers["venv"]),
+        ("-m", "pip") if answers["pip"] else bundled,
     )
 
 
@@ -113,7 +113,7 @@ def candidates(own: str = "") -> list[str]:
     names = [f"python3.{minor}" for minor in range(11, 15)] + ["python3", "python"]
     found = [shutil.which(name) or "" for name in names]
     if sys.platform == "darwin":
-        found += [path for place in _MAC_PLACES for path in sorted(glob.glob(place))]
+        found += [path for pattern in _MAC_PATTERNS for path in sorted(glob.glob(pattern))]
     launcher = shutil.which("py") if sys.platform == "win32" else None
     if launcher:
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):

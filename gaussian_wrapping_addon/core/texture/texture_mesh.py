@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From a mesh and photos to a textured mesh: unwrap, bake, fill, count."""
+"""Texture a mesh from photos: unwrap, bake, fill unseen texels, coverage statistics."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ..progress import Progress
 from ..report_warning import ReportWarning
 from ..settings import TextureSettings
 from .atlas.atlas_raster import AtlasRaster
-from .bake.atlas_colors import CONTINUED_POINTS, AtlasColors, continue_colors
+from .bake.atlas_colors import MAX_FILL_SOURCES, AtlasColors, fill_harmonically
 from .bake.atlas_points import atlas_points, blocks_of
-from .bake.bake import bake, look_at_photos, survey_points
-from .bake.coverage_statistics import Tally
+from .bake.bake import bake, correction_sample_count, prepare_photos
+from .bake.coverage_statistics import CoverageStatistics
 from .bake.photo_samples import SurfaceArrays, SurfacePoints
 from .cost.texture_memory import fit_into_memory
-from .cost.texture_size import gutter_for, plan_textures, wanted_side
+from .cost.texture_size import gutter_for, plan_textures, required_side
 from .detail.detail import bake_detail, merged_statistics, wants_normal_map
 from .unwrap.stretch import texture_stretch
 from .unwrap.unwrap import Unwrap, unwrap
@@ -55,12 +55,12 @@ def texture_mesh(
     mesh : SurfaceMesh
         In the scene frame.
     scene : Scene
-        Whose views the photos are.
+        Views of the photos.
     photos : PhotoStore
-        Anything with ``camera``, ``photo`` and ``mask`` by index and divisor.
+        Any object with ``camera``, ``photo`` and ``mask`` by index and divisor.
     settings : TextureSettings
-        ``size_px = 0`` chooses the size from the photos' footprint, and ``max_atlases = 0`` how
-        many textures.
+        ``size_px = 0`` chooses the size from the photos' footprint, ``max_atlases = 0`` the number
+        of textures.
     work_folder : Path
         For a temporary sub-folder of the unwrap.
     progress : Progress
@@ -68,11 +68,11 @@ def texture_mesh(
     threads : int
         Threads to use; the result does not depend on it.
     dense : SurfaceMesh, optional
-        What the mesh was decimated from: its detail goes into the normal map.
+        The mesh before decimation; its detail goes into the normal map.
     free_bytes : int
-        Memory that may be taken; 0 where it is not known, then nothing is judged.
+        Available memory; 0 if unknown, then memory is not checked.
     unwrapped : Unwrap, optional
-        UVs to keep; the size must be given.
+        Existing UVs to keep; requires a given size.
 
     Raises
     ------
@@ -81,9 +81,9 @@ def texture_mesh(
     UsageError
         The size is out of range.
     ResourceError
-        A texture of the size asked for needs more memory than is free.
+        A texture of the requested size needs more memory than is available.
     """
-    check_mesh(mesh)
+    validate_for_texturing(mesh)
     if settings.size_px < 0 or settings.size_px > limits.MAX_TEXTURE_SIDE_PX:
         raise UsageError(
             f"A texture of {settings.size_px} pixels is out of range.",
@@ -100,11 +100,11 @@ def texture_mesh(
             threads=threads, atlases=atlases,
         )  # fmt: skip
     atlases = unwrapped.atlases
-    surface, sample, first = _sampled(mesh, graph, unwrapped, size_px, count, threads)
-    survey = look_at_photos(
+    surface, sample, first = _sample_surface(mesh, graph, unwrapped, size_px, count, threads)
+    preparation = prepare_photos(
         sample, surface, photos, count, progress.span(0.3, 0.42), threads=threads
     )
-    tally = Tally(len(mesh.faces))
+    coverage = CoverageStatistics(len(mesh.faces))
     colors, details, views = [], [], []
     for number in range(atlases):
         span = progress.span(0.42 + 0.48 * number / atlases, 0.42 + 0.48 * (number + 1) / atlases)
@@ -119,22 +119,24 @@ def texture_mesh(
         atlas = atlas_points(raster, unwrapped.charts)
         del raster
         first = None  # half of the memory
-        baked = bake(atlas.points, surface, photos, survey, span.span(0.2, 1.0), threads=threads)
-        tally.add(atlas.points, baked, overlaps)
+        baked = bake(
+            atlas.points, surface, photos, preparation, span.span(0.2, 1.0), threads=threads
+        )
+        coverage.add(atlas.points, baked, overlaps)
         shown = np.zeros((size_px, size_px), np.uint8)
         for rows in blocks_of(len(atlas.texels)):
             shown.reshape(-1)[atlas.texels[rows]] = baked.views[rows]
         views.append(shown)
-        colors.append(AtlasColors(atlas, baked, CONTINUED_POINTS // atlases, surface))
+        colors.append(AtlasColors(atlas, baked, MAX_FILL_SOURCES // atlases, surface))
         del atlas, baked
-    progress.update(0.9, "filling what no photo saw")
-    continuation = continue_colors(colors, surface)
+    progress.update(0.9, "filling unseen texels")
+    fill = fill_harmonically(colors, surface)
     images = []
     while colors:
-        images.append(colors.pop(0).finish(continuation, surface, gutter_px))
+        images.append(colors.pop(0).finish(fill, surface, gutter_px))
     stretch = texture_stretch(mesh.vertices, mesh.faces, unwrapped.corner_uvs)
     statistics = {
-        **tally.statistics(size_px, settings, unwrapped, graph.areas),
+        **coverage.statistics(size_px, settings, unwrapped, graph.areas),
         "stretch_mean": stretch.mean,
         "stretch_p95": stretch.p95,
         "area_collapsed_share": stretch.collapsed_share,
@@ -159,11 +161,11 @@ def _plan(
     dense: SurfaceMesh | None,
     free_bytes: int,
 ) -> tuple[int, int, ReportWarning | None]:
-    """Return side and number of textures, and a warning where memory makes them fewer."""
+    """Return side and number of textures, and a warning if memory limits them."""
     detail_points = 0
     if dense is not None and wants_normal_map(settings, is_decimated=True):
         detail_points = len(dense.vertices)
-    wanted = wanted_side(graph, photos, count, detail_points)
+    wanted = required_side(graph, photos, count, detail_points)
     size_px, atlases = plan_textures(wanted, settings.size_px, settings.max_atlases)
     size_px, atlases, warning = fit_into_memory(
         size_px, atlases, len(graph.areas), free_bytes, may_lower=settings.size_px == 0
@@ -173,7 +175,7 @@ def _plan(
     return size_px, atlases, warning
 
 
-def _sampled(
+def _sample_surface(
     mesh: SurfaceMesh,
     graph: FaceGraph,
     unwrapped: Unwrap,
@@ -181,11 +183,11 @@ def _sampled(
     photos: int,
     threads: int,
 ) -> tuple[SurfaceArrays, SurfacePoints, AtlasRaster | None]:
-    """Return the surface with its texel size, points all over it, and the raster if there is one.
+    """Return the surface with its texel size, evenly spread points, and the raster if only one.
 
-    Several rasters would take too much memory: they are made once more when they are needed.
+    Several rasters would take too much memory: they are computed again when needed.
     """
-    wanted, inside = survey_points(photos), 0
+    wanted, inside = correction_sample_count(photos), 0
     samples, counts = [], []
     raster = None
     for number in range(unwrapped.atlases):
@@ -193,7 +195,7 @@ def _sampled(
         inside += int(raster.inside.sum())
         used = int(np.count_nonzero(raster.face >= 0))
         counts.append(used)
-        samples.append(_spread(raster, used, min(wanted, used)))
+        samples.append(_even_texels(raster, used, min(wanted, used)))
     texel_size = math.sqrt(float(graph.areas.sum()) / max(inside, 1))
     surface = SurfaceArrays.of(
         np.ascontiguousarray(mesh.vertices, np.float64),
@@ -211,8 +213,8 @@ def _sampled(
     return surface, SurfacePoints(face, bary), None
 
 
-def _spread(raster: AtlasRaster, used: int, wanted: int) -> SurfacePoints:
-    """Return texels that faces own, evenly in their order."""
+def _even_texels(raster: AtlasRaster, used: int, wanted: int) -> SurfacePoints:
+    """Return ``wanted`` of the ``used`` texels with a face, evenly spaced in their order."""
     rank = np.linspace(0, used - 1, wanted).astype(np.int64)
     ends = np.cumsum((raster.face >= 0).sum(axis=1))
     row = np.searchsorted(ends, rank, side="right")
@@ -224,14 +226,14 @@ def _spread(raster: AtlasRaster, used: int, wanted: int) -> SurfacePoints:
     return SurfacePoints(raster.face[row, column], raster.bary[row, column])
 
 
-def check_mesh(mesh: SurfaceMesh) -> None:
-    """Refuse what cannot be unwrapped or written."""
+def validate_for_texturing(mesh: SurfaceMesh) -> None:
+    """Raise ``MeshingError`` if a mesh cannot be unwrapped or written."""
     hint = "Mesh the region again, or send the job folder's log.txt with a bug report."
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if len(faces) == 0 or len(vertices) == 0:
         raise MeshingError("The mesh has no faces.", "Choose a region that holds a surface.")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshingError("A face of the mesh names a vertex that does not exist.", hint)
+        raise MeshingError("A face of the mesh refers to a vertex that does not exist.", hint)
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         first = int(np.flatnonzero(~finite)[0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checkpoints: arrays in an npz, the rest in a JSON file, written last, that names its hash."""
+"""Training checkpoints: arrays in an npz; the rest, and its hash, in a JSON file written last."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ import numpy as np
 from ..dataset.scene import Scene
 from ..errors import ParseError, UsageError
 from ..files import read_json, write_bytes, write_json
-from ..settings import RESULT_FREE, TrainingSettings, to_json
+from ..settings import RESULT_INDEPENDENT, TrainingSettings, to_json
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
 
 VERSION = 2
 KEPT = 2
-"""So many checkpoints stay; the older ones are there for a broken newest."""
+"""Number of checkpoints kept; the older one is the fallback for a broken newest one."""
 
 _NAME = re.compile(r"checkpoint-(\d{1,9})\.json")
 _AGAIN = "Delete the folder and train again."
@@ -32,14 +32,16 @@ _AGAIN = "Delete the folder and train again."
 def fingerprint(
     scene: Scene, settings: TrainingSettings, seed: int, start: Path | None = None
 ) -> str:
-    """Hash what a training's result depends on: settings, seed, cameras, photo names, points.
+    """Hash the inputs that a training's result depends on.
+
+    These are settings, seed, cameras, photo names and points.
 
     Parameters
     ----------
     start : Path, optional
-        File of Gaussians that the training starts from; its content counts.
+        File of Gaussians that the training starts from; its content is hashed.
     """
-    described = {k: v for k, v in to_json(settings).items() if k not in RESULT_FREE}
+    described = {k: v for k, v in to_json(settings).items() if k not in RESULT_INDEPENDENT}
     described.pop("extra_iterations")  # a longer run starts as the shorter one does
     digest = hashlib.sha256()
     digest.update(repr((VERSION, sorted(described.items()), seed)).encode())
@@ -56,12 +58,12 @@ def fingerprint(
 
 
 def save_checkpoint(folder: Path, state: TrainingState, key: str) -> Path:
-    """Write the state atomically and remove checkpoints beyond the last two.
+    """Write the state atomically and remove all but the last two checkpoints.
 
     Returns
     -------
     Path
-        The JSON file. Without it, or with another hash in it, the npz counts for nothing.
+        The JSON file. The npz is ignored without it, or if its hash differs.
     """
     stream = io.BytesIO()
     np.savez(stream, **state.to_arrays())
@@ -82,16 +84,16 @@ def save_checkpoint(folder: Path, state: TrainingState, key: str) -> Path:
 
 
 def load_checkpoint(folder: Path, key: str) -> TrainingState | None:
-    """Return the newest readable state of a folder, or ``None`` where there is no checkpoint.
+    """Return the newest readable state of a folder, or ``None`` without a checkpoint.
 
-    A broken checkpoint is named in the log and the one before it is tried.
+    A broken checkpoint is logged and the one before it is tried.
 
     Raises
     ------
     UsageError
         The checkpoint belongs to other photos, settings or seed.
     ParseError
-        There are checkpoints and none can be read.
+        There are checkpoints, but none can be read.
     """
     failure: ParseError | None = None
     for path in _listed(folder):
@@ -124,8 +126,8 @@ def _load(path: Path, key: str) -> TrainingState:
         raise ParseError(path, "version", f"version {VERSION} was expected.", _AGAIN)
     if values.get("fingerprint") != key:
         raise UsageError(
-            f"{path.name} belongs to other photos, settings or another seed.",
-            "Train in a new folder, or give what the first run was given.",
+            f"{path.name} was written with other photos, settings or another seed.",
+            "Train in a new folder, or use the inputs of the first run.",
         )
     arrays = _read_arrays(path.with_suffix(".npz"), values.get("sha256"))
     try:
@@ -134,7 +136,7 @@ def _load(path: Path, key: str) -> TrainingState:
             raise ValueError("a parameter is not finite")
         return state
     except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise ParseError(path, "state", f"does not fit together ({error}).", _AGAIN) from None
+        raise ParseError(path, "state", f"is inconsistent ({error}).", _AGAIN) from None
 
 
 def _read_arrays(path: Path, sha256: Any) -> dict[str, np.ndarray]:
@@ -143,13 +145,13 @@ def _read_arrays(path: Path, sha256: Any) -> dict[str, np.ndarray]:
     except OSError as error:
         raise ParseError(path, "whole file", f"cannot be read ({error}).", _AGAIN) from None
     if hashlib.sha256(data).hexdigest() != sha256:
-        raise ParseError(path, "whole file", "cut off or changed.", _AGAIN)
+        raise ParseError(path, "whole file", "truncated or changed.", _AGAIN)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            # We store without compression, so nothing can unpack to more than the file holds.
+            # Only stored entries are accepted, so nothing unpacks to more than the file holds.
             if any(e.compress_type != zipfile.ZIP_STORED for e in archive.infolist()):
-                raise ParseError(path, "whole file", "compressed by someone else.", _AGAIN)
+                raise ParseError(path, "whole file", "compressed by another program.", _AGAIN)
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ParseError(path, "whole file", f"no arrays ({error}).", _AGAIN) from None
+        raise ParseError(path, "whole file", f"holds no arrays ({error}).", _AGAIN) from None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One iteration: a window of a photo is rendered, compared, and the Gaussians that it saw step."""
+"""One training iteration: render a window of a photo, compute the losses, step the Gaussians."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..render.types.options import RenderOptions
 from ..render.view_renderer import ViewPass, ViewRenderer
 from .appearance.background import background_gradient, composited, draw_background
 from .appearance.photo_exposure import exposure_rate
-from .losses.footprint_regulariser import add_overlap_price
+from .losses.footprint_regulariser import add_footprint_regulariser
 from .losses.losses import color_loss, normal_losses
 from .losses.multi_view import (
     MultiViewOptions,
@@ -33,19 +33,19 @@ from .state import TrainingState
 from .windows import Window, windows
 
 AVERAGE_SHARE = 0.05
-"""Weight of the newest iteration in the figures of the progress message."""
+"""Weight of the newest iteration in the moving averages of the progress message."""
 
-_MOST_WINDOWS = 1 << 12
-"""More windows than this no photo has: numbers a window of a view for the history."""
+_MAX_WINDOWS = 1 << 12
+"""Upper bound of the windows per photo; combines view and window into one history index."""
 
 
 class NotFinite(Exception):  # noqa: N818 - asks for a restart, caught in trainer.py
-    """A loss stopped being a finite number."""
+    """A loss is not finite."""
 
 
 @dataclass(frozen=True)
-class _Look:
-    """What an iteration looks at."""
+class _Sample:
+    """Training sample of one iteration: a window of a view."""
 
     view: int
     divisor: int
@@ -58,7 +58,7 @@ class _Look:
 
 
 class Stepper:
-    """Does iterations. Holds nothing that the next one depends on: that is the state's.
+    """Run training iterations. All that the next one depends on is in the state.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Stepper:
     views : sequence of int
         Training views.
     neighbours : dict of int to (k,) array
-        Of each training view, the views that the multi-view terms compare it with.
+        For each training view, the views that the multi-view terms compare it with.
     threads : int
     """
 
@@ -86,22 +86,22 @@ class Stepper:
         self.multi_view = MultiViewOptions.of_settings(schedule.settings)
 
     def step(self, state: TrainingState) -> None:
-        """Do one iteration.
+        """Run one iteration.
 
         Raises
         ------
         NotFinite
-            The loss is not a number; the state must be thrown away.
+            The loss is not finite; the state must be discarded.
         """
         iteration, schedule, adam = state.iteration, self.schedule, state.adam
-        look = self._look(state)
+        sample = self._draw_sample(state)
         gathers, uses_depth = schedule.gathers_statistics(iteration), schedule.uses_depth(iteration)
         options = RenderOptions(
             depth=uses_depth, sh_degree=state.degree, threads=self.threads, screen_gradients=gathers
         )
         gaussians = RawArrays.from_gaussians(adam.gaussians())
-        image = self.renderer.render(gaussians, look.camera, options)
-        value, gradients, mean_squared = self._compare_colors(state, look, image)
+        image = self.renderer.render(gaussians, sample.camera, options)
+        value, gradients, mean_squared = self._compare_colors(state, sample, image)
         other: VisibleGradients | None = None
         if uses_depth:
             normal_value, by_normals, _ = normal_losses(
@@ -109,8 +109,8 @@ class Stepper:
                 image.geometric_normal,
                 image.normal,
                 image.alpha,
-                look.camera,
-                look.mask,
+                sample.camera,
+                sample.mask,
                 lambda_depth_normal=self.settings.lambda_depth_normal,
                 lambda_normal=self.settings.lambda_normal if schedule.is_oriented(iteration) else 0,
                 threads=self.threads,
@@ -118,17 +118,17 @@ class Stepper:
             )
             value += normal_value
             gradients = add_image_gradients(by_normals, gradients)
-            if self._compares_views(state, look):
-                shared = self._compare_views(state, look, image, gaussians)
+            if self._compares_views(state, sample):
+                shared = self._compare_views(state, sample, image, gaussians)
                 value += shared[0]
                 gradients, other = add_image_gradients(gradients, shared[1]), shared[2]
         if not math.isfinite(value):
             raise NotFinite()
         seen = image.backward(gradients)
-        # Before the other view's Gaussians join: this one knows no boxes of those it has culled.
-        if self.schedule.spares and self.settings.overlap_price > 0.0:
-            size_px = (look.camera.width, look.camera.height)
-            add_overlap_price(
+        # Before merging the other view's gradients: culled Gaussians have no boxes in this view.
+        if self.schedule.compact and self.settings.overlap_price > 0.0:
+            size_px = (sample.camera.width, sample.camera.height)
+            add_footprint_regulariser(
                 seen, adam.array("log_scales"), image.screen.boxes, size_px,
                 self.settings.overlap_price,
             )  # fmt: skip
@@ -136,23 +136,27 @@ class Stepper:
             seen = merge_gradients(seen, other, len(adam), threads=self.threads, store=self.store)
         if gathers:
             assert image.statistics is not None
-            part = look.camera.width * look.camera.height / (look.whole.width * look.whole.height)
-            state.statistics.add(image.statistics, look.whole.width, look.whole.height, part)
+            part = (
+                sample.camera.width
+                * sample.camera.height
+                / (sample.whole.width * sample.whole.height)
+            )
+            state.statistics.add(image.statistics, sample.whole.width, sample.whole.height, part)
         rates = schedule.rates(iteration, state.rate_factor)
         adam.step_rows(seen, rates, sh_degree=state.degree, threads=self.threads)
         if state.exposure is not None:
             rate = exposure_rate(iteration, self.settings.iterations, len(self.views))
-            state.exposure.step(look.view, state.rate_factor * rate)
+            state.exposure.step(sample.view, state.rate_factor * rate)
         state.iteration = iteration + 1
-        if self._is_empty(look):
-            return  # nothing was compared: nothing is known
-        place = look.view * _MOST_WINDOWS + look.number
-        state.visits.add(iteration, place, len(adam), mean_squared, look.divisor)
+        if self._is_empty(sample):
+            return  # no pixel was compared, so there is no error to record
+        window_id = sample.view * _MAX_WINDOWS + sample.number
+        state.error_history.add(iteration, window_id, len(adam), mean_squared, sample.divisor)
         share = AVERAGE_SHARE if state.error_average > 0.0 else 1.0
         state.error_average += share * (mean_squared - state.error_average)
         state.loss_average += share * (value - state.loss_average)
 
-    def _look(self, state: TrainingState) -> _Look:
+    def _draw_sample(self, state: TrainingState) -> _Sample:
         view = state.next_view(self.views)
         divisor = self.schedule.divisor(state.iteration)
         whole, mask = self.photos.camera(view, divisor), self.photos.mask(view, divisor)
@@ -163,7 +167,7 @@ class Stepper:
             numbers = np.flatnonzero(shown) if shown.any() else numbers
         number = int(numbers[int(state.random.integers(len(numbers)))])
         window = choices[number]
-        return _Look(
+        return _Sample(
             view,
             divisor,
             whole,
@@ -174,21 +178,21 @@ class Stepper:
             None if mask is None else window.of(mask),
         )
 
-    def _is_empty(self, look: _Look) -> bool:
-        """Tell whether the mask leaves nothing to compare."""
+    def _is_empty(self, sample: _Sample) -> bool:
+        """Return whether the mask leaves no pixel to compare."""
         ignores = self.settings.mask_mode == "ignore"
-        return ignores and look.mask is not None and not look.mask.any()
+        return ignores and sample.mask is not None and not sample.mask.any()
 
     def _compare_colors(
-        self, state: TrainingState, look: _Look, image: ViewPass
+        self, state: TrainingState, sample: _Sample, image: ViewPass
     ) -> tuple[float, ImageGradients, float]:
         """Return the colour loss, its gradients on colour and alpha, and the mean squared error."""
         empty = self.settings.mask_mode == "background"
         alpha = image.alpha if empty else None
         color, exposure = image.color, state.exposure
         if exposure is not None:
-            color = exposure.corrected(look.view, image.color, alpha, threads=self.threads)
-        photo, mask = look.photo, look.mask
+            color = exposure.corrected(sample.view, image.color, alpha, threads=self.threads)
+        photo, mask = sample.photo, sample.mask
         background = draw_background(state.random) if empty else None
         if background is not None:
             color, photo = composited(color, image.alpha, photo, mask, background, store=self.store)
@@ -204,31 +208,31 @@ class Stepper:
         by_alpha = None if background is None else background_gradient(by_color, background)
         if exposure is not None:
             by_color, more = exposure.backward(
-                look.view, image.color, by_color, alpha, threads=self.threads
+                sample.view, image.color, by_color, alpha, threads=self.threads
             )
             if by_alpha is not None and more is not None:
                 by_alpha += more
         return value, ImageGradients(color=by_color, alpha=by_alpha), figures.mean_squared
 
-    def _compares_views(self, state: TrainingState, look: _Look) -> bool:
-        if not state.needs.chose("multi_view") or len(self.neighbours[look.view]) == 0:
+    def _compares_views(self, state: TrainingState, sample: _Sample) -> bool:
+        if not state.model_selection.chose("multi_view") or len(self.neighbours[sample.view]) == 0:
             return False
         return self.schedule.compares_views(state.iteration)
 
     def _compare_views(
-        self, state: TrainingState, look: _Look, image: ViewPass, gaussians: RawArrays
+        self, state: TrainingState, sample: _Sample, image: ViewPass, gaussians: RawArrays
     ) -> tuple[float, ImageGradients, VisibleGradients | None]:
-        choices = self.neighbours[look.view]
+        choices = self.neighbours[sample.view]
         other = int(choices[int(state.random.integers(len(choices)))])
         found = multi_view_losses(
             image,
             gaussians,
-            look.camera,
-            look.photo,
-            look.mask,
-            self.photos.camera(other, look.divisor),
-            self.photos.photo(other, look.divisor),
-            self.photos.mask(other, look.divisor),
+            sample.camera,
+            sample.photo,
+            sample.mask,
+            self.photos.camera(other, sample.divisor),
+            self.photos.photo(other, sample.divisor),
+            self.photos.mask(other, sample.divisor),
             self.multi_view,
             state.random,
             threads=self.threads,
@@ -238,6 +242,6 @@ class Stepper:
 
 
 def trimmed(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:
-    """Return the Gaussians without the harmonics above a degree: they were never used."""
+    """Return the Gaussians without the harmonics above a degree, which were never used."""
     used = (degree + 1) ** 2
     return dataclasses.replace(gaussians, sh=gaussians.sh[:, :used].contiguous())

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a person sees of a running training: a preview picture and the PSNR of held-out photos.
+"""Live view of a running training: a preview picture and the PSNR of held-out photos.
 
-Nothing here is part of a training's result: the renderer is another one, nothing is drawn at
-random, and the clock decides only whether to look.
+Nothing here affects a training's result: the renderer is a separate one, no random numbers are
+drawn, and the clock only decides when to update.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ _logger = logging.getLogger(__name__)
 
 PREVIEW_FILE = "preview-training.png"
 PIXELS_FILE = "preview-training.npy"
-"""The same picture as bare (h, w, 3) uint8 values, which need no decoder."""
+"""The same picture as an (h, w, 3) uint8 array, which needs no decoder."""
 PREVIEW_PX = 640
 """Width of the whole picture: photo and render side by side."""
 
 MEASURED_VIEWS = 4
 MEASURED_PX = 240
-"""So many held-out photos are measured along the way, no longer than this: about 5 ms each."""
+"""Number and longest side of the held-out photos measured during training: about 5 ms each."""
 
 BEST_PSNR = 100.0
-"""Equal images count as this many dB, so that a mean stays finite."""
+"""PSNR of identical images, dB: keeps means finite."""
 
 GAP_PX = 4
 
 Correction = Callable[[np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
-"""Brings a (h, w, 3) render to the exposure of a (h, w, 3) uint8 photo, seen through a mask."""
+"""Maps a (h, w, 3) render to the exposure of a (h, w, 3) uint8 photo, within a mask."""
 
 
 def divisor_for(photos: PhotoSource, index: int, longest_px: int) -> int:
@@ -52,12 +52,12 @@ def divisor_for(photos: PhotoSource, index: int, longest_px: int) -> int:
     return max(1, min(divisor, camera.width, camera.height))
 
 
-def spread(views: Sequence[int], count: int) -> list[int]:
+def evenly_spaced(views: Sequence[int], count: int) -> list[int]:
     """Return at most ``count`` of the views, evenly spread."""
     if not views:
         return []
-    places = np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)
-    return [views[place] for place in places.tolist()]
+    positions = np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)
+    return [views[position] for position in positions.tolist()]
 
 
 def measure_held_out(
@@ -72,34 +72,34 @@ def measure_held_out(
 ) -> float:
     """Return the mean PSNR of a few held-out photos at a small size.
 
-    A function of the Gaussians and photos alone: it may stand in a training's history.
+    Depends on the Gaussians and photos alone, so it may enter a training's history.
 
     Parameters
     ----------
     gaussians : OrientedGaussians
-        As they are trained; nothing is copied and nothing is changed.
+        The tensors in training; neither copied nor changed.
     photos : PhotoStore
     held_out : sequence of int
-        Views; :data:`MEASURED_VIEWS` of them, evenly spread, are looked at.
+        Held-out views; :data:`MEASURED_VIEWS` of them, evenly spread, are measured.
     threads : int
         The result does not depend on it.
     renderer : ViewRenderer, optional
-        Whose memory to use; not that of a view whose gradient is still to be asked.
+        Renderer to reuse; not one whose last view still awaits its backward pass.
     exposure_correction : callable, optional
         Applied to each render before it is measured
         (:func:`~.appearance.photo_exposure.corrected_for_measuring`).
     check : callable, optional
-        Called before each view; what it raises ends the measuring.
+        Called before each view; an exception ends the measurement.
 
     Returns
     -------
     float
-        dB; NaN where there is no held-out photo, or masks leave nothing of them.
+        dB; NaN without held-out photos, or if masks cover all of them.
     """
     renderer = renderer or ViewRenderer()
     raw = RawArrays.from_gaussians(gaussians)
     figures = []
-    for view in spread(held_out, MEASURED_VIEWS):
+    for view in evenly_spaced(held_out, MEASURED_VIEWS):
         if check is not None:
             check()
         divisor = divisor_for(photos, view, MEASURED_PX)
@@ -128,22 +128,21 @@ def _rendered(
 
 
 class LiveView:
-    """Looks at a training from outside, every few seconds.
+    """Update the preview of a training every few seconds.
 
     Parameters
     ----------
     photos : PhotoStore
         The training's own; its cache is shared.
     held_out : sequence of int
-        Views that are never trained on. The middle one is shown; the first view of all where
-        there is none.
+        Held-out views. The middle one is shown; without any, the first view of the scene.
     folder : Path
-        Gets :data:`PREVIEW_FILE` and :data:`PIXELS_FILE`, each replaced atomically.
+        Receives :data:`PREVIEW_FILE` and :data:`PIXELS_FILE`, each replaced atomically.
     settings : TrainingSettings
-        ``preview_every_s`` is the time between two looks; 0 never looks.
+        ``preview_every_s`` is the time between two updates; 0 disables them.
     threads : int
     clock : callable
-        Seconds; the first look comes ``preview_every_s`` after the start.
+        Seconds; the first update comes ``preview_every_s`` after the start.
     """
 
     def __init__(
@@ -158,10 +157,10 @@ class LiveView:
         self._photos, self._held_out, self._folder = photos, list(held_out), folder
         self._every_s, self._threads, self._clock = settings.preview_every_s, threads, clock
         self._renderer = ViewRenderer()
-        self._looked_s = clock()
-        self._shown = self._held_out[len(self._held_out) // 2] if self._held_out else 0
+        self._updated_s = clock()
+        self._shown_view = self._held_out[len(self._held_out) // 2] if self._held_out else 0
 
-    def look(
+    def update(
         self,
         gaussians: OrientedGaussians,
         iteration: int,
@@ -169,17 +168,17 @@ class LiveView:
         *,
         force: bool = False,
     ) -> dict[str, float] | None:
-        """Write the preview and measure, where it is time, or ``force`` asks for it.
+        """Write the preview and measure the held-out photos, if due or ``force`` is set.
 
         Returns
         -------
         dict or None
-            ``held_out_psnr`` (dB) and ``held_out_iteration`` for the progress' figures, empty
-            without held-out photos; ``None`` where it is not time yet.
+            ``held_out_psnr`` (dB) and ``held_out_iteration`` for the progress figures, empty
+            without held-out photos; ``None`` if no update is due.
         """
         if self._every_s <= 0:
             return None
-        if not force and self._clock() - self._looked_s < self._every_s:
+        if not force and self._clock() - self._updated_s < self._every_s:
             return None
         figures = {}
         quality = measure_held_out(
@@ -193,24 +192,24 @@ class LiveView:
         if np.isfinite(quality):
             figures = {"held_out_psnr": quality, "held_out_iteration": float(iteration)}
         self._write(gaussians, exposure_correction)
-        # After the work: looks that take long on a slow machine do not follow one on the other.
-        self._looked_s = self._clock()
+        # Taken after the work, so that slow updates do not run back to back.
+        self._updated_s = self._clock()
         return figures
 
     def _write(self, gaussians: OrientedGaussians, correction: Correction | None) -> None:
-        divisor = divisor_for(self._photos, self._shown, (PREVIEW_PX - GAP_PX) // 2)
+        divisor = divisor_for(self._photos, self._shown_view, (PREVIEW_PX - GAP_PX) // 2)
         raw = RawArrays.from_gaussians(gaussians)
         image = _rendered(
-            self._renderer, raw, self._photos, self._shown, divisor, self._threads, correction
+            self._renderer, raw, self._photos, self._shown_view, divisor, self._threads, correction
         )
-        picture = side_by_side(self._photos.photo(self._shown, divisor), image)
+        picture = side_by_side(self._photos.photo(self._shown_view, divisor), image)
         try:
             write_bytes(self._folder / PREVIEW_FILE, png(picture))
             write_bytes(self._folder / PIXELS_FILE, npy(picture))
         except OSError as error:
-            # The training does not need pictures; whether its checkpoints fit is told elsewhere.
+            # The training goes on without pictures; a full disk is reported by the checkpoints.
             self._every_s = 0.0
-            _logger.warning("no more preview pictures: %s", error)
+            _logger.warning("preview pictures are disabled: %s", error)
 
 
 def side_by_side(photo: np.ndarray, rendering: np.ndarray) -> np.ndarray:

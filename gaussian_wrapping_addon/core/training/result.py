@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a training gives back."""
+"""Result of a training: Gaussians, history, held-out metrics, model selection."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from typing import Any
 
 from ..gaussians.model import OrientedGaussians
 from ..report_warning import ReportWarning
-from .selection.model_selection import Needs
+from .selection.model_selection import ModelSelection
 
 
 @dataclass(frozen=True)
-class HeldOutFigure:
-    """How well one photo that was never trained on is reproduced."""
+class HeldOutMetrics:
+    """Image metrics of one held-out photo."""
 
     name: str
     psnr: float
     """dB, at the finest training size."""
     ssim: float
     lpips: float | None = None
-    """``None`` where it was not measured."""
+    """``None`` if not measured."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values; ``lpips`` only where it was measured."""
+        """Return plain JSON values; ``lpips`` only if measured."""
         values = dataclasses.asdict(self)
         if self.lpips is None:
             del values["lpips"]
@@ -34,39 +34,39 @@ class HeldOutFigure:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Trained Gaussians and what was measured of them."""
+    """Trained Gaussians and their metrics."""
 
     gaussians: OrientedGaussians
     iterations: int
     history: tuple[dict[str, float], ...]
-    """Loss, PSNR of the trained photos and number of Gaussians along the way."""
-    held_out: tuple[HeldOutFigure, ...]
+    """Loss, PSNR of the training photos and number of Gaussians over the iterations."""
+    held_out: tuple[HeldOutMetrics, ...]
     seconds: float
     warnings: tuple[ReportWarning, ...]
     lpips_note: str = ""
-    """Why the held-out photos have no LPIPS."""
-    needs: Needs = field(default_factory=Needs)
-    """What was decided for the scene."""
+    """Reason why the held-out photos have no LPIPS."""
+    model_selection: ModelSelection = field(default_factory=ModelSelection)
+    """Decisions on the model (the report's key ``decisions``)."""
     exposure_fitted: bool = False
-    """Held-out photos were measured in their own exposure, fitted crosswise on their halves."""
+    """Whether held-out photos were measured after an exposure fitted crosswise on their halves."""
 
     @property
     def held_out_psnr(self) -> float:
-        """Mean over the held-out photos, dB; NaN without any."""
+        """Mean PSNR of the held-out photos, dB; NaN without any."""
         return _mean([figure.psnr for figure in self.held_out])
 
     @property
     def held_out_ssim(self) -> float:
-        """Mean over the held-out photos; NaN without any."""
+        """Mean SSIM of the held-out photos; NaN without any."""
         return _mean([figure.ssim for figure in self.held_out])
 
     @property
     def held_out_lpips(self) -> float:
-        """Mean over the held-out photos where it was measured; NaN without any."""
+        """Mean LPIPS of the held-out photos that have one; NaN without any."""
         return _mean([figure.lpips for figure in self.held_out if figure.lpips is not None])
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values for the report; the Gaussians are only counted."""
+        """Return plain JSON values for the report; of the Gaussians only their number."""
         values: dict[str, Any] = {
             "gaussians": len(self.gaussians),
             "iterations": self.iterations,
@@ -74,7 +74,7 @@ class TrainingResult:
             "held_out": [figure.to_json() for figure in self.held_out],
             "history": [dict(entry) for entry in self.history],
             "warnings": [warning.to_json() for warning in self.warnings],
-            "decisions": self.needs.to_json(),
+            "decisions": self.model_selection.to_json(),
             "held_out_exposure_fitted": self.exposure_fitted,
             "sh_degree": self.gaussians.sh_degree,
         }

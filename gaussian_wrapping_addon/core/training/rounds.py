@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Between iterations: Gaussians are added and removed, wrapped, filtered; harmonics are tried."""
+"""Updates between iterations: density control, wrapping, 3D filter, choice of the SH degree."""
 
 from __future__ import annotations
 
@@ -14,45 +14,45 @@ from ..dataset.photo_source import PhotoSource
 from ..gaussians.mip_filter import mip_filter
 from ..gaussians.model import OrientedGaussians
 from ..progress import Progress
-from .cancelling import checked
+from .cancellation import cancellable
 from .density.contribution import contributions, least_contributors, prune_contributors
 from .density.density_control import densify_and_prune, reset_opacity
 from .density.wrapping import WrapView, normal_errors, start_orientation, wrap
 from .iteration import Stepper
 from .live_view import divisor_for
 from .schedule import Schedule
-from .selection.harmonics_selection import harmonics_need
-from .selection.harmonics_trial import NeedView
-from .selection.model_selection import wrapping_need
+from .selection.harmonics_selection import select_harmonics
+from .selection.harmonics_trial import TrialView
+from .selection.model_selection import select_wrapping
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
 
 MAX_ROUND_VIEWS = 60
-"""Rounds and the orientation's vote look at no more views, spread evenly."""
+"""Most views rendered for a round or for the vote on orientations, evenly spread."""
 
 ROUND_DIVISOR = 2
 VOTE_DIVISOR = 4
 
 TRIAL_SIDE_PX = 144
-"""Harmonics are tried at about this size: colours change slowly over the surface."""
+"""Long side of the photos on which harmonics are tried: colours vary slowly on the surface."""
 
 Inside = Callable[[np.ndarray], np.ndarray]
 """Maps (n, 3) points to (n,) bool."""
 
 
 class Rounds:
-    """What changes the set of Gaussians. Everything follows from the state and the inputs.
+    """Updates of the set of Gaussians. They depend on the state and the inputs alone.
 
     Parameters
     ----------
     stepper : Stepper
     held_out : sequence of int
-        Views that are never trained on.
+        Held-out views.
     inside : callable, optional
-        Tells which points lie in the regions that Gaussians are spent on first.
+        Tells which points lie in the regions that density control favours.
     progress : Progress
-        Asked for cancelling before every view of a round.
+        Checked for cancellation before every view of a round.
     """
 
     def __init__(
@@ -71,19 +71,19 @@ class Rounds:
         self.progress = progress
 
     def before_step(self, state: TrainingState) -> None:
-        """Do what an iteration needs first."""
+        """Update the state before an iteration."""
         iteration, schedule = state.iteration, self.schedule
         if iteration > 0 and schedule.divisor(iteration) != schedule.divisor(iteration - 1):
             self.filter(state)
         if schedule.starts_depth(iteration):
-            state.visits.clear()  # errors of colour rise where other terms join
+            state.error_history.clear()  # colour errors rise when other terms are added
         if schedule.starts_orientation(iteration):
             start_orientation(state.adam, self._views(VOTE_DIVISOR), threads=self.threads)
         if self.settings.harmonics == "on":
             state.degree = schedule.sh_degree(iteration)
 
     def after_step(self, state: TrainingState) -> None:
-        """Change the set of Gaussians where it is due."""
+        """Apply the updates that are due after an iteration."""
         iteration, schedule, adam = state.iteration, self.schedule, state.adam
         if iteration >= self.settings.iterations:
             if schedule.refilters(iteration):
@@ -104,17 +104,17 @@ class Rounds:
             self.filter(state)
         if schedule.resets_opacity(iteration):
             reset_opacity(adam)
-            state.visits.clear()
+            state.error_history.clear()
         tries = self.settings.harmonics == "auto" and not schedule.refines
         if tries and schedule.tries_harmonics(iteration):
             self._try_harmonics(state)
 
     def filter(self, state: TrainingState) -> None:
-        """Compute the 3D filter for the cameras of the coming iteration's image size."""
+        """Compute the 3D filter for the image size of the coming iteration."""
         state.adam.array("filter_3d")[:] = self._filter_of(state)
 
     def filtered(self, state: TrainingState) -> OrientedGaussians:
-        """Return the Gaussians with a fresh filter; the state stays, so that it can train on."""
+        """Return the Gaussians with an updated filter; the state is unchanged and can train on."""
         fresh = torch.from_numpy(self._filter_of(state).astype(np.float32))
         return state.adam.gaussians().detached().replaced(filter_3d=fresh)
 
@@ -124,20 +124,24 @@ class Rounds:
         return mip_filter(state.adam.array("means"), cameras, threads=self.threads)
 
     def _densify(self, state: TrainingState) -> None:
-        """Add and prune; stop adding for good where it does not pay any more."""
+        """Densify and prune; stop densifying for good once growth no longer pays."""
         setting, limit = self.settings.growth, self.schedule.budget(state.iteration)
-        known = state.needs.get("growth")
+        known = state.model_selection.get("growth")
         if setting != "auto":
             stopped = setting == "off"
             if known is None:
-                need = state.visits.need()
-                state.needs = state.needs.with_decision(need.decision(setting))
+                evidence = state.error_history.growth_evidence()
+                state.model_selection = state.model_selection.with_decision(
+                    evidence.decision(setting)
+                )
         else:
             stopped = known is not None and known.chosen == "stopped"
             if not stopped:
-                need = state.visits.need()
-                state.needs = state.needs.with_decision(need.decision(setting))
-                stopped = not need.pays
+                evidence = state.error_history.growth_evidence()
+                state.model_selection = state.model_selection.with_decision(
+                    evidence.decision(setting)
+                )
+                stopped = not evidence.pays
         weights = self._region_weights(state)
         densify_and_prune(
             state.adam, state.statistics, 0 if stopped else limit, state.random, weights
@@ -153,11 +157,11 @@ class Rounds:
         weights = self._region_weights(state)
         least = least_contributors(found, self.settings.prune_share, weights)
         gone = prune_contributors(state.adam, least)
-        _logger.info("iteration %d: %d Gaussians removed", state.iteration, gone)
+        _logger.info("iteration %d: pruned %d Gaussians", state.iteration, gone)
 
     def _wrap(self, state: TrainingState) -> bool:
-        """Clone with the opposite orientation, where the scene needs it; tell whether it did."""
-        known = state.needs.get("wrapping")
+        """Clone Gaussians with the opposite orientation if selected; return whether it was done."""
+        known = state.model_selection.get("wrapping")
         if known is not None and known.chosen == "off":
             return False
         gaussians = state.adam.gaussians()
@@ -167,28 +171,28 @@ class Rounds:
                 gaussians.detached(), self._views(VOTE_DIVISOR), self.stepper.renderer,
                 threads=self.threads,
             )  # fmt: skip
-            known = wrapping_need(errors, shown.share, self.settings.wrapping)
-            state.needs = state.needs.with_decision(known)
+            known = select_wrapping(errors, shown.share, self.settings.wrapping)
+            state.model_selection = state.model_selection.with_decision(known)
             if known.chosen == "off":
                 return False
         wrap(state.adam, errors, self.settings.wrap_share, self.settings.max_gaussians)
         return True
 
     def _try_harmonics(self, state: TrainingState) -> None:
-        """Raise the degree where enough of the surface gains by it.
+        """Raise the degree of the harmonics if enough of the surface gains by it.
 
-        One that was refused is not tried again: three trials cost a short training a seventh of its
-        time, and the later they are, the more of what changes with the view has gone into shapes.
+        A rejected degree is not tried again: three trials cost a short training a seventh of its
+        time, and the later the trial, the more view dependence has been absorbed by shapes.
         """
         degree = state.degree + 1
-        known = state.needs.get("harmonics")
+        known = state.model_selection.get("harmonics")
         refused = known is not None and known.figures.get("degree_tried") == degree
         if degree > self.settings.sh_degree or refused:
             return
-        found = harmonics_need(
+        found = select_harmonics(
             state.adam.gaussians().detached(),
-            [self._need_view(state, view) for view in checked(self.views, self.progress)],
-            [self._need_view(state, view) for view in checked(self.held_out, self.progress)],
+            [self._trial_view(state, view) for view in cancellable(self.views, self.progress)],
+            [self._trial_view(state, view) for view in cancellable(self.held_out, self.progress)],
             degree,
             threads=self.threads,
             check=self.progress.check,
@@ -197,16 +201,18 @@ class Rounds:
             state.degree = degree
             coefficients = found.coefficients
             state.adam.array("sh")[:, : coefficients.shape[1]] = coefficients
-            state.visits.clear()
-        state.needs = state.needs.with_decision(found.decision("auto", state.degree))
+            state.error_history.clear()
+        state.model_selection = state.model_selection.with_decision(
+            found.decision("auto", state.degree)
+        )
 
-    def _need_view(self, state: TrainingState, view: int) -> NeedView:
+    def _trial_view(self, state: TrainingState, view: int) -> TrialView:
         divisor = divisor_for(self.photos, view, TRIAL_SIDE_PX)
         correction = None
         if state.exposure is not None and view in self.views:
             gain, offset = state.exposure.factors(view)
             correction = (gain, offset)
-        return NeedView(
+        return TrialView(
             self.photos.camera(view, divisor),
             self.photos.photo(view, divisor),
             self.photos.mask(view, divisor),
@@ -214,18 +220,18 @@ class Rounds:
         )
 
     def _region_weights(self, state: TrainingState) -> np.ndarray | None:
-        """Return (n,) weights of the Gaussians, or ``None`` where all count alike."""
+        """Return (n,) weights of the Gaussians, or ``None`` if all weigh the same."""
         if self.inside is None or self.settings.region_weight == 1.0:
             return None
         within = self.inside(state.adam.array("means").astype(np.float64))
         return np.where(within, self.settings.region_weight, 1.0)
 
     def _views(self, divisor: int) -> Iterator[WrapView]:
-        """Yield the training views at a size, at most :data:`MAX_ROUND_VIEWS` of them."""
+        """Yield at most :data:`MAX_ROUND_VIEWS` training views at reduced size."""
         count = min(len(self.views), MAX_ROUND_VIEWS)
         spread = np.linspace(0, len(self.views) - 1, count).round().astype(int)
         side = self.schedule.long_side_px
         divisor = divisor if side / divisor >= 2 * tolerances.TILE_PX else 1
-        for position in checked(spread.tolist(), self.progress):
+        for position in cancellable(spread.tolist(), self.progress):
             view = self.views[position]
             yield WrapView(self.photos.camera(view, divisor), self.photos.mask(view, divisor))

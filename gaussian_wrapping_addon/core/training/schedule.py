@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What happens when: image resolution, harmonics, losses, densification, learning rates."""
+"""Training schedule: image resolution, harmonics, losses, densification, learning rates."""
 
 from __future__ import annotations
 
@@ -39,33 +39,33 @@ RATE_POWERS = {
     "sh_rest": 2.0,
     "orientation": 0.0,
 }
-"""How strongly each rate takes part in that growth."""
+"""Exponent of :attr:`Schedule.short_run_factor` for each rate."""
 
 PYRAMID = ((4, 0.0), (2, 0.1), (1, 0.3))
-"""Divisor of the image size, and the share of the iterations from which it is used."""
+"""Divisor of the image size, and the fraction of the iterations from which it is used."""
 
 REFINING_FROM = 0.7
-"""Where in the decay of the means' rate a training of finished Gaussians begins."""
+"""Point in the decay of the means' rate at which a training of finished Gaussians starts."""
 
 SMALLEST_SIDE_PX = 96
-"""Where the long side of a level would be smaller than this, a finer one is used."""
+"""Smallest long side of a pyramid level; a finer level is used below it."""
 
 TRY_HARMONICS_AT = (0.4, 0.5, 0.6)
-"""Shares of the iterations at which photos are asked whether the next degree is worth it: not
-before shapes and plain colours explain what they can, and early enough to be trained."""
+"""Fractions of the iterations at which the next degree is tried: after shapes and
+view-independent colours have converged, and early enough for the degree to be trained."""
 
 DEGREE_SHARE = 1.0 / 6.0
-"""The harmonics' degree rises by one whenever this share of the iterations has passed."""
+"""Fraction of the iterations after which the degree of the harmonics rises by one."""
 
 FIRST_BUDGET = 5000
-"""The budget of Gaussians is never smaller than this."""
+"""Smallest budget of Gaussians."""
 
 PRUNE_AT = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
-"""Shares of the iterations at which Gaussians of little contribution are removed: while the number
-grows, so that others take their room, and twice after that, where an iteration costs most."""
+"""Fractions of the iterations at which Gaussians of little contribution are pruned: during growth,
+so that others take their place, and twice after it, when an iteration costs most."""
 
 RESET_EVERY = 3000
-"""Iterations between opacity resets (docs/method.md, section 4.1); a run too short for recovery has
+"""Iterations between opacity resets (docs/method.md, section 4.1); runs too short to recover have
 none."""
 
 FILTER_EVERY = 100
@@ -74,7 +74,7 @@ FILTER_EVERY = 100
 
 @dataclass(frozen=True)
 class Schedule:
-    """The plan of one training run. Milestones of the settings are fractions of the iterations.
+    """Schedule of one training run. Milestones in the settings are fractions of the iterations.
 
     Parameters
     ----------
@@ -84,8 +84,8 @@ class Schedule:
     finest : int
         Divisor of the finest level of the pyramid.
     refines : bool
-        The Gaussians come from another training: finest level, all harmonics and late learning
-        rates from the start.
+        Whether the Gaussians come from another training: then the finest level, all harmonics
+        and late learning rates apply from the start.
     """
 
     settings: TrainingSettings
@@ -95,7 +95,7 @@ class Schedule:
 
     @property
     def total(self) -> int:
-        """All iterations, with the extra ones after the plan's end."""
+        """All iterations, including the extra ones after the end of the schedule."""
         return self.settings.iterations + self.settings.extra_iterations
 
     def _share(self, iteration: int) -> float:
@@ -103,7 +103,7 @@ class Schedule:
 
     @property
     def short_run_factor(self) -> float:
-        """Growth of the learning rates where there are fewer iterations than usual; at least 1."""
+        """Base of the factors by which short runs raise the learning rates; at least 1."""
         return max(1.0, REFERENCE_ITERATIONS / self.settings.iterations) ** SHORT_RUN_POWER
 
     def _at(self, share: float) -> int:
@@ -122,7 +122,7 @@ class Schedule:
         return chosen
 
     def sh_degree(self, iteration: int) -> int:
-        """Return the degree of the harmonics where no evidence is asked for."""
+        """Return the degree of the harmonics if it is not selected from the photos."""
         share = 1.0 if self.refines else min(1.0, self._share(iteration))
         return min(self.settings.sh_degree, int(share / DEGREE_SHARE))
 
@@ -131,7 +131,7 @@ class Schedule:
         return iteration >= self._at(self.settings.depth_from)
 
     def compares_views(self, iteration: int) -> bool:
-        """Tell whether the multi-view terms are asked in this iteration."""
+        """Tell whether the multi-view terms are evaluated in this iteration."""
         begin, end = self._at(self.settings.depth_from), self._at(self.settings.multi_view_until)
         return begin <= iteration < end and iteration % self.settings.multi_view_every == 0
 
@@ -140,70 +140,70 @@ class Schedule:
         return iteration == self._at(self.settings.depth_from)
 
     def is_oriented(self, iteration: int) -> bool:
-        """Tell whether the orientation is learned."""
+        """Tell whether the orientation is trained."""
         wanted = self.settings.wrapping != "off"
         return wanted and iteration >= self._at(self.settings.orient_from)
 
     def starts_orientation(self, iteration: int) -> bool:
-        """Tell whether this is the first iteration that learns the orientation."""
+        """Tell whether this is the first iteration that trains the orientation."""
         wanted = self.settings.wrapping != "off"
         return wanted and iteration == self._at(self.settings.orient_from)
 
     def tries_harmonics(self, iteration: int) -> bool:
-        """Tell whether the next degree is tried after this iteration's step, if that decides."""
+        """Tell whether the next degree is tried after this iteration, if trials decide."""
         return iteration in {self._at(share) for share in TRY_HARMONICS_AT}
 
     def gathers_statistics(self, iteration: int) -> bool:
-        """Tell whether the renders of this iteration feed density control."""
+        """Tell whether this iteration collects statistics for density control."""
         return iteration < self._at(self.settings.densify_until)
 
     def densifies(self, iteration: int) -> bool:
-        """Tell whether Gaussians are added and removed after this iteration's step."""
+        """Tell whether density control runs after this iteration."""
         begin, end = self._at(self.settings.densify_from), self._at(self.settings.densify_until)
         return begin < iteration <= end and iteration % self.settings.densify_every == 0
 
     @property
-    def spares(self) -> bool:
-        """Tell whether Gaussians that show little are held small and few."""
+    def compact(self) -> bool:
+        """Tell whether the model is kept compact: footprint regulariser and pruning are on."""
         return self.settings.growth != "on"
 
     def prunes(self, iteration: int) -> bool:
-        """Tell whether Gaussians of little contribution go after this iteration's step."""
-        wanted = self.spares and self.settings.prune_share > 0.0
+        """Tell whether Gaussians of little contribution are pruned after this iteration."""
+        wanted = self.compact and self.settings.prune_share > 0.0
         return wanted and iteration in {self._at(x) for x in PRUNE_AT}
 
     def growth_limit(self) -> int:
-        """Return the number of Gaussians that density control may reach in the end.
+        """Return the final limit of density control on the number of Gaussians.
 
-        The wrapping rounds keep their part of ``max_gaussians``.
+        A part of ``max_gaussians`` is reserved for the wrapping rounds.
         """
         growth = (1.0 + self.settings.wrap_share) ** self.settings.wrap_rounds
         return max(1, math.floor(self.settings.max_gaussians / growth))
 
     def budget(self, iteration: int) -> int:
-        """Return the number of Gaussians that density control may reach after this iteration.
+        """Return the limit on the number of Gaussians after this iteration.
 
-        It grows evenly while the images do: a coarse image cannot tell where many are needed, and
-        those that it asks for cost time in all iterations to come (DashGaussian schedules both
-        together; Taming 3DGS grows along a planned budget).
+        It grows linearly as the image size grows: a coarse image cannot tell where many Gaussians
+        are needed, and those added early cost time in all later iterations (DashGaussian schedules
+        both together; Taming 3DGS grows along a planned budget).
         """
         share = min(1.0, self._share(iteration) / max(self.settings.densify_until, 1e-9))
         limit = self.growth_limit()
         return min(limit, max(FIRST_BUDGET, math.floor(share * limit)))
 
     def resets_opacity(self, iteration: int) -> bool:
-        """Tell whether opacities are reset after this iteration's step."""
+        """Tell whether opacities are reset after this iteration."""
         until = self._at(self.settings.densify_until)
         return iteration % RESET_EVERY == 0 and 0 < iteration <= until - RESET_EVERY
 
     def wraps(self, iteration: int) -> bool:
-        """Tell whether a wrapping round runs after this iteration's step."""
+        """Tell whether a wrapping round runs after this iteration."""
         s = self.settings
         shares = np.linspace(s.wrap_from, s.wrap_until, s.wrap_rounds)
         return iteration > 0 and iteration in {self._at(float(share)) for share in shares}
 
     def refilters(self, iteration: int) -> bool:
-        """Tell whether the 3D filter is computed anew after this iteration's step."""
+        """Tell whether the 3D filter is recomputed after this iteration."""
         return iteration % FILTER_EVERY == 0
 
     def rates(self, iteration: int, factor: float = 1.0) -> dict[str, np.ndarray]:
@@ -212,7 +212,7 @@ class Schedule:
         Parameters
         ----------
         factor : float
-            Multiplies all of them (lowered after a restart).
+            Factor on all rates (lowered after a restart).
         """
         growth = {name: self.short_run_factor**power for name, power in RATE_POWERS.items()}
         first, last = POSITION_RATE

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Everything that the next iteration of a training depends on."""
+"""Training state: everything that the next iteration depends on."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ..report_warning import ReportWarning, read_warnings
 from .appearance.photo_exposure import Exposure
 from .density.density_control import DensityStatistics
 from .optimizer.adam import TRAINED, Adam
-from .selection.growth_selection import GrowthHistory
-from .selection.model_selection import Needs
+from .selection.growth_selection import ErrorHistory
+from .selection.model_selection import ModelSelection
 
 _MOMENTS = ("first", "second")
 _STATISTICS = ("gradient", "gradient_abs", "views")
@@ -23,33 +23,33 @@ _STATISTICS = ("gradient", "gradient_abs", "views")
 
 @dataclass
 class TrainingState:
-    """Parameters, moments, statistics, randomness and view order of a run."""
+    """Parameters, moments, statistics, random generator and view order of a run."""
 
     adam: Adam
     statistics: DensityStatistics
     random: np.random.Generator
     iteration: int = 0
-    """Finished iterations."""
+    """Number of finished iterations."""
     order: list[int] = field(default_factory=list)
-    """Views still to come in this round, last first."""
+    """Views still to come in this epoch, last first."""
     rate_factor: float = 1.0
-    """Lowered after a restart from numbers that were not finite."""
+    """Factor of the learning rates, lowered after a restart from non-finite values."""
     restarts: int = 0
     error_average: float = 0.0
     """Moving average of the mean squared colour error, for the progress message."""
     loss_average: float = 0.0
     degree: int = 0
-    """Of the harmonics in use."""
-    needs: Needs = field(default_factory=Needs)
-    """What was decided so far."""
+    """Degree of the harmonics in use."""
+    model_selection: ModelSelection = field(default_factory=ModelSelection)
+    """Decisions so far; stored under the key ``needs``."""
     exposure: Exposure | None = None
-    """Where exposures are modelled."""
-    visits: GrowthHistory = field(default_factory=GrowthHistory)
-    """Errors of the photos, by which growth is judged."""
+    """Per-photo exposures; ``None`` where they are not modelled."""
+    error_history: ErrorHistory = field(default_factory=ErrorHistory)
+    """Per-view errors from which growth is decided; stored under the prefix ``visits.``."""
     warnings: list[ReportWarning] = field(default_factory=list)
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
-    """Time spent until the last checkpoint."""
+    """Training time up to the last checkpoint."""
 
     @classmethod
     def start(cls, gaussians: OrientedGaussians, seed: int) -> TrainingState:
@@ -58,7 +58,7 @@ class TrainingState:
         return cls(Adam(gaussians), DensityStatistics.zeros(len(gaussians)), random)
 
     def next_view(self, views: list[int]) -> int:
-        """Draw the next view: all of them in random order, then again.
+        """Draw the next view: all views in random order, epoch by epoch.
 
         See docs/method.md, section 1.4.
         """
@@ -67,7 +67,7 @@ class TrainingState:
         return self.order.pop()
 
     def clear_statistics(self) -> None:
-        """Forget the statistics; also after the number of Gaussians has changed."""
+        """Reset the statistics, as after a change in the number of Gaussians."""
         self.statistics = DensityStatistics.zeros(len(self.adam))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
@@ -83,10 +83,10 @@ class TrainingState:
             arrays[f"statistics.{name}"] = getattr(self.statistics, name).copy()
         if self.exposure is not None:
             arrays |= {f"exposure.{k}": v for k, v in self.exposure.to_arrays().items()}
-        return arrays | {f"visits.{k}": v for k, v in self.visits.to_arrays().items()}
+        return arrays | {f"visits.{k}": v for k, v in self.error_history.to_arrays().items()}
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything else as plain JSON values."""
+        """Return the rest of the state as plain JSON values."""
         return {
             "random": self.random.bit_generator.state,
             "iteration": self.iteration,
@@ -98,7 +98,7 @@ class TrainingState:
             "history": [dict(entry) for entry in self.history],
             "seconds": self.seconds,
             "degree": self.degree,
-            "needs": self.needs.to_json(),
+            "needs": self.model_selection.to_json(),
             "warnings": [warning.to_json() for warning in self.warnings],
         }
 
@@ -109,7 +109,7 @@ class TrainingState:
         Raises
         ------
         KeyError, ValueError, TypeError
-            Something is missing or does not fit together.
+            An entry is missing, or entries are inconsistent.
         """
         tensors = {
             name.removeprefix("value."): torch.from_numpy(array.copy())
@@ -142,16 +142,16 @@ class TrainingState:
         state.history = [{k: float(v) for k, v in entry.items()} for entry in values["history"]]
         state.seconds = float(values["seconds"])
         state.degree = int(values["degree"])
-        state.needs = Needs.from_json(values["needs"])
+        state.model_selection = ModelSelection.from_json(values["needs"])
         state.warnings = list(read_warnings(values["warnings"]))
         exposure = _part(arrays, "exposure.")
         state.exposure = Exposure.restore(exposure) if exposure else None
-        state.visits = GrowthHistory.restore(_part(arrays, "visits."))
+        state.error_history = ErrorHistory.restore(_part(arrays, "visits."))
         return state
 
 
 def _part(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """Return the arrays whose names begin with a prefix, without it."""
+    """Return the arrays whose names have a prefix, with the prefix removed."""
     return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 

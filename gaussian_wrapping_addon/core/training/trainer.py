@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The training loop: photos and cameras in, oriented Gaussians out, resumable at any moment."""
+"""Training loop: from photos and cameras to oriented Gaussians, resumable at any iteration."""
 
 from __future__ import annotations
 
@@ -27,47 +27,47 @@ from ..report_warning import ReportWarning
 from ..settings import TrainingSettings
 from .appearance.background import inside_masks
 from .appearance.photo_exposure import Exposure, corrected_for_measuring
-from .cancelling import CheckedPhotos
+from .cancellation import CancellablePhotos
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
-from .live_view import Correction, LiveView, measure_held_out, spread
+from .live_view import Correction, LiveView, evenly_spaced, measure_held_out
 from .losses.neighbours import find_neighbours
-from .result import HeldOutFigure, TrainingResult
+from .result import HeldOutMetrics, TrainingResult
 from .rounds import Inside, Rounds
 from .schedule import SMALLEST_SIDE_PX, Schedule
-from .selection.exposure_selection import exposure_need
-from .selection.image_size_selection import image_need, photo_detail
-from .selection.model_selection import Decision, Needs, decide, multi_view_need
+from .selection.exposure_selection import select_exposure
+from .selection.image_size_selection import photo_detail, select_image_size
+from .selection.model_selection import Decision, ModelSelection, decide, select_multi_view
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
 
 FEW_PHOTOS = 8
-"""With fewer photos than this, only one is held out."""
+"""Below this number of photos, only one is held out."""
 
 SNAPSHOT_EVERY = 100
-"""Iterations between two looks at all numbers, and two states to fall back to."""
+"""Iterations between checks that all values are finite; each one takes a snapshot."""
 
 MEASURE_EVERY = 500
-"""Iterations between two measurements of held-out photos for the history."""
+"""Iterations between measurements of held-out photos for the history."""
 
 REPORT_EVERY = 10
 
 DETAIL_PHOTOS = 8
-"""Photos, spread evenly, that are looked at for detail."""
+"""Number of photos, evenly spread, whose detail is measured."""
 
 TOO_SMALL = "The photos are too small for LPIPS."
 
 RESTART_RATE = 0.5
-"""Learning rates are multiplied by this after a restart."""
+"""Factor on the learning rates after a restart."""
 
 
 def held_out_views(scene: Scene, every: int) -> list[int]:
-    """Return the views that are measured and never trained on.
+    """Return the held-out views, which are measured and never trained on.
 
-    Every n-th photo of the list sorted by name; the first alone where there are fewer than
-    :data:`FEW_PHOTOS`; none where ``every`` is 0 or too few would be left.
+    Every n-th photo sorted by name; only the first with fewer than :data:`FEW_PHOTOS` photos; none
+    if ``every`` is 0 or too few photos would be left.
     """
     count = len(scene.views)
     if every <= 0 or count < 3:
@@ -92,10 +92,10 @@ def train(
 ) -> TrainingResult:
     """Train oriented Gaussians on the photos of a scene.
 
-    Resumes from the newest checkpoint in ``folder``; the result is then bit for bit that of a run
-    without interruption on the same machine, unless numbers break down after it was resumed: the
-    state to go back to is then the resumed one. A checkpoint stays at the end, from which more
-    iterations can go on.
+    Resumes from the newest checkpoint in ``folder``; the result is then bit for bit that of an
+    uninterrupted run on the same machine, unless values become non-finite after resuming: the
+    snapshot to restart from is then the resumed state. The last checkpoint is kept, so that the
+    training can be continued.
 
     Parameters
     ----------
@@ -104,16 +104,16 @@ def train(
         Photos, masks and cameras of the scene's views.
     settings : TrainingSettings
     folder : Path
-        Checkpoints and preview pictures are written here.
+        Receives checkpoints and preview pictures.
     progress : Progress
-        Told every few iterations; asked for cancelling in every one.
+        Updated every few iterations; checked for cancellation in each one.
     seed, threads : int
         0 threads uses every core. The result does not depend on ``threads``.
     start_splat : Path, optional
-        PLY of Gaussians in the world frame of the photos, to start from; then the training is short
-        and adds no Gaussians (:func:`~.initialisation.splat_start.wrapping_settings`).
+        PLY of Gaussians in the world frame of the photos to start from; the training is then short
+        and does not densify (:func:`~.initialisation.splat_start.wrapping_settings`).
     inside : callable, optional
-        Tells which points (n, 3), scene frame, lie where ``settings.region_weight`` applies.
+        Tells for points (n, 3), scene frame, where ``settings.region_weight`` applies.
 
     Returns
     -------
@@ -124,12 +124,12 @@ def train(
     Cancelled
         After a checkpoint was written.
     DatasetError
-        There is no photo to train on, or masks leave nothing of all of them; the splat does not
-        show what the photos show.
+        There is no photo to train on, or masks cover all of them; or the splat does not match the
+        photos.
     ParseError
         The splat cannot be read.
     WrapError
-        The numbers stopped being finite twice.
+        Values became non-finite twice.
     """
     threads = threads or default_threads()
     before = torch.get_num_threads()
@@ -144,7 +144,7 @@ def train(
 
 
 class _Trainer:
-    """One run. What it holds beside the state follows from the inputs alone."""
+    """One training run. Its attributes follow from the inputs; all else is in the state."""
 
     def __init__(
         self,
@@ -161,12 +161,14 @@ class _Trainer:
         if start_splat is not None:
             settings = wrapping_settings(settings)
         self.scene, self.settings = scene, settings
-        self.photos = CheckedPhotos(photos, progress or Progress())
+        self.photos = CancellablePhotos(photos, progress or Progress())
         self.folder, self.seed, self.threads = folder, seed, threads
         self.start_splat, self.inside = start_splat, inside
         self.held_out = held_out_views(scene, settings.holdout_every)
         kept = set(self.held_out)
-        self.views = [i for i in range(len(scene.views)) if i not in kept and self._shows(i)]
+        self.views = [
+            i for i in range(len(scene.views)) if i not in kept and self._has_visible_pixels(i)
+        ]
         if not self.views:
             raise DatasetError("No photo is left to train on.", "Add photos or check the masks.")
         sizes = [photos.camera(i, 1) for i in self.views]
@@ -177,30 +179,30 @@ class _Trainer:
         self.image_decision, finest = self._image_size(side_px)
         self.schedule = Schedule(settings, side_px, finest, start_splat is not None)
         self.stepper = Stepper(photos, self.schedule, self.views, self.neighbours, threads)
-        self.seen: dict[str, float] = {}
+        self.live_figures: dict[str, float] = {}
         self.live = LiveView(photos, self.held_out, folder, settings, threads)
 
-    def _shows(self, index: int) -> bool:
+    def _has_visible_pixels(self, index: int) -> bool:
         mask = self.photos.mask(index, 1)
         return mask is None or bool(mask.any())
 
     def _image_size(self, side_px: int) -> tuple[Decision, int]:
-        """Decide whether the photos hold more than half their size would."""
-        chosen = spread(self.views, DETAIL_PHOTOS)
-        found = image_need(
+        """Decide whether to train at full or half size."""
+        chosen = evenly_spaced(self.views, DETAIL_PHOTOS)
+        found = select_image_size(
             [photo_detail(self.photos.photo(v, 1), self.photos.mask(v, 1)) for v in chosen]
         )
         decision = found.decision(self.settings.full_size)
         if side_px < 2 * SMALLEST_SIDE_PX:
-            evidence = f"{decision.evidence} Half of it would be too small to learn from."
+            evidence = f"{decision.evidence} Half of this size is too small to train on."
             size = f"{side_px} px"
             return dataclasses.replace(decision, chosen=size, evidence=evidence), 1
-        return decision, 1 if found.wants_full(self.settings.full_size) else 2
+        return decision, 1 if found.uses_full_size(self.settings.full_size) else 2
 
     # -- the run ----------------------------------------------------------------------------------
 
     def run(self, progress: Progress) -> TrainingResult:
-        """Start or resume, iterate to the end, measure."""
+        """Start or resume, iterate to the end, measure the held-out photos."""
         key = fingerprint(self.scene, self.settings, self.seed, self.start_splat)
         progress.update(0.0, "preparing the Gaussians")
         rounds = Rounds(self.stepper, self.held_out, self.inside, progress)
@@ -211,24 +213,24 @@ class _Trainer:
             _logger.info("resuming at iteration %d", state.iteration)
         begun_s = saved_s = time.monotonic()
         spent_s, begun_at = state.seconds, state.iteration
-        good = (state.to_arrays(), state.to_json())
-        total, settled = self.schedule.total, True
+        snapshot = (state.to_arrays(), state.to_json())
+        total, consistent = self.schedule.total, True
         try:
             while state.iteration < total:
                 progress.check()
                 try:
                     rounds.before_step(state)
-                    settled = False
+                    consistent = False
                     self.stepper.step(state)
                     rounds.after_step(state)
-                    self._note(state, progress)
-                    settled = True
+                    self._record(state, progress)
+                    consistent = True
                     if state.iteration % SNAPSHOT_EVERY == 0 or state.iteration == total:
                         if not state.adam.is_finite():
                             raise NotFinite()
-                        good = (state.to_arrays(), state.to_json())
+                        snapshot = (state.to_arrays(), state.to_json())
                 except NotFinite:
-                    state, settled = self._fall_back(state, good), True
+                    state, consistent = self._restart(state, snapshot), True
                     continue
                 now_s = time.monotonic()
                 state.seconds = spent_s + now_s - begun_s
@@ -237,19 +239,19 @@ class _Trainer:
                     self._report(state, progress, speed)
                 if now_s - saved_s >= self.settings.checkpoint_every_s:
                     if not state.adam.is_finite():
-                        state = self._fall_back(state, good)
+                        state = self._restart(state, snapshot)
                         continue
                     save_checkpoint(self.folder, state, key)
                     saved_s = time.monotonic()
         except Cancelled:
-            # A round was left half done, or numbers broke down: what is saved must be whole.
-            if not (settled and state.adam.is_finite()):
-                state = TrainingState.restore(*good)
+            # Save a consistent state, not one of a half-finished round or with non-finite values.
+            if not (consistent and state.adam.is_finite()):
+                state = TrainingState.restore(*snapshot)
             save_checkpoint(self.folder, state, key)
             raise
         save_checkpoint(self.folder, state, key)
         gaussians = trimmed(rounds.filtered(state), state.degree)
-        self.live.look(gaussians, state.iteration, self._correction(state), force=True)
+        self.live.update(gaussians, state.iteration, self._correction(state), force=True)
         held_out, lpips_note = self._measure(gaussians, state, progress)
         return TrainingResult(
             gaussians,
@@ -259,7 +261,7 @@ class _Trainer:
             spent_s + time.monotonic() - begun_s,
             tuple(state.warnings),
             lpips_note,
-            state.needs,
+            state.model_selection,
             state.exposure is not None,
         )
 
@@ -282,7 +284,7 @@ class _Trainer:
         state.warnings = warnings
         if self.start_splat is not None:
             state.degree = self.settings.sh_degree if self.settings.harmonics != "off" else 0
-        self._decide(state)
+        self._select_model(state)
         rounds.filter(state)
         return state
 
@@ -311,48 +313,52 @@ class _Trainer:
             seed=self.seed,
         )
 
-    def _decide(self, state: TrainingState) -> None:
-        """Take the decisions that need no training; write down those that a person took."""
+    def _select_model(self, state: TrainingState) -> None:
+        """Take the decisions that need no training; record those made by settings."""
         settings = self.settings
-        needs = Needs((self.image_decision,))
-        exposure = exposure_need(self.scene, self.photos, self.views)
-        needs = needs.with_decision(
+        model_selection = ModelSelection((self.image_decision,))
+        exposure = select_exposure(self.scene, self.photos, self.views)
+        model_selection = model_selection.with_decision(
             decide("exposure", settings.exposure, exposure.needed, exposure.evidence)
         )
-        if needs.chose("exposure"):
+        if model_selection.chose("exposure"):
             count = len(self.scene.views)
             state.exposure = Exposure(count, self.views, exposure.log_gains)
         pairs = [self.neighbours[view] for view in self.views]
-        needs = needs.with_decision(multi_view_need(pairs, settings.multi_view))
+        model_selection = model_selection.with_decision(
+            select_multi_view(pairs, settings.multi_view)
+        )
         if settings.harmonics != "auto" or settings.sh_degree == 0 or self.start_splat:
             degree = settings.sh_degree if settings.harmonics != "off" else 0
-            evidence = "Nothing was tried: " + (
-                "the splat brings its own." if self.start_splat else "the settings decide."
+            evidence = "Not tried: " + (
+                "the splat has harmonics of its own."
+                if self.start_splat
+                else "decided by the settings."
             )
-            needs = needs.with_decision(
+            model_selection = model_selection.with_decision(
                 Decision(
                     "harmonics", settings.harmonics, f"degree {degree}", evidence, measured=False
                 )
             )
         if settings.wrapping == "off":
-            evidence = "Nothing was measured: the settings decide."
-            needs = needs.with_decision(
+            evidence = "Not measured: decided by the settings."
+            model_selection = model_selection.with_decision(
                 Decision("wrapping", "off", "off", evidence, measured=False)
             )
-        state.needs = needs
+        state.model_selection = model_selection
 
-    def _fall_back(
-        self, state: TrainingState, good: tuple[dict[str, np.ndarray], dict[str, object]]
+    def _restart(
+        self, state: TrainingState, snapshot: tuple[dict[str, np.ndarray], dict[str, object]]
     ) -> TrainingState:
-        """Return the last good state with lower rates and another view order, once."""
+        """Restore the last snapshot with lower rates and another view order, at most once."""
         if state.restarts > 0:
             raise WrapError(
-                f"Training broke down twice, at iteration {state.iteration}: the numbers are not "
-                "finite any more.",
+                f"Training diverged twice, the second time at iteration {state.iteration}: values "
+                "are not finite.",
                 "Check the camera poses; try fewer Gaussians or another seed.",
             )
-        _logger.warning("numbers not finite at iteration %d: going back", state.iteration)
-        restored = TrainingState.restore(good[0], good[1])
+        _logger.warning("non-finite values at iteration %d: going back", state.iteration)
+        restored = TrainingState.restore(snapshot[0], snapshot[1])
         restored.restarts = state.restarts + 1
         restored.rate_factor = state.rate_factor * RESTART_RATE
         restored.order = []
@@ -361,7 +367,7 @@ class _Trainer:
             ReportWarning(
                 "training-went-back",
                 f"Training went back from iteration {state.iteration} to {restored.iteration} "
-                "once, because numbers were not finite.",
+                "once, because values were not finite.",
                 "If the figures below are poor, train again with another seed.",
             )
         )
@@ -369,8 +375,8 @@ class _Trainer:
 
     # -- figures ----------------------------------------------------------------------------------
 
-    def _note(self, state: TrainingState, progress: Progress) -> None:
-        """Add to the history, at fixed iterations."""
+    def _record(self, state: TrainingState, progress: Progress) -> None:
+        """Append to the history, at fixed iterations."""
         last = state.iteration == self.schedule.total
         if state.iteration % SNAPSHOT_EVERY and not last:
             return
@@ -398,13 +404,15 @@ class _Trainer:
     def _report(self, state: TrainingState, progress: Progress, speed: float) -> None:
         total, figures = self.schedule.total, self._figures(state)
         figures |= {"iterations": float(total), "iterations_per_s": speed}
-        seen = self.live.look(state.adam.gaussians(), state.iteration, self._correction(state))
-        if seen is not None:
-            self.seen = seen
-        figures |= self.seen
+        live_figures = self.live.update(
+            state.adam.gaussians(), state.iteration, self._correction(state)
+        )
+        if live_figures is not None:
+            self.live_figures = live_figures
+        figures |= self.live_figures
         held_out = ""
-        if "held_out_psnr" in self.seen:
-            held_out = f" · held-out {self.seen['held_out_psnr']:.1f} dB"
+        if "held_out_psnr" in self.live_figures:
+            held_out = f" · held-out {self.live_figures['held_out_psnr']:.1f} dB"
         progress.update(
             state.iteration / total,
             f"iteration {state.iteration}/{total} · loss {state.loss_average:.4f} · "
@@ -415,11 +423,11 @@ class _Trainer:
 
     def _measure(
         self, gaussians: OrientedGaussians, state: TrainingState, progress: Progress
-    ) -> tuple[list[HeldOutFigure], str]:
-        """Return the figures of the held-out photos, and why they have no LPIPS.
+    ) -> tuple[list[HeldOutMetrics], str]:
+        """Return the metrics of the held-out photos, and the reason if they have no LPIPS.
 
-        Where exposures are modelled, that of each half of a photo is fitted on the other half: it
-        was never trained.
+        Where exposures are modelled, the exposure of each half of a photo is fitted on the other
+        half, as it was never trained.
         """
         figures = []
         lpips, reason = lpips_if_ready() if self.held_out else (None, "")
@@ -436,7 +444,7 @@ class _Trainer:
                 image = correction(image, photo, mask)
             scores = score_images(image, photo, mask, lpips=lpips, threads=self.threads)
             name = self.scene.views[view].camera.name
-            figures.append(HeldOutFigure(name, scores.psnr, scores.ssim, scores.lpips))
+            figures.append(HeldOutMetrics(name, scores.psnr, scores.ssim, scores.lpips))
         if not figures or any(figure.lpips is not None for figure in figures):
             return figures, ""
         return figures, reason or TOO_SMALL

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compile the kernels of a training by a tiny one, so that the job can say what it waits for."""
+"""Compile the training kernels ahead by a tiny training, so that a job can report the wait."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _DISTANCE = 4.0
 _DECIDED = ("harmonics", "exposure", "multi_view", "wrapping", "growth")
 
 
-class _Photos:
+class _NoisePhotos:
     """Grey noise in memory, with the interface of ``PhotoStore``."""
 
     def __init__(self, scene: Scene) -> None:
@@ -71,19 +71,18 @@ def tiny_scene() -> Scene:
 def compile_kernels(
     settings: TrainingSettings, folder: Path, progress: Progress, *, threads: int
 ) -> None:
-    """Run a training of seconds that calls every kernel which ``settings`` may use.
+    """Run a training of a few seconds that calls every kernel that ``settings`` may use.
 
-    What fails here is only logged: the training itself compiles what is missing, and says what is
-    wrong.
+    Failures are only logged: the training itself compiles what is missing and reports errors.
 
     Parameters
     ----------
     settings : TrainingSettings
-        Decisions left to the photos count as "on".
+        Settings of "auto" count as "on".
     folder : Path
-        Gets a folder for a moment.
+        Holds a temporary folder.
     progress : Progress
-        Asked for cancelling; told nothing.
+        Checked for cancellation; receives no updates.
 
     Raises
     ------
@@ -99,10 +98,10 @@ def compile_kernels(
     )  # fmt: skip
     scene = tiny_scene()
     quiet = Progress(is_cancelled=progress.cancelled)
-    with tempfile.TemporaryDirectory(dir=folder, prefix="warm-up-") as place:
+    with tempfile.TemporaryDirectory(dir=folder, prefix="warm-up-") as temporary:
         try:
-            train(scene, _Photos(scene), tiny, Path(place), quiet, threads=threads)
+            train(scene, _NoisePhotos(scene), tiny, Path(temporary), quiet, threads=threads)
         except Cancelled:
             raise
         except Exception as error:
-            _logger.warning("compiling ahead ended early: %s: %s", type(error).__name__, error)
+            _logger.warning("warm-up of the kernels failed: %s: %s", type(error).__name__, error)

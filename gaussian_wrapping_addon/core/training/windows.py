@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Windows of a photo: an iteration looks at a part of a large image, all parts in turn."""
+"""Split large photos into overlapping windows, one of which is trained on per iteration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from ..dataset.camera import Camera
 
 OVERLAP_PX = 16
-"""Windows overlap by this much: SSIM leaves out five pixels along the border of each."""
+"""Overlap of neighbouring windows: SSIM leaves out five pixels along the border of each."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Window:
     height: int
 
     def camera(self, camera: Camera) -> Camera:
-        """Return the camera that sees this part of the image."""
+        """Return the camera cropped to this window."""
         if (self.left, self.top, self.width, self.height) == (0, 0, camera.width, camera.height):
             return camera
         return dataclasses.replace(
@@ -37,18 +37,18 @@ class Window:
         )
 
     def of(self, image: np.ndarray) -> np.ndarray:
-        """Return this part of an (h, w, ...) image, C-contiguous."""
+        """Crop an (h, w, ...) image to this window, C-contiguous."""
         part = image[self.top : self.top + self.height, self.left : self.left + self.width]
         return np.ascontiguousarray(part)
 
 
-def windows(width: int, height: int, most_pixels: int) -> list[Window]:
-    """Split an image into equal windows of about ``most_pixels`` at most, row by row.
+def windows(width: int, height: int, max_pixels: int) -> list[Window]:
+    """Split an image into equal windows of about ``max_pixels`` at most, row by row.
 
-    With many pixels an iteration measures nearly the same gradient as with a part of them, and
-    steps in between are worth more than exactness; so time goes into iterations.
+    A part of the pixels gives nearly the same gradient as all of them, and more steps are worth
+    more than exact gradients; so time goes into iterations.
     """
-    count = max(1, math.ceil(math.sqrt(width * height / most_pixels)))
+    count = max(1, math.ceil(math.sqrt(width * height / max_pixels)))
     columns = min(count, max(1, width // (2 * OVERLAP_PX)))
     rows = min(count, max(1, height // (2 * OVERLAP_PX)))
     wide, high = _side(width, columns), _side(height, rows)

@@ -24,7 +24,7 @@ from ...core.errors import ResourceError, UsageError
 from ...core.export_formats import EXPORT_FORMATS, MESH_FORMATS
 from ...core.jobs.store.sidecar import write_sidecar
 from ...core.names import file_stems
-from ...core.texture.files.file_checks import check_mesh, writing
+from ...core.texture.files.file_checks import validate_for_export, write_errors
 from ...core.texture.files.mesh_ply import vertex_colors, write_mesh_ply
 from ..common import tags
 from ..common.mesh_data import mesh_of, values_of
@@ -91,7 +91,7 @@ def export_objects(
     world_from_scene = tags.world_from_scene(frame)
     blender_from_scene = placement_of(frame)
     target_from_scene = blender_from_scene if request.placed else world_from_scene
-    with writing(request.folder):
+    with write_errors(request.folder):
         request.folder.mkdir(parents=True, exist_ok=True)
     paths = []
     stems = _stems(frame, things)
@@ -186,7 +186,7 @@ def _write(
     faces = values_of(data.loop_triangles, "vertices", 3, np.int32).reshape(-1, 3)
     corners = values_of(data.loop_triangles, "loops", 3, np.int32)
     uvs = _corner_uvs(data, corners)
-    check_mesh(local, faces, uvs, name=f"mesh {thing.name}")
+    validate_for_export(local, faces, uvs, name=f"mesh {thing.name}")
     vertices: Any = data.vertices
     vertices.foreach_set("co", local.astype(np.float32).ravel())
     data.update()

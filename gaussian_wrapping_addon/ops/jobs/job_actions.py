@@ -10,7 +10,7 @@ import bpy
 
 from ...core.errors import DatasetError, UsageError
 from ...core.jobs.client import JobClient, worker_python
-from ...core.jobs.store.continue_training import job_with_more
+from ...core.jobs.store.continue_training import continue_training_job
 from ...core.jobs.store.job_file import make_job
 from ...core.jobs.store.job_folder import JobFolder
 from ...core.jobs.store.rollback import finished_job
@@ -121,7 +121,8 @@ def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerCh
     folder = job_folder_of(frame)
     _refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
-    job = job_with_more(JobFolder(folder), earlier, properties_of(scene).training.more_iterations)
+    more = properties_of(scene).training.more_iterations
+    job = continue_training_job(JobFolder(folder), earlier, more)
     job = replace(job, settings=replace(job.settings, threads=choice.threads))
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running

@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 
 from ...core.dataset.frames.camera_up import camera_up
-from ...core.dataset.frames.ground import main_plane
+from ...core.dataset.frames.ground import find_ground_plane
 from ...core.dataset.frames.placement import Plane
 from ...core.errors import UsageError
 from ..cameras.camera_objects import cameras_under
@@ -54,7 +54,7 @@ def automatic_plane(frame: bpy.types.Object) -> tuple[Plane, str]:
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(cross, axis=1)
     normals = cross / np.maximum(length, 1e-300)[:, None]
-    plane = main_plane(corners.mean(1), normals, 0.5 * length, up)
+    plane = find_ground_plane(corners.mean(1), normals, 0.5 * length, up)
     if plane is not None:
         return plane, f"Up by {rule}, ground by the main plane"
     # A mesh that the region cuts off below ends at the region's lowest face.

@@ -20,7 +20,7 @@ from ...core.errors import DatasetError, ParseError
 from ...core.files import read_json
 from ...core.regions.region_file import read_region_file
 from ...core.settings import MAX_LODS
-from ...core.texture.files.file_checks import SINGLE_MAX, atlas_file, check_face_atlas
+from ...core.texture.files.file_checks import SINGLE_MAX, atlas_file, validate_face_atlas
 from .report_data import figures_of_report
 
 _logger = logging.getLogger(__name__)
@@ -218,7 +218,7 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | 
             corner_uvs = np.asarray(arrays["corner_uvs"], np.float64)
             face_atlas = arrays["face_atlas"] if "face_atlas" in arrays.files else None
         if face_atlas is not None:
-            face_atlas = check_face_atlas(face_atlas, len(faces))
+            face_atlas = validate_face_atlas(face_atlas, len(faces))
     except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as error:
         raise ParseError(path, "whole file", f"not a mesh file ({error}).", hint) from None
     if vertices.ndim != 2 or vertices.shape[1:] != (3,):

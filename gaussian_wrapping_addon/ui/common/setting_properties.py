@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 
 from ...core.settings import Declaration, JobSettings, declarations
 from ...core.settings.checks import Range
-from ...core.settings.declaration import Owner, Place
+from ...core.settings.declaration import Owner, PanelName
 from ...ops.jobs.panel_settings import is_shown
 
 _Group = TypeVar("_Group", bound=type)
@@ -30,9 +30,9 @@ def property_of(declared: Declaration, **changes: Any) -> Any:
     default = declared.default if panel.default is None else panel.default
     keywords: dict[str, Any] = {"name": panel.label, "description": panel.description}
     if panel.items:
-        items = [(declared.in_panel(i.value), i.label, i.description) for i in panel.items]
+        items = [(declared.to_panel(i.value), i.label, i.description) for i in panel.items]
         return EnumProperty(
-            **(keywords | {"items": items, "default": declared.in_panel(default)} | changes)
+            **(keywords | {"items": items, "default": declared.to_panel(default)} | changes)
         )
     if declared.is_switch:
         return BoolProperty(**(keywords | {"default": default == "on"} | changes))
@@ -76,9 +76,11 @@ def with_settings(owner: Owner) -> Callable[[_Group], _Group]:
     return give
 
 
-def settings_in(place: Place) -> list[Declaration]:
+def settings_in(panel_name: PanelName) -> list[Declaration]:
     """Return the settings that a panel shows, in its order."""
-    shown = [d for d in declarations(JobSettings) if d.panel is not None and d.place == place]
+    shown = [
+        d for d in declarations(JobSettings) if d.panel is not None and d.panel_name == panel_name
+    ]
     return sorted(shown, key=lambda declared: declared.panel.order if declared.panel else 0)
 
 

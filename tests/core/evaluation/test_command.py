@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``evaluate`` against meshes, clouds and ground-truth scenes, and what it refuses."""
+"""``evaluate`` against meshes, clouds and ground-truth scenes, and its errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gaussian_wrapping_addon.command_line.parser import build_parser
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.evaluation.command import (
-    ELSEWHERE_SHARE,
+    FRAME_MISMATCH_SHARE,
     EvaluationRequest,
     evaluate_mesh,
     find_layout,
@@ -149,7 +149,7 @@ def test_cameras_in_another_frame_are_told_unless_aligned(tmp_path: Path) -> Non
     assert result["scores"]["uniform"]["f1"][-1] < 0.1
     assert result["pose_errors"]["center_share_median"] < 1e-9
     assert result["pose_errors"]["given_share_median"] > 1.0
-    (line,) = [line for line in table(result) if "lie elsewhere" in line]
+    (line,) = [line for line in table(result) if "in another frame" in line]
     assert f"scale {1 / JOB_FROM_TRUTH.scale:.4g}" in line
     apart = [JOB_FROM_TRUTH.points(c.center[None])[0] - c.center for c in CAMERAS]
     shift = float(np.median(np.linalg.norm(apart, axis=1)))
@@ -170,7 +170,7 @@ def test_noise_of_the_cameras_is_not_taken_for_another_frame(tmp_path: Path) -> 
     rng = np.random.default_rng(3)
     cameras = [c.moved(Similarity(1.0, np.eye(3), rng.normal(0.0, 0.2, 3))) for c in CAMERAS]
     result = evaluate(MESH, scene, cameras, protocols=("uniform",), samples=2_000)
-    assert result["pose_errors"]["given_share_median"] > ELSEWHERE_SHARE
+    assert result["pose_errors"]["given_share_median"] > FRAME_MISMATCH_SHARE
     assert not any("elsewhere" in line for line in table(result))
 
 
@@ -235,15 +235,15 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path) -> None:
     for options, words in (
         ({"align": "cameras"}, "no cameras to align by"),
         ({"shares": (0.1,), "distances": (1.0,)}, "both given"),
-        ({"distances": (-1.0,)}, "no positive numbers"),
+        ({"distances": (-1.0,)}, "needs positive numbers"),
         ({"protocols": ("scan",)}, "needs cameras"),
-        ({"protocols": ("best",)}, "not known"),
-        ({"protocols": ()}, "names none"),
+        ({"protocols": ("best",)}, "is unknown"),
+        ({"protocols": ()}, "is empty"),
         ({"samples": 0}, "too few"),
     ):
         with pytest.raises(UsageError, match=words):
             evaluate(MESH, truth, **options)
-    with pytest.raises(DatasetError, match="no ground truth that is known"):
+    with pytest.raises(DatasetError, match="not a known ground truth"):
         find_layout(EvaluationRequest(tmp_path))
     with pytest.raises(DatasetError, match="does not exist"):
         find_layout(EvaluationRequest(tmp_path / "none"))
@@ -273,7 +273,7 @@ def test_broken_meshes_and_clouds_are_named(tmp_path: Path) -> None:
     broken[7, 1] = np.nan
     with pytest.raises(ParseError, match=r"vertex 7: is not finite"):
         read_mesh(write_ply(mesh, (broken, MESH[1])))
-    with pytest.raises(ParseError, match=r"names a vertex that does not exist"):
+    with pytest.raises(ParseError, match=r"refers to a vertex that does not exist"):
         read_mesh(write_ply(mesh, (MESH[0], MESH[1] + 9)))
     with pytest.raises(ParseError, match="not a known mesh format"):
         read_mesh(tmp_path / "mesh.fbx")

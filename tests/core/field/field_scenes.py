@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussians and cameras that the tests of the fields share."""
+"""Gaussians and cameras shared by the tests of the fields."""
 
 from __future__ import annotations
 

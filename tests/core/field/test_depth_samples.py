@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Points where cameras see the isosurface, and pairs of points across it."""
+"""Samples of depth maps, and pairs of points across the isosurface."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import torch
 
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.field.depth_samples import (
-    Sightings,
+    DepthSamples,
     bracket_pairs,
-    find_sightings,
-    thinned,
+    sample_depth_maps,
+    thin_evenly,
 )
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress
@@ -40,7 +40,7 @@ def everywhere(points: np.ndarray) -> np.ndarray:
 
 def test_sightings_of_a_round_gaussian_lie_on_its_sphere_all_around() -> None:
     radius = SIGMA * np.sqrt(2 * np.log(2 * ALPHA))
-    found = find_sightings(one_ball(), cameras_around(12), everywhere, Progress(), threads=1)
+    found = sample_depth_maps(one_ball(), cameras_around(12), everywhere, Progress(), threads=1)
     distance = np.linalg.norm(found.points, axis=1)
     # At the outline a ray only grazes it; the final transmittance decides there.
     assert np.abs(distance - radius).max() < 0.02 * radius
@@ -54,13 +54,13 @@ def test_sightings_of_a_round_gaussian_lie_on_its_sphere_all_around() -> None:
 
 def test_only_what_lies_in_the_volume_is_kept() -> None:
     above = lambda points: points[:, 2] > 0.1  # noqa: E731
-    found = find_sightings(one_ball(), cameras_around(6), above, Progress(), threads=1)
+    found = sample_depth_maps(one_ball(), cameras_around(6), above, Progress(), threads=1)
     assert len(found) > 100
     assert (found.points[:, 2] > 0.1).all()
 
 
 def test_the_number_is_bounded_and_what_is_left_is_even() -> None:
-    found = find_sightings(
+    found = sample_depth_maps(
         one_ball(), cameras_around(8), everywhere, Progress(), most=500, threads=1
     )
     assert 150 < len(found) <= 500
@@ -71,12 +71,12 @@ def test_the_number_is_bounded_and_what_is_left_is_even() -> None:
 def test_thinning_keeps_both_sides_and_the_sharpest() -> None:
     points = np.zeros((4, 3))
     directions = np.array([[1.0, 0, 0], [1.0, 0, 0], [-1.0, -1e-3, 0], [-1.0, -1e-3, 0]])
-    some = Sightings(points, directions, np.array([2.0, 1.0, 3.0, 4.0]))
-    assert thinned(some, 10).footprints.tolist() == [1.0, 3.0]
+    some = DepthSamples(points, directions, np.array([2.0, 1.0, 3.0, 4.0]))
+    assert thin_evenly(some, 10).footprints.tolist() == [1.0, 3.0]
 
 
 def test_pairs_stand_on_both_sides_and_disagreement_is_left_out() -> None:
-    found = find_sightings(one_ball(), cameras_around(8), everywhere, Progress(), threads=1)
+    found = sample_depth_maps(one_ball(), cameras_around(8), everywhere, Progress(), threads=1)
     radius = SIGMA * np.sqrt(2 * np.log(2 * ALPHA))
     is_empty = lambda p: np.linalg.norm(p, axis=1) > radius  # noqa: E731
     outer, inner = bracket_pairs(found, is_empty)
@@ -89,7 +89,7 @@ def test_pairs_stand_on_both_sides_and_disagreement_is_left_out() -> None:
 
 def test_no_camera_sees_anything() -> None:
     nowhere = lambda points: np.zeros(len(points), bool)  # noqa: E731
-    found = find_sightings(one_ball(), cameras_around(3), nowhere, Progress(), threads=1)
+    found = sample_depth_maps(one_ball(), cameras_around(3), nowhere, Progress(), threads=1)
     assert len(found) == 0
     assert len(bracket_pairs(found, everywhere)[0]) == 0
 
@@ -98,5 +98,5 @@ def test_cancelling_stops_before_the_next_view() -> None:
     seen = []
     progress = Progress("mesh", seen.append, lambda: len(seen) >= 2)
     with pytest.raises(Cancelled):
-        find_sightings(one_ball(), cameras_around(30), everywhere, progress, threads=1)
+        sample_depth_maps(one_ball(), cameras_around(30), everywhere, progress, threads=1)
     assert len(seen) <= 3

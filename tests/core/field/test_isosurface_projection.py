@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Projection onto the isosurface: closed forms, the shell, and fields that mislead it."""
+"""Projection onto the isosurface: closed forms, a shell, misleading fields."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Splats of other programs: every convention gives the same Gaussians, everything else a reason."""
+"""Splats of other programs: all conventions give the same Gaussians; others are rejected."""
 
 from __future__ import annotations
 

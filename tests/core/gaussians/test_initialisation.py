@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The first Gaussians: from points, from few points, from none, from bad ones."""
+"""Initial Gaussians from many, few, no, and invalid points."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.gaussians.initialisation import (
-    FEW_POINTS,
     MAX_DISTANCE,
+    MIN_START_POINTS,
     SH_C0,
     initial_gaussians,
 )
@@ -57,20 +57,20 @@ def start(given: Scene, cap: int = 20_000, seed: int = 0, degree: int = 2):  # t
 
 def test_many_points_become_gaussians_one_by_one() -> None:
     random = np.random.default_rng(0)
-    points = random.uniform(-1, 1, (FEW_POINTS, 3))
+    points = random.uniform(-1, 1, (MIN_START_POINTS, 3))
     colors = random.integers(0, 256, points.shape, dtype=np.uint8)
     gaussians, asked = start(scene(points, colors))
     assert asked == []
-    assert len(gaussians) == FEW_POINTS
+    assert len(gaussians) == MIN_START_POINTS
     assert np.abs(gaussians.means.numpy() - points).max() < 1e-6
-    assert gaussians.sh.shape == (FEW_POINTS, 9, 3)
+    assert gaussians.sh.shape == (MIN_START_POINTS, 9, 3)
     assert np.abs(0.5 + SH_C0 * gaussians.sh[:, 0].numpy() - colors / 255).max() < 1e-6
     assert not gaussians.sh[:, 1:].any()
     assert not gaussians.orientation.any()
     assert torch.sigmoid(gaussians.opacity_logits).numpy() == pytest.approx(0.1, abs=1e-6)
     assert torch.equal(gaussians.quats[0], torch.tensor([1.0, 0, 0, 0]))
     # Size against all pairs, for some of them.
-    for i in range(0, FEW_POINTS, 500):
+    for i in range(0, MIN_START_POINTS, 500):
         nearest = np.sort(((points - points[i]) ** 2).sum(1))[1:4].mean() ** 0.5
         assert np.exp(gaussians.log_scales[i].numpy()) == pytest.approx(nearest, rel=1e-5)
 
@@ -93,7 +93,7 @@ def test_few_points_are_filled_up_at_their_depth_with_the_photos_colours() -> No
     sphere *= 0.7 / np.linalg.norm(sphere, axis=1, keepdims=True)
     gaussians, asked = start(scene(sphere))
     assert asked == [0, 1, 2, 3, 5]
-    assert len(gaussians) == FEW_POINTS
+    assert len(gaussians) == MIN_START_POINTS
     assert np.abs(gaussians.means[:400].numpy() - sphere).max() < 1e-6
     added = gaussians.means[400:].numpy()
     # Camera depth of the points lies in [3.4, 4.9]; 5 % jitter around it.
@@ -108,7 +108,7 @@ def test_few_points_are_filled_up_at_their_depth_with_the_photos_colours() -> No
 def test_without_points_most_cameras_see_the_gaussians() -> None:
     given = scene(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     gaussians, _ = start(given)
-    assert len(gaussians) == FEW_POINTS
+    assert len(gaussians) == MIN_START_POINTS
     means = gaussians.means.double().numpy()
     seen = np.zeros(len(means), int)
     for view in given.views:
@@ -122,12 +122,12 @@ def test_without_points_most_cameras_see_the_gaussians() -> None:
 
 def test_outliers_are_pulled_in_and_bad_points_left_out() -> None:
     random = np.random.default_rng(0)
-    points = random.uniform(-1, 1, (FEW_POINTS + 2, 3))
+    points = random.uniform(-1, 1, (MIN_START_POINTS + 2, 3))
     points[7] = (3e6, 4e6, 0.0)
     points[8] = (np.nan, 0.0, 0.0)
     points[9] = (0.0, -np.inf, 0.0)
     gaussians, _ = start(scene(points))
-    assert len(gaussians) == FEW_POINTS
+    assert len(gaussians) == MIN_START_POINTS
     assert all(torch.isfinite(t).all() for _, t in gaussians.tensors())
     far = gaussians.means[7].double().numpy()
     assert far == pytest.approx(MAX_DISTANCE * np.array([0.6, 0.8, 0.0]), abs=1e-3)

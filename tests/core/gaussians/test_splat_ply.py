@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Splat files: round trip, the viewers' variant, and files that promise what they do not hold."""
+"""Splat files: round trip, viewer variant, and files whose header does not match the content."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""LPIPS over random weights of the right shapes; the real ones are nowhere in the repository."""
+"""LPIPS with random weights of the right shapes; the real ones are not in the repository."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gaussian_wrapping_addon.core.errors import ParseError, ResourceError, Usage
 from gaussian_wrapping_addon.core.imaging import lpips as module
 from gaussian_wrapping_addon.core.imaging.lpips import (
     MIN_SIDE_PX,
-    PLACES_VARIABLE,
+    WEIGHTS_VARIABLE,
     Lpips,
     lpips_if_ready,
     lpips_ready,
@@ -29,7 +29,7 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder that is the only place where weights are looked for."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "no_cache"))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setenv(PLACES_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
     return tmp_path
 
 
@@ -125,7 +125,7 @@ def test_a_value_worked_out_by_hand(places: Path) -> None:
 def test_missing_weights_are_a_reason_not_an_error(places: Path) -> None:
     ready, reason = lpips_ready()
     assert not ready
-    for words in ("alexnet-owt", "alex.pth", PLACES_VARIABLE, "nothing is downloaded"):
+    for words in ("alexnet-owt", "alex.pth", WEIGHTS_VARIABLE, "nothing is downloaded"):
         assert words in reason
     assert lpips_if_ready() == (None, reason)
     with pytest.raises(ResourceError, match="AlexNet"):
@@ -138,7 +138,7 @@ def test_missing_weights_are_a_reason_not_an_error(places: Path) -> None:
 
 def test_the_usual_places_are_found(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The cache of torch's hub, and the folder of the package lpips, which is not imported."""
-    monkeypatch.delenv(PLACES_VARIABLE)
+    monkeypatch.delenv(WEIGHTS_VARIABLE)
     cache, package = places / "no_cache" / "hub" / "checkpoints", places / "lpips"
     cache.mkdir(parents=True)
     (package / "weights" / "v0.1").mkdir(parents=True)
@@ -155,9 +155,9 @@ def test_the_usual_places_are_found(places: Path, monkeypatch: pytest.MonkeyPatc
 def test_single_files_may_be_named(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(places, *random_states())
     both = os.pathsep.join([str(places / HEADS), str(places / BACKBONE)])
-    monkeypatch.setenv(PLACES_VARIABLE, both)
+    monkeypatch.setenv(WEIGHTS_VARIABLE, both)
     assert lpips_ready()[0]
-    monkeypatch.setenv(PLACES_VARIABLE, str(places / HEADS))
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(places / HEADS))
     assert not lpips_ready()[0]
 
 

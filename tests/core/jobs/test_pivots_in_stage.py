@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import ResourceError
-from gaussian_wrapping_addon.core.field.depth_samples import Sightings
+from gaussian_wrapping_addon.core.field.depth_samples import DepthSamples
 from gaussian_wrapping_addon.core.jobs.stages import region_meshing
 from gaussian_wrapping_addon.core.meshing import pivot_meshing
 from gaussian_wrapping_addon.core.progress import Progress
@@ -29,7 +29,7 @@ def mesh_here(folder: Path):
     return region_meshing.mesh_by_pivots_in_stage(
         folder, ShapeField(sphere(), 0.05), gaussians_on(sphere(), cube(1.5), 800, 0.05),
         some_cameras(), cube(1.5), MeshingSettings(method="pivots"), Progress(), seed=0, threads=1,
-        sightings=Sightings(points, -points, np.full(500, 0.02)),
+        depth_samples=DepthSamples(points, -points, np.full(500, 0.02)),
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import even_directions
+from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import fibonacci_directions
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from tests.core.gaussians.splat_files import permuted, splat_columns, write_ply
 from tests.core.training.splat_shells import AXES, shell_of_discs
@@ -64,7 +64,7 @@ def test_a_permuted_splat_becomes_a_closed_mesh_on_its_surface(tmp_path: Path) -
     assert np.median(distance) < 0.03
     assert np.percentile(distance, 95) < 0.08
     # The shell is covered from all sides, not only met by what there is of the mesh.
-    truth = SIZE * even_directions(400) * AXES + MOVE
+    truth = SIZE * fibonacci_directions(400) * AXES + MOVE
     _, gap, _ = trimesh.proximity.closest_point(mesh, truth)
     assert np.percentile(gap / SIZE, 95) < 0.08
     assert "made-up views" in (result / "report.json").read_text()

@@ -21,13 +21,14 @@ from gaussian_wrapping_addon.core.jobs.store.job_folder import (
 )
 
 DEAF = """
-import os, sys, threading, time
+import os, subprocess, sys, threading, time
 from pathlib import Path
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.processes import helper_process
 from gaussian_wrapping_addon.core.jobs import worker
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus,
-process_start_ticks import subprocess
+from gaussian_wrapping_addon.core.jobs.store.job_folder import (
+    JobFolder, JobStatus, process_start_ticks
+)
 limits.CANCEL_ALONE_S = 0.2
 worker.PARENT_POLL_S = 0.05
 folder = JobFolder(Path(sys.argv[1]))
@@ -39,7 +40,7 @@ pid = os.getpid()
 status = JobStatus(state="RUNNING", pid=pid, pid_started=process_start_ticks(pid))
 reporter = worker._Reporter(folder, status)
 reporter.write()
-threading.Thread(target=reporter.beat, args=(0,), daemon=True).start()
+threading.Thread(target=reporter.keep_heartbeat, args=(0,), daemon=True).start()
 time.sleep(60)
 """
 

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from gaussian_wrapping_addon.core.jobs.stages.tile_tasks import tile_tasks
-from gaussian_wrapping_addon.core.jobs.store.claims import Claims, Task, work_through
+from gaussian_wrapping_addon.core.jobs.store.claims import Claims, Task, run_tasks
 from gaussian_wrapping_addon.core.meshing.tiles.plan import Field
 from gaussian_wrapping_addon.core.meshing.tiles.store import load_plan
 from gaussian_wrapping_addon.core.progress import Progress
@@ -22,5 +22,5 @@ def torus_tasks(folder: Path) -> list[Task]:
 
 if __name__ == "__main__":
     place = Path(sys.argv[1])
-    done = work_through(torus_tasks(place), Claims(place / "claims"), Progress(), poll_s=0.05)
+    done = run_tasks(torus_tasks(place), Claims(place / "claims"), Progress(), poll_s=0.05)
     sys.stdout.write(f"{done}\n")

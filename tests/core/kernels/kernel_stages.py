@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Run every compiled part on tiny scenes and print a hash of each one's results.
+"""Run every compiled part on tiny scenes and print a hash of each result.
 
 ``python tests/core/kernels/kernel_stages.py STAGE ...`` runs the named stages in the order given,
 each on a scene of its own, and prints ``STAGE HASH ...`` lines: a process with a fresh kernel cache

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Large arrays begin where a large page does; small ones are plain."""
+"""Large arrays are aligned to huge pages; small ones are ordinary arrays."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The same bits from fresh and from cached kernels; stale caches; life without a cache."""
+"""Fresh and cached kernels are bitwise equal; stale caches; operation without a cache."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def installed(tmp_path: Path) -> Path:
     core = target / "core"
     (core / "some_constant.py").write_text("AMOUNT = 1.0\n")
     (core / "some_helper.py").write_text(
-        "from .compiled import inline\nfrom .some_constant import AMOUNT\n\n\n"
+        "from .kernels.compiled import inline\nfrom .some_constant import AMOUNT\n\n\n"
         "@inline\ndef added(x):\n    return x + AMOUNT\n"
     )
     (core / "some_kernel.py").write_text(
-        "from .compiled import kernel\nfrom .some_helper import added\n\n\n"
+        "from .kernels.compiled import kernel\nfrom .some_helper import added\n\n\n"
         "@kernel(fast=True)\ndef run(x):\n    return added(x)\n"
     )
     return root
@@ -120,7 +120,7 @@ def test_a_change_in_an_imported_file_is_compiled(installed: Path) -> None:
     assert value() == "6.0 1\n"
     # Another file that the kernel does not import changes nothing.
     (installed / PACKAGE.name / "core" / "limits.py").touch()
-    with (installed / PACKAGE.name / "core" / "settings.py").open("a") as file:
+    with (installed / PACKAGE.name / "core" / "settings" / "job.py").open("a") as file:
         file.write("\n")
     assert value() == "6.0 1\n"
 

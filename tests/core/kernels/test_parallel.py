@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Chunks cover everything once, and failures come out."""
+"""Chunks cover all items once; exceptions are propagated."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The thread count is a setting that reaches every kernel: one thread starts no other."""
+"""The thread count reaches every kernel: with one thread, no other is started."""
 
 from __future__ import annotations
 

@@ -10,11 +10,11 @@ from gaussian_wrapping_addon.core.mesh.topology import (
     area_vectors,
     edge_keys,
     edge_lengths,
-    ends_of,
     faces_per_edge,
     half_edges,
     next_half_edges,
     normals_and_areas,
+    vertices_of_half_edges,
 )
 
 # A right triangle with legs 3 and 4 in z = 1, one without area, and a neighbour of the first.
@@ -65,4 +65,6 @@ def test_edge_keys_have_no_direction_and_do_not_overflow(dtype: type) -> None:
 def test_open_edges_have_one_face() -> None:
     count = faces_per_edge(FACES, 5)
     np.testing.assert_array_equal(count, [2, 2, 1, 1, 1, 2, 2, 1, 1])
-    np.testing.assert_array_equal(ends_of(count == 2, FACES, 5), [True, True, True, False, False])
+    np.testing.assert_array_equal(
+        vertices_of_half_edges(count == 2, FACES, 5), [True, True, True, False, False]
+    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshing by pivots on known shapes: closed at the region, on the surface, the right topology."""
+"""Pivot meshing of known shapes: closed at the region, on the surface, correct topology."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
-from gaussian_wrapping_addon.core.meshing.cleanup.open_boundary import opened
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
+from gaussian_wrapping_addon.core.meshing.cleanup.open_boundary import without_caps
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import BRACKET_SHARE, mesh_by_pivots
 from gaussian_wrapping_addon.core.meshing.points.pivots import PIVOTS
 from gaussian_wrapping_addon.core.progress import Progress
@@ -51,7 +51,7 @@ def mesh_of(
 
 def assert_good(mesh: SurfaceMesh) -> None:
     assert_closed_manifold(mesh)
-    assert check_mesh(mesh.vertices, mesh.faces).defects() == []
+    assert validate_manifold(mesh.vertices, mesh.faces).defects() == []
 
 
 @pytest.mark.parametrize("pivots", PIVOTS)
@@ -59,7 +59,7 @@ def assert_good(mesh: SurfaceMesh) -> None:
 def test_whole_shapes(shape: Callable[[], Distance], genus: int, pivots: int) -> None:
     mesh = mesh_of(shape(), cube(1.5), pivots=pivots)
     assert_good(mesh)
-    assert [part.genus for part in check_mesh(mesh.vertices, mesh.faces).parts] == [genus]
+    assert [part.genus for part in validate_manifold(mesh.vertices, mesh.faces).parts] == [genus]
     assert np.quantile(np.abs(shape()(mesh.vertices)), 0.99) < 0.03 * SIGMA
     assert mesh.provenance["pivots_each"] == pivots
     assert mesh.provenance["level_error_p99"] < 0.02
@@ -87,7 +87,7 @@ def test_a_cut_sphere_ends_on_the_planes_with_the_exact_volume(pivots: int) -> N
     assert edge.max() == pytest.approx(1.0, abs=0.01)
     off_caps = ~on_plane.any(1)
     assert np.abs(sphere()(mesh.vertices[off_caps])).max() < 0.1 * SIGMA
-    volume = check_mesh(mesh.vertices, mesh.faces).volume
+    volume = validate_manifold(mesh.vertices, mesh.faces).volume
     assert volume == pytest.approx(np.pi / 3, rel=0.02)
 
 
@@ -96,7 +96,7 @@ def test_a_plate_that_the_region_cuts_on_all_sides() -> None:
     region = Region.box("cut", np.array([-1, -1, -0.5]), np.array([1, 1, 0.5]))
     mesh = mesh_of(plate, region, sigma=0.01, count=3000)
     assert_good(mesh)
-    volume = check_mesh(mesh.vertices, mesh.faces).volume
+    volume = validate_manifold(mesh.vertices, mesh.faces).volume
     assert volume == pytest.approx(2 * 2 * 0.04, rel=0.03)
 
 
@@ -105,7 +105,7 @@ def test_a_solid_that_fills_the_corner_of_the_region_gets_that_corner() -> None:
     mesh = mesh_of(sphere(), region, count=2500)
     assert_good(mesh)
     assert np.linalg.norm(mesh.vertices, axis=1).min() < 1e-9
-    assert check_mesh(mesh.vertices, mesh.faces).volume == pytest.approx(np.pi / 6, rel=0.02)
+    assert validate_manifold(mesh.vertices, mesh.faces).volume == pytest.approx(np.pi / 6, rel=0.02)
 
 
 def test_a_solid_that_touches_the_corner_of_the_region() -> None:
@@ -133,7 +133,7 @@ def test_iso_value_exactly_on_pivots() -> None:
             Progress(), seed=0,
         )  # fmt: skip
         assert_good(mesh)
-        assert check_mesh(mesh.vertices, mesh.faces).volume == pytest.approx(4.0, rel=0.02)
+        assert validate_manifold(mesh.vertices, mesh.faces).volume == pytest.approx(4.0, rel=0.02)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e4])
@@ -146,7 +146,7 @@ def test_the_same_mesh_at_any_scale(scale: float) -> None:
     )  # fmt: skip
     assert_good(scaled)
     assert len(scaled.faces) == pytest.approx(len(plain.faces), rel=0.01)
-    volumes = [check_mesh(m.vertices, m.faces).volume for m in (plain, scaled)]
+    volumes = [validate_manifold(m.vertices, m.faces).volume for m in (plain, scaled)]
     assert volumes[1] / scale**3 == pytest.approx(volumes[0], rel=1e-3)
 
 
@@ -170,8 +170,8 @@ def test_brackets_follow_pixels_and_edges() -> None:
 def test_open_and_closed_share_the_surface(closed: bool) -> None:
     region = Region.box("half", np.array([0.0, -1.5, -1.5]), np.array([1.5, 1.5, 1.5]), TURNED)
     whole = mesh_of(sphere(), region)
-    mesh = whole if closed else opened(whole, region)
-    check = check_mesh(mesh.vertices, mesh.faces, None if closed else region)
+    mesh = whole if closed else without_caps(whole, region)
+    check = validate_manifold(mesh.vertices, mesh.faces, None if closed else region)
     assert check.defects() == []
     assert (check.open_edges == 0) == closed
     area = np.pi if closed else 0.0

@@ -57,7 +57,7 @@ def test_a_request_for_too_few_points_is_said() -> None:
     for points, said in ((1, True), (99, True), (100, False)):
         mesh = mesh_shape(sphere(), cube(1.3), points=points)
         notes = " ".join(n["text"] for n in mesh.provenance["notes"])
-        assert (f"surface points; {points} were asked for" in notes) == said
+        assert (f"surface points; {points} were requested" in notes) == said
         assert len(mesh.vertices) >= MIN_VERTICES - 4
     uniform = mesh_shape(sphere(), cube(1.3), points=60, spacing="uniform")
     assert "surface points" not in " ".join(n["text"] for n in uniform.provenance["notes"])

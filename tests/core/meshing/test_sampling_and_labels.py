@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles, thin
 from gaussian_wrapping_addon.core.meshing.points.pivots import (
     directional_sigma,
+    gaussians_reaching,
     nine_pivots,
-    reaching,
-    representative,
+    representative_gaussians,
     two_pivots,
 )
 from gaussian_wrapping_addon.core.meshing.tetrahedra.classification import regularised
@@ -101,8 +101,8 @@ def test_gaussians_that_reach_a_region() -> None:
     scales = np.tile([0.1, 0.01, 0.01], (6, 1))
     alphas = np.array([0.9, 0.9, 0.9, 0.9, 0.003, 0.9])
     arrays = make_arrays(means, scales, alphas)
-    assert reaching(arrays, cube(1.0), 0.0).tolist() == [0, 1]
-    assert reaching(arrays, cube(1.0), 0.25).tolist() == [0, 1, 2, 5]
+    assert gaussians_reaching(arrays, cube(1.0), 0.0).tolist() == [0, 1]
+    assert gaussians_reaching(arrays, cube(1.0), 0.25).tolist() == [0, 1, 2, 5]
     np.testing.assert_allclose(
         directional_sigma(arrays, np.array([0]), np.array([[0.6, 0.8, 0.0]])),
         np.hypot(0.06, 0.008),
@@ -111,11 +111,13 @@ def test_gaussians_that_reach_a_region() -> None:
 
 def test_representatives_are_few_and_cover_space() -> None:
     arrays = random_arrays(5000, 4)
-    index = representative(arrays, np.arange(5000), 800)
+    index = representative_gaussians(arrays, np.arange(5000), 800)
     assert 300 < len(index) <= 800
     far = cKDTree(arrays.means[index]).query(arrays.means)[0]
     assert np.quantile(far, 0.99) < 1.0
-    np.testing.assert_array_equal(representative(arrays, np.arange(700), 800), np.arange(700))
+    np.testing.assert_array_equal(
+        representative_gaussians(arrays, np.arange(700), 800), np.arange(700)
+    )
 
 
 def energy(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tiles fit exactly: the same tetrahedra as without them, and one closed mesh of the same shape."""
+"""Tiled meshing: the same tetrahedra as without tiles, and one closed mesh of the same shape."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from gaussian_wrapping_addon.core.meshing.points.surface_points import SurfacePo
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.meshing.tiles import tiled_mesh
 from gaussian_wrapping_addon.core.meshing.tiles.plan import Field, TilePlan
-from gaussian_wrapping_addon.core.meshing.tiles.steiner_points import CLEAR_RADII, lattice
+from gaussian_wrapping_addon.core.meshing.tiles.steiner_points import (
+    CLEARANCE_RADII,
+    steiner_lattice,
+)
 from gaussian_wrapping_addon.core.meshing.tiles.tile_faces import (
     TileFaces,
     circumradii,
@@ -27,9 +30,13 @@ from gaussian_wrapping_addon.core.meshing.tiles.tile_faces import (
     local_tetrahedra,
     tile_faces,
 )
-from gaussian_wrapping_addon.core.meshing.tiles.tile_points import AllPoints, gather, pieces_in_box
+from gaussian_wrapping_addon.core.meshing.tiles.tile_points import (
+    GatheredPoints,
+    gather,
+    pieces_in_box,
+)
 from gaussian_wrapping_addon.core.meshing.tiles.tiled_mesh import mesh_in_tiles
-from gaussian_wrapping_addon.core.meshing.tiles.tiling import Tiling, cut_evenly
+from gaussian_wrapping_addon.core.meshing.tiles.tiling import Tiling, split_evenly
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings
@@ -73,7 +80,7 @@ def mesh_tiles(
 
 def with_tiling(monkeypatch: pytest.MonkeyPatch, tiling: Tiling) -> None:
     """Let the next mesh use this tiling, whatever its plan says."""
-    name = "gaussian_wrapping_addon.core.meshing.tiles.plan.cut_evenly"
+    name = "gaussian_wrapping_addon.core.meshing.tiles.plan.split_evenly"
     monkeypatch.setattr(name, lambda *_: tiling)
 
 
@@ -107,16 +114,16 @@ def test_tiles_hold_even_shares_also_of_lumped_weight() -> None:
     centers = rng.normal(size=(5000, 3)) ** 3
     weights = rng.uniform(size=5000)
     bounds = (centers.min(0), centers.max(0))
-    tiling = cut_evenly(centers, weights, bounds, lambda count, _: count >= 16)
+    tiling = split_evenly(centers, weights, bounds, lambda count, _: count >= 16)
     shares = np.bincount(tiling.owner(centers), weights, minlength=16) / weights.sum()
     assert shares.min() > 0.9 / 16
     assert shares.max() < 1.1 / 16
-    by_weight = cut_evenly(centers, weights, bounds, lambda _, most: most <= 100.0)
+    by_weight = split_evenly(centers, weights, bounds, lambda _, most: most <= 100.0)
     assert np.bincount(by_weight.owner(centers), weights).max() <= 100.0
     # All in one place cannot be shared, but the cutting ends.
-    lump = cut_evenly(np.zeros((3, 3)), np.ones(3), bounds, lambda count, _: count >= 5)
+    lump = split_evenly(np.zeros((3, 3)), np.ones(3), bounds, lambda count, _: count >= 5)
     assert len(lump) == 5
-    empty = cut_evenly(np.zeros((0, 3)), np.zeros(0), bounds, lambda count, _: count >= 4)
+    empty = split_evenly(np.zeros((0, 3)), np.zeros(0), bounds, lambda count, _: count >= 4)
     assert len(empty) == 4
 
 
@@ -147,31 +154,31 @@ def test_pieces_cover_the_part_of_the_surface_in_a_box() -> None:
 
 def test_a_request_for_too_few_points_is_said() -> None:
     mesh = mesh_tiles(sphere(), cube(1.3), 2, 40, spacing="adaptive")
-    assert "surface points; 40 were asked for" in " ".join(
+    assert "surface points; 40 were requested" in " ".join(
         n["text"] for n in mesh.provenance["notes"]
     )
 
 
 def plan_around(region: Region, tiling: Tiling, radius: float, side: float) -> TilePlan:
-    fillers = lattice(region, side, CLEAR_RADII * radius, 0)
+    steiner = steiner_lattice(region, side, CLEARANCE_RADII * radius, 0)
     surface = CandidateSurface(np.zeros((3, 3)), np.array([[0, 1, 2]]), 0, 0)
     return TilePlan(
-        region, surface, 1.0, Spacing.uniform(radius), tiling, fillers.points, fillers.ball,
+        region, surface, 1.0, Spacing.uniform(radius), tiling, steiner.points, steiner.ball_radius,
         no_caps(), 0, (), 2.0 * radius, 0, 1.0,
     )  # fmt: skip
 
 
 @cache
-def points_on_sheet() -> tuple[Region, Tiling, AllPoints, TilePlan]:
+def points_on_sheet() -> tuple[Region, Tiling, GatheredPoints, TilePlan]:
     """Points on a wavy sheet and a sphere, some exactly on borders of tiles, with their fillers."""
     rng = np.random.default_rng(1)
     radius = 0.004
     ground = rng.uniform(-1, 1, (8000, 3))
     ground[:, 2] = 0.1 * np.sin(4 * ground[:, 0]) - 0.4
-    ball = rng.normal(size=(3000, 3))
-    ball *= 0.4 / np.linalg.norm(ball, axis=1)[:, None]
-    ball[:, 2] += 0.3
-    points = np.concatenate([ground, ball])
+    ball_radius = rng.normal(size=(3000, 3))
+    ball_radius *= 0.4 / np.linalg.norm(ball_radius, axis=1)[:, None]
+    ball_radius[:, 2] += 0.3
+    points = np.concatenate([ground, ball_radius])
     points[::50, 0], points[1::50, 1] = 0.0, 0.0
     region = cube(1.0)
     tiling = grid_tiling((0.0,))
@@ -186,42 +193,42 @@ def points_on_sheet() -> tuple[Region, Tiling, AllPoints, TilePlan]:
 
 
 def test_halo_is_a_small_part_and_no_empty_ball_is_larger_than_stated() -> None:
-    region, _, everything, plan = points_on_sheet()
+    region, _, gathered, plan = points_on_sheet()
     assert plan.halo < 0.15 * region.diagonal
     whole = TilePlan(**{**plan.__dict__, "tiling": Tiling(())})
-    numbers, tetrahedra = local_tetrahedra(whole, everything, 0, 0, Progress())
-    shifted = np.concatenate([everything.shifted[numbers], np.full((8, 3), np.nan)])
-    inner = np.append(everything.inner[numbers], np.zeros(8, np.bool_))
+    numbers, tetrahedra = local_tetrahedra(whole, gathered, 0, 0, Progress())
+    shifted = np.concatenate([gathered.shifted[numbers], np.full((8, 3), np.nan)])
+    inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
     touching = inner[tetrahedra].any(1)
     radii = circumradii(shifted, tetrahedra[touching])
     assert not np.isnan(radii).any()  # none reaches a far point
-    assert radii.max() <= plan.ball
+    assert radii.max() <= plan.ball_radius
 
 
 def test_tiles_know_the_same_tetrahedra_as_the_whole() -> None:
-    _, tiling, everything, plan = points_on_sheet()
+    _, tiling, gathered, plan = points_on_sheet()
     whole = TilePlan(**{**plan.__dict__, "tiling": Tiling(())})
-    numbers, tetrahedra = local_tetrahedra(whole, everything, 0, 0, Progress())
-    inner = np.append(everything.inner[numbers], np.zeros(8, np.bool_))
+    numbers, tetrahedra = local_tetrahedra(whole, gathered, 0, 0, Progress())
+    inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
     tetrahedra = tetrahedra[inner[tetrahedra].all(1)]
     expected = {tuple(row) for row in np.sort(numbers[tetrahedra], 1).tolist()}
     found: list[tuple[int, ...]] = []
-    fewest = len(everything.inner)
+    fewest = len(gathered.inner)
     for tile in range(len(tiling)):
-        numbers, tetrahedra = local_tetrahedra(plan, everything, tile, 7, Progress())
+        numbers, tetrahedra = local_tetrahedra(plan, gathered, tile, 7, Progress())
         fewest = min(fewest, len(numbers))
-        inner = np.append(everything.inner[numbers], np.zeros(8, np.bool_))
+        inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
         tetrahedra = np.sort(tetrahedra[inner[tetrahedra].all(1)], 1)
         tetrahedra = numbers[tetrahedra]
-        own = tiling.owner(everything.cloud.points[tetrahedra[:, 0]]) == tile
+        own = tiling.owner(gathered.cloud.points[tetrahedra[:, 0]]) == tile
         found += [tuple(row) for row in tetrahedra[own].tolist()]
-    assert fewest < 0.5 * len(everything.inner)
+    assert fewest < 0.5 * len(gathered.inner)
     assert len(found) == len(set(found))
     assert set(found) == expected
 
 
 def test_faces_are_closed_whatever_the_labels() -> None:
-    _, tiling, everything, plan = points_on_sheet()
+    _, tiling, gathered, plan = points_on_sheet()
 
     class Noise:
         def __init__(self, tile: int) -> None:
@@ -232,14 +239,14 @@ def test_faces_are_closed_whatever_the_labels() -> None:
             return VacancyResult(value, np.zeros(len(points), np.int32))
 
     parts = [
-        tile_faces(Field(Noise(tile), None, 1), plan, everything, tile, Progress())
+        tile_faces(Field(Noise(tile), None, 1), plan, gathered, tile, Progress())
         for tile in range(len(tiling))
     ]
     faces = joined_faces(parts)
     assert len(faces) > 10_000
     assert len(np.unique(np.sort(faces, 1), axis=0)) == len(faces)
     begin, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
-    size = len(everything.inner)
+    size = len(gathered.inner)
     forward, back = np.sort(begin * size + end), np.sort(end * size + begin)
     assert (forward == back).all()
 

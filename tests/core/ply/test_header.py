@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One reader of PLY headers for splats, clouds and meshes: what it takes, and what it refuses."""
+"""PLY headers of splats, clouds and meshes: accepted and refused input."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_broken_headers_name_their_line(old: str, new: str, place: str, tmp_path
     path = written(tmp_path / "a.ply", HEADER.replace(old, new, 1))
     with pytest.raises(ParseError) as caught:
         read_ply_header(path, "Again.")
-    assert (caught.value.place, caught.value.hint) == (place, "Again.")
+    assert (caught.value.location, caught.value.hint) == (place, "Again.")
     with pytest.raises(ParseError):
         is_cloud(path)
 

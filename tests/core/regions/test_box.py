@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Boxes are found among eight corners; edges within flat faces are not drawn."""
+"""Box detection from eight corners; visible edges of hulls."""
 
 from __future__ import annotations
 

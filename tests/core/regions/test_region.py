@@ -170,7 +170,7 @@ def test_bad_files_are_refused_with_their_place(text: str, place: str, tmp_path:
     for read in (read_region, read_region_file):  # the worker's, Blender's
         with pytest.raises(ParseError) as caught:
             read(path)
-        assert caught.value.place == place
+        assert caught.value.location == place
         assert "roi.json" in caught.value.message
         assert caught.value.hint
 

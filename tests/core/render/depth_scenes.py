@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Views on which a solver of the isosurface depth goes wrong, and how its depths are judged."""
+"""Views that are difficult for an isosurface depth solver, and error measures of its depths."""
 
 from __future__ import annotations
 

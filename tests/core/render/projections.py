@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Projection of small scenes: the views that its tests share, and one Gaussian before a camera."""
+"""Projection of small scenes: shared views, and a single Gaussian in front of a camera."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scenes and positions for depth queries, and the answers by definition: Sigma, mu and rays."""
+"""Scenes and positions for depth queries, with reference results from Sigma, mu and rays."""
 
 from __future__ import annotations
 

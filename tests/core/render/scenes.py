@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Small scenes and cameras that the tests of the renderer share."""
+"""Small scenes and cameras shared by the renderer's tests."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What depth queries refuse, and answers where there is little or nothing to see."""
+"""Depth queries: invalid arguments, and results where little or nothing is visible."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Depth queries where a solver goes wrong: thin layers before and behind surfaces, plateaus."""
+"""Depth queries in difficult cases: thin layers in front of and behind surfaces, plateaus."""
 
 from __future__ import annotations
 

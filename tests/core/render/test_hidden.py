@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussians beyond float32: hidden alike by kernel and definition; sane extremes stay visible."""
+"""Gaussians beyond float32: hidden by kernel and definition alike; valid extremes stay visible."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bands of tiles keep to the budget and change nothing; warm renderings allocate nothing large."""
+"""Bands of tiles respect the budget and do not change results; later renderings reuse memory."""
 
 from __future__ import annotations
 
@@ -14,13 +14,23 @@ from gaussian_wrapping_addon.core.kernels.array_store import ArrayStore
 from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
 from gaussian_wrapping_addon.core.render.render import project_view, render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
-from gaussian_wrapping_addon.core.render.view_renderer import PAIR_BYTES, ViewPass, ViewRenderer
+from gaussian_wrapping_addon.core.render.view_renderer import (
+    INTERSECTION_BYTES,
+    ViewPass,
+    ViewRenderer,
+)
 
 from .scenes import isotropic, look_at, random_gaussians
 from .test_views import assert_equal, image_gradients, run
 
 CAMERA = look_at((2.2, 1.0, 0.8), width=85, height=70, focal=80.0)
-PAIR_ARRAYS = ("gaussian ids", "pair slots", "masks", "pairs", "pair weights")
+INTERSECTION_ARRAYS = (
+    "gaussian ids",
+    "intersection slots",
+    "masks",
+    "intersections",
+    "intersection weights",
+)
 ROUNDED = 2e-6
 """Relative L2 difference that another order of float32 sums of tens of pairs makes."""
 
@@ -39,11 +49,11 @@ def most_pairs_of_a_tile() -> int:
     return int(np.diff(view.lists.start).max())
 
 
-@pytest.mark.parametrize("budget_pairs", [1, 150, 400])
-def test_budgets_change_gradients_by_rounding_only(budget_pairs: int) -> None:
+@pytest.mark.parametrize("budget_intersections", [1, 150, 400])
+def test_budgets_change_gradients_by_rounding_only(budget_intersections: int) -> None:
     whole = run(ViewRenderer(), scene(), CAMERA, statistics=True)
     renderer = ViewRenderer()
-    budget = budget_pairs * PAIR_BYTES
+    budget = budget_intersections * INTERSECTION_BYTES
     parts = run(renderer, scene(), CAMERA, statistics=True, budget_bytes=budget)
     raw = RawArrays.from_gaussians(scene())
     view = renderer.render(raw, CAMERA, RenderOptions(statistics=True, budget_bytes=budget))
@@ -58,7 +68,7 @@ def test_budgets_change_gradients_by_rounding_only(budget_pairs: int) -> None:
 
 
 def test_bands_are_bitwise_the_same_for_any_number_of_threads() -> None:
-    options = {"statistics": True, "budget_bytes": 150 * PAIR_BYTES}
+    options = {"statistics": True, "budget_bytes": 150 * INTERSECTION_BYTES}
     one = run(ViewRenderer(), scene(), CAMERA, threads=1, **options)
     for threads in (2, 4):
         assert_equal(run(ViewRenderer(), scene(), CAMERA, threads=threads, **options), one)
@@ -66,7 +76,7 @@ def test_bands_are_bitwise_the_same_for_any_number_of_threads() -> None:
 
 def test_autograd_renders_in_bands_too() -> None:
     results = []
-    for budget in (2**30, 150 * PAIR_BYTES):
+    for budget in (2**30, 150 * INTERSECTION_BYTES):
         means = scene().means.clone().requires_grad_()
         out = render(
             scene().replaced(means=means), CAMERA, RenderOptions(budget_bytes=budget, threads=2)
@@ -80,13 +90,13 @@ def test_autograd_renders_in_bands_too() -> None:
     assert difference <= ROUNDED * results[0][1].norm()
 
 
-@pytest.mark.parametrize("budget_pairs", [150, 400])
-def test_what_grows_with_pairs_stays_within_the_budget(budget_pairs: int) -> None:
+@pytest.mark.parametrize("budget_intersections", [150, 400])
+def test_what_grows_with_pairs_stays_within_the_budget(budget_intersections: int) -> None:
     assert most_pairs_of_a_tile() < 150
-    budget = budget_pairs * PAIR_BYTES
+    budget = budget_intersections * INTERSECTION_BYTES
     renderer = ViewRenderer()
     run(renderer, scene(), CAMERA, statistics=True, budget_bytes=budget)
-    used = renderer.store.nbytes(*PAIR_ARRAYS)
+    used = renderer.store.nbytes(*INTERSECTION_ARRAYS)
     assert 0.5 * budget < used <= budget
     # The names are all there are: a rendering without bands takes more under the same names only.
     whole = ViewRenderer()
@@ -96,7 +106,7 @@ def test_what_grows_with_pairs_stays_within_the_budget(budget_pairs: int) -> Non
         for name in whole.store.names()
         if whole.store.nbytes(name) > 1.5 * renderer.store.nbytes(name)
     }
-    assert grown == set(PAIR_ARRAYS)
+    assert grown == set(INTERSECTION_ARRAYS)
 
 
 def test_a_warm_renderer_allocates_nothing_that_grows() -> None:
@@ -124,7 +134,7 @@ def test_a_warm_renderer_allocates_nothing_that_grows() -> None:
         # Less than one byte a Gaussian or a seen one, four a pixel, or one a pair.
         assert peak_bytes < WARM_BYTES
     assert min(count, len(view.ids), 4 * view.alpha.size) > WARM_BYTES
-    assert renderer.store.nbytes("pairs") // PAIR_BYTES > WARM_BYTES
+    assert renderer.store.nbytes("intersections") // INTERSECTION_BYTES > WARM_BYTES
 
 
 def test_lists_of_contributors_end_where_the_light_does() -> None:

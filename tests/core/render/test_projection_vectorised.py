@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The projection's blocks are packed float64 arithmetic; an edit can turn that off silently."""
+"""The projection compiles to packed float64 arithmetic; an edit can silently disable that."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which Gaussians the projection hides: faint, behind, aside, between pixel centres, not finite."""
+"""Gaussians that the projection hides: faint, behind, off-screen, sub-pixel, not finite."""
 
 from __future__ import annotations
 

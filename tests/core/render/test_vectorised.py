@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The compiled kernels use packed arithmetic; a harmless-looking edit can turn it off silently."""
+"""The kernels compile to packed arithmetic; a harmless-looking edit can silently disable that."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.render.query.depth_query import query_depth
-from gaussian_wrapping_addon.core.render.query.depth_query_gradient import pull_range
+from gaussian_wrapping_addon.core.render.query.depth_query_gradient import query_gradient_range
 from gaussian_wrapping_addon.core.render.query.depth_query_kernels import query_kernel
 from gaussian_wrapping_addon.core.render.raster import raster_backward, raster_forward
 from gaussian_wrapping_addon.core.render.render import render
@@ -90,7 +90,7 @@ def test_queries_use_packed_arithmetic() -> None:
     gaussians, camera = scene("generic")
     leaf = leaves(gaussians, torch.float32)
     query_depth(leaf, camera, torch.full((1, 2), 20.0)).sum().backward()
-    for kernel, least in ((query_kernel(True), 30), (pull_range, 40)):
+    for kernel, least in ((query_kernel(True), 30), (query_gradient_range, 40)):
         packed, single = fused_instructions(kernel)
         assert packed >= least
         assert single < packed

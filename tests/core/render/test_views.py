@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Views without autograd: bit for bit what render() gives, in memory that is used again."""
+"""Views without autograd are bitwise equal to render(), in reused memory."""
 
 from __future__ import annotations
 

@@ -156,7 +156,7 @@ def test_lists_that_are_refused(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_failures_get_their_type(words: str, kind: type, text: str) -> None:
-    error = install.failure_of(1, words.splitlines())
+    error = install.error_from_output(1, words.splitlines())
     assert type(error) is kind
     assert text in error.message
     assert error.hint

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes, photos and places that have killed unwrapping, baking or exports: all are survived.
+"""Meshes, photos and coordinates that once crashed unwrapping, baking or export.
 
 Cases by their numbers; "handled" is finite UVs in 0 to 1 without overlaps, "refused" a typed error
 with a next step and nothing left behind.
@@ -187,7 +187,7 @@ def test_48_memory(tmp_path: Path) -> None:
     script = (
         "import resource, sys\n"
         "from pathlib import Path\n"
-        "from gaussian_wrapping_addon.core.jobs.commands.worker_call import answer\n"
+        "from gaussian_wrapping_addon.core.jobs.commands.worker_call import run_command\n"
         "from tests.core.texture.test_texture_mesh import run\n"
         "from tests.core.texture.texture_scenes import *\n"
         "photos = photograph(ring(2, 3.0, 0.0), [(sphere_hit, waves)])\n"
@@ -198,7 +198,7 @@ def test_48_memory(tmp_path: Path) -> None:
         "    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))\n"
         "    run(sphere(1), photos, folder, 8192)\n"
         "    return []\n"
-        "sys.exit(answer(work))\n"
+        "sys.exit(run_command(work))\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", script, str(tmp_path)],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The whole texture step on analytic scenes: right colours, no bleeding, filled, counted."""
+"""The texture step on analytic scenes: correct colours, no bleeding, fill, statistics."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
 from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
-from gaussian_wrapping_addon.core.texture.bake.bake import Baked
-from gaussian_wrapping_addon.core.texture.bake.coverage_statistics import Tally
+from gaussian_wrapping_addon.core.texture.bake.bake import BakedColors
+from gaussian_wrapping_addon.core.texture.bake.coverage_statistics import CoverageStatistics
 from gaussian_wrapping_addon.core.texture.bake.fill import surface_positions
 from gaussian_wrapping_addon.core.texture.bake.photo_gains import solve_gains
 from gaussian_wrapping_addon.core.texture.bake.photo_samples import SurfaceArrays, SurfacePoints
@@ -170,13 +170,13 @@ def test_faces_smaller_than_a_texel_are_neither_seen_nor_unseen(areas: tuple) ->
     """Of three faces one is seen, one is not, and one has no texel to tell by."""
     points = SurfacePoints(np.array([0, 0, 1]), np.zeros((3, 2), np.float32))
     views = np.array([2, 0, 0], np.uint8)
-    baked = Baked(
+    baked = BakedColors(
         np.zeros((3, 3), np.uint8), views, views > 0, views > 0, 1, 0.0, False, 0.0, False, 0
     )
     unwrapped = Unwrap(np.zeros((3, 3, 2), np.float32), np.zeros(3, np.int32), "box", 2.0)
-    tally = Tally(3)
-    tally.add(points, baked, 0)
-    counts = tally.statistics(SIZE_PX, TextureSettings(SIZE_PX, 4), unwrapped, np.array(areas))
+    coverage = CoverageStatistics(3)
+    coverage.add(points, baked, 0)
+    counts = coverage.statistics(SIZE_PX, TextureSettings(SIZE_PX, 4), unwrapped, np.array(areas))
     assert counts["area_seen_share"] == (0.75 if areas[0] else 0.0)
     assert counts["area_without_texel_share"] == areas[2] / sum(areas)
     assert counts["faces_without_texel"] == 1

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import torch
 
-from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import even_directions
+from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import fibonacci_directions
 from gaussian_wrapping_addon.core.gaussians.initialisation import SH_C0
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 
@@ -22,7 +22,7 @@ def shell_of_discs(
     count: int, *, sh_degree: int = 0, thickness: float = THICKNESS
 ) -> tuple[OrientedGaussians, np.ndarray]:
     """Return opaque discs on the ellipsoid, float32, without orientation, and outward normals."""
-    unit = even_directions(count)
+    unit = fibonacci_directions(count)
     means = unit * AXES
     normals = unit / AXES
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checkpoints: round trip, the last two, and files that are broken or belong elsewhere."""
+"""Checkpoints: round trip, number kept, broken files and files of another run."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Previews come when they are due, show what they say, and measure the same at any time."""
+"""Live view: previews when due, their content, reproducible measurements."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gaussian_wrapping_addon.core.render.reference.reference import render_refer
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import live_view
-from gaussian_wrapping_addon.core.training.cancelling import checked
+from gaussian_wrapping_addon.core.training.cancellation import cancellable
 from gaussian_wrapping_addon.core.training.live_view import (
     GAP_PX,
     PIXELS_FILE,
@@ -37,15 +37,15 @@ def test_looks_only_when_due_and_writes_photo_and_render(tmp_path: Path) -> None
     now_s = 100.0
     live = LiveView(photos, [0, 4, 8], tmp_path, SETTINGS, 1, clock=lambda: now_s)
     now_s = 109.9
-    assert live.look(gaussians, 3) is None
+    assert live.update(gaussians, 3) is None
     assert list(tmp_path.iterdir()) == []
     now_s = 110.0
-    figures = live.look(gaussians, 7)
+    figures = live.update(gaussians, 7)
     expected = measure_held_out(gaussians, photos, [0, 4, 8], threads=2)
     assert figures == {"held_out_psnr": expected, "held_out_iteration": 7.0}
-    assert live.look(gaussians, 8) is None
+    assert live.update(gaussians, 8) is None
     now_s = 120.0
-    assert live.look(gaussians, 9) is not None
+    assert live.update(gaussians, 9) is not None
     assert {path.name for path in tmp_path.iterdir()} == {PREVIEW_FILE, PIXELS_FILE}
     picture = np.asarray(Image.open(tmp_path / PREVIEW_FILE))
     assert (np.load(tmp_path / PIXELS_FILE, allow_pickle=False) == picture).all()
@@ -64,7 +64,7 @@ def test_a_large_photo_becomes_a_picture_of_at_most_640_px(tmp_path: Path) -> No
         replace(scene, views=views), [np.zeros((1500, 2000, 3), np.uint8)] * len(views)
     )
     live = LiveView(large, [], tmp_path, SETTINGS, 1, clock=iter([0.0, 10.0, 11.0]).__next__)
-    assert live.look(sphere_gaussians(20), 1) == {}
+    assert live.update(sphere_gaussians(20), 1) == {}
     width, height = Image.open(tmp_path / PREVIEW_FILE).size
     assert 500 < width <= 640
     assert abs((width - GAP_PX) / 2 / height - 2000 / 1500) < 0.02
@@ -74,7 +74,7 @@ def test_zero_seconds_never_look(tmp_path: Path) -> None:
     _, photos = sphere_scene()
     never = replace(SETTINGS, preview_every_s=0.0)
     live = LiveView(photos, [0], tmp_path, never, 1, clock=iter([0.0, 1e9]).__next__)
-    assert live.look(sphere_gaussians(20), 1) is None
+    assert live.update(sphere_gaussians(20), 1) is None
 
 
 def test_measuring_is_the_mean_over_the_held_out_photos_within_their_masks() -> None:
@@ -110,7 +110,7 @@ def test_looking_changes_no_gaussian(tmp_path: Path) -> None:
     gaussians = sphere_gaussians(60)
     before = {name: tensor.clone() for name, tensor in gaussians.tensors()}
     live = LiveView(photos, [0], tmp_path, SETTINGS, 1, clock=iter([0.0, 10.0, 11.0]).__next__)
-    live.look(gaussians, 1)
+    live.update(gaussians, 1)
     assert all(bool((before[name] == tensor).all()) for name, tensor in gaussians.tensors())
 
 
@@ -123,8 +123,8 @@ def test_a_full_disk_ends_the_previews_and_not_the_training(
     monkeypatch.setattr(live_view, "write_bytes", full)
     _, photos = sphere_scene()
     live = LiveView(photos, [0], tmp_path, SETTINGS, 1, clock=iter([0.0, 10.0, 11.0]).__next__)
-    assert live.look(sphere_gaussians(20), 1) is not None
-    assert live.look(sphere_gaussians(20), 2) is None
+    assert live.update(sphere_gaussians(20), 1) is not None
+    assert live.update(sphere_gaussians(20), 2) is None
 
 
 def test_cancelling_is_noticed_before_the_next_view_is_rendered() -> None:
@@ -145,4 +145,4 @@ def test_cancelling_is_noticed_before_the_next_view_is_rendered() -> None:
             sphere_gaussians(20), Watched(), [0, 1, 2, 3], threads=1, check=progress.check
         )
     assert rendered == [0, 1]
-    assert list(checked([1, 2], Progress())) == [1, 2]
+    assert list(cancellable([1, 2], Progress())) == [1, 2]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Losses and optimiser use packed arithmetic; a harmless-looking edit can turn it off silently."""
+"""Losses and optimiser compile to SIMD arithmetic, which small edits can disable silently."""
 
 from __future__ import annotations
 

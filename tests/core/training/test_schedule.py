@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The plan of a run: order of milestones, caps, rates, for every preset and odd lengths."""
+"""Schedule: order of milestones, caps, rates, for every preset and unusual lengths."""
 
 from __future__ import annotations
 

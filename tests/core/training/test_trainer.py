@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whole training runs on a tiny scene: quality, resuming, cancelling, masks, broken numbers."""
+"""Training runs on a tiny scene: quality, resuming, cancellation, masks, non-finite values."""
 
 from __future__ import annotations
 
@@ -242,7 +242,7 @@ def test_windows_and_neighbours_resume_bit_for_bit(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
     whole = train(scene, photos, settings, tmp_path / "a", Progress(), seed=3, threads=1)
-    assert whole.needs.chose("multi_view")
+    assert whole.model_selection.chose("multi_view")
     for stop in (30, 40):
         with pytest.raises(Cancelled):
             train(scene, photos, settings, tmp_path / "b", StopAt(stop).progress(), seed=3)
@@ -261,7 +261,7 @@ def test_the_price_is_asked_of_gaussians_that_this_view_has_placed(
     )  # fmt: skip
     views, brought = [], [0]
     render_view, merge, price = (
-        ViewRenderer.render, iteration.merge_gradients, iteration.add_overlap_price,
+        ViewRenderer.render, iteration.merge_gradients, iteration.add_footprint_regulariser,
     )  # fmt: skip
 
     def rendered(self, *arguments, **named):  # type: ignore[no-untyped-def]
@@ -278,7 +278,7 @@ def test_the_price_is_asked_of_gaussians_that_this_view_has_placed(
 
     monkeypatch.setattr(ViewRenderer, "render", rendered)
     monkeypatch.setattr(iteration, "merge_gradients", merged)
-    monkeypatch.setattr(iteration, "add_overlap_price", priced)
+    monkeypatch.setattr(iteration, "add_footprint_regulariser", priced)
     train(scene, photos, settings, tmp_path, Progress(), seed=3, threads=1)
     assert brought[0] > 0
 
@@ -316,9 +316,9 @@ def test_windows_that_a_mask_empties_say_nothing(tmp_path: Path) -> None:
     state = run._start(rounds.Rounds(run.stepper, [], None, Progress()), Progress())
     for _ in range(30):
         run.stepper.step(state)
-    numbers = {row[1] % iteration._MOST_WINDOWS for row in state.visits._rows}
+    numbers = {row[1] % iteration._MAX_WINDOWS for row in state.error_history._rows}
     assert numbers == {0}
-    assert len(state.visits) == 30
+    assert len(state.error_history) == 30
     assert state.error_average > 0
 
 
@@ -352,14 +352,14 @@ def test_every_decision_is_written_down_and_can_be_overridden(tmp_path: Path) ->
     names = {"full_size", "exposure", "multi_view", "harmonics", "wrapping", "growth"}
     settings = dataclasses.replace(SETTINGS, densify_until=0.9)
     result = train(scene, photos, settings, tmp_path, Progress(), threads=1)
-    assert {d.name for d in result.needs} == names
-    assert all(d.evidence and d.setting == "auto" for d in result.needs)
+    assert {d.name for d in result.model_selection} == names
+    assert all(d.evidence and d.setting == "auto" for d in result.model_selection)
     for word, degree in (("on", 1), ("off", 0)):
         (tmp_path / word).mkdir()
         asked = dataclasses.replace(settings, **dict.fromkeys(names, word))
         result = train(scene, photos, asked, tmp_path / word, Progress(), threads=1)
-        assert {d.name for d in result.needs} == names
-        assert all(d.setting == word for d in result.needs)
+        assert {d.name for d in result.model_selection} == names
+        assert all(d.setting == word for d in result.model_selection)
         assert result.gaussians.sh_degree == degree
         assert result.exposure_fitted == (word == "on")
         lengths = np.linalg.norm(result.gaussians.normals().numpy(), axis=1)
@@ -372,7 +372,7 @@ def test_a_refused_degree_is_not_tried_again(
 ) -> None:
     scene, photos = sphere_scene(views=9, size_px=24)
     tried: list[int] = []
-    trial = rounds.harmonics_need
+    trial = rounds.select_harmonics
 
     def counted(gaussians: Any, views: Any, held_out: Any, degree: int, **more: Any) -> Any:
         tried.append(degree)
@@ -380,7 +380,7 @@ def test_a_refused_degree_is_not_tried_again(
         sh = np.zeros((len(gaussians), (degree + 1) ** 2, 3), np.float32)
         return dataclasses.replace(found, coefficients=sh if accepts else None)
 
-    monkeypatch.setattr(rounds, "harmonics_need", counted)
+    monkeypatch.setattr(rounds, "select_harmonics", counted)
     settings = dataclasses.replace(SETTINGS, sh_degree=2)
     train(scene, photos, settings, tmp_path, Progress(), threads=1)
     assert tried == wanted

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Windows of a photo: they cover it, keep to the budget, and render what the whole shows."""
+"""Windows of a photo: coverage, pixel budget, renders equal to crops of the whole image."""
 
 from __future__ import annotations
 

@@ -10,27 +10,27 @@ import numpy as np
 from ...errors import UsageError
 from .normalisation import MEAN_UP, up_direction
 
-HELD = 0.7
+MIN_AGREEING_SHARE = 0.7
 """Share of the cameras that must agree with an up direction: three quarters of hand-held photos
-are held on purpose, and a direction by chance gets at most half (see :func:`_held_share`)."""
+are held on purpose, and a direction by chance gets at most half (:func:`_quarter_turn_share`)."""
 UPRIGHT_DEG = 40.0
 """Roll below which a camera counts as held upright: between level and a quarter turn, 45 degrees
 would be undecided."""
 QUARTER_DEG = 12.0
 """Roll off the nearest quarter turn below which a camera counts as held on purpose. Hands are
 within a few degrees; by chance a quarter of all cameras would be."""
-_SEEN = 0.3
+_MIN_PROJECTED_UP = 0.3
 """A camera that looks along a direction sees nothing of it in its image: below this length of the
 projection (17 degrees) its roll does not count."""
-_RIVAL_DEG = 30.0
+_SAME_DIRECTION_DEG = 30.0
 """Directions within this angle are the same guess."""
-_RIVAL_SHARE = 0.9
+_AMBIGUOUS_SHARE = 0.9
 """Another direction with this share of the best one's agreement makes the answer a guess."""
-_LOOKS_DOWN = 0.05
+_MIN_PITCH_SINE = 0.05
 """Mean sine of the cameras' pitch above which they look down (3 degrees)."""
-_SIGN = 0.2
+_MIN_SIGN_MAJORITY = 0.2
 """Majority, as a share of all cameras, that decides between up and down."""
-_MOST_CAMERAS = 32
+_MAX_CAMERAS = 32
 """Cameras whose axes are tried against each other; all of them judge."""
 
 _HINT = "Pick three points on the ground and press Set Ground."
@@ -69,12 +69,12 @@ def camera_up(rotations: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, s
     if not (np.isfinite(rotations).all() and np.isfinite(centers).all()):
         raise UsageError("A photo camera has no finite position.", "Import the result again.")
     up, rule = up_direction(rotations, centers - centers.mean(0))
-    upright = _upright_share(rotations, up, UPRIGHT_DEG) >= HELD
-    steady = _upright_share(rotations, up, QUARTER_DEG) >= HELD
-    if upright and (steady or rule != MEAN_UP):
+    upright = _upright_share(rotations, up, UPRIGHT_DEG) >= MIN_AGREEING_SHARE
+    nearly_level = _upright_share(rotations, up, QUARTER_DEG) >= MIN_AGREEING_SHARE
+    if upright and (nearly_level or rule != MEAN_UP):
         return up, rule
     try:
-        return _quarter_up(rotations), "cameras turned by quarters"
+        return _up_from_quarter_turns(rotations), "cameras turned by quarters"
     except UsageError:
         # On an arc, the mean of cameras that lie on their sides looks like an up held
         # carelessly; where quarter turns explain nothing, it was that.
@@ -83,27 +83,27 @@ def camera_up(rotations: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, s
         raise
 
 
-def _quarter_up(rotations: np.ndarray) -> np.ndarray:
+def _up_from_quarter_turns(rotations: np.ndarray) -> np.ndarray:
     candidates = _candidates(rotations)
-    shares = np.array([_held_share(rotations, c) for c in candidates])
+    shares = np.array([_quarter_turn_share(rotations, c) for c in candidates])
     best = int(np.argmax(shares))
-    apart = np.abs(candidates @ candidates[best]) < np.cos(np.radians(_RIVAL_DEG))
-    rival = float(shares[apart].max()) if apart.any() else 0.0
-    if shares[best] < HELD:
+    apart = np.abs(candidates @ candidates[best]) < np.cos(np.radians(_SAME_DIRECTION_DEG))
+    second_best = float(shares[apart].max()) if apart.any() else 0.0
+    if shares[best] < MIN_AGREEING_SHARE:
         raise UsageError("The cameras were held in too many ways to tell which way is up.", _HINT)
-    if rival >= _RIVAL_SHARE * shares[best]:
+    if second_best >= _AMBIGUOUS_SHARE * shares[best]:
         raise UsageError("The cameras leave open which of two ways is up.", _HINT)
     up = _refined(rotations, candidates[best])
     return up * _sign(rotations, up)
 
 
-def _in_image(rotations: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _roll_and_projection(rotations: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the (n,) roll in radians of cameras by ``up``, and how much of it each sees."""
     across, along = rotations[:, 0] @ up, -(rotations[:, 1] @ up)
     return np.arctan2(across, along), np.hypot(across, along)
 
 
-def _off_quarter(roll: np.ndarray) -> np.ndarray:
+def _angle_to_quarter_turn(roll: np.ndarray) -> np.ndarray:
     quarter = 0.5 * np.pi
     return np.abs(roll - quarter * np.round(roll / quarter))
 
@@ -113,23 +113,27 @@ def _upright_share(rotations: np.ndarray, up: np.ndarray, limit_deg: float) -> f
 
     Looking straight down says nothing against a direction that others agree on, unless most do.
     """
-    roll, seen = _in_image(rotations, up)
-    held = (np.abs(roll) < np.radians(limit_deg)) & (seen > _SEEN)
-    return float(held.sum() / max((seen > _SEEN).sum(), 0.5 * len(roll)))
+    roll, seen = _roll_and_projection(rotations, up)
+    held = (np.abs(roll) < np.radians(limit_deg)) & (seen > _MIN_PROJECTED_UP)
+    return float(held.sum() / max((seen > _MIN_PROJECTED_UP).sum(), 0.5 * len(roll)))
 
 
-def _held_share(rotations: np.ndarray, up: np.ndarray) -> float:
+def _quarter_turn_share(rotations: np.ndarray, up: np.ndarray) -> float:
     """Return the share of all cameras near a quarter turn; those that look along ``up`` are not."""
-    roll, seen = _in_image(rotations, up)
-    return float(((_off_quarter(roll) < np.radians(QUARTER_DEG)) & (seen > _SEEN)).mean())
+    roll, seen = _roll_and_projection(rotations, up)
+    return float(
+        (
+            (_angle_to_quarter_turn(roll) < np.radians(QUARTER_DEG)) & (seen > _MIN_PROJECTED_UP)
+        ).mean()
+    )
 
 
 def _candidates(rotations: np.ndarray) -> np.ndarray:
     """Return (k, 3) unit directions: image axes, and what is level with those of two cameras."""
-    step = max(1, -(-len(rotations) // _MOST_CAMERAS))
-    some = rotations[::step, :2, :]  # (c, 2, 3): either axis may be the level one
-    found = [*some.reshape(-1, 3)]
-    for first, second in itertools.combinations(some, 2):
+    step = max(1, -(-len(rotations) // _MAX_CAMERAS))
+    subset = rotations[::step, :2, :]  # (c, 2, 3): either axis may be the level one
+    found = [*subset.reshape(-1, 3)]
+    for first, second in itertools.combinations(subset, 2):
         for a, b in itertools.product(first, second):
             normal = np.cross(a, b)
             length = np.linalg.norm(normal)
@@ -141,8 +145,8 @@ def _candidates(rotations: np.ndarray) -> np.ndarray:
 def _refined(rotations: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return the direction most nearly orthogonal to the level axes of the cameras held so."""
     for _ in range(10):
-        roll, seen = _in_image(rotations, up)
-        held = (_off_quarter(roll) < np.radians(QUARTER_DEG)) & (seen > _SEEN)
+        roll, seen = _roll_and_projection(rotations, up)
+        held = (_angle_to_quarter_turn(roll) < np.radians(QUARTER_DEG)) & (seen > _MIN_PROJECTED_UP)
         upright = np.abs(np.cos(roll)) > np.sqrt(0.5)
         level = np.where(upright[:, None], rotations[:, 0], rotations[:, 1])[held]  # (m, 3)
         values, axes = np.linalg.eigh(level.T @ level)
@@ -154,9 +158,9 @@ def _refined(rotations: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 def _sign(rotations: np.ndarray, up: np.ndarray) -> float:
     vote = float((-(rotations[:, 1] @ up)).mean())
-    if abs(vote) > _SIGN:
+    if abs(vote) > _MIN_SIGN_MAJORITY:
         return float(np.sign(vote))
     pitch = float((rotations[:, 2] @ up).mean())
-    if abs(pitch) > _LOOKS_DOWN:
+    if abs(pitch) > _MIN_PITCH_SINE:
         return float(-np.sign(pitch))
     raise UsageError("The cameras do not tell up from down.", _HINT)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .placement import SAME_PLACE, Plane
+from .placement import COINCIDENT, Plane
 
 LEVEL_DEG = 20.0
 """Faces that lean more than this are not ground: the up direction of cameras is off by a few
@@ -19,7 +19,7 @@ LOW_SHARE = 0.4
 _ROUNDS = 4
 
 
-def main_plane(
+def find_ground_plane(
     centers: np.ndarray, normals: np.ndarray, areas: np.ndarray, up: np.ndarray
 ) -> Plane | None:
     """Find the level plane that most of the low, upward-facing surface lies on.
@@ -46,7 +46,7 @@ def main_plane(
     heights = (centers - middle) @ up  # (f,)
     extent = float(np.linalg.norm(np.ptp(centers, 0)))
     band = BAND_SHARE * extent
-    if band <= SAME_PLACE * float(np.abs(centers).max()):
+    if band <= COINCIDENT * float(np.abs(centers).max()):
         return None
     floor, ceiling = float(heights.min()), float(heights.max())
     limit = floor + LOW_SHARE * (ceiling - floor)

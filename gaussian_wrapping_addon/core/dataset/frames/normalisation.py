@@ -16,19 +16,19 @@ RADIUS_MARGIN = 1.1
 """The largest camera distance times this becomes ``SCENE_RADIUS`` (docs/method.md, section 1.7)."""
 FAR_CAMERA_FACTOR = 30.0
 """A camera this many median distances from the median position was solved wrongly."""
-_SAME_PLACE = 1e-12
+_COINCIDENT = 1e-12
 """Share of the coordinates' size below which positions cannot be told apart in float64."""
-_LEVEL_TILT = 0.15
+_MAX_LEVEL_TILT = 0.15
 """Mean |sin| of the angle between level camera axes and the horizon: about 9 degrees."""
-_SPREAD = 0.03
+_MIN_SPREAD_RATIO = 0.03
 """Smallest share of the middle eigenvalue in the largest: directions fan out by 20 degrees."""
-_CLEAR = 0.2
+_MAX_NOISE_RATIO = 0.2
 """Largest share of the smallest eigenvalue in the middle one: the plane is clear of the noise."""
-_FLAT = 0.05
+_MAX_PLANE_THICKNESS = 0.05
 """Thickness over width of a camera path that counts as plane."""
 MEAN_UP = "mean camera up"
 """The rule of :func:`up_direction` where nothing better than the mean was found."""
-_AGREE = np.cos(np.radians(50.0))
+_MIN_AGREEMENT_COS = np.cos(np.radians(50.0))
 """Directions further from the cameras' mean up than this are not the up direction."""
 
 
@@ -77,7 +77,7 @@ def find_scene_frame(rotations: np.ndarray, centers: np.ndarray) -> SceneFrame:
     offsets = kept - mean
     reach = float(np.linalg.norm(offsets, axis=1).max())
     size = float(np.abs(centers[keep]).max())
-    if reach <= _SAME_PLACE * max(size, 1e-300):
+    if reach <= _COINCIDENT * max(size, 1e-300):
         raise DatasetError(
             "All photos were taken from one place, so that no depth can be measured.",
             "Walk around the object while taking photos.",
@@ -102,7 +102,7 @@ def near_cameras(centers: np.ndarray) -> np.ndarray:
     middle = np.median(centers[finite], axis=0)
     distances = np.linalg.norm(np.where(finite[:, None], centers - middle, 0.0), axis=1)
     typical = float(np.median(distances[finite]))
-    if typical <= _SAME_PLACE * max(float(np.abs(middle).max()), 1e-300):
+    if typical <= _COINCIDENT * max(float(np.abs(middle).max()), 1e-300):
         return finite
     return finite & (distances <= FAR_CAMERA_FACTOR * typical)
 
@@ -132,13 +132,18 @@ def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray
     rights = rotations[:, 0, :]  # (n, 3)
     level, values = _least_aligned(rights)
     tilt = float(np.median(np.abs(rights @ level)))
-    fans_out = values[1] > _SPREAD * values[2] and values[0] < _CLEAR * values[1]
-    if fans_out and tilt < _LEVEL_TILT and abs(level @ guess) > _AGREE:
+    fans_out = (
+        values[1] > _MIN_SPREAD_RATIO * values[2] and values[0] < _MAX_NOISE_RATIO * values[1]
+    )
+    if fans_out and tilt < _MAX_LEVEL_TILT and abs(level @ guess) > _MIN_AGREEMENT_COS:
         return _signed(level, guess), "level cameras"
     if len(offsets) >= 8:
         normal, values = _least_aligned(offsets)
-        flat = values[0] < _FLAT**2 * values[1] and values[1] > _SPREAD * values[2]
-        if flat and abs(normal @ guess) > _AGREE:
+        flat = (
+            values[0] < _MAX_PLANE_THICKNESS**2 * values[1]
+            and values[1] > _MIN_SPREAD_RATIO * values[2]
+        )
+        if flat and abs(normal @ guess) > _MIN_AGREEMENT_COS:
             return _signed(normal, guess), "plane camera path"
     return guess, MEAN_UP
 

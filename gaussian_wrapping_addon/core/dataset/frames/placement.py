@@ -16,7 +16,7 @@ import numpy as np
 from ...errors import UsageError
 from ..similarity import Similarity
 
-SAME_PLACE = 1e-6
+COINCIDENT = 1e-6
 """Distance over size of the coordinates below which two points are one: Blender's coordinates
 are single precision, so that such a distance holds hardly one digit."""
 COLLINEAR = 0.01
@@ -64,7 +64,7 @@ def scale_step(points: np.ndarray, length: float) -> Similarity:
     if not (math.isfinite(length) and length > 0.0):
         raise UsageError(f"{length:g} is no distance.", "Type a length greater than zero.")
     distance = float(np.linalg.norm(points[1] - points[0]))
-    if distance <= SAME_PLACE * float(np.abs(points).max()):
+    if distance <= COINCIDENT * float(np.abs(points).max()):
         raise UsageError("The two points lie in one place.", "Pick two points that are far apart.")
     return Similarity(length / distance)
 
@@ -92,7 +92,7 @@ def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
     center = points.mean(0)
     offsets = points - center
     _, extents, axes = np.linalg.svd(offsets, full_matrices=False)  # (3,), (3, 3)
-    if extents[0] <= SAME_PLACE * float(np.abs(points).max()):
+    if extents[0] <= COINCIDENT * float(np.abs(points).max()):
         raise UsageError("The points lie in one place.", "Pick three points that are far apart.")
     if extents[1] <= COLLINEAR * extents[0]:
         raise UsageError(
@@ -100,7 +100,7 @@ def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
         )
     normal = np.cross(axes[0], axes[1])
     side = float(np.median((np.asarray(above, np.float64) - center) @ normal)) if len(above) else 0
-    if abs(side) <= SAME_PLACE * extents[0]:
+    if abs(side) <= COINCIDENT * extents[0]:
         side = normal[2]
     return Plane(center, normal if side >= 0.0 else -normal)
 

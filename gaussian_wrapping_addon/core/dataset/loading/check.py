@@ -18,13 +18,13 @@ from ..photos.photo_finder import PhotoIndex, find_mask, list_photos, photo_root
 from ..photos.photo_header import read_photo_header
 from ..readers.source_kind import SPLAT, SourceKind, read_poses, source_kind
 from ..readers.splat_header import read_splat_header
-from .splat_cameras import WITH_PHOTOS, WITHOUT_PHOTOS
+from .splat_cameras import NO_PHOTOS_HINT, NO_PHOTOS_WARNING
 
 Severity = Literal["error", "warning", "fact"]
 
-_SHARE_OF_BAD = 0.2
+_MAX_UNREADABLE_SHARE = 0.2
 _MIN_GOOD_SIDE_PX = 200
-_SHORT = {"photos": "cameras to be solved", SPLAT: "splat without photos"}
+_SHORT_NAMES = {"photos": "cameras to be solved", SPLAT: "splat without photos"}
 """What is said of kinds whose name is no heading."""
 
 
@@ -55,7 +55,7 @@ def check_input(source: Path) -> list[Finding]:
             Finding(
                 "fact",
                 f"The input is of kind: {kind.kind}.",
-                short=_SHORT.get(kind.kind, kind.kind),
+                short=_SHORT_NAMES.get(kind.kind, kind.kind),
             )
         )
         if kind.kind == SPLAT:
@@ -84,7 +84,7 @@ def _check_splat(path: Path, findings: list[Finding]) -> None:
             short=f"{header.count:,} {kind}",
         )
     )
-    findings.append(Finding("warning", WITHOUT_PHOTOS, WITH_PHOTOS))
+    findings.append(Finding("warning", NO_PHOTOS_WARNING, NO_PHOTOS_HINT))
 
 
 def _check_photos(kind: SourceKind, findings: list[Finding]) -> None:
@@ -103,7 +103,7 @@ def _check_poses(kind: SourceKind, findings: list[Finding]) -> None:
             Finding("fact", f"{kind.transforms.name} is present too; the COLMAP model is used.")
         )
     model = read_poses(kind)
-    findings += [Finding("warning", said.text, said.hint) for said in model.warnings]
+    findings += [Finding("warning", warning.text, warning.hint) for warning in model.warnings]
     findings.append(
         Finding("fact", f"{len(model.photos)} posed photos, {len(model.points)} sparse points.")
     )
@@ -154,7 +154,7 @@ def _check_files(
         sizes[f"{width} x {height}"] += 1
         small += max(width, height) < _MIN_GOOD_SIDE_PX
     good = len(photos) - len(bad)
-    if bad and len(bad) > _SHARE_OF_BAD * len(photos):
+    if bad and len(bad) > _MAX_UNREADABLE_SHARE * len(photos):
         raise DatasetError(
             f"{len(bad)} of {len(photos)} photos cannot be read. First: {bad[0].message}",
             bad[0].hint,

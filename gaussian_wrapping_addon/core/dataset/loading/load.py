@@ -77,11 +77,11 @@ def load_scene(
             facts["also_present"] = f"{kind.transforms.name} (not used: the COLMAP model is)"
     warnings.extend(model.warnings)
     facts.update(model.facts)
-    require_enough(len(model.photos))
+    check_photo_count(len(model.photos))
     views, notes, counts = prepare_views(model, kind, work_folder, prepare_span, threads=threads)
     warnings.extend(notes)
     facts.update(counts)
-    require_enough(len(views))
+    check_photo_count(len(views))
     views, scene_from_world, frame_facts = _frame(views, warnings)
     facts.update(frame_facts)
     cameras = [_camera(view).moved(scene_from_world) for view in views]
@@ -113,7 +113,7 @@ def load_scene(
     )
 
 
-def require_enough(count: int) -> None:
+def check_photo_count(count: int) -> None:
     """Raise :class:`DatasetError` where fewer than ``MIN_IMAGES`` photos are usable."""
     if count < MIN_IMAGES:
         photos = "photo is" if count == 1 else "photos are"
@@ -128,7 +128,7 @@ def _solve(
 ) -> SourceModel:
     root = photo_root(kind.folder)
     photos = list_photos(root)
-    require_enough(len(photos))
+    check_photo_count(len(photos))
     return solve_poses(
         root, photos, kind.mask_roots, work_folder, progress, seed=seed, threads=threads
     )

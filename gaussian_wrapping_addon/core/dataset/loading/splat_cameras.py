@@ -28,15 +28,15 @@ MIN_OPACITY = 0.1
 """Fainter Gaussians tell nothing about where the splat is."""
 
 WHOLE_SHARE, MIDDLE_SHARE = 0.98, 0.5
-TAIL = 3.0
+SURROUNDINGS_RATIO = 3.0
 """Where the radius of :data:`WHOLE_SHARE` is more than this many times that of
 :data:`MIDDLE_SHARE`, the splat has surroundings, and this bounds what the cameras stand around."""
 
-WITHOUT_PHOTOS = (
+NO_PHOTOS_WARNING = (
     "A splat without photos is wrapped from made-up views around its middle: surroundings and "
     "rooms seen from inside are not covered, and errors of the splat stay."
 )
-WITH_PHOTOS = "Where its photos exist, give them as the input and the splat as the start."
+NO_PHOTOS_HINT = "Where its photos exist, give them as the input and the splat as the start."
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,14 @@ def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
     DatasetError
         Everything is transparent, or lies at one place.
     """
-    solid = opacities >= MIN_OPACITY
-    if not solid.any():
+    opaque = opacities >= MIN_OPACITY
+    if not opaque.any():
         raise DatasetError(
             "All Gaussians of the splat are transparent.",
             "Check that opacities are stored as logits.",
         )
-    points = np.asarray(means, np.float64)[solid]
-    weights = np.asarray(opacities, np.float64)[solid]
+    points = np.asarray(means, np.float64)[opaque]
+    weights = np.asarray(opacities, np.float64)[opaque]
     first = points[0]  # subtract first: coordinates may be huge
     local = points - first
     center = np.array([_quantile(local[:, k], weights, 0.5) for k in range(3)])
@@ -81,8 +81,8 @@ def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
     whole = _quantile(distance, weights, WHOLE_SHARE)
     if not whole > 0.0:
         raise DatasetError("All Gaussians of the splat lie at one place.", "Export it again.")
-    has_surroundings = middle > 0.0 and whole > TAIL * middle
-    radius = TAIL * middle if has_surroundings else whole
+    has_surroundings = middle > 0.0 and whole > SURROUNDINGS_RATIO * middle
+    radius = SURROUNDINGS_RATIO * middle if has_surroundings else whole
     return SplatExtent(center + first, float(radius), bool(has_surroundings))
 
 
@@ -92,14 +92,14 @@ def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
     return float(values[order][min(np.searchsorted(total, share * total[-1]), len(values) - 1)])
 
 
-def cameras_around(extent: SplatExtent) -> list[Camera]:
+def cameras_on_spheres(extent: SplatExtent) -> list[Camera]:
     """Return cameras on two spheres around a splat that look at its middle, frame of the file."""
     half = math.radians(0.5 * FIELD_OF_VIEW_DEG)
     focal_px = 0.5 * PHOTO_SIDE_PX / math.tan(half)
     far = FAR_MARGIN / math.sin(half)
     cameras: list[Camera] = []
     for count, distance in ((FAR_VIEWS, far), (NEAR_VIEWS, NEAR_DISTANCE)):
-        for direction in even_directions(count):
+        for direction in fibonacci_directions(count):
             eye = extent.center + distance * extent.radius * direction
             cameras.append(
                 Camera(
@@ -110,13 +110,13 @@ def cameras_around(extent: SplatExtent) -> list[Camera]:
                     focal_px,
                     0.5 * PHOTO_SIDE_PX,
                     0.5 * PHOTO_SIDE_PX,
-                    _looking(eye, -direction),
+                    _look_at(eye, -direction),
                 )
             )
     return cameras
 
 
-def _looking(eye: np.ndarray, forward: np.ndarray) -> np.ndarray:
+def _look_at(eye: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """(3, 4) ``cam_from_world`` with Z up; no direction of the lattice is a pole."""
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -133,7 +133,7 @@ def scene_frame(cameras: list[Camera]) -> Similarity:
     return Similarity(scale, np.eye(3), -scale * mean)
 
 
-def even_directions(count: int) -> np.ndarray:
+def fibonacci_directions(count: int) -> np.ndarray:
     """Return (count, 3) unit vectors of a spherical Fibonacci lattice; none is a pole."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     angle = np.arange(count) * math.pi * (3.0 - math.sqrt(5.0))

@@ -91,7 +91,7 @@ def random_points(
         directions = rng.normal(size=(count, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         points = focus + directions * radius * rng.uniform(size=(count, 1)) ** (1 / 3)
-        good = points[views_of_points(cameras, points) >= _MIN_SEEN]
+        good = points[count_observing_views(cameras, points) >= _MIN_SEEN]
         kept.append(good)
         found += len(good)
         if found >= count:
@@ -99,7 +99,7 @@ def random_points(
     return np.concatenate(kept)[:count]
 
 
-def views_of_points(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
+def count_observing_views(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
     """Count, for (n, 3) points, the cameras whose image they fall into: (n,) int."""
     seen = np.zeros(len(points), np.int64)
     for camera in cameras:

@@ -29,7 +29,7 @@ from ..photos.photo_file import (
 )
 from ..photos.photo_finder import PhotoIndex, find_mask
 from ..photos.photo_header import PhotoHeader
-from ..poses.pose_solver import refuse_if_many_bad
+from ..poses.pose_solver import check_unreadable_share
 from ..readers.source_kind import SourceKind
 from ..readers.source_model import LensCamera, PosedPhoto, SourceModel
 from .undistort import pinhole_of, sampling_map
@@ -94,13 +94,13 @@ def prepare_views(
     notes = _Notes()
     index = PhotoIndex(kind.photo_roots)
     found: list[tuple[PosedPhoto, Path]] = []
-    taken: set[Path] = set()
+    used: set[Path] = set()
     for posed in sorted(model.photos, key=lambda p: p.name):
         match = index.find(posed.name)
-        if match is None or match.path in taken:
+        if match is None or match.path in used:
             notes.missing.append(posed.name)
             continue
-        taken.add(match.path)
+        used.add(match.path)
         notes.renamed += match.how != "exact"
         found.append((posed, match.path))
     if not found:
@@ -114,16 +114,16 @@ def prepare_views(
     maps = _MapCache()
     views: list[PreparedView] = []
 
-    def one(i: int) -> PreparedView | None:
+    def prepare(i: int) -> PreparedView | None:
         posed, path = found[i]
         return _prepare(i, posed, path, model, kind, work_folder, maps, notes)
 
     with ThreadPoolExecutor(threads) as pool:
         try:
-            for i, view in enumerate(pool.map(one, range(len(found)))):
+            for i, view in enumerate(pool.map(prepare, range(len(found)))):
                 if view is not None:
                     views.append(view)
-                refuse_if_many_bad(notes.bad, len(found))
+                check_unreadable_share(notes.bad, len(found))
                 progress.update((i + 1) / len(found), f"preparing photo {i + 1} of {len(found)}")
         except BaseException:
             pool.shutdown(cancel_futures=True)
@@ -166,10 +166,10 @@ def _prepare(
     pinhole = pinhole_of(lens)
     photo_path = path
     if not lens.is_pinhole:
-        where = maps.get(lens, pinhole)
-        color = sample_bicubic(color, where)
+        pixels = maps.get(lens, pinhole)
+        color = sample_bicubic(color, pixels)
         if mask is not None:
-            mask = sample_bicubic(np.where(mask, 255, 0).astype(np.uint8)[..., None], where)
+            mask = sample_bicubic(np.where(mask, 255, 0).astype(np.uint8)[..., None], pixels)
             mask = mask[..., 0] >= MASK_THRESHOLD
     if not lens.is_pinhole or not _is_plain(photo, header):
         photo_path = work_folder / "images" / f"{index:06d}.jpg"
@@ -239,8 +239,8 @@ def fit_lens(
 
 def _same_proportions(size: tuple[int, int], lens: LensCamera) -> bool:
     """Whether ``size`` is the camera's size times one factor, up to rounding to whole pixels."""
-    slack = lens.width + lens.height
-    return abs(size[0] * lens.height - size[1] * lens.width) < slack
+    tolerance = lens.width + lens.height
+    return abs(size[0] * lens.height - size[1] * lens.width) < tolerance
 
 
 def _find_mask(
@@ -297,7 +297,7 @@ def _resized_mask(mask: np.ndarray, shape: tuple[int, ...], path: Path) -> np.nd
 class _MapCache:
     """Sampling maps of the last lenses; photos of one lens share one."""
 
-    _KEPT = 2
+    _MAX_MAPS = 2
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -307,33 +307,33 @@ class _MapCache:
         # The lock is held while computing: two threads would compute the same map.
         with self._lock:
             if lens not in self._maps:
-                while len(self._maps) >= self._KEPT:
+                while len(self._maps) >= self._MAX_MAPS:
                     del self._maps[next(iter(self._maps))]
                 self._maps[lens] = sampling_map(lens, pinhole)
             return self._maps[lens]
 
 
-def _warnings(notes: _Notes, stated: int, kind: str) -> list[ReportWarning]:
+def _warnings(notes: _Notes, total: int, kind: str) -> list[ReportWarning]:
     out = []
 
-    def say(code: str, items: list[str], text: str, hint: str = "") -> None:
+    def add(code: str, items: list[str], text: str, hint: str = "") -> None:
         if items:
             listed = ", ".join(sorted(items)[:3]) + (" ..." if len(items) > 3 else "")
             out.append(ReportWarning(code, f"{len(items)} {text}: {listed}.", hint))
 
-    say(
+    add(
         "photos-not-found",
         notes.missing,
-        f"of the {stated} photos that the {kind} names were not found",
+        f"of the {total} photos that the {kind} names were not found",
     )
-    say(
+    add(
         "photos-unreadable",
         [m.rstrip(".") for m in notes.bad],
         "photos cannot be read and are not used",
         UNREADABLE_HINT,
     )
-    say("masks-not-used", [m.rstrip(".") for m in notes.wrong_masks], "masks were not used")
-    say(
+    add("masks-not-used", [m.rstrip(".") for m in notes.wrong_masks], "masks were not used")
+    add(
         "photos-masked-altogether",
         notes.fully_masked,
         "photos are masked altogether and are not used",

@@ -16,7 +16,7 @@ from .photo_header import PHOTO_SUFFIXES
 
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
 MASK_FOLDERS = ("masks", "mask")
-UNDEVELOPED_SUFFIXES = (
+RAW_SUFFIXES = (
     ".heic", ".heif", ".avif",
     ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2",
 )  # fmt: skip
@@ -57,10 +57,10 @@ def list_photos(root: Path) -> list[Path]:
     return sorted(found, key=lambda p: p.relative_to(root).as_posix())
 
 
-def count_undeveloped(root: Path) -> int:
+def count_raw_photos(root: Path) -> int:
     """Count the files of cameras and phones under ``root`` that must be developed first."""
     return sum(
-        PurePosixPath(name).suffix.lower() in UNDEVELOPED_SUFFIXES
+        PurePosixPath(name).suffix.lower() in RAW_SUFFIXES
         for _, _, names in os.walk(root)
         for name in names
     )

@@ -35,11 +35,11 @@ from .match_pairs import pairs_by_order, pairs_by_pose
 
 MAX_SIFT_PX = 1600
 """Long side of the photos that features are searched in."""
-SHARE_OF_BAD_PHOTOS = 0.2
+MAX_UNREADABLE_SHARE = 0.2
 """More undecodable photos than this refuse the data set."""
 _HELPER = "dataset.poses.pose_solver_helper"
 _MEMORY_SHARE = 0.9
-_LEAST_MEMORY_BYTES = 8 << 30
+_MIN_MEMORY_BYTES = 8 << 30
 """The limit counts reserved addresses too; below this the solver's threads may not even start."""
 
 
@@ -102,7 +102,7 @@ def solve_poses(
             decoded = read_photo(path)
         except DatasetError as error:
             bad.append(error.message)
-            refuse_if_many_bad(bad, len(photos))
+            check_unreadable_share(bad, len(photos))
             continue
         prepared.append(_write_solver_photo(folder, i, decoded, path, find_mask(mask_roots, name)))
         names.append(name)
@@ -133,7 +133,7 @@ def solve_poses(
     write_json(folder / "task.json", task)
     run_helper(_HELPER, folder, progress.span(0.08, 1.0), memory_bytes=_memory_limit_bytes())
     model = read_model(ModelFiles(folder / "model", ".bin"))
-    _keep_model(folder, work_folder)
+    _save_model(folder, work_folder)
     return _with_source_names(model, prepared, names, bad, len(photos))
 
 
@@ -159,14 +159,14 @@ def _with_source_names(
             "Take more photos with more overlap, from a textured object that does not move.",
         )
     warnings = list(model.warnings)
-    placed = {p.name for p in photos}
-    lost = [name for name in names if name not in placed]
-    if lost:
-        listed = ", ".join(lost[:5]) + (" ..." if len(lost) > 5 else "")
+    registered = {p.name for p in photos}
+    unregistered = [name for name in names if name not in registered]
+    if unregistered:
+        listed = ", ".join(unregistered[:5]) + (" ..." if len(unregistered) > 5 else "")
         warnings.append(
             ReportWarning(
                 "photos-not-placed",
-                f"{len(lost)} of {len(names)} photos could not be placed and are not used: "
+                f"{len(unregistered)} of {len(names)} photos could not be placed and are not used: "
                 f"{listed}.",
                 "Take more photos with more overlap there, or remove blurred ones.",
             )
@@ -235,9 +235,9 @@ def triangulate_points(
     return model.points, model.point_colors
 
 
-def refuse_if_many_bad(bad: Sequence[str], offered: int) -> None:
+def check_unreadable_share(bad: Sequence[str], offered: int) -> None:
     """Raise :class:`DatasetError` once more than a fifth of the photos cannot be read."""
-    if len(bad) > SHARE_OF_BAD_PHOTOS * offered:
+    if len(bad) > MAX_UNREADABLE_SHARE * offered:
         raise DatasetError(
             f"{len(bad)} of {offered} photos cannot be read. First: {bad[0]}",
             "Restore the photos, or remove the bad ones.",
@@ -280,16 +280,16 @@ def _fresh_folder(work_folder: Path) -> Path:
     return folder
 
 
-def _keep_model(folder: Path, work_folder: Path) -> None:
+def _save_model(folder: Path, work_folder: Path) -> None:
     """Keep the solved model as ``cameras/``, drop features and temporary photos."""
-    kept = work_folder / "cameras"
-    if kept.exists():
-        shutil.rmtree(kept)
-    os.replace(folder / "model", kept)
+    target = work_folder / "cameras"
+    if target.exists():
+        shutil.rmtree(target)
+    os.replace(folder / "model", target)
     shutil.rmtree(folder)
 
 
 def _memory_limit_bytes() -> int | None:
     """Return a share of the machine's memory, or ``None`` where it is not known."""
     total = total_memory_bytes()
-    return max(int(_MEMORY_SHARE * total), _LEAST_MEMORY_BYTES) if total else None
+    return max(int(_MEMORY_SHARE * total), _MIN_MEMORY_BYTES) if total else None

@@ -17,9 +17,9 @@ from ...processes.helper_process import emit
 
 DEFAULT_FOCAL_FACTORS = (1.2, 0.85, 1.7, 2.5)
 """Focal lengths over the long side that are tried where EXIF gives none, the commonest first."""
-_ENOUGH_PLACED = 0.8
+_MIN_REGISTERED_SHARE = 0.8
 """Share of placed photos at which no other focal length is tried."""
-_LENIENT_BELOW = 0.5
+_LENIENT_REGISTERED_SHARE = 0.5
 """Share of placed photos below which weaker evidence is accepted for a first pair and for poses."""
 _MAX_FEATURES = 8192
 _MAX_FEATURES_POSED = 4096
@@ -72,7 +72,7 @@ def _solve(folder: Path, task: dict[str, Any]) -> None:
     attempts = [(factor, False) for factor in factors] + [(factors[0], True)]
     for factor, lenient in attempts:
         if best is not None and best.num_reg_images() >= total * (
-            _LENIENT_BELOW if lenient else _ENOUGH_PLACED
+            _LENIENT_REGISTERED_SHARE if lenient else _MIN_REGISTERED_SHARE
         ):
             break
         with pycolmap.Database.open(database) as db:
@@ -188,15 +188,15 @@ def _map(folder: Path, database: Path, task: dict[str, Any], total: int, *, leni
         options.mapper.init_min_num_inliers = 40
         options.mapper.init_min_tri_angle = 5.0
         options.mapper.abs_pose_min_num_inliers = 15
-    placed = 2
+    registered = 2
 
     def next_photo() -> None:
-        nonlocal placed
-        placed += 1
-        share = min(placed / total, 1.0)
+        nonlocal registered
+        registered += 1
+        share = min(registered / total, 1.0)
         emit(
             fraction=_MATCH_END + (1.0 - _MATCH_END) * share,
-            message=f"placing photo {min(placed, total)} of {total}",
+            message=f"placing photo {min(registered, total)} of {total}",
         )
 
     output = folder / "models"

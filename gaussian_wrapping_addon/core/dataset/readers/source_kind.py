@@ -9,7 +9,7 @@ from pathlib import Path
 from ...errors import DatasetError
 from ..photos.photo_finder import (
     PHOTO_FOLDERS,
-    count_undeveloped,
+    count_raw_photos,
     list_photos,
     mask_roots_of,
     photo_root,
@@ -85,10 +85,10 @@ def source_kind(source: Path) -> SourceKind:
         return SourceKind("COLMAP model", source.parent, find_transforms(source.parent))
     if list_photos(photo_root(source)):
         return SourceKind("photos", source, None)
-    name, undeveloped = source.name or source, count_undeveloped(source)
-    if undeveloped:
+    name, raw_photos = source.name or source, count_raw_photos(source)
+    if raw_photos:
         raise DatasetError(
-            f"{name} holds no photo that can be read, but {undeveloped} HEIC or RAW files.",
+            f"{name} holds no photo that can be read, but {raw_photos} HEIC or RAW files.",
             "Export them as JPEG or PNG first.",
         )
     raise DatasetError(f"{name} holds no photos.", _WANTED)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far solved cameras are from true ones, after the best similarity of their centres."""
+"""Errors of solved camera poses after a similarity alignment of the camera centres."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from .similarity_alignment import umeyama
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Errors of the cameras that both sets name."""
+    """Errors of the cameras present in both sets."""
 
     names: tuple[str, ...]
     center_shares: np.ndarray
     """(n,) distance of the aligned centre from the true one, over the true cameras' spread: the
     root mean square distance of their centres from their mean."""
     given_shares: np.ndarray
-    """(n,) the same distance as the cameras were given, before any alignment."""
+    """(n,) the same distance before any alignment."""
     rotation_degrees: np.ndarray
     """(n,) angle between the aligned and the true orientation."""
     spread: float
-    """That spread, units of the true frame."""
+    """The spread, units of the true frame."""
     transform: Similarity
     """``true_from_solved``."""
     missing: tuple[str, ...]
-    """True cameras that the solved set lacks."""
+    """True cameras missing in the solved set."""
 
     def to_json(self) -> dict[str, Any]:
         """Return counts, medians and maxima as plain JSON values."""
@@ -50,19 +50,19 @@ class PoseErrors:
 
 
 def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> PoseErrors:
-    """Align the cameras of equal names by their centres (with scale) and measure what is left.
+    """Align cameras of equal names by their centres (with scale) and return the residual errors.
 
     Parameters
     ----------
     cameras : sequence of Camera
         Solved cameras, in any frame.
     true_cameras : sequence of Camera
-        Their true poses. Cameras are matched by ``name``, which must be the same text in both.
+        Their true poses. Cameras are matched by ``name``.
 
     Raises
     ------
     DatasetError
-        A name occurs twice, fewer than three names are common, or the centres lie on one line.
+        Duplicate names, fewer than three common names, or collinear centres.
     """
     solved, true = _by_name(cameras, "solved"), _by_name(true_cameras, "true")
     names = [name for name in true if name in solved]
@@ -79,9 +79,9 @@ def pose_errors(cameras: Sequence[Camera], true_cameras: Sequence[Camera]) -> Po
     distances = np.linalg.norm(transform.points(centers) - true_centers, axis=1)
     given = np.linalg.norm(centers - true_centers, axis=1)
     moved = np.array([solved[name].rotation @ transform.rotation.T for name in names])
-    apart = moved - np.array([true[name].rotation for name in names])  # (n, 3, 3)
-    # ||A - B||_F = 2 sqrt(2) sin(angle / 2): exact for tiny angles, where the trace is not.
-    sines = np.linalg.norm(apart, axis=(1, 2)) / np.sqrt(8.0)
+    difference = moved - np.array([true[name].rotation for name in names])  # (n, 3, 3)
+    # ||A - B||_F = 2 sqrt(2) sin(angle / 2): accurate for tiny angles, unlike the trace.
+    sines = np.linalg.norm(difference, axis=(1, 2)) / np.sqrt(8.0)
     angles = np.degrees(2.0 * np.arcsin(np.minimum(sines, 1.0)))
     missing = tuple(name for name in true if name not in solved)
     return PoseErrors(

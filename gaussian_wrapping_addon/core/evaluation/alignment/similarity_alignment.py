@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Similarity transforms between point sets: closed form, with outliers, and by nearest points.
+"""Similarity transforms between point sets: closed form (Umeyama), RANSAC, and ICP.
 
 Everything is computed about the centroids, so that coordinates of millions of units (a cadastral
-frame) cost no digits beyond those the input has lost already.
+frame) cost no digits beyond those already lost in the input.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ import numpy as np
 
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError
-from ..surface.samples import thin_points
+from ..surface.samples import voxel_downsample_points
 
 COLLINEAR_SHARE = 1e-6
-"""Second over first extent below which points count as collinear: the rotation about their line
-would then rest on a millionth of the scene, which is less than any pose estimate's error."""
+"""Ratio of second to first extent below which points count as collinear: the rotation about their
+line would depend on a millionth of the scene, less than the error of any pose estimate."""
 RANSAC_CONFIDENCE = 1.0 - 1e-9
-"""Chance that one of the drawn triples held no outlier at which drawing ends."""
+"""Drawing ends when one of the drawn triples is free of outliers with this probability."""
 RANSAC_BATCH = 512
-"""Triples that are scored together; bounds the memory to batch x points x 3 numbers."""
+"""Triples scored together; bounds the memory to batch x points x 3 numbers."""
 RANSAC_POLISH = 20
 ICP_ITERATIONS = 100
 ICP_TOLERANCE = 1e-6
@@ -35,31 +35,31 @@ TANKS_STAGES = ((1.0, 80.0), (0.5, 20.0), (0.0, 2.0))
 """Voxel and largest distance of each refinement stage in thresholds (docs/method.md, section 9.1);
 voxel 0 takes every k-th point instead."""
 TANKS_MAX_POINTS = 4_000_000
-"""Points kept by the last stage's even thinning."""
+"""Maximum number of points in the last stage, after taking every k-th."""
 
 
 @dataclass(frozen=True)
 class RansacResult:
-    """What :func:`umeyama_ransac` found."""
+    """Result of :func:`umeyama_ransac`."""
 
     transform: Similarity
     """``target_from_source``."""
     inliers: np.ndarray
     """(n,) bool, pairs within the threshold under ``transform``."""
     rmse: float
-    """Root of the mean squared distance of the inliers, units of the target."""
+    """Root mean square distance of the inliers, units of the target."""
 
 
 @dataclass(frozen=True)
 class IcpResult:
-    """What :func:`icp` found."""
+    """Result of :func:`icp`."""
 
     transform: Similarity
     """``target_from_source``."""
     fitness: float
-    """Share of the source's points that have a partner within ``max_distance``."""
+    """Share of the source points with a correspondence within ``max_distance``."""
     rmse: float
-    """Root of the mean squared distance to the partners, units of the target."""
+    """Root mean square distance of the correspondences, units of the target."""
     iterations: int = 0
     converged: bool = False
 
@@ -94,14 +94,14 @@ def umeyama(source: np.ndarray, target: np.ndarray, *, with_scale: bool) -> Simi
     Parameters
     ----------
     source, target : (n, 3) float64
-        Pairs of points, n >= 3, not on one line.
+        Corresponding points, n >= 3, not collinear.
     with_scale : bool
         Also fit the scale; otherwise it is 1.
 
     Raises
     ------
     DatasetError
-        Fewer than three pairs, values that are not finite, or points on one line.
+        Fewer than three pairs, values that are not finite, or collinear points.
     """
     source, target = _pairs(source, target)
     for points, name in ((source, "source"), (target, "target")):
@@ -113,12 +113,13 @@ def _pairs(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
         raise DatasetError(
-            f"Points of shapes {source.shape} and {target.shape} are no pairs.",
+            f"Points of shapes {source.shape} and {target.shape} do not match.",
             "Give two (n, 3) arrays of the same length.",
         )
     if len(source) < 3:
         raise DatasetError(
-            f"{len(source)} pairs of points determine no alignment.", "At least 3 are needed."
+            f"{len(source)} pairs of points do not determine an alignment.",
+            "At least 3 are needed.",
         )
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise DatasetError("The points to align are not all finite.", "Remove NaN and infinities.")
@@ -133,8 +134,8 @@ def _require_plane(points: np.ndarray, name: str) -> None:
     if extents[1] <= max(COLLINEAR_SHARE * extents[0], rounding):
         what = "in one place" if extents[0] <= rounding else "on one line"
         raise DatasetError(
-            f"The {len(points)} {name} points lie {what}, so no rotation can be told.",
-            "Use cameras or points that spread over a plane at least.",
+            f"The {len(points)} {name} points lie {what}, so the rotation is undetermined.",
+            "Use cameras or points that span at least a plane.",
         )
 
 
@@ -158,11 +159,11 @@ def umeyama_ransac(
     seed: int,
     with_scale: bool,
 ) -> RansacResult:
-    """Fit a similarity to pairs of which some are wrong.
+    """Fit a similarity to pairs with outliers by RANSAC.
 
-    Triples are drawn, fitted and judged by how many pairs they bring within ``threshold``; the
-    best one is fitted again to its inliers until these stay the same. Drawing ends early once
-    an outlier-free triple has come up with a chance of ``RANSAC_CONFIDENCE``.
+    Triples are drawn, fitted and scored by their number of inliers within ``threshold``; the best
+    one is refitted to its inliers until these no longer change. Drawing ends early once an
+    outlier-free triple was drawn with a probability of ``RANSAC_CONFIDENCE``.
 
     Parameters
     ----------
@@ -170,12 +171,12 @@ def umeyama_ransac(
     threshold : float
         Largest distance of an inlier, units of the target.
     iterations : int
-        Most triples to draw.
+        Maximum number of triples.
 
     Raises
     ------
     DatasetError
-        Degenerate pairs (see :func:`umeyama`), or no triple that at least three pairs agree with.
+        Degenerate pairs (see :func:`umeyama`), or no triple with at least three inliers.
     """
     source, target = _pairs(source, target)
     for points, name in ((source, "source"), (target, "target")):
@@ -204,7 +205,7 @@ def umeyama_ransac(
     if best_count < 3:
         raise DatasetError(
             f"No alignment brings three of {len(a)} pairs within {threshold:g}.",
-            "The pairs do not belong together, or the threshold is far too small.",
+            "The pairs do not correspond, or the threshold is far too small.",
         )
     for _ in range(RANSAC_POLISH):
         _require_plane(a[best], "agreeing source")
@@ -227,7 +228,7 @@ def umeyama_ransac(
 def _score_triples(
     a: np.ndarray, b: np.ndarray, triples: np.ndarray, threshold: float, with_scale: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which pairs agree with each triple (k, n) bool, and the inliers' squared sum (k,)."""
+    """Return the inliers of each triple, (k, n) bool, and the sum of their squares, (k,)."""
     p, q = a[triples], b[triples]  # (k, 3, 3)
     p_mean, q_mean = p.mean(1), q.mean(1)
     p, q = p - p_mean[:, None], q - q_mean[:, None]
@@ -256,28 +257,28 @@ def icp(
     tolerance: float = ICP_TOLERANCE,
     threads: int = 1,
 ) -> IcpResult:
-    """Improve an alignment by pairing every source point with the nearest target point.
+    """Refine an alignment by the iterative closest point algorithm.
 
-    Point to point (Besl and McKay 1992). It ends when no partner changes any more, when fitness
-    and rmse both change by less than ``tolerance`` of themselves, or after ``iterations``.
+    Point to point (Besl and McKay 1992). It ends when no correspondence changes, when fitness and
+    rmse both change by less than ``tolerance`` (relative), or after ``iterations``.
 
     Parameters
     ----------
     source : (n, 3) float64
     target : (m, 3) float64
     start : Similarity
-        First guess of ``target_from_source``.
+        Initial ``target_from_source``.
     max_distance : float
-        Pairs further apart are left out, units of the target.
+        Pairs farther apart are ignored, units of the target.
     with_scale : bool
-        Whether the scale may change; otherwise ``start``'s stays.
+        Whether the scale is optimised; otherwise that of ``start`` is kept.
     threads : int
-        Threads of the search (the result does not depend on it).
+        Threads of the search; the result does not depend on it.
 
     Raises
     ------
     DatasetError
-        Fewer than three points, no pair within ``max_distance``, or pairs on one line.
+        Fewer than three points, no pair within ``max_distance``, or collinear pairs.
     """
     from scipy.spatial import cKDTree
 
@@ -286,14 +287,14 @@ def icp(
         if points.ndim != 2 or points.shape[1:] != (3,) or len(points) < 3:
             raise DatasetError(
                 f"ICP needs at least 3 {name} points, not an array {points.shape}.",
-                "Check that the crop leaves something of both surfaces.",
+                "Check that the crop contains parts of both surfaces.",
             )
         if not np.isfinite(points).all():
             raise DatasetError(f"The {name} points are not all finite.", "Remove NaN from them.")
     center = target.mean(0)
     aim = target - center
     tree = cKDTree(aim)
-    # "placed" are the source's points as the start puts them; only what ICP adds is iterated.
+    # "placed" are the source points under ``start``; only the increment is iterated.
     placed = start.points(source) - center
     added = Similarity()
     partners, fitness, rmse, round_, converged = np.zeros(0, np.int64), 0.0, 0.0, 0, False
@@ -306,7 +307,7 @@ def icp(
             raise DatasetError(
                 f"Only {int(near.sum())} of {len(source)} points lie within {max_distance:g} of "
                 "the true surface.",
-                "The first alignment is wrong: check cameras, matrices and units.",
+                "The initial alignment is wrong: check cameras, matrices and units.",
             )
         before = (fitness, rmse)
         fitness = float(near.mean())
@@ -328,7 +329,7 @@ def icp(
             _require_plane(points, name)
         added = _fit(*pairs, with_scale)
         round_ += 1
-    # added(start(x) - c) + c, written as one similarity of x.
+    # added(start(x) - c) + c as one similarity of x.
     rotation = added.rotation @ start.rotation
     scale = added.scale * start.scale
     translation = added.points((start.translation - center)[None])[0] + center
@@ -345,13 +346,13 @@ def refine_as_tanks(
     iterations: int = ICP_ITERATIONS,
     threads: int = 1,
 ) -> TanksRefinement:
-    """Refine as Tanks and Temples does: ICP with scale in three stages.
+    """Refine an alignment as Tanks and Temples does: ICP with scale in three stages.
 
     See docs/method.md, section 9.1.
 
-    Both sets thinned to voxels of ``threshold`` and pairs up to 80 thresholds; half of it and 20;
-    every k-th point and 2. Points outside of the crop take no part; which of the source's are
-    outside is judged anew at the start of every stage.
+    Stage 1: both sets downsampled to voxels of ``threshold``, pairs up to 80 thresholds. Stage 2:
+    half of it and 20. Stage 3: every k-th point and 2. Points outside the crop are ignored; for
+    the source, the crop is evaluated again at the start of every stage.
 
     Parameters
     ----------
@@ -359,12 +360,12 @@ def refine_as_tanks(
     threshold : float
         The scene's tau, units of the target.
     inside : callable or None
-        The crop: maps (n, 3) points of the target's frame to (n,) bool.
+        The crop: maps (n, 3) points in the target's frame to (n,) bool.
 
     Raises
     ------
     DatasetError
-        See :func:`icp`; also where the crop leaves nothing.
+        See :func:`icp`; also if the crop is empty.
     """
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     if inside is not None:
@@ -375,15 +376,15 @@ def refine_as_tanks(
         if min(len(moving), len(target)) < 3:
             raise DatasetError(
                 f"The crop leaves {len(moving)} points of the mesh and {len(target)} of the truth.",
-                "The first alignment is wrong, or the crop belongs to another scene.",
+                "The initial alignment is wrong, or the crop belongs to another scene.",
             )
         aim = target
         if voxels:
-            # Voxels are of the target's frame, so that both sets are equally dense.
+            # Voxels are in the target's frame, so that both sets are equally dense.
             moving = transform.inverse().points(
-                thin_points(transform.points(moving), voxels * threshold)
+                voxel_downsample_points(transform.points(moving), voxels * threshold)
             )
-            aim = thin_points(aim, voxels * threshold)
+            aim = voxel_downsample_points(aim, voxels * threshold)
         else:
             moving, aim = _every_kth(moving), _every_kth(aim)
         stages.append(

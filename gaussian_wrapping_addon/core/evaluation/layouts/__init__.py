@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ground truths as their owners have them: Tanks and Temples, DTU, plain files."""
+"""Readers of ground truths in their original layouts: Tanks and Temples, DTU, plain files."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scans of the DTU data set as their owners have them: read, aligned and scored.
+"""Read, align and score scans of the DTU data set in their original layout.
 
 See docs/method.md, section 9.2.
 
@@ -35,10 +35,10 @@ from ..surface.dtu_chamfer import (
 from .mesh_input import read_cloud
 
 MAX_MISFIT_SHARE = 0.05
-"""Aligned centres may miss the true ones by this share of the cameras' spread (root mean square);
-cameras that are paired wrongly miss them by about all of it."""
+"""Maximum root mean square distance of aligned centres from the true ones, as a share of the
+cameras' spread; wrongly paired cameras have about the full spread."""
 NUMBER_OFFSETS = (0, 1, -1)
-"""Photo names count from 0 or from 1, as the camera files do: the offset that fits is taken."""
+"""Photo names and camera files count from 0 or from 1: the offset that fits best is used."""
 
 _AGAIN = "Use the file that belongs to the data set."
 _CAMERA_FOLDERS = ("", "scan{scan}", "dtu_scan{scan}")
@@ -47,31 +47,31 @@ _ARCHIVES = ("cameras.npz", "cameras_sphere.npz")
 
 @dataclass(frozen=True)
 class DtuScan:
-    """One scan's ground truth, millimetres."""
+    """Ground truth of one scan, millimetres."""
 
     scan: int
     cloud: np.ndarray
     """(n, 3) float64."""
     mask: ObservationMask
     plane: np.ndarray
-    """(4,) ground plane; true points with ``plane . [x, 1] > 0`` are judged."""
+    """(4,) ground plane; true points with ``plane . [x, 1] > 0`` are evaluated."""
     camera_numbers: np.ndarray
-    """(m,) int64; empty where no camera files were found."""
+    """(m,) int64; empty if no camera files were found."""
     camera_centers: np.ndarray
     """(m, 3) float64."""
     camera_source: str
-    """Name of the file or folder the cameras are from."""
+    """Name of the file or folder of the cameras."""
 
 
 @dataclass(frozen=True)
 class DtuAlignment:
-    """How the job's cameras were brought to the true ones."""
+    """Alignment of the job's cameras to the true ones."""
 
     transform: Similarity
     """``truth_from_job``."""
     cameras: int
     number_offset: int
-    """Number in the camera files minus number in the photo's name."""
+    """Number in the camera files minus the number in the photo's name."""
     rmse_mm: float
 
     def to_json(self) -> dict[str, Any]:
@@ -85,7 +85,7 @@ class DtuAlignment:
 
 
 def is_dtu_folder(folder: Path) -> bool:
-    """Tell whether the folder holds the data set's ``Points`` or ``ObsMask``."""
+    """Return whether the folder holds the data set's ``Points`` or ``ObsMask``."""
     return any((root / n).is_dir() for root in _roots(folder) for n in ("Points/stl", "ObsMask"))
 
 
@@ -99,7 +99,7 @@ def _find(folder: Path, name: str) -> Path:
             return root / name
     raise DatasetError(
         f"{folder.name} holds no {name}.",
-        "Needed are Points/stl/stl024_total.ply, ObsMask/ObsMask24_10.mat and ObsMask/Plane24.mat "
+        "Required: Points/stl/stl024_total.ply, ObsMask/ObsMask24_10.mat and ObsMask/Plane24.mat "
         "(for scan 24).",
     )
 
@@ -112,7 +112,7 @@ def read_dtu(folder: Path, scan: int) -> DtuScan:
     DatasetError
         A file is missing.
     ParseError
-        Names the file and the entry that is missing or wrong.
+        States the file and the entry that is missing or invalid.
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder} is not a folder.", "Give the folder of the data set.")
@@ -133,7 +133,7 @@ def read_observation_mask(path: Path) -> ObservationMask:
     values = _read_mat(path, ("ObsMask", "BB", "Res"))
     volume = values["ObsMask"]
     if volume.ndim != 3 or volume.dtype.kind not in "bui" or volume.size == 0:
-        raise ParseError(path, "ObsMask", f"{volume.dtype} {volume.shape} is no volume.", _AGAIN)
+        raise ParseError(path, "ObsMask", f"{volume.dtype} {volume.shape} is not a volume.", _AGAIN)
     box = _floats(path, "BB", values["BB"], (2, 3))
     resolution = float(_floats(path, "Res", values["Res"].reshape(-1), (1,))[0])
     if not (box[1] > box[0]).all():
@@ -161,7 +161,7 @@ def _read_mat(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
 
     try:
         values = loadmat(path, variable_names=keys)
-    except Exception as error:  # a broken file can make a foreign reader raise anything
+    except Exception as error:  # a broken file can make the reader raise anything
         raise ParseError(
             path, "whole file", f"cannot be read as a MATLAB file up to version 7.2 ({error}).",
             _AGAIN,
@@ -233,7 +233,7 @@ def _text_centers(paths: list[Path]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _center(path: Path, place: str, projection: np.ndarray) -> np.ndarray:
-    """Return the point that a (3, 4) projection sends to no pixel."""
+    """Return the centre of a (3, 4) projection, its null space."""
     linear = projection[:, :3]
     if not np.linalg.cond(linear) < 1e12:
         raise ParseError(path, place, "the projection has no centre.", _AGAIN)
@@ -241,10 +241,10 @@ def _center(path: Path, place: str, projection: np.ndarray) -> np.ndarray:
 
 
 def align_to_scan(cameras: Sequence[Camera], truth: DtuScan) -> DtuAlignment:
-    """Return ``truth_from_job`` from the camera centres: Umeyama, rigid with scale.
+    """Return ``truth_from_job`` from the camera centres (Umeyama, with scale).
 
     The first number in a photo's name (``rect_001_3_r5000.png``, ``000000.png``) is that of its
-    camera file; whether it counts from 0 or 1 is found out by what fits.
+    camera file; whether it counts from 0 or 1 is decided by the better fit.
 
     Raises
     ------
@@ -273,7 +273,7 @@ def align_to_scan(cameras: Sequence[Camera], truth: DtuScan) -> DtuAlignment:
         rows = np.array([row_of.get(n + offset, -1) for n in numbers], np.int64)
         known = rows >= 0
         matched = max(matched, int(known.sum()))
-        # An offset that leaves photos without a camera is no reading of their names.
+        # Every photo must have a camera under the right offset.
         if known.sum() < 3 or not known.all():
             continue
         true = truth.camera_centers[rows]
@@ -290,8 +290,8 @@ def align_to_scan(cameras: Sequence[Camera], truth: DtuScan) -> DtuAlignment:
     spread = float(np.sqrt((true_spread**2).sum(1).mean()))
     if best.rmse_mm > MAX_MISFIT_SHARE * spread:
         raise DatasetError(
-            f"The cameras miss those of {truth.camera_source} by {best.rmse_mm:.3g} mm.",
-            "Photos and cameras do not belong together, or the cameras were solved wrongly.",
+            f"The cameras are off those of {truth.camera_source} by {best.rmse_mm:.3g} mm (RMS).",
+            "Photos and cameras do not match, or the cameras were solved wrongly.",
         )
     return best
 
@@ -305,9 +305,9 @@ def score_dtu(
     seed: int = 0,
     threads: int = 1,
 ) -> DtuScore:
-    """Align a mesh, cover it with points, and compare (see :func:`~.dtu_chamfer.dtu_chamfer`).
+    """Align a mesh, resample it as points, and compare (see :func:`~.dtu_chamfer.dtu_chamfer`).
 
-    Faces further than the patch from the observed box take no part: they would not count.
+    Faces farther than the patch from the observed box are left out, as they would not count.
 
     Raises
     ------

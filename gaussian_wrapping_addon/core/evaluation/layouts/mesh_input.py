@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes and point clouds that a user wants judged, or judged against, from common files."""
+"""Read meshes and point clouds for evaluation from common file formats."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ _AGAIN = "Export the file again."
 
 
 def is_cloud(path: Path) -> bool:
-    """Tell whether a PLY file announces no faces; other formats are taken for meshes.
+    """Return whether a file is a PLY without faces; other formats count as meshes.
 
     Raises
     ------
     ParseError
-        A PLY whose header is broken.
+        The header of the PLY is invalid.
     """
     return path.suffix.lower() == ".ply" and not read_ply_header(path, _AGAIN).count("face")
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a triangle mesh through trimesh, in the coordinates that the file holds.
+    """Read a triangle mesh with trimesh, in the coordinates of the file.
 
-    Of a GLB the transforms of its nodes are applied; its axes stay as they are (Y up).
+    Node transforms of a GLB are applied; its axes are kept (Y up).
 
     Returns
     -------
@@ -40,8 +40,8 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises
     ------
     ParseError
-        Not a mesh file, cut off, without faces, with values that are not finite, or with faces
-        that name missing vertices.
+        Not a mesh file, truncated, without faces, with values that are not finite, or with vertex
+        indices out of range.
     WorkerError
         The worker's Python lacks trimesh.
     """
@@ -63,15 +63,15 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
         loaded: Any = trimesh.load(path, process=False, force="mesh", **options)
         vertices = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
         faces = np.asarray(loaded.faces, np.int64).reshape(-1, 3)
-    except Exception as error:  # a broken file can make a foreign reader raise anything
+    except Exception as error:  # a broken file can make the reader raise anything
         raise ParseError(
-            path, "whole file", f"cannot be read as a mesh ({error}); it may be cut off.", _AGAIN
+            path, "whole file", f"cannot be read as a mesh ({error}); it may be truncated.", _AGAIN
         ) from None
     if len(faces) == 0:
-        raise ParseError(path, "faces", "there are none, or the file is cut off.", _AGAIN)
+        raise ParseError(path, "faces", "there are none, or the file is truncated.", _AGAIN)
     if faces.min() < 0 or faces.max() >= len(vertices):
         bad = int(np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(1))[0])
-        raise ParseError(path, f"face {bad}", "names a vertex that does not exist.", _AGAIN)
+        raise ParseError(path, f"face {bad}", "refers to a vertex that does not exist.", _AGAIN)
     _require_finite(path, vertices)
     return vertices, faces
 
@@ -90,7 +90,7 @@ def read_cloud(path: Path) -> np.ndarray:
     Raises
     ------
     ParseError
-        Not a PLY, cut off, empty, or with points that are not finite.
+        Not a PLY, truncated, empty, or with points that are not finite.
     """
     announced = read_ply_header(path, _AGAIN).count("vertex")
     points, _ = read_point_ply(path)

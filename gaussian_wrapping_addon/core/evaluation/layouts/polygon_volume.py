@@ -22,22 +22,22 @@ _PLANES = {"X": (1, 2, 0), "Y": (0, 2, 1), "Z": (0, 1, 2)}
 
 @dataclass(frozen=True)
 class PolygonVolume:
-    """All points whose projection along an axis lies in a polygon, between two heights."""
+    """All points between two heights whose projection along an axis lies in a polygon."""
 
     polygon: np.ndarray
     """(k, 3) float64 corners in order, the last joined to the first; the coordinate along the axis
-    is not used. The polygon may be concave; where it crosses itself the even-odd rule holds."""
+    is not used. The polygon may be concave; self-intersections follow the even-odd rule."""
     orthogonal_axis: str
     """``"X"``, ``"Y"`` or ``"Z"``."""
     axis_min: float
     axis_max: float
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Tell which of (n, 3) points lie inside.
+        """Return whether (n, 3) points lie inside, (n,) bool.
 
-        The heights ``axis_min`` and ``axis_max`` themselves are inside. A point on the polygon's
-        border counts with the side that has larger coordinates, so of two volumes that share an
-        edge exactly one contains it. NaN is outside.
+        The heights ``axis_min`` and ``axis_max`` are inside. A point on the polygon's border is on
+        the side with larger coordinates, so that exactly one of two volumes that share an edge
+        contains it. NaN is outside.
         """
         points = np.asarray(points, np.float64)
         u, v, w = _PLANES[self.orthogonal_axis]
@@ -83,7 +83,7 @@ def read_polygon_volume(path: Path) -> PolygonVolume:
     Raises
     ------
     ParseError
-        Names the entry: missing, not finite, an unknown axis or version, too few corners.
+        States the entry: missing, not finite, an unknown axis or version, too few corners.
     """
     try:
         values = read_json(path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scenes of Tanks and Temples as their owners have them: read, aligned and scored.
+"""Read, align and score scenes of Tanks and Temples in their original layout.
 
 See docs/method.md, section 9.1.
 
@@ -28,7 +28,7 @@ from ..surface.samples import (
     sample_legacy,
     sample_uniformly,
     scan_virtually,
-    thin_points,
+    voxel_downsample_points,
 )
 from ..surface.scores import score_clouds
 from .mesh_input import read_cloud
@@ -38,15 +38,15 @@ THRESHOLDS = {
     "barn": 0.01, "caterpillar": 0.005, "courthouse": 0.025, "ignatius": 0.003,
     "meetingroom": 0.01, "truck": 0.005,
 }  # fmt: skip
-"""Distance that counts as met, by scene (docs/method.md, section 9.1)."""
+"""Distance threshold by scene (docs/method.md, section 9.1)."""
 RANSAC_DISTANCE = 0.2
 RANSAC_ITERATIONS = 100_000
 MIN_AGREEING_SHARE = 0.5
-"""With fewer cameras than this on the reference trajectory, photos were paired wrongly."""
+"""With a smaller share of cameras on the reference trajectory, photos were paired wrongly."""
 SAMPLES = 10_000_000
 ALIGNMENT_SAMPLES = 1_000_000
 SCAN_KEPT_POINTS = 20_000_000
-"""Scanned points are thinned out together whenever more than this have come in."""
+"""Scanned points are downsampled together whenever there are more than this."""
 
 _TRUTH_SUFFIX, _LOG_SUFFIX = "_trans.txt", "_COLMAP_SfM.log"
 _ROTATION_TOLERANCE = 1e-2
@@ -55,7 +55,7 @@ _AGAIN = "Use the file that belongs to the data set."
 
 @dataclass(frozen=True)
 class TanksScene:
-    """One scene's ground truth, in the frame of the scanned cloud."""
+    """Ground truth of one scene, in the frame of the scanned cloud."""
 
     name: str
     threshold: float
@@ -63,13 +63,13 @@ class TanksScene:
     """(n, 3) float64."""
     crop: PolygonVolume
     log_numbers: np.ndarray
-    """(m,) int64, number of the photo of each entry of the trajectory."""
+    """(m,) int64, photo number of each entry of the trajectory."""
     log_centers: np.ndarray
-    """(m, 3) camera centres of the trajectory, already moved by ``_trans.txt``."""
+    """(m, 3) camera centres of the trajectory, transformed by ``_trans.txt``."""
 
 
 def is_tanks_folder(folder: Path) -> bool:
-    """Tell whether the folder holds a trajectory or an alignment matrix of the data set."""
+    """Return whether the folder holds a trajectory or an alignment matrix of the data set."""
     return any(any(folder.glob(f"*{suffix}")) for suffix in (_TRUTH_SUFFIX, _LOG_SUFFIX))
 
 
@@ -79,16 +79,16 @@ def read_tanks(folder: Path, threshold: float | None = None) -> TanksScene:
     Parameters
     ----------
     folder : Path
-        Named like the scene, where it holds the files of several.
+        Must have the name of the scene if it holds the files of several.
     threshold : float or None
-        Instead of the one of :data:`THRESHOLDS`.
+        Replaces that of :data:`THRESHOLDS`.
 
     Raises
     ------
     ParseError
-        Names the file and the place in it.
+        States the file and the location in it.
     DatasetError
-        A file is missing, or it is not clear which scene is meant.
+        A file is missing, or the scene is ambiguous.
     UsageError
         The scene has no known threshold and none was given.
     """
@@ -157,13 +157,13 @@ def read_trajectory(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     numbers : (m,) int64
-        The first number of each entry's line ``i i 0``: which photo in sorted order, from 0.
+        First number of each entry's line ``i i 0``: index of the photo in sorted order, from 0.
     world_from_camera : (m, 4, 4) float64
 
     Raises
     ------
     ParseError
-        With the line: cut off, not numbers, or not a pose.
+        With the line: truncated, not numbers, or not a pose.
     """
     lines = [(number, line.split()) for number, line in _lines(path) if line.strip()]
     if len(lines) < 15 or len(lines) % 5:
@@ -179,7 +179,7 @@ def read_trajectory(path: Path) -> tuple[np.ndarray, np.ndarray]:
             raise ParseError(path, place, "three whole numbers were expected.", _AGAIN)
         rows = [row for _, row in lines[begin + 1 : begin + 5]]
         if any(len(row) != 4 for row in rows):
-            raise ParseError(path, place, "four rows of four numbers have to follow.", _AGAIN)
+            raise ParseError(path, place, "four rows of four numbers must follow.", _AGAIN)
         matrix = _numbers(path, place, rows)
         _similarity(path, place, matrix)
         numbers.append(int(words[0]))
@@ -225,17 +225,17 @@ def _similarity(path: Path, place: str, matrix: np.ndarray) -> Similarity:
 
 
 def photo_numbers(names: Sequence[str], log_numbers: np.ndarray) -> np.ndarray:
-    """Return the row of the trajectory for each photo, -1 for those it does not hold.
+    """Return the row of the trajectory for each photo, -1 if it is missing.
 
-    The trajectory counts the photos in sorted order of their names, from 0. Where there are as
-    many photos as entries, the sorted names are the entries in order. Otherwise (a job with fewer
-    photos) the last number in a name decides: the data set calls its photos 000001.jpg and on, so
-    entry i is photo i + 1.
+    The trajectory counts the photos in sorted order of their names, from 0. If there are as many
+    photos as entries, the sorted names are the entries in order. Otherwise (a job with fewer
+    photos) the last number in the name is used: the data set names its photos 000001.jpg and on,
+    so entry i is photo i + 1.
 
     Raises
     ------
     DatasetError
-        A name without a number, where numbers have to decide.
+        A name without a number where one is needed.
     """
     row_of = {int(number): row for row, number in enumerate(log_numbers)}
     if len(names) == len(log_numbers):
@@ -257,15 +257,15 @@ def photo_numbers(names: Sequence[str], log_numbers: np.ndarray) -> np.ndarray:
 
 
 def align_to_log(cameras: Sequence[Camera], scene: TanksScene, *, seed: int) -> RansacResult:
-    """Return ``truth_from_job`` from the camera centres by RANSAC with scale.
+    """Return ``truth_from_job`` from the camera centres by RANSAC, with scale.
 
     See docs/method.md, section 9.1.
 
     Raises
     ------
     DatasetError
-        Fewer than three photos are in the trajectory, their centres are degenerate, or less than
-        half of them agree with one similarity.
+        Fewer than three photos are in the trajectory, their centres are degenerate, or fewer than
+        half of them are inliers of one similarity.
     """
     rows = photo_numbers([camera.name for camera in cameras], scene.log_numbers)
     known = np.flatnonzero(rows >= 0)
@@ -285,9 +285,9 @@ def align_to_log(cameras: Sequence[Camera], scene: TanksScene, *, seed: int) -> 
     )
     if found.inliers.mean() < MIN_AGREEING_SHARE:
         raise DatasetError(
-            f"{int(found.inliers.sum())} of {len(known)} cameras lie on the trajectory of "
-            f"{scene.name} to {RANSAC_DISTANCE:g}.",
-            "Photos and trajectory do not belong together, or the cameras were solved wrongly.",
+            f"{int(found.inliers.sum())} of {len(known)} cameras match the trajectory of "
+            f"{scene.name} within {RANSAC_DISTANCE:g}.",
+            "Photos and trajectory do not match, or the cameras were solved wrongly.",
         )
     return found
 
@@ -306,38 +306,38 @@ def score_tanks(
     threads: int = 1,
     progress: Progress | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Score a mesh by the data set's protocol: samples, refinement, crop, voxel tau / 2, F1.
+    """Score a mesh by the data set's protocol: sampling, refinement, crop, voxel tau / 2, F1.
 
-    ``uniform`` draws evenly (1e6 samples, or ``samples`` if that is less, for the refinement);
-    samples outside of the crop are dropped one by one, so faces need no rule of their own.
-    ``scan`` takes what the cameras see, thinned to voxels of tau / 4. ``legacy`` takes vertices
-    and face centres. Each is refined by itself, as in the original scripts.
+    ``uniform`` samples uniformly (1e6 samples, or ``samples`` if that is less, for the refinement);
+    samples outside the crop are dropped individually, so faces need no cropping. ``scan`` uses the
+    surface seen by the cameras, downsampled to voxels of tau / 4. ``legacy`` uses vertices and
+    face centres. Each is refined separately, as in the original scripts.
 
     Parameters
     ----------
     vertices, faces : (v, 3), (f, 3)
-        In the job's frame, as are the cameras.
+        In the job's frame, like the cameras.
     start : Similarity
         ``truth_from_job`` before the refinement.
 
     Returns
     -------
     dict
-        For each protocol ``score``, ``transform``, and ``refinement`` (or ``None``); plain values.
+        For each protocol ``score``, ``transform``, ``refinement`` (or ``None``); plain JSON values.
 
     Raises
     ------
     UsageError
         Unknown protocol, or a scan without cameras.
     DatasetError
-        The refinement finds no counterparts, or the crop holds no truth.
+        The refinement finds no correspondences, or the crop holds no truth.
     """
     progress = progress or Progress()
     truth = scene.cloud[scene.crop.inside(scene.cloud)]
     if len(truth) == 0:
         raise DatasetError(
             f"The crop of {scene.name} holds no point of its cloud.",
-            "Crop and cloud belong to different scenes.",
+            "Crop and cloud may belong to different scenes.",
         )
     results: dict[str, dict[str, Any]] = {}
     for index, protocol in enumerate(protocols):
@@ -383,7 +383,7 @@ def score_tanks(
 def _near_faces(
     vertices: np.ndarray, faces: np.ndarray, scene: TanksScene, start: Similarity, *, reach: float
 ) -> np.ndarray:
-    """Return the faces whose box touches the crop's, widened by ``reach`` thresholds."""
+    """Return the faces whose box intersects the crop's, widened by ``reach`` thresholds."""
     low, high = scene.crop.bounds()
     margin = reach * scene.threshold
     corners = start.points(vertices)[faces]  # (f, 3, 3)
@@ -400,10 +400,11 @@ def _scan(
     threads: int,
     progress: Progress,
 ) -> np.ndarray:
-    """Return what cameras see of the mesh inside of the (widened) crop, thinned to tau / 4."""
+    """Return the points that cameras see in the (widened) crop, downsampled to tau / 4."""
     if not cameras:
         raise UsageError(
-            "A virtual scan needs cameras.", "Evaluate a job folder, give --cameras, or leave it."
+            "A virtual scan needs cameras.",
+            "Evaluate a job folder, give --cameras, or omit the scan.",
         )
     voxel = scene.threshold / 4
     low, high = scene.crop.bounds()
@@ -415,10 +416,10 @@ def _scan(
         progress.check()
         seen = start.points(scan_virtually(vertices, faces, [camera], threads=threads).points)
         near = ((seen >= low - margin) & (seen <= high + margin)).all(1)
-        kept.append(thin_points(seen[near], voxel))
+        kept.append(voxel_downsample_points(seen[near], voxel))
         count += len(kept[-1])
         if count > SCAN_KEPT_POINTS:
-            kept = [thin_points(np.concatenate(kept), voxel)]
-            # What is left is as thin as it gets: the next thinning waits for as much again.
+            kept = [voxel_downsample_points(np.concatenate(kept), voxel)]
+            # The rest cannot get sparser: downsample again only after as many new points.
             count = 0
-    return back.points(thin_points(np.concatenate(kept), voxel))
+    return back.points(voxel_downsample_points(np.concatenate(kept), voxel))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report of a job, for people and programs.
+"""The report of a job: ``report.json`` for programs, ``report.md`` for people.
 
-In: figures of all stages. Out: ``report.json``, ``report.md``, pictures.
+In: the figures of all stages. Out: both files and their pictures.
 """

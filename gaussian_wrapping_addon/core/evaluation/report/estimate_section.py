@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report's line on what was expected of the training and what it took."""
+"""Report section: estimated and actual time and memory of the training."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .text import bytes_text, duration, measured, part
 
 
 def estimate_lines(training: dict[str, Any]) -> list[str]:
-    """Return the comparison as Markdown lines; none where nothing was estimated."""
+    """Return the comparison as Markdown lines; none if nothing was estimated."""
     expected = part(training, "estimate")
     low, high = measured(expected.get("seconds_low")), measured(expected.get("seconds_high"))
     took = measured(training.get("seconds_training"))

@@ -8,16 +8,16 @@ from typing import Any
 
 from .text import escaped, measured, number
 
-# Lists of records, shown as tables or pictures of their own.
+# Lists of records that have tables or pictures of their own.
 _SHOWN_ELSEWHERE = {"decisions", "history", "pictures", "warnings", "packages", "stages", "notes"}
 
 _UNITS = {
     "psnr": "dB",
     "held_out_psnr": "dB",
-    "ssim": "1 is equal",
-    "held_out_ssim": "1 is equal",
-    "lpips": "0 is equal",
-    "held_out_lpips": "0 is equal",
+    "ssim": "1 is identical",
+    "held_out_ssim": "1 is identical",
+    "lpips": "0 is identical",
+    "held_out_lpips": "0 is identical",
     "seconds_training": "s",
     "wall_seconds": "s",
     "mesh_seconds": "s",
@@ -118,7 +118,7 @@ def figure_rows(report: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def unit_of(path: tuple[str, ...]) -> str:
-    """Return the unit of a figure by its name; empty where the name is not known."""
+    """Return the unit of a figure by its name; empty for an unknown name."""
     key = path[-1]
     if key.isdigit():  # an entry of a list
         path, key = path[:-1], path[-2]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``report.md``: what a job made, for who ordered it; first plain words, then figures."""
+"""``report.md``: the results of a job as text for its user; a summary, then all figures."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from .estimate_section import estimate_lines
 from .figures import figure_rows
 from .region_section import Picture, note_lines, region_lines, region_summary
 from .report_warnings import FEW_HELD_OUT, collect_warnings, warning_lines
-from .selection_section import needs_lines
+from .selection_section import selection_lines
 from .text import (
     NOT_MEASURED,
     bar,
     bytes_text,
     duration,
     escaped,
+    escaped_or,
     items,
     measured,
     number,
@@ -29,7 +30,6 @@ from .text import (
     percent,
     plural,
     table,
-    words,
 )
 
 CURVE = "learning-curve.svg"
@@ -46,17 +46,17 @@ _MEMORY = {
 }
 _FACTS = {
     "kind": ("Input", ""),
-    "photos": ("Photos offered", "photos"),
-    "photos_placed": ("Photos that could be placed", "photos"),
-    "photos_undistorted": ("Photos straightened (lens distortion)", "photos"),
-    "photos_with_focal_length": ("Photos that name their focal length", "photos"),
+    "photos": ("Photos in the input", "photos"),
+    "photos_placed": ("Photos with a solved camera", "photos"),
+    "photos_undistorted": ("Photos undistorted", "photos"),
+    "photos_with_focal_length": ("Photos with a recorded focal length", "photos"),
     "photo_sizes": ("Photo size", "pixels"),
     "mean_reprojection_error_px": ("Mean reprojection error of the sparse points", "px"),
-    "start_points": ("Start points", ""),
+    "start_points": ("Initial points", ""),
     "up_from": ("Up direction taken from", ""),
     "world_frame": ("World frame", ""),
     "camera_models": ("Lens model", ""),
-    "also_present": ("Also found", ""),
+    "also_present": ("Also found in the input", ""),
 }
 
 
@@ -66,16 +66,16 @@ def report_markdown(report: dict[str, Any], result: Path, earlier: Path | None =
     Parameters
     ----------
     report : dict
-        Content of ``report.json``; of any version, whatever it lacks is said to be not measured.
+        Content of ``report.json`` of any version; missing entries are reported as not measured.
     result : Path
-        The result folder: a picture is linked only where its file lies there.
+        The result folder; a picture is linked only if its file exists.
     earlier : Path or None
-        A result folder whose entries the first one is going to join: what it lacks counts from
-        there.
+        A result folder into which ``result`` will be merged: entries that ``result`` lacks are
+        looked up there.
     """
     picture = _pictures_of(result, earlier)
     lines = [
-        f"# Report: {words(report.get('source'), 'job')}",
+        f"# Report: {escaped_or(report.get('source'), 'job')}",
         "",
         *picture("preview.png", "Left: part of a photo. Right: the textured mesh."),
         *_summary(report),
@@ -92,7 +92,7 @@ def report_markdown(report: dict[str, Any], result: Path, earlier: Path | None =
         "",
         *_training(part(report, "training"), picture),
         "",
-        *needs_lines(part(report, "training")),
+        *selection_lines(part(report, "training")),
     ]
     for name, region in part(report, "regions").items():
         lines += ["", f"## Region {escaped(name)}", "", *region_lines(name, region, picture)]
@@ -107,11 +107,11 @@ def report_markdown(report: dict[str, Any], result: Path, earlier: Path | None =
         "",
         "</details>",
     ]
-    return "\n".join(_without_gaps(lines)) + "\n"
+    return "\n".join(_collapse_blank_lines(lines)) + "\n"
 
 
-def _without_gaps(lines: list[str]) -> list[str]:
-    """Drop empty lines that follow an empty line."""
+def _collapse_blank_lines(lines: list[str]) -> list[str]:
+    """Collapse runs of empty lines into one."""
     return [t for i, t in enumerate(lines) if t or i == 0 or lines[i - 1]]
 
 
@@ -130,71 +130,71 @@ def _pictures_of(result: Path, earlier: Path | None) -> Picture:
 def _summary(report: dict[str, Any]) -> list[str]:
     cameras, training = part(report, "cameras"), part(report, "training")
     preset = part(report, "settings").get("preset")
-    made = f"Photos used: {number(cameras.get('views'))}. "
-    made += f"Gaussians trained on them: {number(training.get('gaussians'))}"
+    text = f"Photos used: {number(cameras.get('views'))}. "
+    text += f"Gaussians trained on them: {number(training.get('gaussians'))}"
     if preset:
-        made += f" (preset {escaped(preset)})"
-    lines = ["## Summary", "", f"- **What was made.** {made}."]
+        text += f" (preset {escaped(preset)})"
+    lines = ["## Summary", "", f"- **Result.** {text}."]
     lines[-1] += "".join(" " + region_summary(n, r) for n, r in part(report, "regions").items())
-    lines.append(f"- **How long.** {_how_long(report)}")
-    lines.append(f"- **How exact.** {_how_exact(training)}{_mesh_exact(report)}")
-    lines.append(f"- **How well seen.** {_how_seen(report)}")
+    lines.append(f"- **Time.** {_duration_sentence(report)}")
+    lines.append(f"- **Accuracy.** {_accuracy_sentence(training)}{_mesh_accuracy_sentence(report)}")
+    lines.append(f"- **Texture coverage.** {_coverage_sentence(report)}")
     warnings = collect_warnings(report)
     if warnings:
-        lines.append(f"- **Be careful about** ({plural(len(warnings), 'warning')}):")
+        lines.append(f"- **Warnings** ({plural(len(warnings), 'warning')}):")
         lines += [f"    - {escaped(w.text)}" for w in warnings]
     else:
-        lines.append("- **Be careful about.** No stage had a warning.")
+        lines.append("- **Warnings.** No stage reported a warning.")
     return lines
 
 
-def _how_long(report: dict[str, Any]) -> str:
+def _duration_sentence(report: dict[str, Any]) -> str:
     stages = [(s, measured(s.get("seconds"))) for s in map(part, items(report.get("stages")))]
     known = [(s, seconds) for s, seconds in stages if seconds is not None]
     total = sum(seconds for _, seconds in known)
-    text = f"Time of this run: {duration(report.get('wall_seconds'))}."
+    text = f"This run: {duration(report.get('wall_seconds'))}."
     reused = [_stage_name(s) for s, _ in stages if s.get("reused") is True]
     if reused:
-        text = f"{text[:-1]}; taken over from an earlier run: {', '.join(reused)}."
+        text = f"{text[:-1]}; reused from an earlier run: {', '.join(reused)}."
     if known and total > 0:
         longest, seconds = max(known, key=lambda pair: pair[1])
         text += (
-            f" All stages together: {duration(total)}, the longest was {_stage_name(longest)} "
+            f" All stages together took {duration(total)}; the longest was {_stage_name(longest)} "
             f"({percent(seconds / total, 0)})."
         )
     return text
 
 
-def _how_exact(training: dict[str, Any]) -> str:
+def _accuracy_sentence(training: dict[str, Any]) -> str:
     held_out = items(training.get("held_out"))
     psnr = measured(training.get("held_out_psnr"))
     if not held_out or psnr is None:
-        why = "No photo was held out: how" if training.get("held_out") == [] else "How"
-        return f"{why} exact new views are was {NOT_MEASURED}."
+        why = "No photo was held out: the" if training.get("held_out") == [] else "The"
+        return f"{why} accuracy of new views was {NOT_MEASURED}."
     text = (
-        f"{plural(len(held_out), 'photo')} never trained on "
+        f"{plural(len(held_out), 'photo')} held out of training "
         f"{'is' if len(held_out) == 1 else 'are'} reproduced by the Gaussians with a PSNR of "
-        f"{psnr:.1f} dB; that is a typical error of "
+        f"{psnr:.1f} dB, a typical error of "
         f"{percent(10.0 ** (-psnr / 20.0))} of full brightness."
     )
     if len(held_out) < FEW_HELD_OUT:
-        text += " These are too few to trust."
+        text += " These are too few for a reliable mean."
     return text
 
 
-def _mesh_exact(report: dict[str, Any]) -> str:
+def _mesh_accuracy_sentence(report: dict[str, Any]) -> str:
     text = ""
     for name, region in part(report, "regions").items():
         rendering = part(region, "mesh_rendering")
         psnr = measured(rendering.get("psnr"))
         if psnr is None:
-            text += f' For the textured mesh of "{escaped(name)}" this was {NOT_MEASURED}.'
+            text += f' Accuracy of the textured mesh of "{escaped(name)}": {NOT_MEASURED}.'
         else:
             views = plural(len(items(rendering.get("views"))), "photo")
             if rendering.get("pixels") == "covered":
-                # The Gaussians above are judged by whole photos: the two are not to be compared.
+                # The Gaussians are measured over whole photos: the two values are not comparable.
                 covered = percent(rendering.get("covered"))
-                views += f", counted where the mesh is: {covered} of the photo"
+                views += f", over the pixels the mesh covers: {covered} of the photo"
             note = rendering.get("note")
             if isinstance(note, str) and note.strip():
                 views += f"; {escaped(note.strip().rstrip('.'))}"
@@ -202,7 +202,7 @@ def _mesh_exact(report: dict[str, Any]) -> str:
     return text
 
 
-def _how_seen(report: dict[str, Any]) -> str:
+def _coverage_sentence(report: dict[str, Any]) -> str:
     parts = []
     for name, region in part(report, "regions").items():
         texture = part(region, "texture")
@@ -242,7 +242,7 @@ def _time(report: dict[str, Any]) -> list[str]:
     rows.append(("**this run, until the report**", wall, "", ""))
     lines = table(("stage", "time", "share", ""), rows, "lrrl")
     memory = part(report, "peak_memory_bytes")
-    lines += ["", "Largest memory in use in this run:", ""]
+    lines += ["", "Peak memory of this run:", ""]
     for key, process in _MEMORY.items():
         value = memory.get(key)
         text = "none ran" if key != "worker" and value == 0 else bytes_text(value)
@@ -266,20 +266,20 @@ def _cameras(cameras: dict[str, Any]) -> list[str]:
             text = number(value, unit)
         else:
             listed = ", ".join(str(v) for v in value if v) if isinstance(value, list) else value
-            text = f"{words(listed)} {unit}".strip()
+            text = f"{escaped_or(listed)} {unit}".strip()
         rows.append((name, text))
     lines = table(("photos and cameras", "figure"), rows, "lr")
     if facts.get("kind") == "photos":
         lines += [
             "",
             (
-                "The cameras were found from the photos alone, which cannot tell the size of "
-                "things: one world unit is an arbitrary length. To measure in metres, scale the "
+                "The cameras were solved from the photos alone, which do not determine the "
+                "scale: one world unit is an arbitrary length. To measure in metres, scale the "
                 "mesh by a known length."
             ),
         ]
     else:
-        lines += ["", "One world unit is the unit of the camera poses that were given."]
+        lines += ["", "One world unit is the unit of the given camera poses."]
     return lines
 
 
@@ -290,26 +290,28 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
         f"{number(training.get('gaussians'), 'Gaussians')} after {iterations}.",
         *estimate_lines(training),
         "",
-        *picture(f"{REPORT_FOLDER}/{CURVE}", "How training went."),
+        *picture(f"{REPORT_FOLDER}/{CURVE}", "PSNR and number of Gaussians during training."),
     ]
     if not held_out:
         why = "No photo was held out: " if training.get("held_out") == [] else ""
         return [*lines, f"{why}PSNR and SSIM of new views were {NOT_MEASURED}."]
     lines += [
         (
-            "Photos held out were never trained on; they tell how well the Gaussians know views "
-            "that they have not seen. PSNR: every 6 dB more is half the error."
+            "Held-out photos are not used for training; they measure the accuracy of new views. "
+            "A PSNR higher by 6 dB means half the error."
         ),
         "",
     ]
     perceptual = any(measured(figure.get("lpips")) is not None for figure in held_out)
-    rows = [_held_out_row(words(f.get("name")), f, perceptual) for f in held_out]
+    rows = [_held_out_row(escaped_or(f.get("name")), f, perceptual) for f in held_out]
     mean = {key: training.get(f"held_out_{key}") for key in ("psnr", "ssim", "lpips")}
     rows.append(_held_out_row("**mean**", mean, perceptual))
-    header = ["photo held out", "PSNR", "typical error", "SSIM (1 is equal)"]
-    lines += table(header + ["LPIPS (0 is equal)"] * perceptual, rows, "lrrr" + "r" * perceptual)
+    header = ["held-out photo", "PSNR", "typical error", "SSIM (1 is identical)"]
+    lines += table(
+        header + ["LPIPS (0 is identical)"] * perceptual, rows, "lrrr" + "r" * perceptual
+    )
     if not perceptual:
-        unknown = ["", f"LPIPS (likeness as people see it) was {NOT_MEASURED}."]
+        unknown = ["", f"LPIPS (perceptual distance) was {NOT_MEASURED}."]
         lines += note_lines({"lpips_note": training.get("lpips_note")}) or unknown
     shown: list[str] = []
     for entry in map(part, items(training.get("pictures"))):
@@ -317,13 +319,13 @@ def _training(training: dict[str, Any], picture: Picture) -> list[str]:
         caption = f"{entry.get('name') or 'photo'}, {psnr}"
         shown += picture(f"{REPORT_FOLDER}/{entry.get('file')}", caption)
     if not shown:
-        return [*lines, "", "There are no pictures of the photos held out."]
+        return [*lines, "", "There are no pictures of the held-out photos."]
     lines += [
         "",
         (
-            "Left the photo, in the middle what the Gaussians show from the same place, right the "
-            "error: black is none, violet about 6 %, red 12 %, orange 19 %, and white a quarter "
-            "of full brightness or more. The worst photo comes first."
+            "Left: the photo. Middle: the Gaussians rendered from the same camera. Right: the "
+            "error; black is none, violet about 6 %, red 12 %, orange 19 %, and white 25 % of "
+            "full brightness or more. The worst photo comes first."
         ),
         "",
     ]
@@ -344,11 +346,11 @@ def _machine(report: dict[str, Any]) -> list[str]:
     if started is not None:
         date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(started))
     packages = part(machine, "packages")
-    versions = ", ".join(f"{escaped(k)} {words(v)}" for k, v in packages.items())
+    versions = ", ".join(f"{escaped(k)} {escaped_or(v)}" for k, v in packages.items())
     threads = f"{number(machine.get('threads'), 'threads')} used"
-    system, python = words(machine.get("system")), words(machine.get("python"))
-    preset, seed = words(settings.get("preset")), words(settings.get("seed"))
-    processor, cores = words(machine.get("processor")), number(machine.get("cores"), "cores")
+    system, python = escaped_or(machine.get("system")), escaped_or(machine.get("python"))
+    preset, seed = escaped_or(settings.get("preset")), escaped_or(settings.get("seed"))
+    processor, cores = escaped_or(machine.get("processor")), number(machine.get("cores"), "cores")
     return [
         f"- Started: {date}",
         f"- Processor: {processor}, {cores}, {threads}",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How large a mesh, its edges and its texels are in the units of the input."""
+"""Size of a mesh, its edges and its texels in world units (the units of the input)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def sizes_in_world(
     faces : (f, 3) int
     world_from_scene : Similarity
     texels : int
-        Texels that lie on the surface; 0 leaves the density out.
+        Number of texels on the surface; with 0, the texel density is left out.
 
     Returns
     -------
@@ -35,7 +35,7 @@ def sizes_in_world(
     """
     if len(faces) == 0:
         return {}
-    # Rotated, but not moved: far from the origin the size would lose digits.
+    # Rotated but not translated: far from the origin the size would lose digits.
     turned = world_from_scene.scale * world_from_scene.directions(vertices[np.unique(faces)])
     size = np.ptp(turned, axis=0)  # (3,)
     edges = world_from_scene.scale * edge_lengths(np.asarray(vertices, np.float64), faces)

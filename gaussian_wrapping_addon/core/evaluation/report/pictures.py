@@ -21,51 +21,51 @@ from .plot import Panel, Series, write_svg
 from .text import items, measured, part
 
 MAX_PICTURES = 4
-"""Held-out photos that are shown: the worst, the best, and some between."""
+"""Number of held-out photos shown: the worst, the best, and some between."""
 
 STRIP_PX = 1500
-"""A strip of three images is at most so wide."""
+"""Maximum width of a strip of three images."""
 
 ERROR_GAIN = 4.0
-"""Errors are shown so many times brighter: a quarter of white is the end of the scale."""
+"""Factor applied to the errors: the scale ends at a quarter of full brightness."""
 
 GAP_PX = 6
 CAPTION_PX = 24
 MAX_DOTS = 20
-"""A curve with more points is a line without dots."""
+"""Curves with more points are drawn as a line without dots."""
 JPEG_QUALITY = 88
 _PAPER = (32, 32, 34)
 _INK = (232, 232, 232)
 
-# Dark to bright also in grey, so that it reads without colour: black, violet, red, orange, ivory.
+# Monotonic in brightness, so that it reads in greyscale: black, violet, red, orange, ivory.
 _HEAT = np.array([(0, 0, 0), (74, 20, 120), (196, 42, 80), (250, 150, 30), (255, 250, 210)])
 
 
-def heat(values: np.ndarray) -> np.ndarray:
-    """Return (h, w, 3) uint8 colours of values from 0 (black) to 1 (ivory); beyond is clipped."""
-    places = np.linspace(0.0, 1.0, len(_HEAT))
+def heat_colors(values: np.ndarray) -> np.ndarray:
+    """Return (h, w, 3) uint8 colours of values clipped to 0 (black) to 1 (ivory)."""
+    stops = np.linspace(0.0, 1.0, len(_HEAT))
     clipped = np.clip(values, 0.0, 1.0)
-    channels = [np.interp(clipped, places, _HEAT[:, c]) for c in range(3)]
+    channels = [np.interp(clipped, stops, _HEAT[:, c]) for c in range(3)]
     return np.rint(np.stack(channels, -1)).astype(np.uint8)
 
 
 def error_map(
     photo: np.ndarray, rendering: np.ndarray, mask: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the absolute error, mean of the channels, :data:`ERROR_GAIN` times, as heat.
+    """Return the absolute error (mean of the channels, times :data:`ERROR_GAIN`) as heat colours.
 
     Parameters
     ----------
     photo : (h, w, 3) uint8
     rendering : (h, w, 3)
-        Floats whose white is 1; clamped as a display would.
+        Floats, white is 1; clipped to [0, 1].
     mask : (h, w) bool, optional
         Pixels that count; others are black.
     """
     error = np.abs(np.clip(rendering, 0.0, 1.0) - photo / 255.0).mean(-1)  # (h, w)
     if mask is not None:
         error = np.where(mask, error, 0.0)
-    return heat(ERROR_GAIN * error)
+    return heat_colors(ERROR_GAIN * error)
 
 
 def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX) -> bytes:
@@ -75,7 +75,7 @@ def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX)
     ----------
     images : sequence of (caption, (h, w, 3) uint8)
     width_px : int
-        The strip is made smaller where it would be wider.
+        Maximum width; a wider strip is scaled down.
     """
     height, width = images[0][1].shape[:2]
     room = (width_px - GAP_PX * (len(images) - 1)) // len(images)
@@ -88,7 +88,7 @@ def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX)
         left = index * (size[0] + GAP_PX)
         image = Image.fromarray(np.ascontiguousarray(pixels))
         canvas.paste(image.resize(size, Image.Resampling.LANCZOS), (left, CAPTION_PX))
-        head = Image.new("RGB", (size[0], CAPTION_PX), _PAPER)  # cuts what is too long
+        head = Image.new("RGB", (size[0], CAPTION_PX), _PAPER)  # clips long captions
         ImageDraw.Draw(head).text((4, 3), caption, fill=_INK, font=font)
         canvas.paste(head, (left, 0))
     stream = io.BytesIO()
@@ -97,7 +97,7 @@ def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX)
 
 
 def worst_to_best(figures: Sequence[float], count: int = MAX_PICTURES) -> list[int]:
-    """Return which of the figures to show: the lowest, the highest, and some evenly between."""
+    """Return indices of figures to show: the lowest, the highest, evenly spaced ones between."""
     ranked = sorted(range(len(figures)), key=lambda i: (figures[i], i))
     spread = np.linspace(0, len(ranked) - 1, min(count, len(ranked))).round().astype(int)
     return [ranked[position] for position in spread.tolist()]
@@ -111,18 +111,18 @@ def write_held_out(
     *,
     threads: int,
 ) -> list[dict[str, Any]]:
-    """Render held-out views as the trainer measured them, and write photo, rendering and error.
+    """Render held-out views as the trainer does, and write photo, rendering and error.
 
     Parameters
     ----------
     gaussians : OrientedGaussians
         Trained.
     photos : PhotoStore
-        The one that was trained with: its finest size is shown.
+        The photos used for training; their finest size is shown.
     views : sequence of (index, name, psnr)
         All measured views; the pictures are chosen by :func:`worst_to_best`.
     folder : Path
-        Gets ``held-out-0.jpg`` and so on.
+        Where ``held-out-0.jpg`` and so on are written.
     threads : int
 
     Returns
@@ -153,13 +153,13 @@ def write_held_out(
 
 
 def write_learning_curve(training: dict[str, Any], path: Path) -> bool:
-    """Write PSNR and number of Gaussians over the iterations; ``False`` where there is no curve.
+    """Plot PSNR and number of Gaussians over the iterations; return ``False`` if there is no curve.
 
     Parameters
     ----------
     training : dict
         Of a report: ``history`` (a list of ``iteration``, ``psnr`` of the photos trained on, dB,
-        and ``gaussians``), and ``iterations`` and ``held_out_psnr``, where they were measured.
+        and ``gaussians``), and ``iterations`` and ``held_out_psnr`` if measured.
     path : Path
         An SVG file.
     """
@@ -173,14 +173,14 @@ def write_learning_curve(training: dict[str, Any], path: Path) -> bool:
     if len(quality) < 2:
         return False
     dots = len(quality) <= MAX_DOTS
-    curves = [Series("photos trained on (running mean)", quality, dots=dots)]
+    curves = [Series("training photos (running mean)", quality, dots=dots)]
     end, held_out = measured(training.get("iterations")), measured(training.get("held_out_psnr"))
     if end is not None and held_out is not None:
-        curves.append(Series("photos held out (mean, at the end)", [(end, held_out)], line=False))
+        curves.append(Series("held-out photos (mean, at the end)", [(end, held_out)], line=False))
     growth = [Series("Gaussians", count, dots=dots)]
     panels = [
-        Panel("Likeness to the photos", "iteration", "PSNR (dB)", curves, False, False, False),
-        Panel("Growth", "iteration", "Gaussians (thousands)", growth, False, False, False),
+        Panel("Image quality", "iteration", "PSNR (dB)", curves, False, False, False),
+        Panel("Model size", "iteration", "Gaussians (thousands)", growth, False, False, False),
     ]
     write_svg(panels, path)
     return True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Plots with linear or logarithmic axes, written as SVG by hand: no plotting library is needed."""
+"""Plots with linear or logarithmic axes as SVG, without a plotting library."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from pathlib import Path
 from ...files import write_bytes
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#8b4513")
-"""Told apart by colour-blind people (Okabe and Ito)."""
+"""Distinguishable by colour-blind readers (Okabe and Ito)."""
 _WIDTH, _HEIGHT = 460, 360
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 34, 46
 _LINEAR_TICKS = 6
 _MARGIN = 0.06
-"""Room around the points of a linear axis, as a share of their spread."""
+"""Margin around the points of a linear axis, as a share of their spread."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Series:
-    """Points of one name, joined by a line in the order given."""
+    """A named series of points, joined by a line in the order given."""
 
     name: str
     points: Sequence[tuple[float, float]]
     line: bool = True
     labels: Sequence[str] = ()
-    """Words beside the points; none, or one for each point."""
+    """Labels beside the points; none, or one for each point."""
     dots: bool = True
 
 
@@ -56,8 +56,8 @@ class _Axis:
     ticks: tuple[float, ...]
 
     def share(self, value: float) -> float:
-        place = math.log10(value) if self.log else value
-        return (place - self.low) / (self.high - self.low)
+        attributes = math.log10(value) if self.log else value
+        return (attributes - self.low) / (self.high - self.low)
 
 
 def _axis(values: Sequence[float], log: bool) -> _Axis:
@@ -81,7 +81,7 @@ def _tick(value: float, log: bool) -> str:
 
 
 def _shown(panel: Panel) -> list[tuple[float, float]]:
-    """Return the points that the axes can show."""
+    """Return the points within the domain of the axes."""
     return [p for series in panel.series for p in series.points if _fits(panel, p)]
 
 
@@ -90,9 +90,9 @@ def _fits(panel: Panel, point: tuple[float, float]) -> bool:
     return finite and (not panel.x_log or point[0] > 0) and (not panel.y_log or point[1] > 0)
 
 
-def _text(x: float, y: float, words: str, anchor: str = "middle", extra: str = "") -> str:
-    place = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{extra}'
-    return f"<text {place}>{html.escape(words)}</text>"
+def _text(x: float, y: float, content: str, anchor: str = "middle", extra: str = "") -> str:
+    attributes = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{extra}'
+    return f"<text {attributes}>{html.escape(content)}</text>"
 
 
 def _dot(x: float, y: float, color: str) -> str:
@@ -112,7 +112,7 @@ def _panel(panel: Panel, left: int, top: int) -> list[str]:
         _text(left + 14, middle_y, panel.y_label, extra=turned),
     ]
     if not points:
-        return [*parts, _text(middle_x, middle_y, "nothing was measured")]
+        return [*parts, _text(middle_x, middle_y, "no data")]
     across = _axis([p[0] for p in points], panel.x_log)
     up = _axis([p[1] for p in points], panel.y_log)
 
@@ -130,20 +130,20 @@ def _panel(panel: Panel, left: int, top: int) -> list[str]:
     for number, series in enumerate(panel.series):
         color = _COLORS[number % len(_COLORS)]
         kept = [i for i, p in enumerate(series.points) if _fits(panel, p)]
-        places = [at(series.points[i]) for i in kept]
-        if series.line and len(places) > 1:
-            path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+        positions = [at(series.points[i]) for i in kept]
+        if series.line and len(positions) > 1:
+            path = " ".join(f"{x:.1f},{y:.1f}" for x, y in positions)
             parts.append(
                 f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="1.5"/>'
             )
         if series.dots:
             parts += [
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{color}"/>' for x, y in places
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{color}"/>' for x, y in positions
             ]
         if series.labels:
             parts += [
                 _text(x + 5, y - 5, series.labels[i], "start", f' fill="{color}"')
-                for i, (x, y) in zip(kept, places, strict=True)
+                for i, (x, y) in zip(kept, positions, strict=True)
             ]
         y = y0 + 14 + 15 * number
         if panel.legend_low:
@@ -156,8 +156,7 @@ def _panel(panel: Panel, left: int, top: int) -> list[str]:
 def write_svg(panels: Sequence[Panel], path: Path, *, columns: int = 3) -> None:
     """Write panels side by side, in rows of ``columns``.
 
-    Points that are not finite, or not positive on a logarithmic axis, cannot be shown and are left
-    out.
+    Points that are not finite, or not positive on a logarithmic axis, are left out.
     """
     rows = -(-len(panels) // columns)
     width, height = _WIDTH * min(columns, len(panels)), _HEIGHT * rows

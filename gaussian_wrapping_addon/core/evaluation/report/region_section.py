@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The section of a report about one region: its mesh, its texture, and how both were measured."""
+"""Report section of one region: mesh, texture, and comparison with photos."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from .text import (
     NOT_MEASURED,
     duration,
     escaped,
+    escaped_or,
     items,
     measured,
     number,
@@ -17,19 +18,18 @@ from .text import (
     percent,
     plural,
     table,
-    words,
 )
 
 Picture = Callable[[str, str], list[str]]
-"""Gives the lines that show a picture (path below the result folder, caption), none without it."""
+"""Markdown lines of a picture (path below the result folder, caption); none if it is missing."""
 
 
 def region_summary(name: str, region: dict[str, Any]) -> str:
-    """Return one sentence about a region: size, closed or not, how much photos saw."""
+    """Return one sentence about a region: number of faces, closedness, texture coverage."""
     statistics = part(region, "statistics")
     coverage = measured(part(region, "texture").get("coverage"))
     seen = (
-        "how much of its texture photos saw was not measured"
+        "its texture coverage was not measured"
         if coverage is None
         else f"photos saw {percent(coverage)} of its texture, the rest is filled in"
         if coverage < 1.0
@@ -42,12 +42,12 @@ def region_summary(name: str, region: dict[str, Any]) -> str:
 
 
 def closedness(statistics: dict[str, Any], provenance: dict[str, Any]) -> str:
-    """Return whether a mesh is closed, in words; an open boundary may have been asked for."""
+    """Return whether a mesh is closed; an open boundary may be a setting."""
     closed = statistics.get("closed")
     if not isinstance(closed, bool):
         return "closedness not measured"
     if not closed and provenance.get("boundary") == "open":
-        return "open by request where the region cuts through things"
+        return "open by request at the region boundary"
     return "closed (watertight)" if closed else "not closed"
 
 
@@ -57,9 +57,9 @@ def region_lines(name: str, region: dict[str, Any], picture: Picture) -> list[st
     Parameters
     ----------
     name : str
-        Also the folder of its files in the result folder.
+        Name of the region and of its folder in the result folder.
     region : dict
-        Its figures; whatever lacks is said to be not measured.
+        Its figures; missing ones are reported as not measured.
     picture : callable
         See :data:`Picture`.
     """
@@ -75,7 +75,7 @@ def region_lines(name: str, region: dict[str, Any], picture: Picture) -> list[st
         "",
         *_texture(region),
         "",
-        "### The textured mesh against photos",
+        "### Textured mesh compared with photos",
         "",
         *_rendering(part(region, "mesh_rendering")),
         "",
@@ -96,21 +96,21 @@ def _mesh(region: dict[str, Any]) -> list[str]:
         ("Faces", number(statistics.get("faces"), "faces")),
         ("Vertices", number(statistics.get("vertices"), "vertices")),
         ("Closed", topology),
-        ("Check of closedness and manifold", _checked(part(region, "check"))),
-        ("Separate parts", plural(statistics.get("components"), "part")),
-        *_removed(provenance),
-        *_made(provenance),
+        ("Check of the mesh (closed, manifold)", _check_text(part(region, "check"))),
+        ("Connected components", plural(statistics.get("components"), "part")),
+        *_removal_rows(provenance),
+        *_tile_rows(provenance),
         ("Size (x, y, z)", extent),
         ("Surface area", number(world.get("area"), "square world units")),
         ("Edge length, mean", number(world.get("edge_mean"), "world units")),
         ("Edge length, median", number(world.get("edge_median"), "world units")),
         ("Residual, median", _residual(provenance, "median")),
         ("Residual, mean", _residual(provenance, "mean")),
-        ("Residual, 99 % of vertices below", _residual(provenance, "p99")),
+        ("Residual, 99th percentile", _residual(provenance, "p99")),
         ("Residual, largest", _residual(provenance, "max")),
-        *_cleaned(provenance),
+        *_simplification_rows(provenance),
         ("Time", duration(seconds.get("mesh"))),
-        *_expected(part(region, "estimate")),
+        *_estimate_rows(part(region, "estimate")),
     ]
     lines = table(("mesh", "figure"), rows, "lr")
     vertices = measured(statistics.get("vertices"))
@@ -118,51 +118,51 @@ def _mesh(region: dict[str, Any]) -> list[str]:
     lines += [
         "",
         (
-            "The residual is |v - 0.5|: v is the vacancy, 0 inside of things and 1 in the open, so "
-            "that the surface lies at 0.5. It tells how well the mesh follows the Gaussians, not "
-            "how well the Gaussians follow the real thing."
+            "The residual is |v - 0.5|, where the vacancy v is 0 inside objects and 1 in free "
+            "space; the surface lies at 0.5. It measures how well the mesh follows the Gaussians, "
+            "not how well the Gaussians follow the real object."
         ),
     ]
     if vertices and on_surface is not None:
         capped = measured(provenance.get("vertices_on_region_boundary")) or 0.0
-        lines[-1] += f" Measured at the {percent(on_surface / vertices)} of the vertices"
+        lines[-1] += f" It is measured at the {percent(on_surface / vertices)} of the vertices"
         lines[-1] += " that should lie on the surface."
         if capped:
             does = "end" if provenance.get("boundary") == "open" else "close"
             lines[-1] += (
-                f" {percent(capped / vertices)} of the vertices {does} the mesh where the region "
-                "cuts through things."
+                f" {percent(capped / vertices)} of the vertices {does} the mesh at the boundary of "
+                "the region."
             )
     return lines
 
 
-def _checked(check: dict[str, Any]) -> str:
+def _check_text(check: dict[str, Any]) -> str:
     defects = check.get("defects")
     if not isinstance(defects, list):
         return NOT_MEASURED
-    return "; ".join(words(defect) for defect in defects) or "no defect"
+    return "; ".join(escaped_or(defect) for defect in defects) or "no defect"
 
 
-def _removed(provenance: dict[str, Any]) -> list[tuple[str, str]]:
+def _removal_rows(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     solids = measured(provenance.get("removed_solids"))
     cavities = measured(provenance.get("removed_cavities"))
     if solids is None or cavities is None:
         return []
-    hollows = plural(int(cavities), "small cavity", "small cavities")
-    text = f"{plural(int(solids), 'floater')}, {hollows}"
+    cavity_count = plural(int(cavities), "small cavity", "small cavities")
+    text = f"{plural(int(solids), 'floater')}, {cavity_count}"
     if solids or cavities:
         text += f": {percent(provenance.get('removed_area_share'))} of the area"
-    rows = [("Removed for their size", text)]
+    rows = [("Small components removed", text)]
     if pieces := measured(provenance.get("removed_open_pieces")):
         share = percent(provenance.get("removed_open_area_share"))
         text = f"{plural(int(pieces), 'small piece')}: {share} of the area"
-        rows.append(("Removed after opening at the region", text))
+        rows.append(("Small open components removed", text))
     if handles := measured(provenance.get("small_handles_closed")):
-        rows.append(("Handles closed, smaller than the edges resolve", f"{int(handles)}"))
+        rows.append(("Small handles closed (below the resolution of the edges)", f"{int(handles)}"))
     return rows
 
 
-def _cleaned(provenance: dict[str, Any]) -> list[tuple[str, str]]:
+def _simplification_rows(provenance: dict[str, Any]) -> list[tuple[str, str]]:
     before = measured(provenance.get("faces_before_clean_up"))
     if before is None:
         return []
@@ -171,37 +171,37 @@ def _cleaned(provenance: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("Smoothed", plural(int(steps), "step")))
     if target := measured(provenance.get("target_faces")):
         rows.append(("Faces before decimation", number(before, "faces")))
-        rows.append(("Faces asked for", number(target, "faces")))
+        rows.append(("Target number of faces", number(target, "faces")))
     return rows
 
 
-def _made(provenance: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return in how many tiles the mesh was made, and how much of the space nobody has seen."""
+def _tile_rows(provenance: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the number of tiles, and the share of field evaluations that no camera sees."""
     rows = []
     if tiles := measured(provenance.get("tiles")):
         text = plural(int(tiles), "tile")
         if processes := measured(provenance.get("tile_processes")):
             text += f", by {plural(int(processes), 'process', 'processes')}"
-        rows.append(("Made in", text))
-    asked = measured(provenance.get("field_evaluations"))
+        rows.append(("Tiles", text))
+    evaluated = measured(provenance.get("field_evaluations"))
     unseen = measured(provenance.get("unseen_evaluations"))
-    if asked and unseen is not None:
-        text = f"{percent(unseen / asked)} of the points asked for"
+    if evaluated and unseen is not None:
+        text = f"{percent(unseen / evaluated)} of the points evaluated"
         if provenance.get("unseen") in ("empty", "occupied"):
-            text += f", taken as {provenance['unseen']}"
+            text += f", treated as {provenance['unseen']}"
         rows.append(("Seen by no camera", text))
     return rows
 
 
-def _expected(estimate: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return what was said before the mesh was made; nothing of reports that had no estimate."""
+def _estimate_rows(estimate: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the estimates made before meshing; empty for reports without them."""
     few, many = (measured(estimate.get(f"points_{end}")) for end in ("low", "high"))
     soon, late = (measured(estimate.get(f"seconds_{end}")) for end in ("low", "high"))
     if few is None or many is None or soon is None or late is None:
         return []
     return [
-        ("Faces, as estimated", f"{number(2 * few)} to {number(2 * many, 'faces')}"),
-        ("Time, as estimated", f"{duration(soon)} to {duration(late)}"),
+        ("Faces, estimated", f"{number(2 * few)} to {number(2 * many, 'faces')}"),
+        ("Time, estimated", f"{duration(soon)} to {duration(late)}"),
     ]
 
 
@@ -218,25 +218,25 @@ def _texture(region: dict[str, Any]) -> list[str]:
         if atlases > 1:
             side = f"{int(atlases)} textures of {side}"
         if texture.get("size_automatic") is True:
-            side += ", chosen from the photos"
+            side += ", chosen from the resolution of the photos"
     rows = [
         ("Size", side),
         ("Texel density", number(world.get("texels_per_unit"), "texels per world unit")),
         ("One texel", number(world.get("texel_size"), "world units")),
         ("Coverage: seen by photos", percent(texture.get("coverage"))),
-        ("Surface area seen", percent(texture.get("area_seen_share"))),
+        ("Surface area seen by photos", percent(texture.get("area_seen_share"))),
         (
             "Area of faces smaller than a texel",
             percent(texture.get("area_without_texel_share")),
         ),
         (
-            "Photos behind each seen texel",
+            "Photos blended per seen texel",
             number(texture.get("views_per_seen_texel"), "photos", digits=1),
         ),
-        ("Pieces (charts)", plural(texture.get("charts"), "chart")),
-        ("Image used by the mesh", percent(texture.get("utilisation"))),
-        ("Stretch, mean over the surface (1 is even)", number(texture.get("stretch_mean"))),
-        ("Stretch that 95 % of the surface stay below", number(texture.get("stretch_p95"))),
+        ("Charts", plural(texture.get("charts"), "chart")),
+        ("Share of the image covered by charts", percent(texture.get("utilisation"))),
+        ("Stretch, mean over the surface (1 is uniform)", number(texture.get("stretch_mean"))),
+        ("Stretch, 95th percentile of the surface", number(texture.get("stretch_p95"))),
         ("Time", duration(part(region, "seconds").get("texture"))),
     ]
     return table(("texture", "figure"), rows, "lr")
@@ -249,22 +249,24 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
         return lines + note_lines(rendering)
     perceptual = any(measured(view.get("lpips")) is not None for view in views)
     where = {
-        "mask": "Counted are the pixels inside of the photos' masks.",
-        "covered": "Counted are only the pixels that the mesh covers.",
+        "mask": "Only pixels inside the photos' masks are compared.",
+        "covered": "Only pixels that the mesh covers are compared.",
     }.get(str(rendering.get("pixels")), "")
-    rows = [_view_row(words(view.get("name")), view, perceptual) for view in views]
+    rows = [_view_row(escaped_or(view.get("name")), view, perceptual) for view in views]
     rows.append(_view_row("**mean**", rendering, perceptual))
-    header = ["photo", "PSNR", "SSIM (1 is equal)", "of the photo covered"]
+    header = ["photo", "PSNR", "SSIM (1 is identical)", "covered share of the photo"]
     trained = {
         "True": "The Gaussians were not trained on these photos.",
         "False": "The Gaussians were trained on these photos.",
     }.get(str(rendering.get("held_out")), "")
-    intro = ("The textured mesh, unlit, seen from the photos' cameras.", where, trained)
+    intro = ("The textured mesh, unlit, rendered from the cameras of the photos.", where, trained)
     lines = [" ".join(filter(None, intro)), ""]
-    lines += table(header + ["LPIPS (0 is equal)"] * perceptual, rows, "lrrr" + "r" * perceptual)
+    lines += table(
+        header + ["LPIPS (0 is identical)"] * perceptual, rows, "lrrr" + "r" * perceptual
+    )
     left_out = measured(rendering.get("left_out"))
     if left_out:
-        lines += ["", f"{plural(int(left_out), 'photo')} could not be judged: no pixel counts."]
+        lines += ["", f"{plural(int(left_out), 'photo')} could not be compared: no valid pixel."]
     return lines + note_lines(rendering)
 
 
@@ -280,7 +282,7 @@ def _view_row(name: str, view: dict[str, Any], perceptual: bool) -> list[str]:
 
 
 def note_lines(figures: dict[str, Any]) -> list[str]:
-    """Return what a measurement says of itself: ``note``, and ``lpips_note``, why LPIPS lacks."""
+    """Return the notes of a measurement: ``note``, and ``lpips_note``, why LPIPS is missing."""
     lines = []
     for key in ("note", "lpips_note"):
         text = figures.get(key)
@@ -300,7 +302,7 @@ def _comparisons(name: str, region: dict[str, Any], picture: Picture) -> list[st
     for file in items(rendering.get("pictures")):
         if not isinstance(file, str):
             continue
-        caption = "Left the photo, right the textured mesh."
+        caption = "Left: the photo. Right: the textured mesh."
         if file in shown:
             psnr = number(shown[file].get("psnr"), "dB", digits=1)
             caption = f"{shown[file].get('name') or 'photo'}, {psnr}. {caption}"

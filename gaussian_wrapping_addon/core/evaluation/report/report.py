@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report of a job: ``report.json`` for programs, ``report.md`` for people, a headline."""
+"""Write the report of a job (``report.json``, ``report.md``) and summarise it in a few lines."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from ...files import finite, write_bytes, write_json
+from ...files import finite_json, write_bytes, write_json
 from .markdown import report_markdown
 from .region_section import closedness
 from .report_warnings import collect_warnings
@@ -19,31 +19,30 @@ def write_report(
     regions: dict[str, Any],
     earlier: Path | None = None,
 ) -> None:
-    """Write both files into the result folder; the pictures must lie there already.
+    """Write both files into the result folder; the pictures must already be there.
 
     Parameters
     ----------
     result : Path
         The result folder.
     summary : dict
-        What was measured of the whole job: machine, stages, cameras, training.
+        Figures of the whole job: machine, stages, cameras, training.
     regions : dict
         For each region: mesh statistics, residuals, size in world units, texture coverage,
         renderings of the mesh, seconds.
     earlier : Path or None
-        The result that this one will join: pictures of other regions lie there.
+        Result folder into which this one will be merged; it has the pictures of other regions.
     """
-    report = finite({"version": 1, **summary, "regions": regions})
+    report = finite_json({"version": 1, **summary, "regions": regions})
     report["warnings"] = [warning.to_json() for warning in collect_warnings(report)]
     write_json(result / "report.json", report)
-    # Names of files and of regions may hold what no encoding writes; a report is written all the
-    # same.
+    # File and region names may contain characters that cannot be encoded (lone surrogates).
     text = report_markdown(report, result, earlier).encode(errors="replace")
     write_bytes(result / "report.md", text)
 
 
 def headline(report: dict[str, Any]) -> list[str]:
-    """Return the few figures of a report that a person wants first, one line each."""
+    """Return the main figures of a report, one line each."""
     training = part(report, "training")
     gaussians = number(training.get("gaussians"), "Gaussians")
     lines = [f"time: {duration(report.get('wall_seconds'))}, {gaussians}"]

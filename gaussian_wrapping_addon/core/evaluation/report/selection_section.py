@@ -1,65 +1,65 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report's section on what a scene needed: what was decided, why, how to decide otherwise."""
+"""Report section on model selection: each choice, its evidence, the setting to override it."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from .text import escaped, items, part, table, words
+from .text import escaped, escaped_or, items, part, table
 
 _TITLES = {
-    "harmonics": "Colours that change with the viewing direction (gloss)",
-    "exposure": "Brightness and tint of each photo on its own",
-    "multi_view": "Comparing photos taken from similar places",
-    "wrapping": "Thin parts: surfaces with two sides",
+    "harmonics": "View-dependent colour (gloss)",
+    "exposure": "Brightness and tint of each photo",
+    "multi_view": "Comparison of neighbouring photos",
+    "wrapping": "Thin parts (two-sided surfaces)",
     "growth": "Number of Gaussians",
     "full_size": "Size of the training images",
 }
-"""Of each decision, what it is about in an artist's words."""
+"""Title of each choice, in an artist's words."""
 
 _EFFECTS = {
-    "harmonics": (
-        '"on" uses all degrees up to `sh_degree`; "off" gives every point one colour from all sides'
-    ),
-    "exposure": '"on" corrects every photo; "off" takes them as they are',
+    "harmonics": ('"on" uses all degrees up to `sh_degree`; "off" gives each point one colour'),
+    "exposure": '"on" corrects every photo; "off" uses them unchanged',
     "multi_view": '"on" or "off"',
     "wrapping": '"on" or "off"',
-    "full_size": '"on" trains on the full size up to `max_image_px`; "off" on half of it',
+    "full_size": '"on" trains at full size up to `max_image_px`; "off" at half of it',
     "growth": '"on" lets the number grow up to `max_gaussians`; "off" adds none',
 }
 
-_WHO = {"auto": "the photos", "on": "you (on)", "off": "you (off)"}
+_DECIDED_BY = {"auto": "the photos", "on": "you (on)", "off": "you (off)"}
 
 
-def needs_lines(training: dict[str, Any]) -> list[str]:
-    """Return the Markdown lines of the section, with its heading; none where nothing was decided.
+def selection_lines(training: dict[str, Any]) -> list[str]:
+    """Return the Markdown lines of the section with its heading; none if nothing was selected.
 
     Parameters
     ----------
     training : dict
         The report's training figures; its entry ``decisions`` holds what
-        :meth:`~.model_selection.Needs.to_json` wrote. Entries of newer versions are shown as they
-        are.
+        :meth:`~.model_selection.ModelSelection.to_json` wrote. Unknown entries of newer versions
+        are shown unchanged.
     """
     decisions = [part(entry) for entry in items(training.get("decisions"))]
     decisions = [entry for entry in decisions if entry.get("name")]
     if not decisions:
         return []
-    rows = [(_title(entry), words(entry.get("chosen")), _who(entry)) for entry in decisions]
+    rows = [
+        (_title(entry), escaped_or(entry.get("chosen")), _decided_by(entry)) for entry in decisions
+    ]
     lines = [
-        "## What this scene needed",
+        "## Model selection",
         "",
         (
-            "More model than a scene needs costs time and can even harm. So the photos decide what "
-            "is used, unless you do."
+            "A larger model than the scene needs costs time and can lower the quality. Each part "
+            "is therefore chosen from the photos, unless you set it."
         ),
         "",
-        *table(("about", "used", "decided by"), rows, "lll"),
+        *table(("part", "used", "chosen by"), rows, "lll"),
         "",
     ]
     for entry in decisions:
-        lines += [f"- **{_title(entry)}: {words(entry.get('chosen'))}.** {_evidence(entry)}"]
-        lines += [f"    - *To decide otherwise:* {_override(entry)}."]
+        lines += [f"- **{_title(entry)}: {escaped_or(entry.get('chosen'))}.** {_evidence(entry)}"]
+        lines += [f"    - *To change this:* {_override(entry)}."]
     return lines
 
 
@@ -67,20 +67,20 @@ def _title(entry: dict[str, Any]) -> str:
     return _TITLES.get(str(entry["name"]), escaped(entry["name"]))
 
 
-def _who(entry: dict[str, Any]) -> str:
-    return _WHO.get(str(entry.get("setting")), words(entry.get("setting")))
+def _decided_by(entry: dict[str, Any]) -> str:
+    return _DECIDED_BY.get(str(entry.get("setting")), escaped_or(entry.get("setting")))
 
 
 def _evidence(entry: dict[str, Any]) -> str:
-    evidence = words(entry.get("evidence"), "No evidence was recorded.")
-    measured = entry.get("measured") is not False  # version 0.1.0 did not tell
+    evidence = escaped_or(entry.get("evidence"), "No evidence was recorded.")
+    measured = entry.get("measured") is not False  # absent in version 0.1.0
     if entry.get("setting") in ("on", "off") and measured:
-        return f"You decided this. What the photos say: {evidence}"
+        return f"Set by you. Evidence from the photos: {evidence}"
     return evidence
 
 
 def _override(entry: dict[str, Any]) -> str:
     name = str(entry["name"])
     effect = f": {_EFFECTS[name]}" if name in _EFFECTS else ""
-    back = '; "auto" leaves it to the photos' if entry.get("setting") in ("on", "off") else ""
+    back = '; "auto" chooses from the photos' if entry.get("setting") in ("on", "off") else ""
     return f"setting `{escaped(name) if name not in _TITLES else name}`{effect}{back}"

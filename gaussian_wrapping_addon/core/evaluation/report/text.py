@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Words of a report: numbers with units, spans of time, escaped Markdown, tables, bars."""
+"""Text formatting for reports: numbers with units, durations, escaped Markdown, tables, bars."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _MARKUP = str.maketrans(
 
 
 def part(values: Any, *keys: str) -> dict[str, Any]:
-    """Return a dictionary inside of dictionaries; empty where a key is missing or other."""
+    """Return a nested dictionary; empty if a key is missing or not a dictionary."""
     for key in keys:
         values = values.get(key) if isinstance(values, dict) else None
     return values if isinstance(values, dict) else {}
 
 
 def items(values: Any) -> list[Any]:
-    """Return a list as it is, anything else as an empty one."""
+    """Return a list unchanged, anything else as an empty list."""
     return values if isinstance(values, list) else []
 
 
 def measured(value: Any) -> float | None:
-    """Return a finite number, or ``None`` for everything else (booleans and NaN too)."""
+    """Return a finite number, or ``None`` for anything else, including booleans and NaN."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:
@@ -44,11 +44,11 @@ def number(value: Any, unit: str = "", *, digits: int | None = None) -> str:
     Parameters
     ----------
     value : any
-        What a report holds; only finite numbers count as measured.
+        Value of a report; only finite numbers count as measured.
     unit : str
     digits : int, optional
-        Digits after the point; by default whole numbers are written whole and others with four
-        significant digits.
+        Digits after the decimal point; by default, integers are written in full and other
+        numbers with four significant digits.
     """
     found = measured(value)
     if found is None:
@@ -70,7 +70,7 @@ def plural(count: Any, one: str, many: str = "") -> str:
 
 
 def percent(value: Any, digits: int = 1) -> str:
-    """Return a share as per cent; never 0 % or 100 % unless it is."""
+    """Return a share as a percentage; 0 % and 100 % only if exact."""
     share = measured(value)
     if share is None:
         return NOT_MEASURED
@@ -84,7 +84,7 @@ def percent(value: Any, digits: int = 1) -> str:
 
 
 def duration(seconds: Any) -> str:
-    """Return a span of time as a person would say it."""
+    """Return a duration in seconds, minutes or hours."""
     found = measured(seconds)
     if found is None:
         return NOT_MEASURED
@@ -107,17 +107,17 @@ def bytes_text(value: Any) -> str:
 
 
 def escaped(text: Any) -> str:
-    """Return text that Markdown shows as it is, on one line, also inside of a table."""
+    """Escape text for Markdown, on one line, valid inside a table."""
     return " ".join(str(text).split()).translate(_MARKUP)
 
 
-def words(value: Any, instead: str = "unknown") -> str:
-    """Return text from outside, escaped, or other words where there is none."""
-    return instead if value is None or value == "" else escaped(value)
+def escaped_or(value: Any, default: str = "unknown") -> str:
+    """Return escaped text, or ``default`` if it is missing or empty."""
+    return default if value is None or value == "" else escaped(value)
 
 
 def bar(share: float) -> str:
-    """Return a bar of text for a share of 1; anything above 0 shows."""
+    """Return a text bar for a share in [0, 1]; any share above 0 is visible."""
     full = max(0.0, min(1.0, share)) * BAR_CHARACTERS
     count = max(1, round(full)) if share > 0 else 0
     return "█" * count + "░" * (BAR_CHARACTERS - count)
@@ -130,7 +130,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], align: str) -> l
     ----------
     header : sequence of str
     rows : sequence of sequences of str
-        Cells as Markdown: what comes from outside must be :func:`escaped` before.
+        Cells as Markdown; text from outside must already be :func:`escaped`.
     align : str
         One of ``l`` and ``r`` for each column.
     """

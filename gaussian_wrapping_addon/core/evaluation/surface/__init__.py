@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Distances and scores between a surface and the true one.
+"""Distances and scores of a reconstructed surface against the ground truth.
 
-In: meshes, clouds, cameras. Out: precision, recall, F1, Chamfer distances.
+In: meshes, point clouds, cameras. Out: precision, recall, F1, Chamfer distances.
 """

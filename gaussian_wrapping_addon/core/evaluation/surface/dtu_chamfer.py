@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Accuracy, completeness and Chamfer distance in the manner of the DTU data set.
+"""Accuracy, completeness and Chamfer distance by the protocol of the DTU data set.
 
 See docs/method.md, section 9.2.
 """
@@ -14,30 +14,30 @@ from typing import Any
 import numpy as np
 
 from ...errors import MeshingError, ResourceError, UsageError
-from ...files import finite
+from ...files import finite_json
 from ...limits import MAX_POINTS
 from ...mesh.distance import distances_to_cloud
 from ...mesh.surface_sampling import thin
 
 DENSITY_MM = 0.2
-"""Predicted points are no denser than this, and a resampled mesh has no wider gaps."""
+"""Minimum distance of predicted points, and maximum gap of a resampled mesh."""
 PATCH_MM = 60.0
-"""Predicted points farther than this outside of the observed box do not count at all."""
+"""Predicted points farther than this outside the observed box are ignored."""
 MAX_DISTANCE_MM = 20.0
-"""Distances from here on are dropped from the means."""
+"""Distances of this or more are dropped from the means."""
 
 MAX_CELLS = 2e6
-"""Largest extent in densities: cells of three such sides still have numbers in 64 bits."""
+"""Maximum extent in densities: indices of cells over three such axes fit into 64 bits."""
 ROW_SHARE = math.sqrt(0.75)
-"""Distance of rows in densities: a place below the very end of the next row is then still nearer
-than one density to a point of its own row, half a density away along it."""
+"""Distance of rows in densities: a position just below the next row is still nearer than one
+density to a point of its own row, half a density away along it."""
 
 _MORE = "Check that the mesh is in the truth's unit (mm), or give a larger density."
 
 
 @dataclass(frozen=True)
 class ObservationMask:
-    """Which part of space the data set's cameras observe (``ObsMask``, ``BB``, ``Res``)."""
+    """Volume observed by the data set's cameras (``ObsMask``, ``BB``, ``Res``)."""
 
     volume: np.ndarray
     """(x, y, z) bool; voxel (i, j, k) is centred at ``low + resolution * (i, j, k)``."""
@@ -48,7 +48,7 @@ class ObservationMask:
     """Distance between voxel centres."""
 
     def __post_init__(self) -> None:
-        sound = (
+        is_valid = (
             self.volume.ndim == 3
             and self.volume.dtype == np.bool_
             and np.shape(self.low) == (3,)
@@ -58,23 +58,23 @@ class ObservationMask:
             and math.isfinite(self.resolution)
             and self.resolution > 0
         )
-        if not sound:
+        if not is_valid:
             raise UsageError(
                 "The observation mask is not a bool volume with a box and a resolution > 0.",
                 "Read it from the data set's ObsMask file again.",
             )
 
     def within(self, points: np.ndarray, margin: float) -> np.ndarray:
-        """Tell which of (n, 3) points are in the box or at most ``margin`` outside, (n,) bool."""
+        """Return whether (n, 3) points are in the box or at most ``margin`` outside, (n,) bool."""
         return ((points >= self.low - margin) & (points <= self.high + margin)).all(1)
 
     def observed(self, points: np.ndarray) -> np.ndarray:
-        """Tell which of (n, 3) points lie in an observed voxel, (n,) bool."""
-        # Clipped before the cast: far points would not fit an integer.
-        place = np.clip(
+        """Return whether (n, 3) points lie in an observed voxel, (n,) bool."""
+        # Clipped before the cast: far points would overflow an integer.
+        along_row = np.clip(
             np.floor((points - self.low) / self.resolution + 0.5), -1.0, self.volume.shape
         )
-        index = place.astype(np.int64)  # (n, 3)
+        index = along_row.astype(np.int64)  # (n, 3)
         inside = ((index >= 0) & (index < self.volume.shape)).all(1)
         result = np.zeros(len(points), np.bool_)
         i, j, k = index[inside].T
@@ -84,7 +84,7 @@ class ObservationMask:
 
 @dataclass(frozen=True)
 class DtuScore:
-    """Mean distances in the truth's unit (mm); infinite where no distance is left to average."""
+    """Mean distances in the truth's unit (mm); infinite if there is no distance to average."""
 
     accuracy: float
     """From predicted points in observed voxels to the truth."""
@@ -94,14 +94,14 @@ class DtuScore:
     """Mean of the two: the data set's Chamfer distance."""
     accuracy_count: int
     completeness_count: int
-    """Distances averaged."""
+    """Number of distances averaged."""
     accuracy_dropped: float
     completeness_dropped: float
-    """Share of the distances that the largest distance dropped; 0 where there were none."""
+    """Share of distances dropped because of the maximum distance; 0 without distances."""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return dict(finite(dataclasses.asdict(self)))
+        return dict(finite_json(dataclasses.asdict(self)))
 
 
 def dtu_chamfer(
@@ -116,21 +116,21 @@ def dtu_chamfer(
     seed: int = 0,
     threads: int = 1,
 ) -> DtuScore:
-    """Compare points with a scan as the data set's paper describes (Jensen et al., CVPR 2014).
+    """Compare points with a scan by the protocol of the data set (Jensen et al., CVPR 2014).
 
-    1. Predicted points farther than ``patch`` outside of the mask's box are left out.
-    2. The others are taken in random order, and left out where one that was taken before is nearer
-       than ``density``, so that dense parts do not weigh more.
+    1. Predicted points farther than ``patch`` outside the mask's box are removed.
+    2. The others are visited in random order and removed if a point kept before is nearer than
+       ``density``, so that dense parts do not weigh more.
     3. Accuracy: mean distance to the nearest true point, of those in an observed voxel.
     4. Completeness: mean distance to the nearest predicted point left by step 2 (observed or not),
        of the true points above the ground plane.
-    5. Distances of ``max_distance`` and more are dropped from both means, as the usual tool does:
-       gross errors do not show in the means. :class:`DtuScore` therefore tells their share.
+    5. Distances of ``max_distance`` and more are dropped from both means, as in the usual tool:
+       gross errors do not affect the means. :class:`DtuScore` therefore holds their share.
 
     Parameters
     ----------
     points : (n, 3) float64
-        Predicted, in the truth's frame; of a mesh: :func:`resample_mesh`. May be empty.
+        Predicted, in the truth's frame; for a mesh, see :func:`resample_mesh`. May be empty.
     truth_points : (m, 3) float64
     mask : ObservationMask
     plane : (4,) float64
@@ -138,14 +138,14 @@ def dtu_chamfer(
     density, patch, max_distance : float
         In the truth's unit (mm); ``density`` 0 keeps all points.
     seed : int
-        Order of step 2.
+        Seed of the order in step 2.
     threads : int
-        Of the search; the result does not depend on it.
+        Threads of the search; the result does not depend on it.
 
     Raises
     ------
     UsageError
-        Values are not finite, lengths not positive, or no true point is above the plane.
+        Values that are not finite, lengths that are not positive, or no true point above the plane.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     truth_points = np.asarray(truth_points, np.float64).reshape(-1, 3)
@@ -155,7 +155,7 @@ def dtu_chamfer(
     if plane.shape != (4,) or not np.isfinite(plane).all():
         raise UsageError("The ground plane is not four finite numbers.", "Read it again.")
     if not (density >= 0 and patch >= 0 and max_distance > 0):
-        raise UsageError("Density, patch or largest distance are negative.", "Give lengths > 0.")
+        raise UsageError("Density, patch or maximum distance is negative.", "Give lengths > 0.")
     above = truth_points[truth_points @ plane[:3] + plane[3] > 0]
     if len(above) == 0:
         raise UsageError("No true point is above the ground plane.", "Check the plane's sign.")
@@ -172,12 +172,12 @@ def dtu_chamfer(
 
 
 def thin_by_distance(points: np.ndarray, density: float, *, seed: int) -> np.ndarray:
-    """Keep points, taken in random order, that are at least ``density`` from all kept before.
+    """Keep points, in random order, that are at least ``density`` from all points kept before.
 
     Returns
     -------
     (k, 3) float64
-        In their old order; every point that is missing is nearer than ``density`` to one of them.
+        In the original order; every removed point is nearer than ``density`` to one of them.
 
     Raises
     ------
@@ -198,11 +198,11 @@ def thin_by_distance(points: np.ndarray, density: float, *, seed: int) -> np.nda
 
 
 def resample_mesh(vertices: np.ndarray, faces: np.ndarray, density: float) -> np.ndarray:
-    """Cover a mesh with points: every place on it has one nearer than ``density``.
+    """Cover a mesh with points such that every position on it has one nearer than ``density``.
 
-    Each face gets rows of points parallel to its longest edge, ``density`` apart at most along the
-    row and :data:`ROW_SHARE` of it between rows. Edges are covered by both of their faces:
-    :func:`dtu_chamfer` thins that out.
+    Each face gets rows of points parallel to its longest edge, at most ``density`` apart along the
+    row and :data:`ROW_SHARE` of it between rows. Edges are covered by both of their faces;
+    :func:`dtu_chamfer` removes the duplicates.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def resample_mesh(vertices: np.ndarray, faces: np.ndarray, density: float) -> np
     MeshingError
         A vertex is not finite.
     ResourceError
-        More than :data:`~.limits.MAX_POINTS` points would be needed.
+        More than :data:`~.limits.MAX_POINTS` points are needed.
     """
     if not (math.isfinite(density) and density > 0):
         raise UsageError(f"A density of {density} cannot be used.", "Give a length > 0.")
@@ -233,14 +233,14 @@ def resample_mesh(vertices: np.ndarray, faces: np.ndarray, density: float) -> np
     if not np.isfinite(corners).all():
         raise MeshingError("The mesh has a vertex that is not finite.", "Remove it.")
     edges = np.roll(corners, -1, axis=1) - corners  # (f, 3, 3), a to b, b to c, c to a
-    first = np.linalg.norm(edges, axis=2).argmax(1)  # (f,), where the longest edge begins
+    first = np.linalg.norm(edges, axis=2).argmax(1)  # (f,), start of the longest edge
     turn = (first[:, None] + np.arange(3)) % 3
     a, b, c = np.take_along_axis(corners, turn[:, :, None], 1).transpose(1, 0, 2)
     base = b - a
     length = np.linalg.norm(base, axis=1)
     along = ((c - a) * base).sum(1) / np.where(length > 0, length**2, 1.0)
     height = np.linalg.norm(c - a - along[:, None] * base, axis=1)
-    # Bounds first: lengths in a wrong unit would ask for more rows than there is memory.
+    # Checked first: lengths in a wrong unit would need more rows than fit into memory.
     if not float((height / density + 2) @ (length / density + 2)) < 4.0 * MAX_POINTS:
         raise ResourceError("The mesh would need too many points.", _MORE)
     rows = np.ceil(height / (density * ROW_SHARE)).astype(np.int64)  # from the edge to the corner
@@ -250,9 +250,9 @@ def resample_mesh(vertices: np.ndarray, faces: np.ndarray, density: float) -> np
     line, step = _counted(steps + 1)
     if len(line) > MAX_POINTS:
         raise ResourceError(f"The mesh would need {len(line)} points.", _MORE)
-    place = step / np.maximum(steps[line], 1)  # (n,), along the row
+    along_row = step / np.maximum(steps[line], 1)  # (n,), along the row
     lift, owner = share[line], face[line]
-    weights = np.stack([(1 - lift) * (1 - place), (1 - lift) * place, lift], 1)  # (n, 3)
+    weights = np.stack([(1 - lift) * (1 - along_row), (1 - lift) * along_row, lift], 1)  # (n, 3)
     result = weights[:, :1] * a[owner]
     result += weights[:, 1:2] * b[owner]
     result += weights[:, 2:] * c[owner]
@@ -260,14 +260,14 @@ def resample_mesh(vertices: np.ndarray, faces: np.ndarray, density: float) -> np
 
 
 def _counted(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Repeat row i ``counts[i]`` times: its index and the number of the repetition from 0."""
+    """Repeat row i ``counts[i]`` times; return its index and the repetition number from 0."""
     owner = np.repeat(np.arange(len(counts)), counts)
     starts = np.cumsum(counts) - counts
     return owner, np.arange(len(owner)) - starts[owner]
 
 
 def _mean_below(distances: np.ndarray, limit: float) -> tuple[float, int, float]:
-    """Mean of the distances below a limit, their number, and the share that is dropped."""
+    """Return the mean of the distances below a limit, their number, and the share dropped."""
     below = distances[distances < limit]
     if len(distances) == 0:
         return math.inf, 0, 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far depth and vacancy of trained Gaussians are from a true surface, before any meshing."""
+"""Errors of depth and vacancy of trained Gaussians against a true surface, without meshing."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from ...render.render import render
 from ...render.types.options import RenderOptions
 
 PROBE_REACH = 2.0
-"""Vacancy is probed along each normal this many largest thresholds to both sides."""
+"""Vacancy is sampled along each normal over this many largest thresholds to both sides."""
 PROBES_PER_SIDE = 40
 
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Isosurface depth against the true surface's depth, over the pixels that show it."""
+    """Isosurface depth against the depth of the true surface, over the pixels that show it."""
 
     pixels: int
     """Pixels whose ray meets the true surface."""
     found: float
-    """Share of them where the Gaussians have a depth at all."""
+    """Share of them where the Gaussians have a depth."""
     median: float
-    """Median absolute difference along the ray where found, in the unit of the scene."""
+    """Median absolute difference along the ray where found, scene units."""
     percentile_95: float
     within: tuple[float, ...]
-    """Share of all these pixels that have a depth within each threshold."""
+    """Share of all these pixels with a depth within each threshold."""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -45,17 +45,17 @@ class DepthErrors:
 
 @dataclass(frozen=True)
 class VacancyErrors:
-    """Where vacancy crosses 0.5 along the true surface's normals."""
+    """Crossings of vacancy 0.5 along the normals of the true surface."""
 
     samples: int
     found: float
-    """Share of samples with a crossing (outside empty, inside not) within the probed reach."""
+    """Share of samples with a crossing (empty outside, occupied inside) in the sampled range."""
     median_offset: float
-    """Median signed offset of the nearest crossing, positive outside, in the unit of the scene."""
+    """Median signed offset of the nearest crossing, positive outside, scene units."""
     median: float
     """Median absolute offset."""
     within: tuple[float, ...]
-    """Share of all samples whose crossing is within each threshold."""
+    """Share of all samples with a crossing within each threshold."""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -80,16 +80,16 @@ def depth_errors(
     gaussians : OrientedGaussians
         Scene frame.
     cameras : sequence of Camera
-        In the same frame; every pixel of each is compared.
+        In the same frame; all pixels are compared.
     vertices, faces : (v, 3) float64, (f, 3) int
-        The true surface in the same frame. Nothing else may stand before it.
+        The true surface in the same frame. Nothing else may occlude it.
     thresholds : sequence of float
         Distances along the ray, unit of the frame.
 
     Raises
     ------
     UsageError
-        If no pixel shows the surface.
+        No pixel shows the surface.
     """
     threads = threads or default_threads()
     errors, missing = [], 0
@@ -122,12 +122,12 @@ def vacancy_errors(
     normals: np.ndarray,
     thresholds: Sequence[float],
 ) -> VacancyErrors:
-    """Probe vacancy along the normals of true surface samples and find where it crosses 0.5.
+    """Sample vacancy along the normals of true surface samples and find where it crosses 0.5.
 
-    Probes stand ``PROBE_REACH`` times the largest threshold to both sides, evenly; a crossing lies
-    between an emptier probe and the occupied one below it, by linear interpolation. The one nearest
-    to the sample counts, so that a thin part's other side is not mistaken for this one unless it
-    is nearer.
+    Probes are evenly spaced up to ``PROBE_REACH`` times the largest threshold to both sides; a
+    crossing lies between an empty probe and the occupied one below it, by linear interpolation.
+    The crossing nearest to the sample is used, so that the other side of a thin part is taken
+    only if it is nearer.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def vacancy_errors(
     Raises
     ------
     UsageError
-        If there is no sample.
+        There is no sample.
     """
     count = len(points)
     if count == 0:
@@ -152,13 +152,13 @@ def vacancy_errors(
     outer, inner = vacancy[:, :-1], vacancy[:, 1:]  # (n, k - 1)
     crosses = (outer > 0.5) & (inner <= 0.5)
     share = np.where(crosses, (outer - 0.5) / np.where(crosses, outer - inner, 1.0), 0.0)
-    place = offsets[:-1] + share * (offsets[1:] - offsets[:-1])  # (n, k - 1)
-    distance = np.where(crosses, np.abs(place), np.inf)
+    crossing = offsets[:-1] + share * (offsets[1:] - offsets[:-1])  # (n, k - 1)
+    distance = np.where(crosses, np.abs(crossing), np.inf)
     nearest = distance.argmin(1)
     rows = np.arange(count)
     least = distance[rows, nearest]
     found = np.isfinite(least)
-    signed = place[rows, nearest][found]
+    signed = crossing[rows, nearest][found]
     return VacancyErrors(
         count,
         float(found.mean()),

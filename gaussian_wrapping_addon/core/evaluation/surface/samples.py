@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Points with normals that stand for a surface when it is judged: three ways to choose them."""
+"""Sample a surface by points with normals: uniformly, by a virtual scan, or per face (legacy)."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ...errors import MeshingError, UsageError
 from ...mesh.depth_buffer import depth_buffer
 
 DEGENERATE_SHARE = 1e-12
-"""A face whose doubled area is below this share of its longest edge squared has no direction."""
+"""A face whose doubled area is below this share of its longest edge squared has no normal."""
 
 SCAN_NEAR_SHARE = 1e-7
-"""Near plane of a virtual scan, as a share of the extent of mesh and cameras: the protocol has
-none, but a point in the camera's own plane has no pixel."""
+"""Near plane of a virtual scan, as a share of the extent of mesh and cameras. The protocol has
+none, but a point in the camera's plane has no projection."""
 
 PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])
-"""Steps of the plane's additive sequence with the smallest discrepancy known: 1 / g and 1 / g^2
-with g^3 = g + 1."""
+"""Steps of the R2 sequence, the additive recurrence in the plane with the smallest known
+discrepancy: 1 / g and 1 / g^2 with g^3 = g + 1."""
 
 
 @dataclass(frozen=True)
@@ -32,23 +32,23 @@ class SurfaceSamples:
     points: np.ndarray
     """(n, 3) float64."""
     normals: np.ndarray
-    """(n, 3) float64, unit, or 0 where unknown; as the surface is oriented."""
+    """(n, 3) float64, unit length, or 0 if unknown; oriented like the surface."""
 
     def __len__(self) -> int:
         return len(self.points)
 
     def kept(self, mask: np.ndarray) -> SurfaceSamples:
-        """Return those that a (n,) bool mask or an index array chooses."""
+        """Return the samples selected by a (n,) bool mask or an index array."""
         return SurfaceSamples(self.points[mask], self.normals[mask])
 
     @classmethod
-    def none(cls) -> SurfaceSamples:
-        """Return zero samples: what an empty mesh has."""
+    def empty(cls) -> SurfaceSamples:
+        """Return an empty set of samples."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit normals (f, 3) and areas (f,) of faces, both 0 for degenerate ones."""
+    """Return unit normals (f, 3) and areas (f,) of faces, both 0 for degenerate faces."""
     corners = vertices[faces]  # (f, 3, 3)
     edges = np.roll(corners, -1, axis=1) - corners  # (f, 3, 3), b - a, c - b, a - c
     cross = np.cross(edges[:, 0], -edges[:, 2])  # (f, 3)
@@ -62,35 +62,35 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
 def sample_uniformly(
     vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int
 ) -> SurfaceSamples:
-    """Spread points evenly over the area of a mesh (docs/method.md, section 9.1).
+    """Sample a mesh uniformly by area (docs/method.md, section 9.1).
 
-    One point is drawn from each of ``count`` equal parts of the area, counted along the list of
-    faces; where many fall on one face, they follow a low-discrepancy sequence over it. The number
-    on any part of the surface therefore depends on its area and not on its tessellation.
+    Stratified: one point is drawn from each of ``count`` equal parts of the area, along the list of
+    faces; several points on one face follow a low-discrepancy sequence. The density on any part of
+    the surface therefore depends on its area and not on its tessellation.
 
     Parameters
     ----------
     vertices : (v, 3) float64
     faces : (f, 3) int
     count : int
-        Number of samples, exactly.
+        Exact number of samples.
     seed : int
-        The same seed gives bitwise the same samples.
+        The same seed gives bitwise identical samples.
 
     Returns
     -------
     SurfaceSamples
-        With the normals of the faces. Degenerate faces get none.
+        With the normals of the faces; degenerate faces get no samples.
 
     Raises
     ------
     MeshingError
-        No face has an area, or a vertex that is used is not finite.
+        No face has an area, or a used vertex is not finite.
     UsageError
-        ``count`` is less than one, or faces name vertices that do not exist.
+        ``count`` is less than one, or a vertex index of a face is out of range.
     """
     if count < 1:
-        raise UsageError(f"{count} samples were asked for.", "Ask for at least one.")
+        raise UsageError(f"{count} samples were requested.", "Request at least one.")
     vertices, faces = _checked(vertices, faces)
     local, origin = _centred(vertices, faces)
     normals, areas = face_normals(local, faces)
@@ -112,10 +112,10 @@ def sample_uniformly(
 
 
 def sample_legacy(vertices: np.ndarray, faces: np.ndarray) -> SurfaceSamples:
-    """Return all vertices that faces use and all face centres (docs/method.md, section 9.1).
+    """Return all used vertices and all face centres (docs/method.md, section 9.1).
 
-    The number on a part of the surface depends on its tessellation: the bias that the other ways
-    avoid. Vertices have no normal here, centres that of their face.
+    The density depends on the tessellation: the bias that the other samplings avoid. Vertices have
+    no normal here; centres have that of their face.
 
     Raises
     ------
@@ -141,12 +141,12 @@ def scan_virtually(
     threads: int = 1,
     step_px: float = 1.0,
 ) -> SurfaceSamples:
-    """Collect what cameras see of a mesh: first hits of all pixels (docs/method.md, section 9.1).
+    """Collect the first hits of all pixels of cameras on a mesh (docs/method.md, section 9.1).
 
-    No near plane, no culling of back faces: a side that shows hides what is behind it. Points lie
-    on their faces to float64 precision, also at world coordinates of millions. Normals are those
-    of the faces as the mesh orients them: they are not turned towards the camera, so that a face
-    seen from its inner side is counted as wrongly oriented.
+    No near plane and no back-face culling: faces occlude from both sides. Points lie on their faces
+    to float64 precision, also at world coordinates of millions. Normals are those of the faces as
+    oriented in the mesh, not turned towards the camera, so that a face seen from its inner side
+    counts as wrongly oriented.
 
     Parameters
     ----------
@@ -157,12 +157,12 @@ def scan_virtually(
     threads : int
         Threads to use; the result does not depend on it.
     step_px : float
-        Distance between rays, in pixels of the cameras: 2 gives a quarter of the points.
+        Distance between rays in pixels of the cameras; 2 gives a quarter of the points.
 
     Returns
     -------
     SurfaceSamples
-        Camera after camera, row after row; empty if no camera sees the mesh.
+        Ordered by camera, then row; empty if no camera sees the mesh.
 
     Raises
     ------
@@ -196,9 +196,9 @@ def scan_virtually(
 
 
 def _weights_on_faces(corners: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Barycentric weights (n, 3) where rays (n, 3) from the origin meet triangles (n, 3, 3).
+    """Return barycentric weights (n, 3) where rays (n, 3) from the origin hit triangles (n, 3, 3).
 
-    Clamped to the triangle: a ray that grazes a face stays on it, whatever rounding does.
+    Clamped to the triangle, so that rounding moves no point of a grazing ray off its face.
     """
     volumes = np.stack(
         [
@@ -206,33 +206,33 @@ def _weights_on_faces(corners: np.ndarray, rays: np.ndarray) -> np.ndarray:
             for k in range(3)
         ],
         1,
-    )  # (n, 3), of one sign where the ray meets the face
+    )  # (n, 3), of one sign where the ray hits the face
     sign = np.sign(volumes.sum(1, keepdims=True))
     weights = np.maximum(volumes * sign, 0.0)
     total = weights.sum(1, keepdims=True)
     return np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1.0 / 3.0)
 
 
-def thin_out(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
-    """Replace the samples in each cell of a grid by their mean, as point-cloud tools do.
+def voxel_downsample(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
+    """Replace the samples in each voxel by their mean, as point-cloud tools do.
 
-    The grid begins half a cell before the smallest coordinates. Mean normals are made unit again;
-    they are 0 where those of a cell cancel.
+    The grid begins half a voxel before the smallest coordinates. Mean normals are normalised; they
+    are 0 where the normals in a voxel cancel.
 
     Parameters
     ----------
     voxel : float
-        Side of a cell, > 0, in the samples' frame.
+        Side of a voxel, > 0, in the samples' frame.
 
     Returns
     -------
     SurfaceSamples
-        In order of the cells (x, then y, then z).
+        In order of the voxels (x, then y, then z).
 
     Raises
     ------
     UsageError
-        ``voxel`` is not a positive number, or so small that cells cannot be numbered.
+        ``voxel`` is not a positive number, or too small to index the voxels.
     """
     group, members = _cells(samples.points, voxel)
     if len(samples) == 0:
@@ -240,35 +240,37 @@ def thin_out(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
     low = samples.points.min(0)
     normals = _means(samples.normals, group, members)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    known = length > 1e-9  # shorter means are those of normals that cancel, up to rounding
+    known = length > 1e-9  # shorter means result from normals that cancel, up to rounding
     normals = np.where(known, normals / np.where(known, length, 1.0), 0.0)
     return SurfaceSamples(_means(samples.points - low, group, members) + low, normals)
 
 
-def thin_points(points: np.ndarray, voxel: float) -> np.ndarray:
-    """Thin out (n, 3) points that have no normals; see :func:`thin_out`."""
-    return thin_out(SurfaceSamples(points, np.zeros_like(points)), voxel).points
+def voxel_downsample_points(points: np.ndarray, voxel: float) -> np.ndarray:
+    """Downsample (n, 3) points without normals; see :func:`voxel_downsample`."""
+    return voxel_downsample(SurfaceSamples(points, np.zeros_like(points)), voxel).points
 
 
 def choose_per_cell(samples: SurfaceSamples, voxel: float) -> SurfaceSamples:
-    """Keep in each cell of a grid the sample nearest to the mean of those there.
+    """Keep in each voxel the sample nearest to the mean of its samples.
 
-    As even as :func:`thin_out`, whose means leave a curved surface: these samples stay on it.
-    Same grid, order and errors; ties go to the earlier sample.
+    As even as :func:`voxel_downsample`, but the samples stay on a curved surface, which means do
+    not. Same grid, order and errors; ties go to the earlier sample.
     """
     group, members = _cells(samples.points, voxel)
     if len(samples) == 0:
         return samples
     local = samples.points - samples.points.min(0)
     away = ((local - _means(local, group, members)[group]) ** 2).sum(1)  # (n,)
-    order = np.lexsort((away, group))  # stable: equal ones stay in order
+    order = np.lexsort((away, group))  # stable: ties stay in order
     return samples.kept(order[np.cumsum(members) - members])
 
 
 def _cells(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Number of the occupied cell of each point (n,), and how many points each has (c,)."""
+    """Return the index of the occupied voxel of each point (n,), and the points per voxel (c,)."""
     if not (np.isfinite(voxel) and voxel > 0):
-        raise UsageError(f"A cell of {voxel} cannot be used to thin out.", "Give a length > 0.")
+        raise UsageError(
+            f"A voxel of {voxel} cannot be used for downsampling.", "Give a length > 0."
+        )
     if len(points) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     local = points - points.min(0)
@@ -276,8 +278,8 @@ def _cells(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
     size = cells.max(0) + 1
     if not np.prod(size) < 2.0**62:
         raise UsageError(
-            f"Cells of {voxel} are too small for samples that extend over {local.max():.6g}.",
-            "Give a larger one.",
+            f"Voxels of {voxel} are too small for samples that extend over {local.max():.6g}.",
+            "Give a larger voxel.",
         )
     whole, sides = cells.astype(np.int64), size.astype(np.int64)
     key = (whole[:, 0] * sides[1] + whole[:, 1]) * sides[2] + whole[:, 2]
@@ -286,7 +288,7 @@ def _cells(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _means(values: np.ndarray, group: np.ndarray, members: np.ndarray) -> np.ndarray:
-    """Mean of the rows (n, 3) of each group, (c, 3)."""
+    """Return the mean of the rows (n, 3) of each group, (c, 3)."""
     sums = [np.bincount(group, values[:, k], len(members)) for k in range(3)]
     return np.stack(sums, 1) / members[:, None]
 
@@ -302,8 +304,8 @@ def _checked(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
         raise MeshingError("The mesh has no faces.", "Check that the reconstruction is not empty.")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise UsageError(
-            f"The mesh's faces name vertices outside of 0 to {len(vertices) - 1}.",
-            "Write the mesh again.",
+            f"The mesh's faces have vertex indices outside 0 to {len(vertices) - 1}.",
+            "Export the mesh again.",
         )
     if not np.isfinite(vertices[np.unique(faces)]).all():
         raise MeshingError(
@@ -313,7 +315,7 @@ def _checked(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _centred(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices relative to the middle of the used ones' bounds, and that middle (3,)."""
+    """Return vertices relative to the centre of the used ones' bounds, and that centre (3,)."""
     used = vertices[np.unique(faces)]
     origin = (used.min(0) + used.max(0)) / 2
     return vertices - origin, origin

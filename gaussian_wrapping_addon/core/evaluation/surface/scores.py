@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How close a reconstructed surface is to the true one: F1, Chamfer, normals.
+"""Scores of a reconstructed surface: precision, recall, F1, Chamfer distance, normals.
 
 See docs/method.md, section 9.1.
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from ...dataset.camera import Camera
 from ...errors import UsageError
-from ...files import finite
+from ...files import finite_json
 from ...kernels.parallel import default_threads
 from ...mesh.distance import distances_to_cloud, distances_to_mesh
 from .samples import (
@@ -26,17 +26,17 @@ from .samples import (
     sample_legacy,
     sample_uniformly,
     scan_virtually,
-    thin_points,
+    voxel_downsample_points,
 )
 from .truth import MIN_CAMERAS, Truth
 
 PROTOCOLS = ("uniform", "scan", "legacy")
 
 MIN_THIN_SHARE = 0.01
-"""Recall of thin parts says nothing where fewer of the true samples than these are thin."""
+"""Recall of thin parts is not meaningful if a smaller share of the true samples is thin."""
 
 SCAN_RAYS = 4_000_000
-"""Rays of a virtual scan unless a step is given: some 400 MB of points at most."""
+"""Rays of a virtual scan unless a step is given: at most about 400 MB of points."""
 
 Shares = tuple[float, ...]
 """One number in [0, 1] for each threshold."""
@@ -53,31 +53,31 @@ class SurfaceScore:
     recall: Shares
     f1: Shares
     visible_recall: Shares | None
-    """Recall over the true samples that cameras see; ``None`` where that is not known of any."""
+    """Recall over the true samples that cameras see; ``None`` if visibility is unknown."""
     thin_recall: Shares | None
-    """Recall over seen samples on thin structures; ``None`` where there are none."""
+    """Recall over visible samples on thin structures; ``None`` without any."""
     accuracy_mean: float
     accuracy_median: float
-    """Distance from the predicted samples to the truth; infinite without any."""
+    """Distance from the predicted samples to the truth; infinite without samples."""
     completeness_mean: float
     completeness_median: float
-    """Distance from the true samples to the prediction; infinite where that is empty."""
+    """Distance from the true samples to the prediction; infinite if that is empty."""
     chamfer_mean: float
     chamfer_median: float
     """Mean of accuracy and completeness (means, medians)."""
     normal_consistency: float
-    """Mean absolute cosine between normals of counterparts, both directions averaged."""
+    """Mean absolute cosine between corresponding normals, averaged over both directions."""
     normal_agreement: float
-    """Share of counterparts whose normals point to the same side, likewise."""
+    """Share of corresponding points whose normals point to the same side, averaged likewise."""
     predicted_count: int
     truth_count: int
     visible_count: int
     thin_count: int
-    """Samples that were judged."""
+    """Number of evaluated samples."""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return dict(finite(dataclasses.asdict(self)))
+        return dict(finite_json(dataclasses.asdict(self)))
 
 
 @dataclass(frozen=True)
@@ -90,14 +90,14 @@ class CloudScore:
     f1: float
     accuracy_mean: float
     completeness_mean: float
-    """Mean distances; infinite where the prediction is empty."""
+    """Mean distances; infinite if the prediction is empty."""
     predicted_count: int
     truth_count: int
-    """Points after thinning out."""
+    """Number of points after downsampling."""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; infinite distances become ``None``."""
-        return dict(finite(dataclasses.asdict(self)))
+        return dict(finite_json(dataclasses.asdict(self)))
 
 
 def score_surface(
@@ -112,46 +112,46 @@ def score_surface(
 ) -> SurfaceScore:
     """Compare samples of a surface with the truth.
 
-    The crop decides which samples are judged, on either side, never what they are measured
-    against: a sample at its boundary finds its counterpart beyond. Conventions:
+    The crop selects the samples that are evaluated, on either side, but not what they are compared
+    with: a sample at its boundary may have its counterpart outside. Conventions:
 
-    - precision: share of judged predicted samples within the threshold (``<=``) of the truth's
-      mesh, or of its cloud where it has no mesh;
-    - recall: share of judged true samples within it of ``predicted_mesh``, or where that is
-      ``None`` of the samples ``reached``, or else of those predicted; visible recall: of those
-      that at least ``min_cameras`` cameras see; thin recall: of those that are thin and, where
-      that is known, visible;
-    - F1: harmonic mean of the two, 0 where both are 0;
-    - normals: over all judged samples of either side, whatever their distance, as far as both the
-      sample and its nearest counterpart have one. 0 where no pair has;
-    - an empty prediction, or one outside of the crop, has precision, recall, F1 and normal scores
-      of 0 and infinite distances, where there is nothing to measure from or to. No figure is NaN.
+    - precision: share of evaluated predicted samples within the threshold (``<=``) of the truth's
+      mesh, or of its cloud if it has no mesh;
+    - recall: share of evaluated true samples within it of ``predicted_mesh``, or if that is
+      ``None`` of the samples ``reached``, or else of the predicted ones; visible recall: of those
+      that at least ``min_cameras`` cameras see; thin recall: of those that are thin and, if
+      known, visible;
+    - F1: harmonic mean of the two, 0 if both are 0;
+    - normals: over all evaluated samples of either side, at any distance, if both the sample and
+      its nearest counterpart have a normal; 0 without such pairs;
+    - an empty prediction, or one outside the crop, has precision, recall, F1 and normal scores of
+      0 and infinite distances if there is nothing to measure from or to. No figure is NaN.
 
     Parameters
     ----------
     predicted : SurfaceSamples
-        In the truth's frame, as is the mesh.
+        In the truth's frame, like the mesh.
     predicted_mesh : (vertices, faces) or None
-        Given for the uniform protocol; ``None`` for scan and legacy, which judge a cloud.
+        Given for the uniform protocol; ``None`` for scan and legacy, which evaluate a cloud.
     truth : Truth
     thresholds : sequence of float
         Distances > 0 in the truth's frame.
     reached : SurfaceSamples, optional
-        A denser set out of which ``predicted`` was chosen to be even.
+        A denser set from which ``predicted`` was evenly subsampled.
     min_cameras : int
         Not used where ``truth.seen`` is boolean.
     threads : int
-        Of the search in clouds; the result does not depend on it.
+        Threads of the search in clouds; the result does not depend on it.
 
     Raises
     ------
     UsageError
-        A threshold is not a positive number, or no true sample is inside of the crop.
+        A threshold is not a positive number, or no true sample is inside the crop.
     """
     limits = _checked(thresholds)
     judged = truth.judged()
     if not judged.any():
-        raise UsageError("No true sample lies inside of the crop.", "Check the crop's frame.")
+        raise UsageError("No true sample lies inside the crop.", "Check the crop's frame.")
     inside = np.ones(len(predicted), np.bool_)
     if truth.crop is not None and len(predicted):
         inside = truth.crop.inside(predicted.points)
@@ -188,8 +188,8 @@ def score_surface(
         completeness_median=medians[1],
         chamfer_mean=(means[0] + means[1]) / 2,
         chamfer_median=(medians[0] + medians[1]) / 2,
-        normal_consistency=_both_ways([np.abs(values) for values in pairs]),
-        normal_agreement=_both_ways([(values > 0).astype(np.float64) for values in pairs]),
+        normal_consistency=_symmetric_mean([np.abs(values) for values in pairs]),
+        normal_agreement=_symmetric_mean([(values > 0).astype(np.float64) for values in pairs]),
         predicted_count=len(shown),
         truth_count=len(true),
         visible_count=int(visible.sum()) if knows_seen else 0,
@@ -211,18 +211,18 @@ def score_protocols(
     step_px: float | None = None,
     min_cameras: int = MIN_CAMERAS,
 ) -> dict[str, SurfaceScore]:
-    """Judge a mesh by several protocols (docs/method.md, section 9.1).
+    """Score a mesh by several protocols (docs/method.md, section 9.1).
 
-    - ``uniform``: ``count`` samples spread evenly over the mesh; recall is measured against the
-      mesh itself, so it does not depend on their density. Inner sides and hidden parts count.
-    - ``scan``: what the cameras see of the mesh, thinned out to one point in each cell of half the
-      smallest threshold, so that parts near to many cameras do not weigh more. Recall is measured
-      against all that they see, and over those true samples only that at least ``min_cameras``
-      cameras see (all, where that is not known), because a scan cannot reach others. Hidden parts
-      do not count on either side. The distance between neighbouring points of the scan has to be
-      well below the thresholds.
-    - ``legacy``: vertices and centres of faces; recall is measured against these points. Biased by
-      tessellation: reported to be compared with older figures only.
+    - ``uniform``: ``count`` samples uniform over the mesh; recall is measured against the mesh
+      itself, so it does not depend on their density. Inner sides and hidden parts count.
+    - ``scan``: the surface seen by the cameras, downsampled to one point per voxel of half the
+      smallest threshold, so that parts near many cameras do not weigh more. Recall is measured
+      against all points seen, and only over the true samples that at least ``min_cameras``
+      cameras see (all, if unknown), because a scan cannot reach others. Hidden parts do not count
+      on either side. The distance between neighbouring points of the scan must be well below the
+      thresholds.
+    - ``legacy``: vertices and face centres; recall is measured against these points. Biased by
+      tessellation: only for comparison with older figures.
 
     Parameters
     ----------
@@ -230,30 +230,30 @@ def score_protocols(
         The mesh in the truth's frame, possibly empty.
     truth : Truth
     cameras : sequence of Camera
-        In the truth's frame; used by ``scan`` only.
+        In the truth's frame; only used by ``scan``.
     thresholds : sequence of float
         Distances > 0.
     count, seed
         See :func:`~.samples.sample_uniformly`.
     threads : int
-        Threads to use, 0 for every core; the result does not depend on it. The distances to meshes
-        take every core whatever is said here (see :func:`~...mesh.distance.distances_to_mesh`).
+        Threads to use, 0 for every core; the result does not depend on it. Distances to meshes
+        always use every core (see :func:`~...mesh.distance.distances_to_mesh`).
     protocols : sequence of str
-        Out of :data:`PROTOCOLS`.
+        Elements of :data:`PROTOCOLS`.
     step_px : float, optional
-        See :func:`~.samples.scan_virtually`; the smallest with :data:`SCAN_RAYS` rays in
-        all unless given.
+        See :func:`~.samples.scan_virtually`; by default the smallest with at most
+        :data:`SCAN_RAYS` rays in total.
 
     Returns
     -------
     dict of str to SurfaceScore
-        By protocol, in the order asked for.
+        By protocol, in the given order.
 
     Raises
     ------
     UsageError
-        An unknown protocol, a scan without cameras or of which no true sample is visible, or what
-        :func:`score_surface` refuses.
+        An unknown protocol, a scan without cameras or without a visible true sample, or as in
+        :func:`score_surface`.
     MeshingError
         A vertex is not finite.
     """
@@ -270,19 +270,19 @@ def score_protocols(
             visible = truth.visible(min_cameras)
             if not visible.any():
                 raise UsageError(
-                    f"No true sample is seen by {min_cameras} cameras.", "Ask for fewer cameras."
+                    f"No true sample is seen by {min_cameras} cameras.", "Require fewer cameras."
                 )
             judged = truth.kept(visible)
-            predicted = SurfaceSamples.none()
+            predicted = SurfaceSamples.empty()
             if len(faces):
                 step = _scan_step(cameras) if step_px is None else step_px
                 reached = scan_virtually(vertices, faces, cameras, threads=threads, step_px=step)
                 predicted = choose_per_cell(reached, min(limits) / 2)
         elif protocol == "legacy":
-            predicted = sample_legacy(vertices, faces) if len(faces) else SurfaceSamples.none()
+            predicted = sample_legacy(vertices, faces) if len(faces) else SurfaceSamples.empty()
         else:
             raise UsageError(f"Protocol {protocol!r} is unknown.", f"Use {', '.join(PROTOCOLS)}.")
-        # An area that lies on nothing but degenerate faces is as empty as no faces.
+        # A mesh of degenerate faces only counts as empty.
         result[protocol] = score_surface(
             predicted, mesh if len(predicted) else None, judged, limits,
             reached=reached, min_cameras=min_cameras, threads=threads,
@@ -298,27 +298,27 @@ def score_clouds(
     voxel: float | None,
     threads: int = 1,
 ) -> CloudScore:
-    """Compare clouds as Tanks and Temples does, after alignment and crop.
+    """Compare point clouds by the protocol of Tanks and Temples, after alignment and crop.
 
     See docs/method.md, section 9.1.
 
     Parameters
     ----------
     predicted_points : (n, 3) float64
-        May be empty: precision, recall and F1 are 0 then.
+        May be empty; precision, recall and F1 are then 0.
     truth_points : (m, 3) float64
     threshold : float
-        Distance within which (``<=``) a point counts.
+        A point counts within this distance (``<=``).
     voxel : float or None
-        Both clouds are thinned out to one mean per cell of this side first; the protocol takes
-        half of the threshold. ``None``: they are compared as they are.
+        Both clouds are first downsampled to one mean per voxel of this side; the protocol uses
+        half of the threshold. ``None``: no downsampling.
     threads : int
-        Of the search; the result does not depend on it.
+        Threads of the search; the result does not depend on it.
 
     Raises
     ------
     UsageError
-        The truth is empty, a value is not finite, or threshold or voxel are not positive.
+        The truth is empty, a value is not finite, or threshold or voxel is not positive.
     """
     (limit,) = _checked([threshold])
     clouds = []
@@ -327,7 +327,7 @@ def score_clouds(
         if not np.isfinite(points).all():
             raise UsageError(f"The {name} cloud has a point that is not finite.", "Remove it.")
         if voxel is not None:
-            points = thin_points(points, voxel)
+            points = voxel_downsample_points(points, voxel)
         clouds.append(points)
     predicted, truth = clouds
     if len(truth) == 0:
@@ -350,19 +350,19 @@ def _uniform(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> 
     if len(faces) == 0 or (
         np.isfinite(vertices[np.unique(faces)]).all() and not face_normals(vertices, faces)[1].any()
     ):
-        return SurfaceSamples.none()
+        return SurfaceSamples.empty()
     return sample_uniformly(vertices, faces, count, seed=seed)
 
 
 def _nearest(
     samples: SurfaceSamples, mesh: _Mesh | None, cloud: SurfaceSamples, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (n,) to a mesh, or to a cloud without one, and normals (n, 3) of what is there."""
+    """Return distances (n,) to the mesh, or to the cloud without one, and normals (n, 3) there."""
     if mesh is not None:
         distances, face, _ = distances_to_mesh(samples.points, *mesh)
         if len(mesh[1]) == 0:
             return distances, np.zeros((len(samples), 3))
-        met = np.asarray(mesh[1])[face]  # (n, 3), vertices of the faces that were met
+        met = np.asarray(mesh[1])[face]  # (n, 3), vertices of the nearest faces
         low = np.asarray(mesh[0], np.float64)
         corners = low[met]  # (n, 3, 3)
         flat = (corners - corners[:, :1]).reshape(-1, 3)
@@ -400,7 +400,7 @@ def _median(distances: np.ndarray) -> float:
     return float(np.median(distances)) if len(distances) else math.inf
 
 
-def _both_ways(pairs: list[np.ndarray]) -> float:
-    """Mean of the two directions' means; of one where the other has no pair; 0 without any."""
+def _symmetric_mean(pairs: list[np.ndarray]) -> float:
+    """Return the mean of both directions' means; of one if the other has no pair; 0 without any."""
     means = [float(values.mean()) for values in pairs if len(values)]
     return sum(means) / len(means) if means else 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a reconstruction is compared with: the true surface, its samples and what was seen."""
+"""Ground truth of a reconstruction: the true surface, its samples and their visibility."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .samples import SurfaceSamples
 TRUTH_FILE = "truth.npz"
 CROP_FILE = "crop.json"
 MIN_CAMERAS = 2
-"""A sample counts as visible if this many training cameras see it: fewer give no depth."""
+"""A sample counts as visible if this many training cameras see it; fewer give no depth."""
 
 _AGAIN = "Make the scene again."
 
 
 class CropVolume(Protocol):
-    """A volume outside of which samples are not judged."""
+    """Volume outside which samples are not evaluated."""
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Tell which of (n, 3) points are inside, (n,) bool."""
+        """Return whether (n, 3) points are inside, (n,) bool."""
         ...
 
 
@@ -38,30 +38,30 @@ class RegionCrop:
     region: Region
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Tell which of (n, 3) points are inside or on the boundary, (n,) bool."""
+        """Return whether (n, 3) points are inside or on the boundary, (n,) bool."""
         return self.region.contains(points)
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The true surface, in one frame with what is compared with it.
+    """The true surface, in the frame of the surfaces compared with it.
 
     Raises
     ------
     DatasetError
-        Arrays of different lengths, not finite values, or no samples at all.
+        Arrays of different lengths, values that are not finite, or no samples.
     """
 
     samples: SurfaceSamples
     vertices: np.ndarray | None = None
-    """(v, 3) float64, or ``None`` where only a cloud is known."""
+    """(v, 3) float64, or ``None`` if only a cloud is known."""
     faces: np.ndarray | None = None
     """(f, 3) int."""
     thin: np.ndarray | None = None
-    """(n,) bool: the sample lies on a thin structure; ``None`` where nobody labelled it."""
+    """(n,) bool: the sample lies on a thin structure; ``None`` if not labelled."""
     seen: np.ndarray | None = None
-    """(n,) int32: how many training cameras see the sample, or (n,) bool: it counts as visible;
-    ``None`` where unknown."""
+    """(n,) int32: number of training cameras that see the sample, or (n,) bool: visible or not;
+    ``None`` if unknown."""
     crop: CropVolume | None = None
 
     def __post_init__(self) -> None:
@@ -90,19 +90,19 @@ class Truth:
         return self.vertices, self.faces
 
     def judged(self) -> np.ndarray:
-        """Tell which samples are inside of the crop, (n,) bool."""
+        """Return whether each sample is inside the crop, (n,) bool."""
         if self.crop is None:
             return np.ones(len(self.samples), np.bool_)
         return self.crop.inside(self.samples.points)
 
     def visible(self, min_cameras: int = MIN_CAMERAS) -> np.ndarray:
-        """Tell which samples at least ``min_cameras`` cameras see, (n,) bool; unknown: all."""
+        """Return whether at least ``min_cameras`` see each sample, (n,) bool; true if unknown."""
         if self.seen is None:
             return np.ones(len(self.samples), np.bool_)
         return self.seen if self.seen.dtype == np.bool_ else self.seen >= min_cameras
 
     def kept(self, mask: np.ndarray) -> Truth:
-        """Return the same surface with only the samples of a (n,) bool mask."""
+        """Return the same surface with the samples selected by a (n,) bool mask."""
         return replace(
             self,
             samples=self.samples.kept(mask),
@@ -122,7 +122,7 @@ def read_truth(folder: Path) -> Truth:
     Raises
     ------
     ParseError
-        Names the file and the entry that is missing or wrong.
+        States the file and the entry that is missing or invalid.
     """
     path = Path(folder) / TRUTH_FILE
     try:
@@ -144,7 +144,7 @@ def read_truth(folder: Path) -> Truth:
             raise ParseError(path, name, f"has the type {values.dtype}.", _AGAIN)
     faces = entries["faces"].astype(np.int64)
     if len(faces) and not (faces.min() >= 0 and faces.max() < len(entries["vertices"])):
-        raise ParseError(path, "faces", "names vertices that do not exist.", _AGAIN)
+        raise ParseError(path, "faces", "refers to vertices that do not exist.", _AGAIN)
     samples = SurfaceSamples(
         entries["points"].astype(np.float64), entries["normals"].astype(np.float64)
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The textured mesh seen from cameras, beside photos.
+"""Renderings of the textured mesh, compared with photos.
 
 In: a textured mesh, cameras, photos. Out: pictures and figures.
 """

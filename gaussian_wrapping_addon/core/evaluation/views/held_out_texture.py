@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mesh's texture baked again without some photos, so that these may judge it."""
+"""Bake a mesh's texture again without some photos, for an unbiased comparison with them."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from ...texture.unwrap.unwrap import Unwrap
 MIN_SIZE_PX = 256
 
 
-class _Subset:
-    """Some photos of a store, numbered anew."""
+class _PhotoSubset:
+    """A renumbered subset of the photos of a store."""
 
     def __init__(self, photos: PhotoSource, indices: list[int]) -> None:
         self._photos = photos
@@ -40,7 +40,7 @@ class _Subset:
         return self._photos.mask(self._indices[index], divisor)
 
 
-def texture_without(
+def bake_held_out_texture(
     textured: TexturedMesh,
     scene: Scene,
     photos: PhotoSource,
@@ -51,19 +51,19 @@ def texture_without(
     *,
     threads: int,
 ) -> TexturedMesh:
-    """Bake the colours again from all photos but the named ones, on the same UVs.
+    """Bake the colours again on the same UVs from all photos except the named ones.
 
     Parameters
     ----------
     textured : TexturedMesh
         Scene frame.
     names : collection of str
-        Photos to leave out; some must remain.
+        Photos to leave out; at least one must remain.
     reduction : int
-        How many times coarser than the photos the pictures are that will be compared: the texture
-        is smaller by the largest power of two that is no more.
+        Factor by which the compared pictures are coarser than the photos: the texture is reduced
+        by the largest power of two up to it.
     work_folder : Path
-        For temporary files, none of which stays.
+        For temporary files, all removed before returning.
 
     Returns
     -------
@@ -88,6 +88,6 @@ def texture_without(
     )
     part = dataclasses.replace(scene, views=tuple(scene.views[i] for i in kept))
     return texture_mesh(
-        mesh, part, _Subset(photos, kept), settings, work_folder, progress,
+        mesh, part, _PhotoSubset(photos, kept), settings, work_folder, progress,
         threads=threads, unwrapped=unwrapped,
     )  # fmt: skip

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Mesh-based rendering: how close the textured mesh, seen from a camera, comes to a photo.
+"""Mesh-based rendering: compare renderings of the textured mesh with photos.
 
 Unlike the measure of the same name in the papers (docs/method.md, section 9.3), no colour field is
-trained on the mesh: what is judged is the mesh with the texture that a person gets.
+trained on the mesh: the mesh is evaluated with its final texture.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ class MeshView:
     """Figures of one photo."""
 
     name: str
-    """Of the camera."""
+    """Name of the camera."""
     scores: ViewScores
     covered: float
-    """Share of the pixels that could count (of the mask, or of the whole photo where there is none)
-    that the mesh covers wholly."""
+    """Share of the candidate pixels (of the mask, or of the whole photo without one) that the mesh
+    covers wholly."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values; ``lpips`` only where it was measured."""
+        """Return plain JSON values; ``lpips`` only if measured."""
         return {"name": self.name, **self.scores.to_json(), "covered": self.covered}
 
 
 @dataclass(frozen=True)
 class MeshRenderingScore:
-    """Figures of all photos; means are over the photos, each counting once."""
+    """Figures of all photos; means are over photos with equal weights."""
 
     views: tuple[MeshView, ...]
     pixels: str
-    """``"mask"``: the pixels of given masks; ``"covered"``: those that the mesh covers wholly."""
+    """``"mask"``: pixels of the given masks; ``"covered"``: pixels that the mesh covers wholly."""
     left_out: int
-    """Photos in which no pixel counts, or none that a window of SSIM can be centred on."""
+    """Photos without a valid pixel, or without one on which an SSIM window can be centred."""
     lpips_note: str = ""
-    """Why LPIPS is absent."""
+    """Why LPIPS is missing."""
 
     @property
     def psnr(self) -> float | None:
@@ -64,7 +64,7 @@ class MeshRenderingScore:
 
     @property
     def lpips(self) -> float | None:
-        """Mean LPIPS of the views where it was measured; ``None`` without any."""
+        """Mean LPIPS of the views with a value; ``None`` without any."""
         return _mean([v.scores.lpips for v in self.views if v.scores.lpips is not None])
 
     @property
@@ -73,7 +73,7 @@ class MeshRenderingScore:
         return _mean([view.covered for view in self.views])
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values; what was not measured is absent, and nothing is infinite."""
+        """Return plain JSON values; unmeasured values are absent, and no value is infinite."""
         means = {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips, "covered": self.covered}
         values: dict[str, Any] = {
             "views": [view.to_json() for view in self.views],
@@ -97,37 +97,37 @@ def render_views(
     threads: int = 0,
     on_view: OnView | None = None,
 ) -> MeshRenderingScore:
-    """Render the mesh from each camera and compare with the camera's photo.
+    """Render the mesh from each camera and compare with its photo.
 
-    PSNR, SSIM and LPIPS are those of :func:`~...imaging.view_metrics.score_images` over the pixels
-    that count. The rendering is antialiased by ``SUPERSAMPLING`` squared rays a pixel, unlit, both
-    sides of the surface shown.
+    PSNR, SSIM and LPIPS are those of :func:`~...imaging.view_metrics.score_images` over the valid
+    pixels. The rendering is unlit, two-sided and antialiased with ``SUPERSAMPLING`` squared rays
+    per pixel.
 
     Parameters
     ----------
     textured : TexturedMesh
         Scene frame.
     cameras : sequence of Camera
-        In the mesh's frame (``Camera.moved`` brings others there), each of the size of its photo.
+        In the mesh's frame (see ``Camera.moved``), each of the size of its photo.
     images : sequence of (h, w, 3) uint8, or floats whose white is 1
         The photos.
     masks : sequence of (h, w) bool, optional
-        Pixels that count, such as true silhouettes. Where the mesh leaves one uncovered, the
-        background colour stands there and counts: a hole is an error. Without masks, the pixels
-        that the mesh covers wholly count: holes and missing parts cost nothing, and whatever stands
-        in front of the mesh in the photo is an error.
+        Valid pixels, such as true silhouettes. Pixels that the mesh leaves uncovered have the
+        background colour and are compared too: a hole is an error. Without masks, the pixels that
+        the mesh covers wholly are compared: holes and missing parts cost nothing, and occluders in
+        front of the mesh in the photo are errors.
     counted : sequence of ((h, w) bool or None), optional
-        Pixels of each photo that may count at all, such as a photo's own mask.
+        Candidate pixels of each photo, such as the photo's own mask.
     lpips : Lpips, optional
     threads : int
-        0 uses every core; the result does not depend on it (LPIPS excepted, in its last digits).
+        0 uses every core; the result does not depend on it, except for the last digits of LPIPS.
     on_view : callable, optional
-        Called with name, photo and rendering of each view that counts.
+        Called with name, photo and rendering of each view compared.
 
     Raises
     ------
     UsageError
-        If a photo or mask has another size than its camera, or the numbers of them differ.
+        A photo or mask differs in size from its camera, or their numbers differ.
     """
     threads = threads or default_threads()
     renderer = TexturedRenderer(textured, threads=threads)
@@ -182,7 +182,7 @@ def _check_sizes(camera: Camera, *pictures: np.ndarray | None) -> None:
 def _note(lpips: Lpips | None, views: list[MeshView]) -> str:
     if lpips is None:
         ready, reason = lpips_ready()
-        return "LPIPS was not asked for." if ready else reason
+        return "LPIPS was not requested." if ready else reason
     if views and all(view.scores.lpips is None for view in views):
         return "The pictures are too small for LPIPS."
     return ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A job's textured mesh beside some of the job's own photos: figures and pictures."""
+"""Compare a job's textured mesh with some of the job's photos: figures and pictures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ...imaging.lpips import lpips_if_ready
 from ...kernels.parallel import default_threads
 from ...mesh.textured_mesh import TexturedMesh
 from ...progress import Progress
-from .held_out_texture import texture_without
+from .held_out_texture import bake_held_out_texture
 from .mesh_rendering import render_views
 from .side_by_side import write_side_by_side
 
@@ -25,9 +25,13 @@ MAX_PHOTOS = 8
 LONG_SIDE_PX = 800
 MAX_PICTURES = 3
 PICTURE_WIDTH_PX = 1200
-INCLUDED = "the texture was baked from all photos, these included"
-WITHOUT = "the texture compared was baked again without the held-out photos; the files have all"
-FROM_GAUSSIANS = "the texture is of the Gaussians, which no held-out photo has trained"
+NOTE_ALL_PHOTOS = "the texture was baked from all photos, including those compared"
+NOTE_HELD_OUT = (
+    "the texture compared was baked without the held-out photos; the files use all photos"
+)
+NOTE_GAUSSIANS = (
+    "the texture is rendered from the Gaussians, which were not trained on the held-out photos"
+)
 
 
 def compare_with_photos(
@@ -41,25 +45,25 @@ def compare_with_photos(
     from_gaussians: bool = False,
     threads: int = 0,
 ) -> dict[str, Any]:
-    """Measure mesh-based rendering over covered pixels, and write some of the comparisons.
+    """Evaluate mesh-based rendering over covered pixels, and write some of the comparisons.
 
-    A photo that the texture was baked from proves little. Where photos were held out, a texture
-    baked without them is compared, as coarse as the pictures allow.
+    Comparison with a photo from which the texture was baked is biased. If photos were held out, a
+    texture baked without them is compared, at the coarsest size that the pictures allow.
 
     Parameters
     ----------
     textured : TexturedMesh
         Scene frame.
     scene : Scene
-        Whose views the photos are.
+        Views of the photos.
     photos : PhotoStore
     held_out : collection of str
-        Names of photos that no Gaussian was trained on. Up to :data:`MAX_PHOTOS` are taken evenly
-        from these, or from all photos where there are none.
+        Names of photos held out of training. Up to :data:`MAX_PHOTOS` evenly spaced ones of these
+        are compared, or of all photos if none were held out.
     folder : Path
-        Gets ``comparison-1.jpg`` and so on: photo left, rendering right.
+        Where ``comparison-1.jpg`` and so on are written: photo left, rendering right.
     from_gaussians : bool
-        The texture has no colours of photos, so that none need be left out.
+        The texture has no colours of photos, so no photo has to be left out.
     threads : int
         0 uses every core.
 
@@ -67,9 +71,9 @@ def compare_with_photos(
     -------
     dict
         What :meth:`~.mesh_rendering.MeshRenderingScore.to_json` returns, with ``pictures`` (file
-        names), ``held_out`` (whether the photos were held out of training), ``note``, and where a
-        texture was baked for it ``texture_size_px`` and ``bake_s``. A view that is pictured names
-        its ``picture``.
+        names), ``held_out`` (whether the photos were held out of training), ``note``, and, if a
+        texture was baked for it, ``texture_size_px`` and ``bake_s``. Views with a picture have the
+        key ``picture``.
 
     Raises
     ------
@@ -78,7 +82,7 @@ def compare_with_photos(
     """
     names = [view.camera.name for view in scene.views]
     wanted = [index for index, name in enumerate(names) if name in held_out]
-    chosen = _evenly(wanted or list(range(len(names))), MAX_PHOTOS)
+    chosen = _evenly_spaced(wanted or list(range(len(names))), MAX_PHOTOS)
     cameras, images, counted = [], [], []
     reduction = 0
     for index in chosen:
@@ -90,15 +94,17 @@ def compare_with_photos(
         cameras.append(photos.camera(index, divisor))
         images.append(photos.photo(index, divisor))
         counted.append(photos.mask(index, divisor))
-    told: dict[str, Any] = {"note": FROM_GAUSSIANS if from_gaussians and wanted else INCLUDED}
+    description: dict[str, Any] = {
+        "note": NOTE_GAUSSIANS if from_gaussians and wanted else NOTE_ALL_PHOTOS
+    }
     if wanted and len(wanted) < len(names) and not from_gaussians:
         begun_s = time.monotonic()
-        textured = texture_without(
+        textured = bake_held_out_texture(
             textured, scene, photos, held_out, reduction, folder, progress,
             threads=threads or default_threads(),
         )  # fmt: skip
-        told = {
-            "note": WITHOUT,
+        description = {
+            "note": NOTE_HELD_OUT,
             "texture_size_px": len(textured.albedo),
             "bake_s": round(time.monotonic() - begun_s, 1),
         }
@@ -112,15 +118,15 @@ def compare_with_photos(
     if reason:
         values["lpips_note"] = reason
     values["pictures"] = []
-    for number, index in enumerate(_evenly(list(range(len(shown))), MAX_PICTURES), start=1):
+    for number, index in enumerate(_evenly_spaced(list(range(len(shown))), MAX_PICTURES), start=1):
         name = f"comparison-{number}.jpg"
         write_side_by_side(folder / name, *shown[index], max_width_px=PICTURE_WIDTH_PX)
         values["views"][index]["picture"] = name
         values["pictures"].append(name)
-    return {**values, "held_out": bool(wanted), **told}
+    return {**values, "held_out": bool(wanted), **description}
 
 
-def _evenly(items: list[int], count: int) -> list[int]:
-    """Return ``count`` of the items (or all), from the first to the last."""
-    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
-    return [items[place] for place in places.tolist()]
+def _evenly_spaced(items: list[int], count: int) -> list[int]:
+    """Return up to ``count`` evenly spaced items, including the first and the last."""
+    positions = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[position] for position in positions.tolist()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Preview picture: a photo beside the textured mesh seen from the same camera."""
+"""Preview picture: a photo beside a rendering of the textured mesh from the same camera."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ MIN_MARGIN_SHARE = 0.02
 def choose_view(
     textured: TexturedMesh, photos: PhotoSource, count: int, *, threads: int = 0
 ) -> int:
-    """Return the photo in which the mesh is large, whole, and seen from its front.
+    """Return the photo that shows the mesh large, complete, and from the front.
 
-    0 threads uses every core.
+    With 0 threads, every core is used.
     """
     threads = threads or default_threads()
     vertices, faces = textured.mesh.vertices, textured.mesh.faces
@@ -55,7 +55,7 @@ def choose_view(
 
 
 def _crop(textured: TexturedMesh, camera: Camera, threads: int) -> tuple[int, int, int, int]:
-    """Return left, top, right, bottom of the part of the photo that is worth showing."""
+    """Return left, top, right, bottom of the part of the photo that shows the mesh."""
     factor = max(1, max(camera.width, camera.height) // (2 * CHOICE_LONG_SIDE_PX))
     coarse = camera.resized(max(1, camera.width // factor), max(1, camera.height // factor))
     mesh = textured.mesh
@@ -79,14 +79,14 @@ def write_preview(
     view: int | None = None,
     threads: int = 0,
 ) -> None:
-    """Write a PNG: left the part of a photo that shows the mesh, right the mesh from its camera.
+    """Write a PNG: left the part of a photo that shows the mesh, right its rendering.
 
     Parameters
     ----------
     textured : TexturedMesh
         Scene frame.
     scene : Scene
-        Whose views the photos are.
+        Views of the photos.
     photos : PhotoStore
     path : Path
         Its folder must exist.

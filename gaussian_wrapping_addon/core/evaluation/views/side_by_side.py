@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pictures that show two images of the same size beside each other."""
+"""Write two images of the same size side by side."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ JPEG_QUALITY = 88
 def write_side_by_side(
     path: Path, left: np.ndarray, right: np.ndarray, *, max_width_px: int | None = None
 ) -> None:
-    """Write a PNG or JPEG, by the path's suffix.
+    """Write a PNG or JPEG, depending on the path's suffix.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def write_side_by_side(
         Its folder must exist.
     left, right : (h, w, 3) uint8
     max_width_px : int, optional
-        A wider picture is made smaller.
+        A wider picture is scaled down.
 
     Raises
     ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A textured mesh seen from a camera: unlit, antialiased, on plain grey."""
+"""Render a textured mesh from a camera: unlit, antialiased, on a plain grey background."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from ...mesh.textured_mesh import TexturedMesh
 
 BACKGROUND = (92, 92, 94)
 SUPERSAMPLING = 3
-"""Rays per pixel and direction."""
+"""Rays per pixel along each axis."""
 
 
 @dataclass(frozen=True)
 class TexturedView:
-    """A rendering and where it shows the mesh."""
+    """A rendering and its coverage."""
 
     image: np.ndarray
-    """(h, w, 3) uint8; :data:`BACKGROUND` where there is no mesh, mixed with it along outlines."""
+    """(h, w, 3) uint8; :data:`BACKGROUND` outside the mesh, blended along silhouettes."""
     coverage: np.ndarray
     """(h, w) float32 in [0, 1]: share of the pixel's rays that meet the mesh."""
 
@@ -36,14 +36,14 @@ class TexturedView:
 
 
 class TexturedRenderer:
-    """Renders one textured mesh from many cameras; front and back sides alike are shown.
+    """Render one textured mesh from many cameras; faces are two-sided.
 
     Parameters
     ----------
     textured : TexturedMesh
-        In the scene frame (surfaces nearer than ``depth_buffer.NEAR_DEPTH`` are cut away).
+        In the scene frame; surfaces nearer than ``depth_buffer.NEAR_DEPTH`` are clipped.
     threads : int
-        0 uses every core; the pictures do not depend on it.
+        0 uses every core; the result does not depend on it.
     """
 
     def __init__(self, textured: TexturedMesh, *, threads: int = 0) -> None:
@@ -62,7 +62,7 @@ class TexturedRenderer:
         camera : Camera
             Of any size; its view is resampled.
         size : (width, height), optional
-            Of the picture, pixels; by default the camera's.
+            Size of the picture in pixels; by default that of the camera.
         """
         width, height = size or (camera.width, camera.height)
         fine = camera.resized(width * SUPERSAMPLING, height * SUPERSAMPLING)
@@ -95,7 +95,7 @@ class TexturedRenderer:
 
 
 def _pixel_sums(rays: np.ndarray) -> np.ndarray:
-    """Sum what the rays of each pixel brought: (3 h, 3 w, ...) bool or uint8 to (h, w, ...)."""
+    """Sum over the rays of each pixel: (3 h, 3 w, ...) bool or uint8 to (h, w, ...) uint16."""
     total = rays[::SUPERSAMPLING, ::SUPERSAMPLING].astype(np.uint16)
     for row, column in list(np.ndindex(SUPERSAMPLING, SUPERSAMPLING))[1:]:
         total += rays[row::SUPERSAMPLING, column::SUPERSAMPLING]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vacancy of points: the largest transmittance from any camera that sees them.
+"""Vacancy field: the largest transmittance to a point from any camera that sees it.
 
-In: points, Gaussians, cameras, masks. Out: vacancy, the deciding camera, gradients.
+In: points, Gaussians, cameras, masks. Out: vacancy, the arg-max camera, gradients.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vacancy by its definition, every Gaussian at every point: for tests and benchmarks only."""
+"""Brute-force vacancy, every Gaussian at every point: for tests and benchmarks only."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def log_transmittance(arrays: GaussianArrays, center: np.ndarray, points: np.nda
 
     See docs/method.md, section 5.1.
 
-    Far too slow for anything but tests and benchmarks: cost is Gaussians x points.
+    Only for tests and benchmarks, since the cost is Gaussians x points.
 
     Parameters
     ----------
     arrays : GaussianArrays
-        All ``m`` Gaussians take part, also those beside or behind the camera (those contribute
+        All ``m`` Gaussians are included, also those beside or behind the camera (which contribute
         their value at the camera, docs/method.md, section 5.4).
     center : (3,) float64
         Camera centre, scene frame.
@@ -62,7 +62,7 @@ def brute_force_vacancy(
     *,
     near_z: float = tolerances.NEAR_Z,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return vacancy and arg-max camera in float64, without culling, tails or early exit.
+    """Return vacancy and arg-max camera in float64, without culling, cut-off or early exit.
 
     For tests and benchmarks only (see :func:`log_transmittance`).
 
@@ -71,14 +71,14 @@ def brute_force_vacancy(
     points : (n, 3) float64
         Scene frame.
     near_z : float
-        A camera sees a point if it lies in the image and deeper than this (scene units).
+        A camera sees a point that lies in its image and deeper than this (scene units).
 
     Returns
     -------
     vacancy : (n,) float64
         Largest transmittance over the cameras that see the point; NaN where none does.
     camera : (n,) int32
-        The first camera that reaches it, or -1.
+        The first camera that attains it, or -1.
     """
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
     best = np.full(len(points), -np.inf)

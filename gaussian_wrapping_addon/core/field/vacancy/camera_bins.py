@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Gaussians that one camera sees, packed and listed by tile for vacancy queries."""
+"""Bin the Gaussians seen by a camera into tiles, packed for vacancy queries."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from ...render.projection.projection import pack_camera, project_arrays
 from .vacancy_kernels import BOUND_COLUMNS, ROW_COLUMNS, list_tiles
 
 VIRTUAL_SIDE_PX = 65536
-"""Longer side of the screen that queries use. Nothing is drawn, so the only thing that pixels
-decide is which Gaussians are lost between pixel centres: at this size, none that matters."""
+"""Long side of the virtual screen of queries. Nothing is rasterised, so its resolution only decides
+which Gaussians are lost between pixel centres: at this size, none that matters."""
 TILES_ALONG_SIDE = 64
 TILE_PX = VIRTUAL_SIDE_PX // TILES_ALONG_SIDE
 DEPTH_TAIL = 1e-5
-"""In front of the depth where a Gaussian's value first exceeds this, it is left out."""
+"""A Gaussian is ignored in front of the depth where its value first exceeds this."""
 STRIP_MARGIN_PX = 0.05
 """Several float32 roundings of a coordinate on the virtual screen."""
-MAX_PAIRS = 2**31 - 1
+MAX_TILE_INTERSECTIONS = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class VirtualScreen:
-    """A camera resampled so that its longer side has :data:`VIRTUAL_SIDE_PX` pixels."""
+    """A camera resized so that its longer side has :data:`VIRTUAL_SIDE_PX` pixels."""
 
     camera: Camera
     packed: np.ndarray
@@ -39,7 +39,7 @@ class VirtualScreen:
 
     @classmethod
     def of(cls, camera: Camera, near_z: float) -> VirtualScreen:
-        """Return the screen of a camera of any resolution."""
+        """Return the virtual screen of a camera of any resolution."""
         scale = VIRTUAL_SIDE_PX / max(camera.width, camera.height)
         width, height = round(camera.width * scale), round(camera.height * scale)
         virtual = camera.resized(max(1, width), max(1, height))
@@ -54,7 +54,7 @@ class VirtualScreen:
 
 @dataclass(frozen=True)
 class CameraBins:
-    """What :func:`.vacancy_kernels.transmittance_of_cells` reads for one camera."""
+    """Binned Gaussians of one camera, for :func:`.vacancy_kernels.transmittance_of_cells`."""
 
     rows: np.ndarray
     """(m, 16) float32, nearest first."""
@@ -63,14 +63,14 @@ class CameraBins:
     tile_start: np.ndarray
     """(tiles + 1,) int64."""
     tile_ids: np.ndarray
-    """(pairs,) int32."""
+    """(intersections,) int32."""
     longest_list: int
     ids: np.ndarray
     """(m,) int32: the Gaussian of each row."""
 
     @property
     def size_bytes(self) -> int:
-        """Memory held."""
+        """Size in memory."""
         arrays = (self.rows, self.bounds, self.tile_start, self.tile_ids, self.ids)
         return sum(a.nbytes for a in arrays)
 
@@ -78,7 +78,7 @@ class CameraBins:
 def region_window(
     camera: Camera, bounds: np.ndarray, near_z: float
 ) -> tuple[float, float, float, float, float] | None:
-    """Return the part of the image and the depth in which a box can be seen.
+    """Bound the image area and depth in which a box can be visible.
 
     Parameters
     ----------
@@ -92,12 +92,12 @@ def region_window(
     """
     corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), -1).reshape(-1, 3)  # (8, 3)
     pixels, depth = camera.project(corners)
-    # A little less than near_z: a point on the box's far corner may round to the other side.
+    # Slightly less than near_z: a point on the box's far corner may round to the other side.
     if depth.max() <= near_z * (1.0 - 1e-9):
         return None
     x0, y0, x1, y1 = 0.0, 0.0, float(camera.width), float(camera.height)
     if depth.min() > 1e-6 * depth.max():
-        # Only then is the box's picture inside the hull of its corners' pictures.
+        # Only then does the projected box lie in the hull of its projected corners.
         x0, y0 = max(x0, pixels[:, 0].min() - 1.0), max(y0, pixels[:, 1].min() - 1.0)
         x1, y1 = min(x1, pixels[:, 0].max() + 1.0), min(y1, pixels[:, 1].max() + 1.0)
         if x0 > x1 or y0 > y1:
@@ -106,19 +106,19 @@ def region_window(
 
 
 def footprint_bounds(boxes: np.ndarray, skews: np.ndarray) -> np.ndarray:
-    """Bound elliptic footprints by their box and by the narrowest strip that holds them.
+    """Bound elliptic footprints by their box and by the narrowest strip that contains them.
 
     Parameters
     ----------
     boxes : (n, 4) float32
         x0 y0 x1 y1, pixels.
     skews : (n,) float32
-        x offset from the middle to the ellipse's point of largest y; inf where unbounded.
+        x offset from the centre to the ellipse's point of largest y; inf where unbounded.
 
     Returns
     -------
     (n, 8) float32
-        See ``vacancy_kernels.BOUND_COLUMNS``. A strip of infinite width bounds nothing.
+        See ``vacancy_kernels.BOUND_COLUMNS``. A strip of infinite width is no constraint.
     """
     wide = boxes.astype(np.float64)
     middle = 0.5 * (wide[:, :2] + wide[:, 2:])  # (n, 2)
@@ -130,7 +130,7 @@ def footprint_bounds(boxes: np.ndarray, skews: np.ndarray) -> np.ndarray:
     turn = 0.5 * np.arctan2(2.0 * xy, xx - yy) + 0.5 * math.pi  # angle of the minor axis
     normal = np.stack([np.cos(turn), np.sin(turn)], 1)  # (n, 2)
     width_sq = normal[:, 0] ** 2 * xx + 2.0 * normal.prod(1) * xy + normal[:, 1] ** 2 * yy
-    # xy comes from rounded float32 values, so a thin ellipse's width is known to about this.
+    # xy is derived from float32 values, which limits the accuracy of a thin ellipse's width.
     width = np.sqrt(np.maximum(width_sq, 0.0) + 1e-6 * (xx + yy)) + STRIP_MARGIN_PX
     out = np.empty((len(boxes), BOUND_COLUMNS), np.float32)
     out[:, :4] = boxes
@@ -147,12 +147,12 @@ def bin_camera(
     bounds: np.ndarray | None,
     threads: int,
 ) -> CameraBins | None:
-    """Project, pack and bin what a camera sees of the region; ``None`` if it cannot see it.
+    """Project, pack and bin the Gaussians for a camera; ``None`` if it cannot see the region.
 
     Raises
     ------
     ResourceError
-        If the tile lists do not fit.
+        The tile lists are too long.
     """
     camera = virtual.camera
     window = None if bounds is None else region_window(camera, bounds, near_z)
@@ -189,9 +189,9 @@ def bin_camera(
     list_tiles(footprints, tile_px, tiles_x, tiles_y, start[1:], tile_ids, False)
     longest = int(start.max())
     np.cumsum(start, out=start)
-    if start[-1] > MAX_PAIRS:
+    if start[-1] > MAX_TILE_INTERSECTIONS:
         raise ResourceError(
-            f"Camera {camera.name} would list {start[-1]} pairs of Gaussian and tile.",
+            f"Camera {camera.name} would have {start[-1]} tile intersections of Gaussians.",
             "Train with fewer Gaussians.",
         )
     tile_ids = np.empty(start[-1], np.int32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vacancy of points on an NVIDIA GPU: the same field, evaluated by the CUDA kernels."""
+"""Vacancy field evaluated by CUDA kernels on an NVIDIA GPU."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from .camera_bins import TILE_PX, CameraBins
 from .vacancy import VacancyField
 
 GPU_CACHE_SHARE = 0.25
-"""Share of the GPU's free memory that prepared cameras may take; a pass of 2 million points takes
-about 0.2 GB beside them."""
+"""Share of the GPU's free memory for prepared cameras; a pass of 2 million points takes about
+0.2 GB in addition."""
 POINTS_PER_WARP = 32
 CELL_BITS = 8
-"""Bits of a point's place within its tile in the keys of ``locate_points``."""
+"""Bits of a point's cell within its tile in the keys of ``locate_points``."""
 _MASK_MODES = {"ignore": 1, "background": 2}
 
 
@@ -37,7 +37,7 @@ class _DeviceBins:
     rows: Tensor  # (m, 16) float32
     bounds: Tensor  # (m, 8) float32
     tile_start: Tensor  # (tiles + 1,) int64
-    tile_ids: Tensor  # (pairs,) int32
+    tile_ids: Tensor  # (intersections,) int32
 
     @classmethod
     def of(cls, bins: CameraBins, device: torch.device) -> _DeviceBins:
@@ -52,7 +52,7 @@ class _DeviceBins:
 
 @dataclass(frozen=True)
 class _Query:
-    """Points of one pass and what is known of them, on the GPU."""
+    """Points of one pass and their current results, on the GPU."""
 
     points: Tensor  # (n, 3) float64; NaN outside of the region
     best: Tensor  # (n,) float32
@@ -83,7 +83,7 @@ class _Query:
         )
 
     def read(self, best: np.ndarray, winner: np.ndarray, seen: np.ndarray | None) -> None:
-        """Copy the answers into arrays."""
+        """Copy the results into arrays."""
         best[:] = self.best.cpu().numpy()
         winner[:] = self.winner.cpu().numpy()
         if seen is not None:
@@ -91,32 +91,32 @@ class _Query:
 
 
 class CudaVacancyField(VacancyField):
-    """:class:`VacancyField` whose vacancy, signs and transmittance a GPU evaluates.
+    """:class:`VacancyField` with vacancy, occupancy and transmittance evaluated on a GPU.
 
-    Definition, cut-offs, rules for unseen and masked points and order of cameras are the same;
-    values differ by float32 rounding, and by 1/255 of one Gaussian where that decides whether the
-    rim of its footprint holds the ray. Results are the same in every run and do not depend on how
-    points are split into calls, except where vacancy exceeds 0.999. The processor prepares the
-    cameras and evaluates :meth:`~.vacancy.VacancyField.log_gradient`.
+    Definition, cut-offs, rules for unseen and masked points and the order of cameras are the same;
+    values differ by float32 rounding, and by 1/255 of one Gaussian where rounding decides whether
+    the ray lies inside the rim of its footprint. Results are the same in every run and do not
+    depend on how points are split into calls, except where vacancy exceeds 0.999. The processor
+    prepares the cameras and evaluates :meth:`~.vacancy.VacancyField.log_gradient`.
 
     Parameters
     ----------
     arrays, cameras, **options
-        As of :class:`VacancyField`.
+        As for :class:`VacancyField`.
     device : str or torch.device
-        ``"cuda"`` is torch's current GPU.
+        ``"cuda"`` selects torch's current GPU.
     kernels : Kernels, optional
-        What runs the kernels; by default those of the GPU.
+        Loaded kernels; by default those of the GPU.
     device_cache_bytes : int, optional
-        GPU memory for prepared cameras, by default a quarter of what is free; the others are sent
-        anew in each call.
+        GPU memory for prepared cameras, by default a quarter of the free memory; other cameras are
+        transferred in each call.
 
     Raises
     ------
     UsageError
-        As of :class:`VacancyField`.
+        As for :class:`VacancyField`.
     DeviceError
-        If there is no GPU, or its compiler or driver are missing or fail.
+        There is no GPU, or its compiler or driver is missing or fails.
     """
 
     def __init__(
@@ -150,10 +150,10 @@ class CudaVacancyField(VacancyField):
         self._device_cache_left = device_cache_bytes
 
     def prepare(self, progress: Progress | None = None) -> None:
-        """Project and bin the Gaussians for all cameras now, and send them to the GPU."""
+        """Project and bin the Gaussians for all cameras now, and transfer them to the GPU."""
         progress = progress or Progress()
         with self._on_device():
-            for done, index in enumerate(self.visiting_order().tolist()):
+            for done, index in enumerate(self.evaluation_order().tolist()):
                 progress.update(done / len(self.cameras), "Preparing cameras")
                 self._device_bins(index)
 
@@ -168,15 +168,15 @@ class CudaVacancyField(VacancyField):
         seen: np.ndarray | None,
         progress: Progress,
     ) -> None:
-        order = self.visiting_order()
+        order = self.evaluation_order()
         with self._on_device():
             query = _Query.of(points, self._in_region(points), best, winner, self._torch_device)
             for done, index in enumerate(order.tolist()):
-                self._look(index, query, settled)
-                progress.update((done + 1) / len(order), "Looking from each camera")
+                self._evaluate_query(index, query, settled)
+                progress.update((done + 1) / len(order), "Evaluating transmittance per camera")
             query.read(best, winner, seen)
 
-    def _one_camera(
+    def _evaluate_camera(
         self,
         index: int,
         points: np.ndarray,
@@ -188,11 +188,11 @@ class CudaVacancyField(VacancyField):
     ) -> None:
         with self._on_device():
             query = _Query.of(points, inside, best, winner, self._torch_device)
-            self._look(index, query, settled)
+            self._evaluate_query(index, query, settled)
             query.read(best, winner, seen)
 
-    def _look(self, index: int, query: _Query, settled: float) -> None:
-        """Raise what is known of the query's points by one camera."""
+    def _evaluate_query(self, index: int, query: _Query, settled: float) -> None:
+        """Raise the best values of the query's points by one camera."""
         view = self._screens[index]
         self._kernels.launch_each(
             "locate_points", len(query.points), query.points, CameraValues.of(view.packed),
@@ -205,7 +205,7 @@ class CudaVacancyField(VacancyField):
         group_start = torch.zeros_like(point_start)
         groups_in_tile = (point_start.diff() + (POINTS_PER_WARP - 1)) // POINTS_PER_WARP
         group_start[1:] = groups_in_tile.cumsum(0)
-        groups = int(group_start[-1])  # waits for the GPU
+        groups = int(group_start[-1])  # synchronises with the GPU
         if groups == 0:
             return
         bins = self._device_bins(index)
@@ -217,7 +217,7 @@ class CudaVacancyField(VacancyField):
         )  # fmt: skip
 
     def _mask_arguments(self, index: int) -> tuple[Tensor, int, int, int]:
-        """Return the camera's mask, how it counts (0: not at all), its width and height."""
+        """Return the camera's mask, its mode (0: none), its width and height."""
         mask = self._masks[index]
         if mask is None:
             return torch.empty(0, dtype=torch.uint8, device=self._torch_device), 0, 0, 0
@@ -241,12 +241,12 @@ class CudaVacancyField(VacancyField):
 
     @contextlib.contextmanager
     def _on_device(self) -> Iterator[None]:
-        """Turn torch's error of the GPU's memory into ours."""
+        """Convert torch's out-of-memory error to :class:`ResourceError`."""
         try:
             yield
         except torch.OutOfMemoryError as error:
             raise ResourceError(
-                f"The GPU's memory does not suffice for the vacancy of {len(self.arrays)} "
+                f"The GPU has too little memory for the vacancy field of {len(self.arrays)} "
                 f"Gaussians: {error}.",
                 "Close other programs that use the GPU, or mesh on the processor.",
             ) from None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled loop of the gradient of log T, in float64 and scene coordinates."""
+"""Compiled kernel of the gradient of log transmittance, in float64 and scene coordinates."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import math
 from ...kernels.compiled import kernel
 
 TABLE_COLUMNS = 14
-"""One Gaussian: its mean, L = S^-1 R^T by rows, log opacity, and the largest squared Mahalanobis
-distance from a ray at which it counts."""
+"""Columns of a Gaussian: mean, L = S^-1 R^T by rows, log opacity, and the largest squared
+Mahalanobis distance from a ray at which it contributes."""
 
 LOG_HALF = -0.6931471805599453
 
@@ -20,7 +20,7 @@ def log_transmittance_gradient(
     begin, end, rows, points, camera, center, tile_px, tiles_x, tiles_y, bounds, row_table,
     tile_start, tile_ids, ids, table, log_t, gradient,
 ):  # fmt: skip
-    """Write log T and its gradient for ``rows[begin:end]`` of ``points``, as one camera sees them.
+    """Write log T from one camera and its gradient for ``rows[begin:end]`` of ``points``.
 
     ``row_table`` are the packed rows of :class:`.camera_bins.CameraBins`, ``ids`` the Gaussian of
     each; ``table (n, 14)`` as above. With s = L (x - o), m = L (mu - o) and the foot k = m.s / s.s,
@@ -73,7 +73,7 @@ def log_transmittance_gradient(
                 total += math.log1p(-math.exp(log_g))
             else:
                 total += math.log(max(-math.expm1(log_g), 1e-300))
-            # The floor keeps 0 * inf away at the centre of an opaque Gaussian.
+            # The floor avoids 0 * inf at the centre of an opaque Gaussian.
             pull = at / max(math.expm1(-log_g), 1e-300)
             gx -= pull * (table[i, 3] * fa + table[i, 6] * fb + table[i, 9] * fc)
             gy -= pull * (table[i, 4] * fa + table[i, 7] * fb + table[i, 10] * fc)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The exact gradient of log vacancy: that of log T of the camera that sees a point best."""
+"""Exact gradient of log vacancy: that of log transmittance from the arg-max camera."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .gradient_kernels import TABLE_COLUMNS, log_transmittance_gradient
 
 
 def gradient_table(arrays: GaussianArrays) -> np.ndarray:
-    """Return (n, 14) float64 rows as ``gradient_kernels.TABLE_COLUMNS`` says."""
+    """Return (n, 14) float64 rows in the layout of ``gradient_kernels.TABLE_COLUMNS``."""
     table = np.empty((len(arrays), TABLE_COLUMNS))
     table[:, :3] = arrays.means
     whiten = arrays.rotations.transpose(0, 2, 1) / arrays.scales[:, :, None]  # (n, 3, 3)
@@ -37,9 +37,9 @@ def gradient_from_camera(
 ) -> None:
     """Write log T and its gradient of some points from one camera.
 
-    Gaussians take part as in the vacancy field: those whose footprint ``alpha >= 1/255`` holds the
-    ray. The gradient is that of the terms that take part; where one joins, log T jumps by at most
-    1/255 and has none.
+    The same Gaussians contribute as in the vacancy field: those whose footprint ``alpha >= 1/255``
+    contains the ray. The gradient is that of the contributing terms; at the rim of a footprint,
+    log T jumps by at most 1/255 and has none.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What photo masks say of points: not seen there, or nothing is there."""
+"""Photo masks in the vacancy field: masked points are unseen, or known to be empty."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ...errors import UsageError
 from ...kernels.compiled import kernel
 
 MaskMode = Literal["ignore", "background"]
-"""As in training: masked pixels tell nothing, or show that the space before them is empty."""
+"""As in training: masked pixels are ignored, or show that the space before them is empty."""
 
 
 @kernel(fast=False)
 def masked_points(begin, end, screen, cells, mask, scale_x, scale_y, out):  # type: ignore[no-untyped-def]
-    """Tell which points with a cell lie in a pixel that the mask leaves out.
+    """Tell which points with a cell lie in a masked pixel.
 
-    ``scale_x`` and ``scale_y`` lead from pixels of ``screen`` to those of the mask.
+    ``scale_x`` and ``scale_y`` convert pixels of ``screen`` to those of the mask.
     """
     height, width = mask.shape
     for p in range(begin, end):
@@ -35,12 +35,12 @@ def masked_points(begin, end, screen, cells, mask, scale_x, scale_y, out):  # ty
 def checked_masks(
     masks: Sequence[np.ndarray | None] | None, cameras: Sequence[Camera], mode: str
 ) -> tuple[np.ndarray | None, ...]:
-    """Return one mask or ``None`` for each camera; masks that leave nothing out are dropped.
+    """Validate masks; return one or ``None`` per camera, ``None`` also if nothing is masked.
 
     Raises
     ------
     UsageError
-        The numbers of masks and cameras differ, a mask is no image, or the mode is unknown.
+        The numbers of masks and cameras differ, a mask is not an image, or the mode is unknown.
     """
     if mode not in ("ignore", "background"):
         raise UsageError(f"The mask mode is {mode!r}.", 'Use "ignore" or "background".')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Forms of log alpha, log G, log(1 - G) and G / (1 - G) that keep all their digits."""
+"""Numerically stable log alpha, log G, log(1 - G) and G / (1 - G)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ LOG_HALF = -0.6931471805599453
 
 
 def log_sigmoid(logits: np.ndarray) -> np.ndarray:
-    """Return the logarithm of the opacity of a logit, ``-softplus(-logit)``.
+    """Return the log opacity of a logit, ``-softplus(-logit)``.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ def log_sigmoid(logits: np.ndarray) -> np.ndarray:
         Accurate to a few ulp also where the opacity rounds to 1 (docs/method.md, section 5.4).
     """
     logits = np.asarray(logits, np.float64)
-    # Either branch alone loses digits or overflows on the other side of zero.
+    # A single branch would lose digits or overflow on the other side of zero.
     return np.minimum(logits, 0.0) - np.log1p(np.exp(-np.abs(logits)))
 
 
@@ -51,8 +51,8 @@ def log_one_minus(log_g: np.ndarray) -> np.ndarray:
         ``-inf`` where ``log_g`` is 0 (docs/method.md, section 5.4).
     """
     log_g = np.asarray(log_g, np.float64)
-    # Both forms are computed and one is chosen: where G is small, 1 - G rounds, and log1p does not
-    # need it; where G is near 1, exp(log G) rounds, and expm1 keeps the difference.
+    # Both forms are computed and one is chosen: for small G, 1 - G rounds, which log1p avoids; for
+    # G near 1, exp(log G) rounds, which expm1 avoids.
     with np.errstate(divide="ignore"):
         near_zero = np.log1p(-np.exp(log_g))
         near_one = np.log(-np.expm1(log_g))
@@ -72,5 +72,5 @@ def odds(log_g: np.ndarray) -> np.ndarray:
         ``inf`` where ``log_g`` is 0, 0 where G underflows (docs/method.md, section 5.4).
     """
     with np.errstate(divide="ignore", over="ignore"):
-        # abs, not minus: -0.0 would give minus infinity.
+        # abs instead of negation: -0.0 would give minus infinity.
         return 1.0 / np.expm1(np.abs(np.asarray(log_g, np.float64)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vacancy of points: the largest transmittance from any camera that sees them."""
+"""Vacancy field: the largest transmittance to a point from any camera that sees it."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from .photo_masks import MaskMode, checked_masks, masked_points
 from .vacancy_kernels import project_points, sort_by_cell, transmittance_of_cells
 
 SETTLED = 1.0 - 1e-3
-"""A point this vacant is not looked at from further cameras."""
+"""Points with a higher vacancy are not evaluated from further cameras."""
 POINTS_PER_PASS = 1 << 21
 CACHE_SHARE = 0.25
-"""Share of the machine's memory that prepared cameras may take."""
+"""Share of the machine's memory for prepared cameras."""
 CACHE_BYTES_UNKNOWN = 1 << 30
 POINTS_PER_CELL = 40
-"""Cells are made as small as leaves about this many points in each: fewer waste lanes, more widen
-the lists of Gaussians."""
+"""Target number of points per cell: fewer waste SIMD lanes, more lengthen the lists of
+Gaussians."""
 MAX_CELL_SHIFT = 3
 
 Unseen = Literal["empty", "occupied", "invalid"]
@@ -44,22 +44,22 @@ _UNSEEN_VALUES = {"empty": 1.0, "occupied": 0.0, "invalid": float("nan")}
 
 @dataclass(frozen=True)
 class VacancyResult:
-    """Vacancy of points."""
+    """Vacancy of points and their arg-max cameras."""
 
     vacancy: np.ndarray
     """(n,) float32 in [0, 1]; 1 is empty, the surface is at 0.5. Values above 0.999 are lower
-    bounds, values below 1e-4 are 0. NaN where no camera sees the point and that is invalid."""
+    bounds, values below 1e-4 are 0. NaN where no camera sees the point, if unseen is invalid."""
     camera: np.ndarray
     """(n,) int32: the camera that sees the point best, or -1 where none sees it."""
 
     @property
     def filled(self) -> np.ndarray:
-        """(n,) float32: vacancy with invalid points taken for empty, as the mesher takes them."""
+        """(n,) float32: vacancy with invalid points as empty, as in meshing."""
         return np.where(np.isnan(self.vacancy), np.float32(1.0), self.vacancy)
 
 
 def default_cache_bytes() -> int:
-    """Return how much memory prepared cameras may take on this machine."""
+    """Return the default memory for prepared cameras on this machine."""
     return int(CACHE_SHARE * total_memory_bytes()) or CACHE_BYTES_UNKNOWN
 
 
@@ -67,16 +67,16 @@ class VacancyField:
     """``v(x) = max over cameras c that see x of prod_i (1 - G_i(o_c + min(t, t*_i) w))``.
 
     The transmittance is that of training (docs/method.md, sections 2.4 and 5.1): exact in three
-    dimensions, with a Gaussian dropped outside its footprint ``alpha >= 1/255``. Where the tails of
-    m Gaussians that were dropped overlap, vacancy is too large by at most ``1 - (1 - 1/255)^m``: on
-    a dense shell by 0.0045 (median) to 0.012 (largest) near the surface, and up to 0.018 where
-    vacancy is 0.9. In depth, only tails below 1e-5 are dropped. Gaussians whose centre is not
-    deeper than ``near_z`` do not count, as in training. A camera sees a point that lies in its
-    image and deeper than ``near_z``. Pixels and depths are float32: a Gaussian thinner than about
-    1e-6 of its distance blurs to that.
+    dimensions, with Gaussians truncated to their footprint ``alpha >= 1/255``. Where the truncated
+    tails of m Gaussians overlap, vacancy is too large by at most ``1 - (1 - 1/255)^m``: on a dense
+    shell by 0.0045 (median) to 0.012 (largest) near the surface, and up to 0.018 where vacancy is
+    0.9. In depth, only tails below 1e-5 are truncated. Gaussians whose centre is not deeper than
+    ``near_z`` are ignored, as in training. A camera sees a point that lies in its image and deeper
+    than ``near_z``. Pixels and depths are float32: a Gaussian thinner than about 1e-6 of its
+    distance is blurred to that.
 
     Results do not depend on ``threads``. They depend on earlier calls only where vacancy exceeds
-    0.999, as cameras that won most often are asked first.
+    0.999, as cameras that were the arg-max most often are evaluated first.
 
     Parameters
     ----------
@@ -87,27 +87,26 @@ class VacancyField:
         0 uses every core.
     unseen : {"empty", "occupied", "invalid"}
         Vacancy 1, 0 or NaN of points that no camera sees (docs/method.md, section 5.3). Invalid
-        points count as empty where only a side is asked for, and ``unseen_evaluations`` says how
-        many there were.
+        points count as empty in :meth:`is_empty`, and ``unseen_evaluations`` counts them.
     masks : sequence of (h, w) bool or None, optional
-        One a camera, true where its photo counts, of any resolution.
+        One per camera, true where its photo counts, of any resolution.
     mask_mode : {"ignore", "background"}
-        A camera does not see points in masked pixels; or sees that nothing is there, so that they
-        are empty whatever other cameras say, as far as training was told so too.
+        Points in masked pixels are unseen by the camera; or known to be empty, whatever other
+        cameras see, provided that training used the same mode.
     region_bounds : (2, 3) float64, optional
-        Box that holds all points that will be asked for, scene frame. Cameras that do not see it
-        and Gaussians that cannot change anything in it are left out, which saves time and memory
-        and changes no value. Points outside it count as unseen.
+        Box that contains all query points, scene frame. Cameras that do not see it and Gaussians
+        that cannot affect it are skipped, which saves time and memory and changes no value. Points
+        outside it count as unseen.
     near_z : float
         Scene units.
     cache_bytes : int, optional
-        Cameras are kept projected and binned up to this much memory, by default a quarter of the
-        machine's; the others are prepared anew in each call (about 120 bytes a Gaussian).
+        Memory for projected and binned cameras, by default a quarter of the machine's; other
+        cameras are prepared again in each call (about 120 bytes per Gaussian).
 
     Raises
     ------
     UsageError
-        If there are no cameras, or the bounds, masks or ``unseen`` make no sense.
+        There are no cameras, or the bounds, masks or ``unseen`` are invalid.
     """
 
     def __init__(
@@ -133,7 +132,7 @@ class VacancyField:
         self.unseen: Unseen = unseen
         self.near_z = near_z
         self.device = "cpu"
-        """Where vacancy is evaluated, as torch names it."""
+        """Device of the evaluation, in torch's notation."""
         self.region_bounds: np.ndarray | None = None
         if region_bounds is not None:
             bounds = np.asarray(region_bounds, np.float64)
@@ -141,11 +140,11 @@ class VacancyField:
                 raise UsageError("Region bounds are not a lowest and a highest corner.")
             self.region_bounds = bounds
         self.wins = np.zeros(len(self.cameras), np.int64)
-        """How often each camera was the arg-max so far."""
+        """Number of times that each camera was the arg-max."""
         self.evaluations = 0
-        """Points asked for so far."""
+        """Number of points evaluated."""
         self.unseen_evaluations = 0
-        """Those of them that no camera saw."""
+        """Number of those points that no camera sees."""
         self._masks = checked_masks(masks, self.cameras, mask_mode)
         self._mask_mode = mask_mode
         self._gradient_table: np.ndarray | None = None
@@ -156,10 +155,10 @@ class VacancyField:
     def prepare(self, progress: Progress | None = None) -> None:
         """Project and bin the Gaussians for all cameras now, as far as memory allows.
 
-        Otherwise the first query that needs a camera does it.
+        Otherwise this is done by the first query that needs a camera.
         """
         progress = progress or Progress()
-        for done, index in enumerate(self.visiting_order().tolist()):
+        for done, index in enumerate(self.evaluation_order().tolist()):
             progress.update(done / len(self.cameras), "Preparing cameras")
             self._bins(index)
 
@@ -190,8 +189,8 @@ class VacancyField:
         """Tell whether vacancy exceeds ``level``, without finding its value.
 
         Equal to ``vacancy(points).vacancy > level`` for levels from 1e-4 to 0.999, but a point is
-        done with at the first camera that finds it empty, and a camera with it as soon as it
-        cannot find it empty.
+        finished at the first camera that finds it empty, and the evaluation from a camera stops as
+        soon as the point cannot be empty for it.
 
         Returns
         -------
@@ -220,15 +219,15 @@ class VacancyField:
         for begin in range(0, len(points), POINTS_PER_PASS):
             end = min(begin + POINTS_PER_PASS, len(points))
             inside = self._in_region(points[begin:end])
-            self._one_camera(
+            self._evaluate_camera(
                 camera_index, points[begin:end], inside, 2.0, best[begin:end], winner[begin:end]
             )
         return np.where(winner >= 0, best, np.float32(np.nan))
 
     def log_gradient(self, points: np.ndarray, camera: np.ndarray) -> np.ndarray:
-        """Return the gradient of log T at points, each as its own camera sees it.
+        """Return the gradient of log transmittance at points, each from its own camera.
 
-        With the arg-max camera of :meth:`vacancy` that is the gradient of log vacancy, exact up to
+        With the arg-max camera of :meth:`vacancy` this is the gradient of log vacancy, exact up to
         rounding in float64 (where the arg-max changes, vacancy has a kink).
 
         Parameters
@@ -260,13 +259,13 @@ class VacancyField:
                 )  # fmt: skip
         return gradient
 
-    def visiting_order(self) -> np.ndarray:
-        """Return camera indices, most frequent winners first; ties are spread over the list."""
+    def evaluation_order(self) -> np.ndarray:
+        """Return camera indices, most frequent arg-max first; ties are spread over the list."""
         count = len(self.cameras)
         bits = max(1, (count - 1).bit_length())
         index = np.arange(count)
         spread = np.zeros(count, np.int64)
-        for bit in range(bits):  # neighbours in the list see much the same
+        for bit in range(bits):  # bit reversal: neighbours in the list have similar views
             spread |= ((index >> bit) & 1) << (bits - 1 - bit)
         return np.lexsort((spread, -self.wins))
 
@@ -301,7 +300,7 @@ class VacancyField:
             self.arrays, self._screens[index], self.near_z, self.region_bounds, self.threads
         )
         size = 0 if bins is None else bins.size_bytes
-        # Nothing is ever evicted: cameras are asked in cycles, where the oldest is needed next.
+        # Nothing is evicted: cameras are used cyclically, so the oldest is needed next.
         if size <= self._cache_left:
             self._cache[index] = bins
             self._cache_left -= size
@@ -316,7 +315,7 @@ class VacancyField:
         winner: np.ndarray,
         seen: np.ndarray | None,
     ) -> None:
-        """Take masked points out of the camera's view, or settle them as empty."""
+        """Mark masked points as unseen by the camera, or settle them as empty."""
         mask, virtual = self._masks[index], self._screens[index].camera
         assert mask is not None
         masked = np.empty(len(cells), np.bool_)
@@ -344,12 +343,12 @@ class VacancyField:
         progress: Progress,
     ) -> None:
         inside = self._in_region(points)
-        order = self.visiting_order()
+        order = self.evaluation_order()
         for done, index in enumerate(order.tolist()):
-            self._one_camera(index, points, inside, settled, best, winner, seen)
-            progress.update((done + 1) / len(order), "Looking from each camera")
+            self._evaluate_camera(index, points, inside, settled, best, winner, seen)
+            progress.update((done + 1) / len(order), "Evaluating transmittance per camera")
 
-    def _one_camera(
+    def _evaluate_camera(
         self,
         index: int,
         points: np.ndarray,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled loops of the vacancy field: binning of Gaussians and points, product along rays."""
+"""Compiled kernels of the vacancy field: binning of Gaussians and points, transmittance."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ import numpy as np
 from ...kernels.compiled import inline, kernel
 
 ROW_COLUMNS = 16
-"""One Gaussian on a screen, one cache line of float32: u v qa qb qc px py r s t z a0 opacity, the
-largest footprint distance, the depth where it begins to matter, and 0."""
+"""Columns of a projected Gaussian, one cache line of float32: u v qa qb qc px py r s t z a0
+opacity, the largest footprint distance, the depth from which it contributes, and 0."""
 
 BOUND_COLUMNS = 8
-"""Bounds of one footprint, float32 pixels: x0 y0 x1 y1, unit normal of its narrowest strip, the
-strip's middle along the normal, and its half width."""
+"""Columns of a footprint's bounds, float32 pixels: x0 y0 x1 y1, unit normal of its narrowest strip,
+the strip's centre along the normal, and its half width."""
 
 GROUP = 64
 LANES = 16
 CHECK_EVERY = 16
-"""Gaussians between two looks at whether any point of a group can still win."""
+"""Gaussians between two checks of whether any point of a group can still improve."""
 
 # float32 constants: a plain Python float would widen the loops to float64.
 _ZERO = np.float32(0.0)
@@ -42,7 +42,7 @@ _C5 = np.float32(0.0010119646615415825)
 
 @inline
 def _exp_minus(x):
-    """Return exp(-x) for x >= 0; what is beyond 12 counts as 12."""
+    """Return exp(-x) for x >= 0, with x clamped to 12."""
     y = min(x, _EXP_MAX) * _SIXTEENTH
     e = _ONE + y * (_C0 + y * (_C1 + y * (_C2 + y * (_C3 + y * (_C4 + y * _C5)))))
     e = e * e
@@ -53,7 +53,7 @@ def _exp_minus(x):
 
 @inline
 def _strip_misses(bounds, i, x, y, half_x, half_y):
-    """Tell whether the rectangle of these half sides around (x, y) lies outside the strip."""
+    """Tell whether a rectangle around (x, y) with given half sides lies outside the strip."""
     nx, ny = bounds[i, 4], bounds[i, 5]
     outside = abs(nx * x + ny * y - bounds[i, 6]) - bounds[i, 7]
     return outside > half_x * abs(nx) + half_y * abs(ny)
@@ -61,9 +61,9 @@ def _strip_misses(bounds, i, x, y, half_x, half_y):
 
 @kernel(fast=False)
 def list_tiles(bounds, tile_px, tiles_x, tiles_y, heads, ids, write):
-    """Count the footprints of each tile in ``heads``, or write them, in order, into their lists.
+    """Count the footprints of each tile in ``heads``, or write them, in order, to its list.
 
-    When writing, ``heads`` holds where each list begins and is advanced.
+    When writing, ``heads`` holds the begin of each list and is advanced.
     """
     half = _HALF * tile_px
     for i in range(bounds.shape[0]):
@@ -87,11 +87,11 @@ def list_tiles(bounds, tile_px, tiles_x, tiles_y, heads, ids, write):
 def project_points(
     begin, end, points, camera, settled, best, tile_px, shift, tiles_x, tiles_y, screen, cells
 ):
-    """Project points; write pixel and z-depth, and the cell or -1 for those left out.
+    """Project points; write pixel and z-depth, and the cell, or -1 for skipped points.
 
-    ``camera`` is packed as in ``render.projection.pack_camera``. A point is left out where its
-    ``best`` is above ``settled``, where it is not deeper than the near plane, or off the image.
-    Cells divide each tile 2^shift times and are numbered tile by tile.
+    ``camera`` is packed as in ``render.projection.pack_camera``. A point is skipped if its ``best``
+    is above ``settled``, if it is not deeper than the near plane, or outside the image. Cells
+    divide each side of a tile by 2^shift and are numbered tile by tile.
     """
     mask = (1 << shift) - 1
     cell_px = tile_px / (mask + 1)
@@ -121,7 +121,7 @@ def project_points(
 
 @kernel(fast=False)
 def sort_by_cell(cells, start, order):
-    """Counting sort of points by cell, stable; return how many have one.
+    """Sort points by cell with a stable counting sort; return the number of points with a cell.
 
     ``start (cells + 2,)`` must be zero; afterwards cell c holds ``order[start[c] : start[c + 1]]``.
     """
@@ -142,20 +142,20 @@ def transmittance_of_cells(
     begin, end, cell_start, order, screen, rows, bounds, tile_start, tile_ids, list_capacity, shift,
     camera_index, best, winner,
 ):  # fmt: skip
-    """Raise ``best`` and ``winner`` of the points of cells ``begin .. end`` by one camera.
+    """Update ``best`` and ``winner`` of the points of cells ``begin .. end`` by one camera.
 
-    A product that falls below 1e-4 counts as 0. Ties go to the lower camera index.
+    Transmittance below 1e-4 counts as 0. Ties go to the lower camera index.
     """
     near = np.empty(list_capacity, np.int32)
-    # Rows of GROUP: x, y, depth, transmittance, value to beat. One array at constant offsets lets
-    # the compiler prove that nothing overlaps.
+    # Rows of GROUP: x, y, depth, transmittance, value to exceed. One array with constant offsets
+    # lets the compiler prove that they do not overlap.
     M = np.empty(5 * GROUP, np.float32)
     for cell in range(begin, end):
         first, last = cell_start[cell], cell_start[cell + 1]
         if last <= first:
             continue
         tile = cell >> (2 * shift)
-        # Only what reaches the points themselves: often much less than what reaches the cell.
+        # Bounds of the points themselves, often much smaller than the cell.
         x0, y0 = _FAR, _FAR
         x1, y1, deepest = -_ONE, -_ONE, _ZERO
         for p in range(first, last):
@@ -180,7 +180,7 @@ def transmittance_of_cells(
             blocks = lanes_used // LANES
             k = 0
             while True:
-                # The list is culled no further than some group of the cell walks it.
+                # The list is culled lazily, as far as some group of the cell traverses it.
                 while count <= k and scan < scan_end:
                     i = tile_ids[scan]
                     scan += 1
@@ -205,7 +205,7 @@ def transmittance_of_cells(
                 z, a0, opacity = rows[i, 10], rows[i, 11], rows[i, 12]
                 reach, begin_z = rows[i, 13], rows[i, 14]
                 for h in range(blocks):
-                    # The mask proves that the index is not negative, which allows vector code.
+                    # The bit mask proves that the index is not negative, which allows SIMD code.
                     b = (h & 3) * LANES
                     for x in range(LANES):
                         dx = M[b + x] - u

@@ -135,7 +135,7 @@ def diagnose_worker(python: str) -> list[Diagnosis]:
     """
     try:
         command = child_command("jobs.commands.doctor", python=python)
-        _, output, last_words = run_to_end(command, DOCTOR_DEADLINE_S)
+        _, output, error_output = run_to_end(command, DOCTOR_DEADLINE_S)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise WorkerError(
             f"{python} does not run: {error}.", "Press Set Up Worker, or choose another Python."
@@ -148,9 +148,9 @@ def diagnose_worker(python: str) -> list[Diagnosis]:
         except (ValueError, TypeError):
             continue
     if not findings:
-        words = last_words.strip().splitlines()
+        error_lines = error_output.strip().splitlines()
         raise WorkerError(
-            f"{python} gave no answer: {words[-1] if words else 'no output'}.",
+            f"{python} gave no answer: {error_lines[-1] if error_lines else 'no output'}.",
             "Press Set Up Worker, or choose a Python 3.11 or newer with the worker's packages.",
         )
     return findings

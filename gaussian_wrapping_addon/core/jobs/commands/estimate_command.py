@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ...errors import DatasetError
 from ...report_warning import ReportWarning
 from ..store.job_file import JobFile
-from .worker_call import answer
+from .worker_call import run_command
 
 if TYPE_CHECKING:
     from ...training.cost.training_estimate import SceneFacts
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def main(arguments: list[str]) -> int:
     """Estimate the job of ``arguments = [job file as JSON]``; return the exit code."""
-    return answer(lambda: _estimate(JobFile.from_json(json.loads(arguments[0]))))
+    return run_command(lambda: _estimate(JobFile.from_json(json.loads(arguments[0]))))
 
 
 def _estimate(job: JobFile) -> list[str | ReportWarning]:
@@ -29,8 +29,8 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
     from ...training.cost.machine_speed import machine_speed, renderer_is_compiled
     from ...training.cost.training_estimate import (
         MESH_AND_TEXTURE_SHARE,
+        check_resources,
         estimate,
-        judge,
         this_machine,
     )
     from ...training.initialisation.splat_start import wrapping_settings
@@ -59,7 +59,7 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
         lines.append("solving the cameras: minutes before")
     if not compiled:
         lines.append("not timed here: the first job compiles the renderer, about a minute, once")
-    return [*lines, *judge(expected, machine)]
+    return [*lines, *check_resources(expected, machine)]
 
 
 def input_facts(source: Path) -> SceneFacts:

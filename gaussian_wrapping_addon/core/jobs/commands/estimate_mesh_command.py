@@ -17,23 +17,23 @@ from ...names import AUTOMATIC_REGIONS
 from ...progress import Progress
 from ...report_warning import ReportWarning
 from ...settings import MeshingSettings, from_json
-from ..stages.region_meshing import expected_by_pivots, expected_mesh, free_bytes
+from ..stages.region_meshing import estimate_region_mesh, estimate_region_pivots, free_bytes
 from ..store.continue_training import no_finished_training
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import read_done
-from .worker_call import answer
+from .worker_call import run_command
 
-MOST_VIEWS = 24
+MAX_VIEWS = 24
 """Photos whose cameras look for the surface: more cover little more of it."""
-MOST_SIGHTINGS = 60_000
+MAX_DEPTH_SAMPLES = 60_000
 
 
 def main(arguments: list[str]) -> int:
     """Estimate ``arguments = [{"out", "region", "meshing", "threads"} as JSON]``."""
-    return answer(lambda: _lines(json.loads(arguments[0])))
+    return run_command(lambda: _estimate(json.loads(arguments[0])))
 
 
-def _newest(stages: Path, name: str) -> Path:
+def _newest_stage(stages: Path, name: str) -> Path:
     """Return the stage that was finished last."""
     done = [(values["finished_unix_s"], path) for path in sorted(stages.glob(f"{name}-*"))
             if (values := read_done(path)) is not None]  # fmt: skip
@@ -42,9 +42,9 @@ def _newest(stages: Path, name: str) -> Path:
     return max(done)[1]
 
 
-def _lines(request: dict[str, Any]) -> list[str | ReportWarning]:
+def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     from ...dataset.scene_file import load_saved_scene
-    from ...field.depth_samples import find_sightings
+    from ...field.depth_samples import sample_depth_maps
     from ...field.vacancy.vacancy import VacancyField
     from ...gaussians.gaussian_file import load_gaussians
     from ...meshing.points.resolution import checked_request
@@ -58,22 +58,22 @@ def _lines(request: dict[str, Any]) -> list[str | ReportWarning]:
     threads = int(request["threads"]) or default_threads()
     if request["region"] not in AUTOMATIC_REGIONS:
         world_region = read_region(Path(request["region"]))
-    scene = load_saved_scene(_newest(folder.stages, "cameras"))
-    gaussians = load_gaussians(_newest(folder.stages, "train") / "gaussians.npz")
+    scene = load_saved_scene(_newest_stage(folder.stages, "cameras"))
+    gaussians = load_gaussians(_newest_stage(folder.stages, "train") / "gaussians.npz")
     arrays = gaussians.arrays()
     if request["region"] not in AUTOMATIC_REGIONS:
         region = world_region.transformed(scene.world_from_scene.inverse())
     else:
         automatic = request["region"] == "auto"
         region = automatic_region(scene) if automatic else whole_region(scene, arrays)
-    cameras = scene.cameras[:: max(1, -(-len(scene.cameras) // MOST_VIEWS))]
+    cameras = scene.cameras[:: max(1, -(-len(scene.cameras) // MAX_VIEWS))]
     edge_length = meshing.edge_length / scene.world_from_scene.scale
     notes = checked_request(edge_length, meshing.points, region).notes  # refuses before any work
-    sightings = find_sightings(
+    depth_samples = sample_depth_maps(
         gaussians, cameras, lambda points: region.contains(points, 0.0), Progress(),
-        most=MOST_SIGHTINGS, threads=threads,
+        most=MAX_DEPTH_SAMPLES, threads=threads,
     )  # fmt: skip
-    if len(sightings) == 0:
+    if len(depth_samples) == 0:
         raise MeshingError(
             f"The cameras see no surface in region {region.name!r}.",
             "Draw the region around something that was photographed.",
@@ -81,11 +81,13 @@ def _lines(request: dict[str, Any]) -> list[str | ReportWarning]:
     vacancy = VacancyField(arrays, scene.cameras, threads=threads)
     memory_bytes = free_bytes(folder.root, threads)
     if meshing.method == "pivots":
-        by_pivots = expected_by_pivots(vacancy, arrays, region, meshing, sightings)
+        by_pivots = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
         by_pivots.refuse(memory_bytes)
         return [*by_pivots.lines()]
-    expected = expected_mesh(vacancy, scene.cameras, region, meshing, edge_length, sightings)
+    expected = estimate_region_mesh(
+        vacancy, scene.cameras, region, meshing, edge_length, depth_samples
+    )
     tiled = meshing.tiles != "off" and (meshing.tiles != "auto" or expected.tiles_for(memory_bytes))
     expected.refuse(memory_bytes, tiled=tiled)
-    how = "it would be meshed in tiles" if tiled else "it would be meshed whole"
-    return [*expected.lines(), how, *notes]
+    mode = "it would be meshed in tiles" if tiled else "it would be meshed whole"
+    return [*expected.lines(), mode, *notes]

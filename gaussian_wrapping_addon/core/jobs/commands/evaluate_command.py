@@ -26,20 +26,20 @@ from ...errors import (
     ParseError,
     UsageError,
     WorkerError,
-    cannot_be_written,
+    unwritable_error,
 )
 from ...files import read_json, write_json
 from ...processes.helper_process import child_command, emit
 from ...processes.spawn import kill_group, spawn
 from ..store.job_folder import MARKER, JobFolder
-from .worker_call import answer
+from .worker_call import run_command
 
 if TYPE_CHECKING:
     from ...dataset.camera import Camera
 
 _logger = logging.getLogger("gaussian_wrapping")
 
-LAST_WORDS_BYTES = 2000
+ERROR_TAIL_BYTES = 2000
 
 
 def run_in_worker(
@@ -67,36 +67,38 @@ def run_in_worker(
         It does not start, or ends without a word.
     """
     text = json.dumps(request, allow_nan=False)
-    with tempfile.TemporaryFile() as words:
+    with tempfile.TemporaryFile() as error_file:
         try:
-            process = spawn(child_command(module, text, python=python), stderr=words)
+            process = spawn(child_command(module, text, python=python), stderr=error_file)
         except OSError as error:
             raise WorkerError(
                 f"{python} does not run: {error}.", "Choose another Python."
             ) from None
-        spoken = False
+        error_shown = False
         try:
             assert process.stdout is not None
             for raw in process.stdout:
-                spoken = _show(raw) or spoken
+                error_shown = _log_line(raw) or error_shown
             code = process.wait()
         except KeyboardInterrupt:
             _logger.info("cancelled")
             return EXIT_CANCELLED
         finally:
             kill_group(process)
-        if code not in (EXIT_DONE, *range(EXIT_OTHER, EXIT_CANCELLED + 1)) or (code and not spoken):
-            words.seek(max(0, words.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
-            last = words.read().decode(errors="replace").strip().splitlines()
+        if code not in (EXIT_DONE, *range(EXIT_OTHER, EXIT_CANCELLED + 1)) or (
+            code and not error_shown
+        ):
+            error_file.seek(max(0, error_file.seek(0, os.SEEK_END) - ERROR_TAIL_BYTES))
+            error_lines = error_file.read().decode(errors="replace").strip().splitlines()
             reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
             raise WorkerError(
-                f"The {what} {reason}: {last[-1] if last else 'no output'}.",
+                f"The {what} {reason}: {error_lines[-1] if error_lines else 'no output'}.",
                 "See whether batch.py doctor finds something.",
             )
         return code
 
 
-def _show(raw: bytes) -> bool:
+def _log_line(raw: bytes) -> bool:
     """Log one line of the child; tell whether it was its error."""
     try:
         values = json.loads(raw)
@@ -119,33 +121,33 @@ def _show(raw: bytes) -> bool:
 def main(arguments: list[str]) -> int:
     """Evaluate ``arguments = [request as JSON]`` in this process; return the exit code."""
 
-    from ...texture.files.file_checks import writing
+    from ...texture.files.file_checks import write_errors
 
     def work() -> list[str]:
         request = json.loads(arguments[0])
         out = Path(request["out"]) if request["out"] else None
         if out is not None:
-            _refuse_output(out)
+            _check_output(out)
         report, lines = _evaluate(request)
         if out is not None:
-            with writing(out):
+            with write_errors(out):
                 write_json(out, report)
             lines.append(f"written to {out}")
         return lines
 
-    return answer(work, "Use fewer --samples or close other programs.")
+    return run_command(work, "Use fewer --samples or close other programs.")
 
 
-def _refuse_output(out: Path) -> None:
+def _check_output(out: Path) -> None:
     """Refuse a file that cannot be written: before the work, not after it."""
     if out.is_dir():
         raise UsageError(f"{out} is a folder.", "Give a file for the figures.")
     if not (out.parent.is_dir() and os.access(out.parent, os.W_OK)):
         reason = errno.EACCES if out.parent.is_dir() else errno.ENOENT
-        raise cannot_be_written(out, OSError(reason, os.strerror(reason)))
+        raise unwritable_error(out, OSError(reason, os.strerror(reason)))
 
 
-def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return the report and its table."""
     from ...evaluation.command import EvaluationRequest, evaluate_mesh, read_cameras, table
     from ...evaluation.layouts.mesh_input import read_mesh
@@ -157,31 +159,35 @@ def _evaluate(asked: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     begun_s, begun_unix_s = time.monotonic(), time.time()
 
     def shares(name: str) -> tuple[Any, ...] | None:
-        return None if asked[name] is None else tuple(asked[name])
+        return None if given[name] is None else tuple(given[name])
 
     request = EvaluationRequest(
-        Path(asked["truth"]), asked["layout"], asked["scan"], shares("shares"),
-        shares("distances"), asked["align"], shares("protocols"), asked["samples"], asked["seed"],
-        asked["threads"] or default_threads(),
+        Path(given["truth"]), given["layout"], given["scan"], shares("shares"),
+        shares("distances"), given["align"], shares("protocols"), given["samples"], given["seed"],
+        given["threads"] or default_threads(),
     ).checked()  # fmt: skip
-    source = Path(asked["mesh"])
+    source = Path(given["mesh"])
     cameras: list[Camera] = []
     if source.is_dir():
-        path = job_mesh(source, asked["region"])
+        path = job_mesh(source, given["region"])
         cameras = job_cameras(source)
     else:
-        if asked["region"]:
+        if given["region"]:
             raise UsageError(f"{source.name} has no regions.", "Leave --region, or give a job.")
         path = source
-    if asked["cameras"]:
-        place = Path(asked["cameras"])
-        cameras = job_cameras(place) if (place / MARKER).exists() else read_cameras(place)
+    if given["cameras"]:
+        cameras_path = Path(given["cameras"])
+        cameras = (
+            job_cameras(cameras_path)
+            if (cameras_path / MARKER).exists()
+            else read_cameras(cameras_path)
+        )
 
-    def say(event: ProgressEvent) -> None:
+    def report_progress(event: ProgressEvent) -> None:
         emit(fraction=event.fraction, message=event.message)
 
     vertices, faces = read_mesh(path)
-    result = evaluate_mesh(vertices, faces, cameras, request, Progress("evaluate", say))
+    result = evaluate_mesh(vertices, faces, cameras, request, Progress("evaluate", report_progress))
     report = {
         "version": 1,
         "started_unix_s": begun_unix_s,

@@ -26,7 +26,7 @@ from ...names import SPLAT_STEM, file_stems
 from ...texture.files.file_checks import atlas_file
 from ..store.job_folder import MARKER
 from ..store.sidecar import write_sidecar
-from .worker_call import answer
+from .worker_call import run_command
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -129,11 +129,11 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
     ResourceError
         The folder cannot be written.
     """
-    from ...texture.files.file_checks import writing
+    from ...texture.files.file_checks import write_errors
 
     for name, known in (("formats", WORKER_FORMATS), ("shading", SHADINGS)):
-        asked = getattr(request, name)
-        wrong = sorted({*([asked] if isinstance(asked, str) else asked)} - set(known))
+        given = getattr(request, name)
+        wrong = sorted({*([given] if isinstance(given, str) else given)} - set(known))
         if wrong:
             raise UsageError(f"{wrong[0]!r} is not written here.", f"Use {', '.join(known)}.")
     frames = frames_of(request.result)
@@ -141,7 +141,7 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
         _splat_of(request.result)  # before anything is written
     if request.out.exists() and not request.out.is_dir():
         raise UsageError(f"{request.out} is a file.", "Give a folder for the exports.")
-    with writing(request.out):
+    with write_errors(request.out):
         request.out.mkdir(parents=True, exist_ok=True)
     wanted = [f for f in request.formats if f != "splat"]
     if wanted:
@@ -161,25 +161,25 @@ def _meshes(request: ExportRequest) -> Iterator[StoredMesh]:
         raise UsageError(
             f"{request.result} holds no mesh {missing[0]}.", f"Use {', '.join(known)}."
         )
-    places = {(r, n): path for r in known for n, path in _levels(request.result / r)}
-    stems = file_stems(places)
+    level_folders = {(r, n): path for r in known for n, path in _levels(request.result / r)}
+    stems = file_stems(level_folders)
     for region in dict.fromkeys(request.regions or known):
-        for (owner, level), folder in places.items():
+        for (owner, level), folder in level_folders.items():
             if owner == region and (request.levels or level == 0):
                 yield _read_mesh(region, level, folder, stems[region, level])
 
 
 def _levels(folder: Path) -> Iterator[tuple[int, Path]]:
     """Give the number and the folder of each level that a region has."""
-    level, place = 0, folder
-    while (place / "mesh.npz").is_file():
-        yield level, place
+    level, level_folder = 0, folder
+    while (level_folder / "mesh.npz").is_file():
+        yield level, level_folder
         level += 1
-        place = folder / f"lod{level}"
+        level_folder = folder / f"lod{level}"
 
 
 def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
-    from ...texture.files.file_checks import check_face_atlas, check_mesh
+    from ...texture.files.file_checks import validate_face_atlas, validate_for_export
 
     path = folder / "mesh.npz"
     try:
@@ -190,7 +190,7 @@ def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
             )
             face_atlas = arrays["face_atlas"] if "face_atlas" in arrays.files else None
         if face_atlas is not None:
-            face_atlas = check_face_atlas(face_atlas, len(faces))
+            face_atlas = validate_face_atlas(face_atlas, len(faces))
         if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
             raise ValueError("not lists of triples")
         if corner_uvs.shape != (len(faces), 3, 2):
@@ -200,7 +200,7 @@ def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
             path, "whole file", f"not a mesh file ({error}).", "Mesh the region again."
         ) from None
     mesh = StoredMesh(region, level, folder, vertices, faces, corner_uvs, stem, face_atlas)
-    check_mesh(vertices, faces, corner_uvs, name=f"mesh {mesh.stem}")
+    validate_for_export(vertices, faces, corner_uvs, name=f"mesh {mesh.stem}")
     return mesh
 
 
@@ -211,7 +211,7 @@ def _write_mesh(
     world_from_scene: Similarity,
     blender_from_scene: Similarity,
 ) -> Path:
-    from ...texture.files.file_checks import writing
+    from ...texture.files.file_checks import write_errors
     from ...texture.files.mesh_ply import vertex_colors, write_mesh_ply
     from ...texture.files.textured_files import write_glb, write_obj
 
@@ -236,15 +236,15 @@ def _write_mesh(
         write_mesh_ply(path, local, mesh.faces, colors)
     elif format == "obj":
         sources = {name: mesh.maps(name) for name in ("albedo", "normal")}
-        beside = {n: [f"{mesh.stem}-{f.name}" for f in files] for n, files in sources.items()}
-        textures = [*beside["albedo"], *beside["normal"]]
+        copy_names = {n: [f"{mesh.stem}-{f.name}" for f in files] for n, files in sources.items()}
+        textures = [*copy_names["albedo"], *copy_names["normal"]]
         for file in [*sources["albedo"], *sources["normal"]]:
             data, copy = _png(file), request.out / f"{mesh.stem}-{file.name}"
-            with writing(copy):
+            with write_errors(copy):
                 write_bytes(copy, data)
         write_obj(
             path, local @ frame.turn.T, mesh.faces, mesh.corner_uvs,
-            beside["albedo"], beside["normal"], mesh.face_atlas,
+            copy_names["albedo"], copy_names["normal"], mesh.face_atlas,
         )  # fmt: skip
     else:
         maps = {
@@ -301,8 +301,8 @@ def _write_splat(
     request: ExportRequest, world_from_scene: Similarity, blender_from_scene: Similarity
 ) -> Path:
     from ...gaussians.splat_ply import read_splat_ply, write_viewer_ply
-    from ...texture.files.file_checks import writing
-    from ...training.initialisation.splat_motion import move_gaussians
+    from ...texture.files.file_checks import write_errors
+    from ...training.initialisation.splat_transform import transform_gaussians
 
     found = read_splat_ply(_splat_of(request.result))
     target_from_scene = blender_from_scene if request.placed else world_from_scene
@@ -310,9 +310,9 @@ def _write_splat(
     if not request.placed:
         offset = file_offset(target_from_scene.points(found.gaussians.means.double().numpy()))
     frame = FileFrame("splat", target_from_scene, offset)
-    moved = move_gaussians(found.gaussians, frame.file_from_scene())
+    moved = transform_gaussians(found.gaussians, frame.file_from_scene())
     path = request.out / SPLAT_NAME
-    with writing(path):
+    with write_errors(path):
         write_viewer_ply(path, moved)
     write_sidecar(
         path, frame, world_from_scene, blender_from_scene,
@@ -326,11 +326,11 @@ def main(arguments: list[str]) -> int:
     """Export ``arguments = [the request as JSON]`` in this process; return the exit code."""
 
     def work() -> Iterator[str]:
-        asked = json.loads(arguments[0])
+        given = json.loads(arguments[0])
         request = ExportRequest(
-            Path(asked["result"]), Path(asked["out"]), tuple(asked["formats"]), asked["placed"],
-            tuple(asked["regions"]), asked["levels"], asked["shading"],
+            Path(given["result"]), Path(given["out"]), tuple(given["formats"]), given["placed"],
+            tuple(given["regions"]), given["levels"], given["shading"],
         )  # fmt: skip
         yield from (f"written: {path}" for path in export_files(request))
 
-    return answer(work)
+    return run_command(work)

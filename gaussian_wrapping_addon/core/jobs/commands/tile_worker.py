@@ -14,9 +14,9 @@ from pathlib import Path
 from ...errors import UsageError, WrapError
 from ...kernels.parallel import default_threads
 from ...progress import Progress
-from ..stages.region_meshing import open_lists, work_on_list
+from ..stages.region_meshing import unfinished_tile_lists, work_on_tile_list
 from ..store.job_folder import JobFolder
-from .worker_call import answer
+from .worker_call import run_command
 
 POLL_S = 0.5
 
@@ -27,13 +27,13 @@ def main(arguments: list[str]) -> int:
     def work() -> list[str]:
         request = json.loads(arguments[0])
         folder = JobFolder(Path(request["out"]))
-        done = help_with_tiles(folder, int(request["threads"]), float(request["wait_s"]))
+        done = work_on_tiles(folder, int(request["threads"]), float(request["wait_s"]))
         return [f"{done} parts done here"]
 
-    return answer(work)
+    return run_command(work)
 
 
-def help_with_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
+def work_on_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
     """Work on every open tile list of a job; return how many parts were done here.
 
     Parameters
@@ -50,7 +50,7 @@ def help_with_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
         raise UsageError(f"{folder.root} is no job folder.", "Give the --out of a job.")
     until_s = time.monotonic() + wait_s
     progress = Progress("mesh", None, folder.cancel_path.exists)
-    while not (lists := open_lists(folder)):
+    while not (lists := unfinished_tile_lists(folder)):
         progress.check()
         if time.monotonic() >= until_s:
             raise UsageError(
@@ -61,9 +61,11 @@ def help_with_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
     done: list[str] = []
     for path in lists:
         try:
-            work_on_list(folder.stages, path, progress, done, threads=threads or default_threads())
+            work_on_tile_list(
+                folder.stages, path, progress, done, threads=threads or default_threads()
+            )
         except (WrapError, OSError):
             # The job has joined the tiles and removed their files while we looked.
-            if path in open_lists(folder):
+            if path in unfinished_tile_lists(folder):
                 raise
     return len(done)

@@ -12,13 +12,13 @@ import time
 from collections.abc import Callable, Iterable
 
 from ...errors import (
+    DISK_FULL_ERRNOS,
     EXIT_CANCELLED,
     EXIT_DONE,
     EXIT_OTHER,
     EXIT_RESOURCES,
-    NO_ROOM,
     WrapError,
-    cannot_be_written,
+    unwritable_error,
 )
 from ...processes.helper_process import emit
 from ...report_warning import ReportWarning
@@ -26,7 +26,7 @@ from ...report_warning import ReportWarning
 PARENT_POLL_S = 1.0
 
 
-def answer(
+def run_command(
     work: Callable[[], Iterable[str | ReportWarning]], memory_hint: str = "Close other programs."
 ) -> int:
     """Emit the lines and warnings of ``work`` as they come, or its error; return the exit code.
@@ -34,7 +34,7 @@ def answer(
     The process ends when the one that asked does.
     """
     # Not the caller's own id: where Python is started through a launcher, that is the parent.
-    threading.Thread(target=end_with, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=exit_with_parent, args=(os.getppid(),), daemon=True).start()
     try:
         for line in work():
             if isinstance(line, ReportWarning):
@@ -54,8 +54,8 @@ def answer(
         )
         return EXIT_OTHER
     except OSError as error:
-        if error.errno in NO_ROOM:
-            full = cannot_be_written(error.filename or "a file", error)
+        if error.errno in DISK_FULL_ERRNOS:
+            full = unwritable_error(error.filename or "a file", error)
             emit(error=full.message, hint=full.hint)
             return full.exit_code
         emit(error=f"{error}.", hint="Check the path and its permissions.")
@@ -63,7 +63,7 @@ def answer(
     return EXIT_DONE
 
 
-def end_with(parent: int) -> None:
+def exit_with_parent(parent: int) -> None:
     """End this process when the one that asked has gone: nobody waits for the answer."""
     while os.getppid() == parent:
         time.sleep(PARENT_POLL_S)

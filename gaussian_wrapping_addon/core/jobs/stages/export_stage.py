@@ -11,7 +11,7 @@ from typing import Any
 from ...dataset.similarity import Similarity
 from ...evaluation.report.markdown import CURVE
 from ...evaluation.report.report import write_report
-from ...files import finite, read_json, resolve_inside, write_json
+from ...files import finite_json, read_json, resolve_inside, write_json
 from ...names import REPORT_FOLDER
 from ...progress import Progress
 from ..store.job_file import JobFile
@@ -63,7 +63,7 @@ def export_results(
             shutil.copy2(textured.folder / "preview.png", target / "preview.png")
             figures = _region_figures(trained, meshed, textured)
             figures["world"] = _in_world_units(meshed, figures, scene.world_from_scene)
-            write_json(target / "figures.json", _plain(figures))
+            write_json(target / "figures.json", _json_values(figures))
         shutil.copy2(regions[0][2].folder / "preview.png", new / "preview.png")
         progress.update(0.9, "writing the report")
         # A region may have the name of this folder, of this job or of an earlier one.
@@ -73,15 +73,15 @@ def export_results(
         # Regions of an earlier training stay on disk; this report is about this training.
         known = {**_figures_in(folder.result), **_figures_in(new)}
         of_training = {n: f for n, f in sorted(known.items()) if f.get("training") == trained.key}
-        whole = _plain({**summary, **_whole(cameras, trained, regions)})
-        write_report(new, whole, of_training, earlier=folder.result)
+        report = _json_values({**summary, **_job_report(cameras, trained, regions)})
+        write_report(new, report, of_training, earlier=folder.result)
 
 
 def _figures_in(result: Path) -> dict[str, dict[str, Any]]:
     return {path.parent.name: read_json(path) for path in sorted(result.glob("*/figures.json"))}
 
 
-def _whole(
+def _job_report(
     cameras: Stage, trained: Stage, regions: list[tuple[str, Stage, Stage]]
 ) -> dict[str, Any]:
     stages = [cameras, trained, *(s for _, m, t in regions for s in (m, t))]
@@ -104,7 +104,7 @@ def _region_figures(trained: Stage, meshed: Stage, textured: Stage) -> dict[str,
     figures = {**meshed.done, **textured.done}
     figures["training"] = trained.key
     figures["seconds"] = {"mesh": meshed.done["seconds"], "texture": textured.done["seconds"]}
-    return _plain(figures)
+    return _json_values(figures)
 
 
 def _in_world_units(
@@ -133,6 +133,6 @@ def _training_pictures(trained: Stage, folder: Path) -> None:
     write_learning_curve(trained.done, folder / CURVE)
 
 
-def _plain(values: Any) -> Any:
+def _json_values(values: Any) -> Any:
     """Return the values as JSON would read them back: no tuples, and nothing that is not finite."""
-    return json.loads(json.dumps(finite(values)))
+    return json.loads(json.dumps(finite_json(values)))

@@ -17,17 +17,17 @@ from ...settings import MeshingSettings, TrainingSettings
 
 _logger = logging.getLogger(__name__)
 
-MAX_STEPS = 2
-GAUSSIANS_STEP = 0.6
-IMAGE_STEP = 0.75
+MAX_RETRIES = 2
+GAUSSIANS_FACTOR = 0.6
+IMAGE_FACTOR = 0.75
 """A step leaves 0.6 of the Gaussians and 0.56 of the pixels: about half of the memory that grows
 with them."""
 
 MIN_GAUSSIANS = 1000
 MIN_IMAGE_PX = 96
-STEPS_FILE = "smaller.json"
+RETRIES_FILE = "smaller.json"
 
-_TORCH_MARKS = ("out of memory", "can't allocate memory", "not enough memory")
+_TORCH_OOM_MESSAGES = ("out of memory", "can't allocate memory", "not enough memory")
 
 Result = TypeVar("Result")
 
@@ -53,13 +53,13 @@ def is_out_of_memory(error: BaseException) -> bool:
     if not isinstance(error, RuntimeError):
         return False
     text = str(error).lower()
-    return any(mark in text for mark in _TORCH_MARKS)
+    return any(message in text for message in _TORCH_OOM_MESSAGES)
 
 
-def one_smaller(settings: TrainingSettings) -> TrainingSettings | None:
+def reduced_settings(settings: TrainingSettings) -> TrainingSettings | None:
     """Return the settings one step smaller; ``None`` where they are as small as is useful."""
-    gaussians = max(MIN_GAUSSIANS, round(GAUSSIANS_STEP * settings.max_gaussians))
-    side_px = max(MIN_IMAGE_PX, round(IMAGE_STEP * settings.max_image_px))
+    gaussians = max(MIN_GAUSSIANS, round(GAUSSIANS_FACTOR * settings.max_gaussians))
+    side_px = max(MIN_IMAGE_PX, round(IMAGE_FACTOR * settings.max_image_px))
     gaussians = min(gaussians, settings.max_gaussians)
     side_px = min(side_px, settings.max_image_px)
     if (gaussians, side_px) == (settings.max_gaussians, settings.max_image_px):
@@ -67,11 +67,11 @@ def one_smaller(settings: TrainingSettings) -> TrainingSettings | None:
     return replace(settings, max_gaussians=gaussians, max_image_px=side_px)
 
 
-def train_within_memory(
+def train_with_oom_retry(
     train: Callable[[TrainingSettings], Result],
     settings: TrainingSettings,
     folder: Path,
-    forget: Callable[[], None],
+    discard_checkpoints: Callable[[], None],
 ) -> Trained[Result]:
     """Train; after running out of memory, train again one step smaller, at most twice.
 
@@ -93,9 +93,9 @@ def train_within_memory(
     ResourceError
         The smallest try also ran out of memory. Whatever else ``train`` raises is passed on.
     """
-    reasons = _read_steps(folder)
+    reasons = _read_retries(folder)
     for _ in reasons:
-        settings = one_smaller(settings) or settings
+        settings = reduced_settings(settings) or settings
     while True:
         try:
             result = train(settings)
@@ -105,19 +105,19 @@ def train_within_memory(
             # Words only: the error itself would keep the memory of the failed training.
             if not is_out_of_memory(error):
                 raise
-            smaller = one_smaller(settings)
-            if smaller is None or len(reasons) >= MAX_STEPS:
+            reduced = reduced_settings(settings)
+            if reduced is None or len(reasons) >= MAX_RETRIES:
                 raise ResourceError(
                     f"Memory did not suffice, even with at most {settings.max_gaussians} Gaussians "
                     f"and photos of {settings.max_image_px} px ({_first_line(error)}).",
                     "Close other programs, or choose a smaller preset.",
                 ) from error
-            reasons.append(_reason(error, settings, smaller))
+            reasons.append(_reason(error, settings, reduced))
         _logger.warning("%s", reasons[-1])
-        forget()
-        write_json(folder / STEPS_FILE, {"reasons": reasons})
+        discard_checkpoints()
+        write_json(folder / RETRIES_FILE, {"reasons": reasons})
         gc.collect()
-        settings = smaller
+        settings = reduced
 
 
 def _reason(error: BaseException, before: TrainingSettings, after: TrainingSettings) -> str:
@@ -133,18 +133,18 @@ def _first_line(error: BaseException) -> str:
     return lines[0].rstrip(".") if lines else type(error).__name__
 
 
-def _read_steps(folder: Path) -> list[str]:
+def _read_retries(folder: Path) -> list[str]:
     try:
-        values: Any = read_json(folder / STEPS_FILE)
-        return [str(reason) for reason in values["reasons"]][:MAX_STEPS]
+        values: Any = read_json(folder / RETRIES_FILE)
+        return [str(reason) for reason in values["reasons"]][:MAX_RETRIES]
     except (OSError, ParseError, KeyError, TypeError):
         return []
 
 
 def killed_hint(settings: TrainingSettings) -> str:
     """Return the next step after the system has ended a worker, probably for its memory."""
-    smaller = one_smaller(settings)
-    number = settings.max_gaussians if smaller is None else smaller.max_gaussians
+    reduced = reduced_settings(settings)
+    number = settings.max_gaussians if reduced is None else reduced.max_gaussians
     return (
         "Close other programs and resume, which continues from the last checkpoint; or resume with "
         f"--max-gaussians {number}, which trains anew with fewer."
@@ -159,10 +159,10 @@ def killed_mesh_hint(meshing: MeshingSettings, *, kept: bool) -> str:
     kept : bool
         Whether the folder has the result of an earlier job.
     """
-    finer = "fewer --points, a larger --edge-length, or --tiles N with more tiles"
+    alternatives = "fewer --points, a larger --edge-length, or --tiles N with more tiles"
     if meshing.method == "pivots":
-        finer = "a smaller region, or --method pam with fewer --points"
+        alternatives = "a smaller region, or --method pam with fewer --points"
     elif meshing.tiles == "auto":
-        finer = "fewer --points, a larger --edge-length, or --tiles N"
+        alternatives = "fewer --points, a larger --edge-length, or --tiles N"
     unchanged = " The earlier result is unchanged." if kept else ""
-    return f"Close other programs and resume; or use mesh with {finer}.{unchanged}"
+    return f"Close other programs and resume; or use mesh with {alternatives}.{unchanged}"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import MeshingError
 from ...progress import Progress
 from ...settings import JobSettings, MeshingSettings, from_json, to_json
-from ..store.claims import Claims, work_through
+from ..store.claims import Claims, run_tasks
 from ..store.job_file import read_job
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import read_done
@@ -21,7 +21,7 @@ from .mesh_keys import mesh_stages
 
 if TYPE_CHECKING:
     from ...dataset.camera import Camera
-    from ...field.depth_samples import Sightings
+    from ...field.depth_samples import DepthSamples
     from ...field.vacancy.vacancy import VacancyField
     from ...field.vector_field import VectorField
     from ...gaussians.model import GaussianArrays
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 
-FOLDER = "tiles"
+TILES_FOLDER = "tiles"
 """In the stage's folder, while the tiles are worked on."""
 
-CLAIMS = "claims"
+CLAIMS_FOLDER = "claims"
 
-MOST_LOOKED_UP = 5_000
-"""Sightings at which it is looked up what the photos resolve, about."""
+MAX_SPACING_SAMPLES = 5_000
+"""Depth samples at which it is looked up what the photos resolve, about."""
 
 
 def mesh_in_stage(
@@ -55,7 +55,7 @@ def mesh_in_stage(
     seed: int,
     threads: int,
     edge_length_scene: float,
-    sightings: Sightings,
+    depth_samples: DepthSamples,
     origin: dict[str, Any],
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
     """Estimate the mesh of a region, then make it, whole or in tiles.
@@ -77,25 +77,27 @@ def mesh_in_stage(
     from ...meshing.tiles.plan import Field
     from ...meshing.tiles.store import LIST_NAME
 
-    expected = expected_mesh(vacancy, cameras, region, meshing, edge_length_scene, sightings)
+    expected = estimate_region_mesh(
+        vacancy, cameras, region, meshing, edge_length_scene, depth_samples
+    )
     for line in expected.lines():
         _logger.info("region %s, estimated %s", region.name, line)
     memory_bytes = free_bytes(stage_folder, threads)
-    begun = (stage_folder / FOLDER / LIST_NAME).is_file()
+    begun = (stage_folder / TILES_FOLDER / LIST_NAME).is_file()
     tiled = meshing.tiles != "off" and (
         meshing.tiles != "auto" or begun or expected.tiles_for(memory_bytes)
     )
     expected.refuse(memory_bytes, tiled=tiled)
     if tiled:
-        mesh = mesh_in_tiles_here(
+        mesh = mesh_tiled_in_stage(
             stage_folder, Field(vacancy, vectors, threads), arrays, cameras, region, meshing,
             progress, tiles=0 if meshing.tiles == "auto" else int(meshing.tiles), seed=seed,
-            edge_length_scene=edge_length_scene, sightings=sightings, origin=origin,
+            edge_length_scene=edge_length_scene, depth_samples=depth_samples, origin=origin,
         )  # fmt: skip
     else:
         mesh = mesh_region(
             vacancy, vectors, arrays, cameras, region, meshing, progress, seed=seed,
-            threads=threads, edge_length_scene=edge_length_scene, sightings=sightings,
+            threads=threads, edge_length_scene=edge_length_scene, depth_samples=depth_samples,
         )  # fmt: skip
     return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": tiled}
 
@@ -111,66 +113,66 @@ def mesh_by_pivots_in_stage(
     *,
     seed: int,
     threads: int,
-    sightings: Sightings,
+    depth_samples: DepthSamples,
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
     """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
     from ...meshing.pivot_meshing import mesh_by_pivots
 
-    expected = expected_by_pivots(vacancy, arrays, region, meshing, sightings)
+    expected = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
     for line in expected.lines():
         _logger.info("region %s, estimated %s", region.name, line)
     memory_bytes = free_bytes(stage_folder, threads)
     expected.refuse(memory_bytes)
     mesh = mesh_by_pivots(
-        vacancy, arrays, cameras, region, meshing, progress, seed=seed, sightings=sightings
+        vacancy, arrays, cameras, region, meshing, progress, seed=seed, depth_samples=depth_samples
     )
     return mesh, {**expected.to_json(), "free_memory_bytes": memory_bytes, "tiled": False}
 
 
-def expected_by_pivots(
+def estimate_region_pivots(
     vacancy: VacancyField,
     arrays: GaussianArrays,
     region: Region,
     meshing: MeshingSettings,
-    sightings: Sightings,
+    depth_samples: DepthSamples,
 ) -> PivotEstimate:
-    """Estimate the mesh of a region by pivots from the Gaussians and sightings in it."""
+    """Estimate the mesh of a region by pivots from the Gaussians and depth_samples in it."""
     from ...meshing.cost.mesh_estimate import evaluation_seconds
-    from ...meshing.cost.pivot_estimate import estimate_pivots
+    from ...meshing.cost.pivot_estimate import estimate_pivot_mesh
 
-    return estimate_pivots(
-        arrays, region, meshing.pivots, len(sightings),
-        evaluation_s=evaluation_seconds(vacancy, sightings.points),
+    return estimate_pivot_mesh(
+        arrays, region, meshing.pivots, len(depth_samples),
+        evaluation_s=evaluation_seconds(vacancy, depth_samples.points),
     )  # fmt: skip
 
 
-def expected_mesh(
+def estimate_region_mesh(
     vacancy: VacancyField,
     cameras: Sequence[Camera],
     region: Region,
     meshing: MeshingSettings,
     edge_length_scene: float,
-    sightings: Sightings,
+    depth_samples: DepthSamples,
 ) -> MeshEstimate:
     """Estimate the mesh of a region from where the cameras see its surface."""
     from ...meshing.cost.mesh_estimate import (
-        area_of,
+        box_counting_area,
         estimate_mesh,
         evaluation_seconds,
-        occupied_boundary,
+        occupied_boundary_area,
     )
     from ...meshing.points.resolution import checked_request
     from ...meshing.points.spacing import resolved_edges
 
     adaptive = meshing.spacing == "adaptive"
-    some = sightings.points[:: max(1, len(sightings) // MOST_LOOKED_UP)]
+    subset = depth_samples.points[:: max(1, len(depth_samples) // MAX_SPACING_SAMPLES)]
     return estimate_mesh(
-        area_of(sightings.points),
-        occupied_boundary(region, vacancy.is_empty),
+        box_counting_area(depth_samples.points),
+        occupied_boundary_area(region, vacancy.is_empty),
         checked_request(edge_length_scene, meshing.points, region),
         adaptive=adaptive,
-        evaluation_s=evaluation_seconds(vacancy, sightings.points),
-        resolved=resolved_edges(some, cameras) if adaptive else None,
+        evaluation_s=evaluation_seconds(vacancy, depth_samples.points),
+        resolved=resolved_edges(subset, cameras) if adaptive else None,
     )
 
 
@@ -181,7 +183,7 @@ def free_bytes(folder: Path, threads: int) -> int:
     return int(MEMORY_SHARE_LEFT * this_machine(folder, threads).memory_bytes)
 
 
-def mesh_in_tiles_here(
+def mesh_tiled_in_stage(
     stage_folder: Path,
     field: Field,
     arrays: GaussianArrays,
@@ -193,7 +195,7 @@ def mesh_in_tiles_here(
     tiles: int,
     seed: int,
     edge_length_scene: float,
-    sightings: Sightings | None,
+    depth_samples: DepthSamples | None,
     origin: dict[str, Any],
 ) -> SurfaceMesh:
     """Mesh a region tile by tile, alone or with other processes that join in.
@@ -219,23 +221,23 @@ def mesh_in_tiles_here(
     from ...meshing.tiles.tiled_mesh import join_tiles, plan_tiles
     from .tile_tasks import tile_tasks
 
-    folder = stage_folder / FOLDER
+    folder = stage_folder / TILES_FOLDER
     if not (folder / LIST_NAME).is_file():
         save_plan(
             folder,
             plan_tiles(
                 field, arrays, cameras, region, meshing, progress.span(0.0, 0.2), tiles=tiles,
-                seed=seed, edge_length_scene=edge_length_scene, sightings=sightings,
+                seed=seed, edge_length_scene=edge_length_scene, depth_samples=depth_samples,
             ),
             origin,
         )  # fmt: skip
     plan, _ = load_plan(folder)
-    claims = Claims(folder / CLAIMS)
-    work_through(tile_tasks(folder, plan, field), claims, progress.span(0.2, 0.9))
+    claims = Claims(folder / CLAIMS_FOLDER)
+    run_tasks(tile_tasks(folder, plan, field), claims, progress.span(0.2, 0.9))
     parts = [load_faces(faces_path(folder, tile)) for tile in range(len(plan.tiling))]
-    everything = load_gathered(gathered_path(folder))
-    mesh = join_tiles(field, plan, everything, parts, meshing, progress.span(0.9, 1.0))
-    mesh.provenance["tile_processes"] = claims.workers()
+    all_points = load_gathered(gathered_path(folder))
+    mesh = join_tiles(field, plan, all_points, parts, meshing, progress.span(0.9, 1.0))
+    mesh.provenance["tile_processes"] = claims.worker_count()
     return mesh
 
 
@@ -246,10 +248,10 @@ def tiles_origin(cameras: Path, training: Path, settings: JobSettings) -> dict[s
 
 def remove_tiles(stage_folder: Path) -> None:
     """Remove the files of the tiles once the mesh is saved."""
-    folder = stage_folder / FOLDER
+    folder = stage_folder / TILES_FOLDER
     if not folder.is_dir():
         return
-    aside = stage_folder / f"{FOLDER}-joined"
+    aside = stage_folder / f"{TILES_FOLDER}-joined"
     try:
         os.replace(folder, aside)  # at once: nobody finds half a list
     except OSError:
@@ -257,7 +259,7 @@ def remove_tiles(stage_folder: Path) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def open_lists(folder: JobFolder) -> list[Path]:
+def unfinished_tile_lists(folder: JobFolder) -> list[Path]:
     """Return the folders of the tile lists that the job in a folder is not done with.
 
     Lists of jobs before it, which nobody will join, do not count. Whether its worker is alive does
@@ -265,15 +267,15 @@ def open_lists(folder: JobFolder) -> list[Path]:
     """
     from ...meshing.tiles.store import LIST_NAME
 
-    found = sorted(folder.stages.glob(f"mesh-*/{FOLDER}/{LIST_NAME}"))
-    undone = [path.parent for path in found if read_done(path.parent.parent) is None]
-    if not undone or folder.read_status().state == "DONE":
+    found = sorted(folder.stages.glob(f"mesh-*/{TILES_FOLDER}/{LIST_NAME}"))
+    unfinished = [path.parent for path in found if read_done(path.parent.parent) is None]
+    if not unfinished or folder.read_status().state == "DONE":
         return []
-    owned = mesh_stages(folder, read_job(folder.job_path))
-    return [path for path in undone if path.parent.name in owned]
+    own_stages = mesh_stages(folder, read_job(folder.job_path))
+    return [path for path in unfinished if path.parent.name in own_stages]
 
 
-def work_on_list(
+def work_on_tile_list(
     stages: Path, folder: Path, progress: Progress, done_here: list[str], *, threads: int
 ) -> None:
     """Work on a tile list from a process of its own; note the names of the parts it did.
@@ -293,10 +295,12 @@ def work_on_list(
     from .tile_tasks import tile_tasks
 
     plan, origin = load_plan(folder)
-    places = [resolve_inside(stages, str(origin.get(key, ""))) for key in ("cameras", "training")]
-    if None in places:
+    stage_folders = [
+        resolve_inside(stages, str(origin.get(key, ""))) for key in ("cameras", "training")
+    ]
+    if None in stage_folders:
         raise MeshingError("The tile list names no stages of this job.", "Mesh the region again.")
-    cameras, training = (place for place in places if place is not None)
+    cameras, training = (stage for stage in stage_folders if stage is not None)
     scene = load_saved_scene(cameras)
     gaussians = load_gaussians(training / "gaussians.npz")
     arrays = gaussians.arrays()
@@ -307,4 +311,4 @@ def work_on_list(
     )  # fmt: skip
     field = Field(vacancy, VectorField(arrays, threads=threads), threads)
     tasks = tile_tasks(folder, plan, field)
-    work_through(tasks, Claims(folder / CLAIMS), progress, done_here=done_here)
+    run_tasks(tasks, Claims(folder / CLAIMS_FOLDER), progress, done_here=done_here)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ...dataset.loading.splat_cameras import (
-    WITHOUT_PHOTOS,
-    cameras_around,
+    NO_PHOTOS_WARNING,
+    cameras_on_spheres,
     scene_frame,
     splat_extent,
 )
@@ -25,7 +25,7 @@ from ..store.job_file import JobFile
 MAX_START_POINTS = 30_000
 """So many middles of opaque Gaussians stand for the sparse points of a reconstruction."""
 
-SOLID = 0.5
+MIN_START_OPACITY = 0.5
 """Opacity of the Gaussians that do."""
 
 
@@ -58,18 +58,18 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
     from ...gaussians.initialisation import SH_C0
     from ...render.render import render
     from ...render.types.options import RenderOptions
-    from ...training.initialisation.splat_motion import move_gaussians
     from ...training.initialisation.splat_start import baked, fit_filter
+    from ...training.initialisation.splat_transform import transform_gaussians
 
     progress.update(0.0, "reading the splat")
     splat = read_foreign_splat(source)
     world = baked(splat.gaussians)
     means, opacities = world.means.numpy(), torch.sigmoid(world.opacity_logits).numpy()
     extent = splat_extent(means, opacities)
-    around = cameras_around(extent)
-    scene_from_world = scene_frame(around)
-    cameras = [camera.moved(scene_from_world) for camera in around]
-    gaussians = fit_filter(move_gaussians(world, scene_from_world), cameras, threads=threads)
+    file_cameras = cameras_on_spheres(extent)
+    scene_from_world = scene_frame(file_cameras)
+    cameras = [camera.moved(scene_from_world) for camera in file_cameras]
+    gaussians = fit_filter(transform_gaussians(world, scene_from_world), cameras, threads=threads)
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     options = RenderOptions(depth=False, threads=threads)
@@ -82,10 +82,10 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
         write_bytes(path, _png(color))
         views.append(View(camera, path))
     near = np.linalg.norm(means - extent.center, axis=1) <= extent.radius
-    chosen = np.nonzero((opacities >= SOLID) & near)[0]
+    chosen = np.nonzero((opacities >= MIN_START_OPACITY) & near)[0]
     chosen = chosen[:: max(1, -(-len(chosen) // MAX_START_POINTS))]
     colors = np.clip(0.5 + SH_C0 * world.sh[chosen, 0].numpy(), 0.0, 1.0)  # (m, 3)
-    warnings = [*splat.warnings, ReportWarning("without-photos", WITHOUT_PHOTOS)]
+    warnings = [*splat.warnings, ReportWarning("without-photos", NO_PHOTOS_WARNING)]
     if extent.has_surroundings:
         text = "The splat reaches far beyond its middle; only the middle is covered by the views."
         warnings.append(ReportWarning("surroundings-not-covered", text))

@@ -26,18 +26,18 @@ from ..store.claims import Task
 def tile_tasks(folder: Path, plan: TilePlan, field: Field) -> list[Task]:
     """Return the tasks of a tile list: points of each tile, all points, faces of each tile."""
     count = len(plan.tiling)
-    everything = cache(lambda: load_gathered(gathered_path(folder)))
+    all_points = cache(lambda: load_gathered(gathered_path(folder)))
 
-    def sample(tile: int, progress: Progress) -> None:
+    def make_points(tile: int, progress: Progress) -> None:
         save_points(points_path(folder, tile), tile_points(field, plan, tile, progress))
 
-    def bring_together(progress: Progress) -> None:
+    def gather_points(progress: Progress) -> None:
         progress.update(0.0, "bringing the tiles' points together")
         parts = [load_points(points_path(folder, tile)) for tile in range(count)]
         save_gathered(gathered_path(folder), gather(plan, parts))
 
-    def connect(tile: int, progress: Progress) -> None:
-        part = tile_faces(field, plan, everything(), tile, progress)
+    def make_faces(tile: int, progress: Progress) -> None:
+        part = tile_faces(field, plan, all_points(), tile, progress)
         save_faces(faces_path(folder, tile), part)
 
     def all_sampled() -> bool:
@@ -49,17 +49,17 @@ def tile_tasks(folder: Path, plan: TilePlan, field: Field) -> list[Task]:
             f"points-{tile:04d}",
             points_path(folder, tile).is_file,
             lambda: True,
-            partial(sample, tile),
+            partial(make_points, tile),
         )
         for tile in range(count)
     ]
-    tasks.append(Task("points", gathered, all_sampled, bring_together))
+    tasks.append(Task("points", gathered, all_sampled, gather_points))
     tasks += [
         Task(
             f"faces-{tile:04d}",
             faces_path(folder, tile).is_file,
             gathered,
-            partial(connect, tile),
+            partial(make_faces, tile),
         )
         for tile in range(count)
     ]

@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any
 from ...errors import DatasetError
 from ...progress import COMPILING, Progress
 from ...report_warning import ReportWarning
-from ...settings import RESULT_FREE, TrainingSettings, to_json
+from ...settings import RESULT_INDEPENDENT, TrainingSettings, to_json
 from ..store.continue_training import (
-    bring_checkpoints,
     checkpoints,
     lineage,
+    link_checkpoints,
     nothing_to_continue,
     shorter_training,
 )
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
-from ..store.stage_folder import Stage, note_interrupted, run_stage, stage_key
-from .oom_retry import STEPS_FILE, train_within_memory
+from ..store.stage_folder import Stage, record_interrupted_time, run_stage, stage_key
+from .oom_retry import RETRIES_FILE, train_with_oom_retry
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,7 +59,7 @@ def start_fingerprint(path: str) -> list[Any]:
 def training_keys(version: int, cameras_key: str, job: JobFile) -> tuple[str, str]:
     """Return the stage's key, and the key without the extra iterations."""
     training = to_json(job.settings.training)
-    described = {k: v for k, v in training.items() if k not in RESULT_FREE}
+    described = {k: v for k, v in training.items() if k not in RESULT_INDEPENDENT}
     start = start_fingerprint(job.settings.start_splat)
     parts = (version, cameras_key, job.settings.seed, *([start] if start else []))
     key = stage_key(*parts, described)
@@ -92,14 +92,14 @@ def run_training(
         if extra and not checkpoints(stage_folder):
             shorter = shorter_training(folder.stages, base_key, extra)
             if shorter is not None:
-                bring_checkpoints(shorter, stage_folder, (STEPS_FILE,))
+                link_checkpoints(shorter, stage_folder, (RETRIES_FILE,))
             elif job.command == "more":
                 raise nothing_to_continue(folder)
         begun_s = time.monotonic()
         try:
             done = _train(stage_folder, job, cameras, progress, threads)
         except BaseException:
-            note_interrupted(folder.stages, "train", key, time.monotonic() - begun_s)
+            record_interrupted_time(folder.stages, "train", key, time.monotonic() - begun_s)
             raise
         return {**done, "lineage": lineage(base_key, extra)}
 
@@ -129,7 +129,7 @@ def _train(
             seed=job.settings.seed, threads=threads, start_splat=start_splat_of(job), inside=inside,
         )  # fmt: skip
 
-    trained = train_within_memory(
+    trained = train_with_oom_retry(
         attempt, job.settings.training, stage_folder, lambda: remove_checkpoints(stage_folder)
     )
     result = trained.result
@@ -183,7 +183,12 @@ def _estimate(
     The renderer is compiled meanwhile where that was never done here.
     """
     from ...training.cost.machine_speed import machine_speed, renderer_is_compiled
-    from ...training.cost.training_estimate import estimate, judge, scene_facts, this_machine
+    from ...training.cost.training_estimate import (
+        check_resources,
+        estimate,
+        scene_facts,
+        this_machine,
+    )
     from ...training.initialisation.splat_start import wrapping_settings
     from ...training.warm_up import compile_kernels
     from .splat_scene import start_splat_of
@@ -199,7 +204,7 @@ def _estimate(
     done = [int(path.stem.rpartition("-")[2]) for path in checkpoints(stage_folder)]
     first = max(done, default=0)
     expected = estimate(scene_facts(scene), training, machine, first=first)
-    warnings = judge(expected, machine)  # raises where the disk is too full
+    warnings = check_resources(expected, machine)  # raises where the disk is too full
     _logger.info("estimate: %s", expected.sentence())
     for warning in warnings:
         _logger.warning("%s", warning.text)

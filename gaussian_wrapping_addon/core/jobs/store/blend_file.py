@@ -17,21 +17,21 @@ EARLIER = "scene.blend1"
 """As Blender calls the version before: it may hold what a person has added."""
 
 
-def shown_result(result: Path) -> dict[str, bytes]:
+def result_state(result: Path) -> dict[str, bytes]:
     """Return what tells one result from another: the figures of each region, by its name."""
     return {path.parent.name: path.read_bytes() for path in sorted(result.glob("*/figures.json"))}
 
 
-def set_aside_stale(result: Path, before: dict[str, bytes]) -> bool:
+def back_up_stale_blend(result: Path, before: dict[str, bytes]) -> bool:
     """Rename ``scene.blend`` where the result has changed; tell whether it was.
 
     Parameters
     ----------
     before : dict
-        From :func:`shown_result`, when the file was up to date.
+        From :func:`result_state`, when the file was up to date.
     """
     blend = result / NAME
-    if not blend.is_file() or shown_result(result) == before:
+    if not blend.is_file() or result_state(result) == before:
         return False
     os.replace(blend, result / EARLIER)
     _logger.info("%s showed the result before this one: it is %s now", NAME, EARLIER)

@@ -30,7 +30,7 @@ from .job_folder import process_alive, process_start_ticks
 
 _logger = logging.getLogger(__name__)
 
-BEAT_S = 5.0
+REFRESH_S = 5.0
 STALE_S = 60.0
 """A claim of another machine that was not refreshed for so long is dead. Measured by the own clock
 from the first look, as clocks of machines differ."""
@@ -66,16 +66,16 @@ class Claims:
         """Return the file of a claim."""
         return self._folder / f"{name}.json"
 
-    def note_work(self) -> None:
+    def record_worker(self) -> None:
         """Say that this process has done a part."""
         (self._folder / f"{self._worker}.{_WORKER}").touch()
 
-    def workers(self) -> int:
+    def worker_count(self) -> int:
         """Return how many processes have done a part; one that was started anew counts again."""
         return sum(1 for _ in self._folder.glob(f"*.{_WORKER}"))
 
     @contextmanager
-    def taken(self, name: str) -> Iterator[bool]:
+    def held(self, name: str) -> Iterator[bool]:
         """Hold a claim for the duration of a block; false where another process has it."""
         if not (self._create(name) or (self._drop_stale(name) and self._create(name))):
             yield False
@@ -95,18 +95,18 @@ class Claims:
             number = os.open(self.path(name), os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
         except FileExistsError:
             return False
-        mine = {
-            "place": this_place(),
+        owner = {
+            "place": host_and_pid_namespace(),
             "pid": os.getpid(),
             "started": process_start_ticks(os.getpid()),
             "token": uuid.uuid4().hex,
         }
         with os.fdopen(number, "w") as stream:
-            json.dump(mine, stream)
+            json.dump(owner, stream)
         return True
 
     def _refresh(self, name: str, ended: threading.Event) -> None:
-        while not ended.wait(BEAT_S):
+        while not ended.wait(REFRESH_S):
             try:
                 os.utime(self.path(name))
             except OSError:
@@ -121,7 +121,7 @@ class Claims:
         except FileNotFoundError:
             return True  # given back just now
         owner = self._owner(path)
-        here = owner.get("place") == this_place()
+        here = owner.get("place") == host_and_pid_namespace()
         if here and process_alive(int(owner["pid"]), int(owner["started"])):
             return False
         state = (owner.get("token"), time_ns)
@@ -150,7 +150,7 @@ class Claims:
             return {}
 
 
-def this_place() -> str:
+def host_and_pid_namespace() -> str:
     """Return a text that processes share only where they know each other's process ids."""
     parts = [platform.node()]
     for read in (
@@ -164,7 +164,7 @@ def this_place() -> str:
     return " ".join(parts)
 
 
-def work_through(
+def run_tasks(
     tasks: Sequence[Task],
     claims: Claims,
     progress: Progress,
@@ -185,23 +185,23 @@ def work_through(
     WrapError
         Of a task that failed here, or the request to stop.
     """
-    mine = [] if done_here is None else done_here
+    completed = [] if done_here is None else done_here
     while True:
-        undone = [task for task in tasks if not task.done()]
-        finished = len(tasks) - len(undone)
+        unfinished = [task for task in tasks if not task.done()]
+        finished = len(tasks) - len(unfinished)
         progress.update(finished / max(len(tasks), 1), f"{finished} of {len(tasks)} parts")
-        if not undone:
-            return len(mine)
+        if not unfinished:
+            return len(completed)
         worked = False
-        for task in undone:
+        for task in unfinished:
             if not task.ready():
                 continue
-            with claims.taken(task.name) as free:
+            with claims.held(task.name) as free:
                 if not free or task.done():  # done between our look and our claim
                     continue
                 task.run(progress.span(finished / len(tasks), (finished + 1) / len(tasks)))
-                mine.append(task.name)
-                claims.note_work()
+                completed.append(task.name)
+                claims.record_worker()
                 worked = True
                 break
         if not worked:

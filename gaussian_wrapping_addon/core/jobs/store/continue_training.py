@@ -22,7 +22,7 @@ _CHECKPOINT = re.compile(r"checkpoint-(\d{1,9})\.json")
 _INSTEAD = "Train anew instead: wrap with as many --iterations as you want in all."
 
 
-def job_with_more(folder: JobFolder, job: JobFile, iterations: int) -> JobFile:
+def continue_training_job(folder: JobFolder, job: JobFile, iterations: int) -> JobFile:
     """Return the job that trains so many iterations more than ``job``, then meshes again.
 
     Raises
@@ -81,7 +81,7 @@ def shorter_training(stages: Path, base_key: str, extra_iterations: int) -> Path
     return None if best is None else best[2]
 
 
-def bring_checkpoints(source: Path, target: Path, others: tuple[str, ...] = ()) -> None:
+def link_checkpoints(source: Path, target: Path, others: tuple[str, ...] = ()) -> None:
     """Put the checkpoints of a finished stage into a new one, as hard links where that works.
 
     Files of a stage are replaced, never written into, so that a link cannot change its origin.

@@ -148,7 +148,7 @@ def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:
     return {name: float(value) for name, value in values.items()}
 
 
-def refuse_replacing(result: Path, job: JobFile) -> None:
+def reject_region_conflicts(result: Path, job: JobFile) -> None:
     """Refuse a job of which a region would replace the result of another region.
 
     A region of the same name is the same region, meshed again.
@@ -170,10 +170,10 @@ def refuse_replacing(result: Path, job: JobFile) -> None:
         parse_region_file(body, Path(request)).name: region_name(request, body)
         for request, body in job.region_bodies.items()
     }
-    refuse_other_regions(result, folders)
+    reject_folder_conflicts(result, folders)
 
 
-def refuse_other_regions(result: Path, folders: dict[str, str]) -> None:
+def reject_folder_conflicts(result: Path, folders: dict[str, str]) -> None:
     """Refuse regions whose folder in a result is that of a region with another name.
 
     A region of the same name is the same region, meshed again.

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ...errors import NO_ROOM, ParseError, UsageError, cannot_be_written
+from ...errors import DISK_FULL_ERRNOS, ParseError, UsageError, unwritable_error
 from ...files import overwrite_json, read_json, write_json
 
 STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
@@ -204,7 +204,7 @@ class JobFolder:
             (self.root / MARKER).touch()
             self.stages.mkdir(exist_ok=True)
         except OSError as error:
-            raise cannot_be_written(self.root, error) from None
+            raise unwritable_error(self.root, error) from None
 
     def is_job(self) -> bool:
         """Whether a job was started here."""
@@ -241,7 +241,7 @@ class JobFolder:
         try:
             write_json(self.status_path, asdict(status))
         except OSError as error:
-            if error.errno not in NO_ROOM or status.active:
+            if error.errno not in DISK_FULL_ERRNOS or status.active:
                 raise
             # The last words of a worker that has met a full disk.
             overwrite_json(self.status_path, asdict(status))

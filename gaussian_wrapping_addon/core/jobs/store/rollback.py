@@ -26,7 +26,7 @@ _logger = logging.getLogger(__name__)
 NAME = "job-finished.json"
 
 
-def keep_finished(folder: JobFolder, job: JobFile) -> None:
+def save_rollback(folder: JobFolder, job: JobFile) -> None:
     """Keep what a folder holds before ``job`` is written there.
 
     Of several meshes without an end in between, the job before the first is kept: where the last
@@ -45,8 +45,8 @@ def keep_finished(folder: JobFolder, job: JobFile) -> None:
     except (UsageError, ParseError):
         path.unlink(missing_ok=True)
         return  # nothing that could be put back
-    kept = {"job": finished.to_json(), "status": asdict(_without_error(status))}
-    write_json(path, {**kept, "stages": sorted(p.name for p in folder.stages.iterdir())})
+    saved = {"job": finished.to_json(), "status": asdict(_without_error(status))}
+    write_json(path, {**saved, "stages": sorted(p.name for p in folder.stages.iterdir())})
 
 
 def finished_job(folder: JobFolder) -> JobFile:
@@ -57,38 +57,38 @@ def finished_job(folder: JobFolder) -> JobFile:
     UsageError, ParseError
         There is no job.
     """
-    kept = _read(folder.root / NAME)
-    if kept is None or folder.read_status().state == "DONE":
+    saved = _read(folder.root / NAME)
+    if saved is None or folder.read_status().state == "DONE":
         return read_job(folder.job_path)
-    return JobFile.from_json(kept["job"])
+    return JobFile.from_json(saved["job"])
 
 
-def forget_finished(folder: JobFolder) -> None:
+def discard_rollback(folder: JobFolder) -> None:
     """Take the job at hand for the finished one."""
     (folder.root / NAME).unlink(missing_ok=True)
 
 
-def put_back(folder: JobFolder) -> JobStatus | None:
+def roll_back(folder: JobFolder) -> JobStatus | None:
     """Make a folder what it was before a mesh that has failed; return its status then.
 
     ``None`` where there was no finished job, or another command has failed.
     """
-    kept = _read(folder.root / NAME)
-    if kept is None:
+    saved = _read(folder.root / NAME)
+    if saved is None:
         return None
     try:
-        job = JobFile.from_json(kept["job"])
-        status = JobStatus.from_json(kept["status"])
+        job = JobFile.from_json(saved["job"])
+        status = JobStatus.from_json(saved["status"])
     except (UsageError, TypeError, ValueError):
         return None
-    known = set(kept["stages"])
+    known = set(saved["stages"])
     for stage in (*folder.stages.glob("mesh-*"), *folder.stages.glob("texture-*")):
         if stage.name not in known and read_done(stage) is None:
             shutil.rmtree(stage, ignore_errors=True)
     if folder.result.is_dir():
         recover(folder.result)
     write_job(folder.job_path, job)
-    forget_finished(folder)
+    discard_rollback(folder)
     _logger.info("the job is again as it was before this mesh")
     # The folder may be a copy, whose status names the place of the other one.
     return replace(status, result=str(folder.result) if status.result else "")

@@ -20,7 +20,7 @@ import numpy as np
 from ...dataset.frames.file_frame import FileFrame
 from ...dataset.similarity import Similarity
 from ...errors import WrapError
-from ...files import finite, read_json, write_json
+from ...files import finite_json, read_json, write_json
 from ...names import AUTOMATIC_REGIONS
 from ...settings import to_json
 from .job_file import read_job
@@ -73,7 +73,7 @@ def write_sidecar(
         **_source(result, contents.get("region")),
         "made_with": _versions(),
     }
-    write_json(sidecar_path(path), finite(values))
+    write_json(sidecar_path(path), finite_json(values))
 
 
 def _source(result: Path, region: Any) -> dict[str, Any]:

@@ -114,7 +114,7 @@ def run_stage(
     begun_s, begun_processor_s = time.monotonic(), time.process_time()
     progress.update(0.0, f"{name}: starting")
     done = work(folder, progress)
-    seconds = _seconds_before(folder) + time.monotonic() - begun_s
+    seconds = _seconds_so_far(folder) + time.monotonic() - begun_s
     # Of this process and this run alone, not of helpers.
     processor_s = time.process_time() - begun_processor_s
     done = {
@@ -128,14 +128,14 @@ def run_stage(
     return Stage(name, key, folder, done, False)
 
 
-def note_interrupted(stages: Path, name: str, key: str, seconds: float) -> None:
+def record_interrupted_time(stages: Path, name: str, key: str, seconds: float) -> None:
     """Add the time of an interrupted run to the stage, so that reports count it."""
     folder = stages / f"{name}-{key}"
     if folder.is_dir() and read_done(folder) is None:
-        write_json(folder / "spent.json", {"seconds": _seconds_before(folder) + seconds})
+        write_json(folder / "spent.json", {"seconds": _seconds_so_far(folder) + seconds})
 
 
-def _seconds_before(folder: Path) -> float:
+def _seconds_so_far(folder: Path) -> float:
     try:
         return float(read_json(folder / "spent.json")["seconds"])
     except (OSError, ParseError, KeyError, TypeError, ValueError):

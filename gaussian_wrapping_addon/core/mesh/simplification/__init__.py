@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fewer faces by edge collapses in the order of their quadric error.
+"""Mesh simplification by edge collapses in order of quadric error.
 
-In: a closed manifold. Out: one of fewer faces, or the vertices that it should keep.
+In: a closed manifold. Out: one with fewer faces, or with fewer of its vertices.
 """

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Faces around vertices while edges collapse: linked corners, and the merging of two vertices.
+"""Linked lists of the corners at each vertex during edge collapses, and vertex merging (numba).
 
 The corners (3 face + k) of a vertex are linked: ``head[v]`` is its first, ``following[corner]`` the
-next, -1 ends. Dead faces have -1 as first corner and stay linked until :func:`drop_dead`.
+next, -1 ends. Dead faces have -1 as first corner and stay linked until :func:`unlink_dead_faces`.
 
 ``mesh`` is the tuple of points (v, 3) float64, faces (f, 3) int64, head (v,) int64, following (3f,)
 int64, quadrics (v, 11) float64, stamps (v,) int64 (how often a vertex has changed) and marks (v,)
-int64 (of :mod:`.link_condition`). All are changed in place.
+int64 (see :mod:`.link_condition`). All are modified in place.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -18,7 +18,7 @@ from .counters import FACES_LEFT, VERTICES_LEFT
 
 @kernel(fast=False)
 def link_corners(faces, head, following):
-    """Fill ``head`` and ``following``; corners of a vertex come in rising order."""
+    """Fill ``head`` and ``following``; corners of a vertex are in increasing order."""
     for f in range(len(faces) - 1, -1, -1):
         if faces[f, 0] < 0:
             continue
@@ -29,8 +29,8 @@ def link_corners(faces, head, following):
 
 
 @part(fast=False)
-def drop_dead(v, faces, head, following):
-    """Take dead faces out of the links of ``v``; return the last corner."""
+def unlink_dead_faces(v, faces, head, following):
+    """Remove dead faces from the list of ``v``; return its last corner."""
     last, corner = -1, head[v]
     while corner >= 0:
         after = following[corner]
@@ -46,8 +46,8 @@ def drop_dead(v, faces, head, following):
 
 
 @part(fast=False)
-def merge(u, v, mesh, counts):
-    """Let ``v`` become ``u`` where the link condition allows it; dead faces must be dropped."""
+def merge_vertices(u, v, mesh, counts):
+    """Merge ``v`` into ``u``; the link condition must hold and dead faces be unlinked."""
     _, faces, head, following, quadrics, stamps, _ = mesh
     corner = head[v]
     while corner >= 0:
@@ -59,13 +59,13 @@ def merge(u, v, mesh, counts):
             faces[f, k] = u
         corner = following[corner]
     counts[VERTICES_LEFT] -= 1
-    last = drop_dead(u, faces, head, following)
+    last = unlink_dead_faces(u, faces, head, following)
     if last < 0:
         head[u] = head[v]
     else:
         following[last] = head[v]
     head[v] = -1
-    drop_dead(u, faces, head, following)
+    unlink_dead_faces(u, faces, head, following)
     quadrics[u] += quadrics[v]
     stamps[u] += 1
     stamps[v] += 1

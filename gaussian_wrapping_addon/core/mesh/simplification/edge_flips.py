@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which way the edges of a coarse closed mesh run: closest to the dense mesh it was selected from.
+"""Flip edges of a coarse closed mesh to approximate the dense mesh that it was simplified from.
 
-Removing vertices one by one leaves edges as they fell. Flipping some of them lowers the surface
-error of an adaptive mesh by a tenth, with the same vertices.
+Half-edge collapses leave the edges in arbitrary directions. Flipping some of them lowers the
+surface error of an adaptive mesh by a tenth, with the same vertices.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ PASSES = 6
 """Nearly all flips happen in the first two; the third and fourth find a few more."""
 
 LEAST_GAIN = 0.02
-"""Share of the error of two triangles that a flip must save: else rounding decides."""
+"""Share of the error of two triangles that a flip must save; below it, rounding would decide."""
 
 FLAT_HEIGHT = 1e-4
-"""Errors below this share of the edges are none: flat parts stay as they are."""
+"""Errors below this share of the edges are ignored: flat parts are not changed."""
 
 
 def flip_edges(
@@ -33,9 +33,9 @@ def flip_edges(
 ) -> np.ndarray:
     """Flip edges while that brings the faces closer to a dense mesh of the same surface.
 
-    Vertices stay, and so do genus and parts; no face turns over or becomes narrow. The error of a
-    triangle follows from the heights of the surface over the middles of its edges, as if the
-    surface were quadratic over it.
+    Vertices, genus and parts do not change; no face turns over or becomes narrow. The error of a
+    triangle is computed from the heights of the surface over the midpoints of its edges, with a
+    quadratic model of the surface.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def flip_edges(
     dense_faces : (m, 3) int64
         Oriented alike.
     longest : float
-        No edge becomes longer.
+        Greatest length of a new edge.
 
     Returns
     -------
@@ -57,9 +57,9 @@ def flip_edges(
     if len(faces) == 0 or len(dense_faces) == 0:
         return faces
     low, high = dense_vertices.min(0), dense_vertices.max(0)
-    # Measured near the origin: nearest points far from it would be rounded.
+    # Relative to the mesh: far from the origin nearest points would be rounded.
     points = vertices - (low + high) / 2
-    surface = _Heights(points, dense_vertices - (low + high) / 2, dense_faces)
+    surface = _SurfaceHeights(points, dense_vertices - (low + high) / 2, dense_faces)
     for _ in range(PASSES):
         chosen = _one_pass(points, faces, surface, longest)
         if chosen == 0:
@@ -67,8 +67,8 @@ def flip_edges(
     return faces
 
 
-class _Heights:
-    """Height of the surface over the middles of edges, each measured once."""
+class _SurfaceHeights:
+    """Heights of the surface over the midpoints of edges, each computed once."""
 
     def __init__(self, points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> None:
         self._points, self._count = points, len(points)
@@ -81,7 +81,7 @@ class _Heights:
         self._heights, self._up = np.zeros(0), np.zeros((0, 3))
 
     def key(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return a number for each pair of vertices, whatever their order."""
+        """Return a key for each pair of vertices, independent of their order."""
         return edge_keys(a, b, self._count)
 
     def over(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -101,9 +101,11 @@ class _Heights:
         return self._heights[at], self._up[at]
 
 
-def _one_pass(points: np.ndarray, faces: np.ndarray, surface: _Heights, longest: float) -> int:
-    """Flip the best edges, none of which share a face, in place; return their number."""
-    # Half-edge 3 f + k runs from corner k of face f to the next one, opposite the one after.
+def _one_pass(
+    points: np.ndarray, faces: np.ndarray, surface: _SurfaceHeights, longest: float
+) -> int:
+    """Flip the best edges, no two in the same face, in place; return their number."""
+    # Half-edge 3 f + k leads from corner k of face f to the next, opposite the third.
     start, end, tip = (np.roll(faces, -k, 1).ravel() for k in range(3))
     backward = end * len(points) + start
     order = np.argsort(start * len(points) + end)
@@ -112,7 +114,7 @@ def _one_pass(points: np.ndarray, faces: np.ndarray, surface: _Heights, longest:
     other = twin[one]
     a, b, c, d = start[one], end[one], tip[one], tip[other]
 
-    # Cheap tests first: shapes of the two new faces, and that their edge is none already.
+    # Cheap tests first: shapes of the two new faces, and that their edge does not exist yet.
     normal_1, area_1, round_1 = _shapes(points, a, b, c)
     normal_2, area_2, round_2 = _shapes(points, b, a, d)
     normal_3, area_3, round_3 = _shapes(points, a, d, c)
@@ -120,15 +122,15 @@ def _one_pass(points: np.ndarray, faces: np.ndarray, surface: _Heights, longest:
     up = normal_1 * area_1[:, None] + normal_2 * area_2[:, None]
     up /= np.maximum(np.linalg.norm(up, axis=1), 1e-300)[:, None]
     least = np.minimum(LEAST_ROUNDNESS, np.minimum(round_1, round_2))
-    may = np.minimum(round_3, round_4) >= least
+    allowed = np.minimum(round_3, round_4) >= least
     for normal in (normal_3, normal_4):
-        may &= (normal * up).sum(1) > LEAST_COSINE
-    may &= (normal_3 * normal_4).sum(1) > 0.0
-    may &= np.linalg.norm(points[c] - points[d], axis=1) <= longest
+        allowed &= (normal * up).sum(1) > LEAST_COSINE
+    allowed &= (normal_3 * normal_4).sum(1) > 0.0
+    allowed &= np.linalg.norm(points[c] - points[d], axis=1) <= longest
     edges = surface.key(a, b)
-    may &= ~np.isin(surface.key(c, d), edges)
+    allowed &= ~np.isin(surface.key(c, d), edges)
 
-    rows = np.flatnonzero(may)
+    rows = np.flatnonzero(allowed)
     one, other, a, b, c, d = (x[rows] for x in (one, other, a, b, c, d))
     across, there = surface.over(c, d)
     along, bc, ca = surface.over(a, b)[0], surface.over(b, c)[0], surface.over(c, a)[0]
@@ -136,7 +138,7 @@ def _one_pass(points: np.ndarray, faces: np.ndarray, surface: _Heights, longest:
     before = _error(area_1[rows], along, bc, ca) + _error(area_2[rows], along, ad, db)
     after = _error(area_3[rows], ad, across, ca) + _error(area_4[rows], db, bc, across)
     flat = FLAT_HEIGHT * (area_1 + area_2)[rows] ** 1.5
-    # Where the nearest surface is the far side of a thin wall, nothing is known.
+    # Where the nearest surface is the far side of a thin wall, the height is unknown.
     good = (after < (1.0 - LEAST_GAIN) * before) & (before > flat)
     good &= (there * up[rows]).sum(1) > LEAST_COSINE
     best = np.flatnonzero(good)
@@ -164,9 +166,9 @@ def _shapes(
 
 
 def _error(area: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Area times the root mean square height of ``4 (x l1 l2 + y l2 l3 + z l3 l1)``.
+    """Return the area times the root mean square height of ``4 (x l1 l2 + y l2 l3 + z l3 l1)``.
 
-    That is the quadratic surface through the corners, with these heights over the middles of the
+    That is the quadratic surface through the corners, with these heights over the midpoints of the
     edges; l are barycentric coordinates, and the mean of (4 l1 l2)^2 is 8 / 45.
     """
     return area * np.sqrt(8.0 / 45.0 * (x * x + y * y + z * z + x * y + y * z + z * x))
@@ -174,7 +176,7 @@ def _error(area: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.
 
 @kernel(fast=False)
 def _independent(faces_1, faces_2, edge, face_count, edge_count):  # type: ignore[no-untyped-def]
-    """Take flips in order where neither face nor the new edge is taken."""
+    """Select flips in order, such that no face and no new edge is used twice."""
     locked, made = np.zeros(face_count, np.bool_), np.zeros(edge_count, np.bool_)
     taken = np.zeros(len(faces_1), np.bool_)
     for i in range(len(faces_1)):

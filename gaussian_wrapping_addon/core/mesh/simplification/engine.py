@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arrays of a simplification, and the loop around the kernels that work on them."""
+"""State of a simplification run, and the driver loop of its collapse kernels."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ Heap = tuple[np.ndarray, ...]
 
 
 class Simplification:
-    """A mesh whose edges collapse, in place.
+    """A mesh under simplification, modified in place.
 
     Parameters
     ----------
     points : (v, 3) float64
         In units of about the mesh's size.
     faces : (f, 3) int64
-        Oriented 2-manifold; changed in place.
+        Oriented 2-manifold; modified in place.
     scale, point_weight : float
-        Of :func:`.quadrics.add_face_quadrics`.
+        See :func:`.quadrics.add_face_quadrics`.
     """
 
     def __init__(
@@ -57,15 +57,15 @@ class Simplification:
 
     @property
     def faces_left(self) -> int:
-        """Faces that still live."""
+        """Number of remaining faces."""
         return int(self.counts[FACES_LEFT])
 
     def faces(self) -> np.ndarray:
-        """Return the faces that still live, (g, 3) int64, in their first order."""
+        """Return the remaining faces, (g, 3) int64, in their original order."""
         return self._faces[self._faces[:, 0] >= 0]
 
     def empty_heap(self, size: int, columns: int) -> Heap:
-        """Return a heap for ``size`` entries or more, with so many columns of integers."""
+        """Return a heap for at least ``size`` entries with this many integer columns."""
         self.counts[HEAP_SIZE] = 0
         size = max(size, 2 * HEAP_ROOM)
         return (np.zeros(size), *(np.zeros(size, np.int64) for _ in range(columns)))
@@ -81,7 +81,7 @@ class Simplification:
         Parameters
         ----------
         collapse : callable
-            Goes on with the heap; returns one of :data:`.counters.DONE` and so on.
+            Continues with the heap; returns a code such as :data:`.counters.DONE`.
         after : callable, optional
             Called after every call, for progress.
         """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Half-edge collapses: a vertex merges into a neighbour, and none moves (numba).
+"""Half-edge collapses: a vertex merges into a neighbour, and no vertex moves (numba).
 
-The heap holds vertices, each with the price of its cheapest collapse, and three columns: costs,
-vertices, stamps. What lies two edges away may change that price without a new entry, so it is
-computed again when a vertex is taken.
+The heap holds vertices with the cost of their cheapest collapse, in three columns: costs, vertices,
+stamps. Changes two edges away may alter that cost without a new entry, so it is recomputed when a
+vertex is popped.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -14,35 +14,35 @@ from typing import NamedTuple
 import numpy as np
 
 from ...kernels.compiled import kernel, part
-from .corners import drop_dead, merge
+from .corners import merge_vertices, unlink_dead_faces
 from .counters import DONE, EMPTY, FULL, HEAP_ROOM, HEAP_SIZE, PAUSED, VERTICES_LEFT
-from .heap import drop_first, take_in_last
+from .heap import pop_first, sift_up_last
 from .link_condition import link_allows, mark_ring
 from .quadrics import WEIGHT, area_vector, error_of_one
 
 MAX_RING = 64
-"""Neighbours of a vertex at most; a vertex with more stays."""
+"""Most neighbours of a vertex that can be removed."""
 
 HEAP_COLUMNS = 2
-"""Columns of integers of the heap: vertices and stamps."""
+"""Integer columns of the heap: vertices and stamps."""
 
 
 class ShapeBounds(NamedTuple):
-    """What a half-edge collapse may do to the faces around the vertex that goes."""
+    """Bounds on the faces around a removed vertex."""
 
     longest_squared: float
-    """No new edge is longer; square of a length."""
+    """Square of the greatest length of a new edge."""
     shape_weight: float
-    """Price of length beside that of height, both squared."""
+    """Weight of squared length relative to squared height in the cost."""
     least_roundness: float
-    """Height over the longest edge that a changed triangle must keep, unless it was narrower."""
+    """Least height over longest edge of a changed triangle, unless it was narrower before."""
     least_cosine: float
-    """Between normals of a triangle before and after."""
+    """Least cosine between the normals of a triangle before and after."""
 
 
 @part(fast=False)
 def _shapes_allow(gone, stays, mesh, bounds):
-    """Tell whether no face of ``gone`` turns, gets narrow or long when it moves to ``stays``."""
+    """Return whether all faces of ``gone`` stay within the bounds when it moves to ``stays``."""
     points, faces, head, following = mesh[0], mesh[1], mesh[2], mesh[3]
     longest_squared, _, least_roundness, least_cosine = bounds
     corner = head[gone]
@@ -85,18 +85,18 @@ def _shapes_allow(gone, stays, mesh, bounds):
 
 @part(fast=False)
 def _cheapest(vertex, mesh, counts, bounds, ring):
-    """Return the neighbour that ``vertex`` merges into at the least price, and the price.
+    """Return the neighbour that ``vertex`` merges into at the least cost, and the cost.
 
-    (-1, inf) without one. Equal prices go by number, so that the order of faces does not matter.
+    (-1, inf) if there is none. Ties are broken by index, so the order of faces does not matter.
     """
     points, faces, head, following, quadrics = mesh[0], mesh[1], mesh[2], mesh[3], mesh[4]
     shape_weight = bounds[1]
     best, lowest = -1, np.inf
-    drop_dead(vertex, faces, head, following)
+    unlink_dead_faces(vertex, faces, head, following)
     around, mark = mark_ring(vertex, mesh, counts, ring)
     if around > MAX_RING:
         return best, lowest
-    # Nothing merges into a neighbour with more faces than MAX_RING, although a vertex with three
+    # No vertex merges into a neighbour with more faces than MAX_RING, although one with three
     # faces would leave it with that number.
     limit = MAX_RING - 1 if around == 3 else MAX_RING
     for i in range(around):
@@ -108,7 +108,7 @@ def _cheapest(vertex, mesh, counts, bounds, ring):
         price = error + shape_weight * quadrics[vertex, WEIGHT] * square
         if price > lowest or (price == lowest and stays > best):
             continue
-        drop_dead(stays, faces, head, following)
+        unlink_dead_faces(stays, faces, head, following)
         if not link_allows(vertex, stays, around, mark, limit, mesh, counts):
             continue
         if _shapes_allow(vertex, stays, mesh, bounds):
@@ -120,12 +120,12 @@ def _cheapest(vertex, mesh, counts, bounds, ring):
 def _push(vertex, price, stamp, heap, counts):
     slot = counts[HEAP_SIZE]
     heap[0][slot], heap[1][slot], heap[2][slot] = price, vertex, stamp
-    take_in_last(heap, counts)
+    sift_up_last(heap, counts)
 
 
 @kernel(fast=False)
 def push_vertices(mesh, heap, counts, bounds):
-    """Put every vertex that can go into the empty heap, which must have room for all."""
+    """Push every removable vertex onto the empty heap, which must have room for all."""
     head, stamps = mesh[2], mesh[5]
     ring = np.empty(MAX_RING, np.int64)
     for vertex in range(len(head)):
@@ -146,7 +146,7 @@ def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
     bounds : tuple
         Values of :class:`ShapeBounds`.
     budget : int
-        Entries looked at.
+        Greatest number of entries to pop.
     """
     stamps = mesh[5]
     ring, changed = np.empty(MAX_RING, np.int64), np.empty(MAX_RING + 1, np.int64)
@@ -159,7 +159,7 @@ def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
         if counts[HEAP_SIZE] > room:
             return FULL
         price, gone, stamp = heap[0][0], heap[1][0], heap[2][0]
-        drop_first(heap, counts)
+        pop_first(heap, counts)
         if stamps[gone] != stamp:
             continue
         stays, now = _cheapest(gone, mesh, counts, bounds, ring)
@@ -169,7 +169,7 @@ def collapse_half_edges(mesh, heap, counts, bounds, target, budget):
             stamps[gone] += 1
             _push(gone, now, stamps[gone], heap, counts)
             continue
-        merge(stays, gone, mesh, counts)
+        merge_vertices(stays, gone, mesh, counts)
         around, _ = mark_ring(stays, mesh, counts, changed)
         changed[around] = stays
         for slot in range(around + 1):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Binary heap over columns, so that a long run can stop, grow the heap and go on (numba).
+"""Binary heap over columns, so that a long run can pause, grow the heap and resume (numba).
 
-A heap is a tuple of arrays of one length: costs float64, ties int64, then any int64 columns. The
+A heap is a tuple of arrays of equal length: costs float64, ties int64, then any int64 columns. The
 entry with the least (cost, tie) comes first; ``counts[HEAP_SIZE]`` entries are in use.
 """
 # mypy: disable-error-code="no-untyped-def"
@@ -30,8 +30,8 @@ def _swap(heap, a, b):
 
 
 @part(fast=False)
-def take_in_last(heap, counts):
-    """Add the entry that was written behind the last one."""
+def sift_up_last(heap, counts):
+    """Add the entry that was written after the last one."""
     slot = counts[HEAP_SIZE]
     counts[HEAP_SIZE] += 1
     while slot > 0 and _less(heap, slot, (slot - 1) // 2):
@@ -47,11 +47,11 @@ def _copy(heap, source, target):
 
 
 @part(fast=False)
-def drop_first(heap, counts):
+def pop_first(heap, counts):
     """Remove the cheapest entry."""
     last = counts[HEAP_SIZE] - 1
     counts[HEAP_SIZE] = last
-    # The last entry takes the place that becomes free on the way down.
+    # The last entry fills the hole at the end of the path of smaller children.
     slot = 0
     while True:
         child = 2 * slot + 1

@@ -1,28 +1,28 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The link condition: which edges can collapse so that a manifold stays one (numba).
+"""Link condition: which edges can be collapsed without changing the topology (numba).
 
 Dey, Edelsbrunner, Guha and Nekhayev, "Topology preserving edge contraction" (1999). Members of a
-ring are marked with numbers that only grow, so that no mark has to be erased.
+ring are marked with increasing numbers, so that marks need not be erased.
 """
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
 
 from ...kernels.compiled import part
-from .counters import TICK
+from .counters import LAST_MARK
 
 
 @part(fast=False)
 def mark_ring(u, mesh, counts, ring):
     """Mark the neighbours of ``u``; return the number of its faces, and the mark.
 
-    The marks hold until another ring is marked. Dead faces must have been dropped. ``ring`` (n,) is
-    filled with the vertices that follow ``u`` in its faces, as many as fit: where the mesh is
-    closed, that is each neighbour once.
+    The marks are valid until another ring is marked. Dead faces must have been unlinked. ``ring``
+    (n,) is filled with the vertices that follow ``u`` in its faces, as many as fit: on a closed
+    mesh, each neighbour once.
     """
     faces, head, following, marks = mesh[1], mesh[2], mesh[3], mesh[6]
-    counts[TICK] += 1
-    mark = counts[TICK]
+    counts[LAST_MARK] += 1
+    mark = counts[LAST_MARK]
     around = 0
     corner = head[u]
     while corner >= 0:
@@ -38,18 +38,18 @@ def mark_ring(u, mesh, counts, ring):
 
 @part(fast=False)
 def link_allows(u, v, around_u, mark, max_ring, mesh, counts):
-    """Tell whether the surface stays a manifold when ``u`` and ``v`` merge.
+    """Return whether the surface stays a manifold when ``u`` and ``v`` merge.
 
     Parameters
     ----------
     around_u, mark : int
-        Of :func:`mark_ring` for ``u``.
+        From :func:`mark_ring` for ``u``.
     max_ring : int
-        Faces around the merged vertex at most.
+        Most faces around the merged vertex.
     """
     faces, head, following, marks = mesh[1], mesh[2], mesh[3], mesh[6]
-    counts[TICK] += 1
-    seen = counts[TICK]
+    counts[LAST_MARK] += 1
+    seen = counts[LAST_MARK]
     around_v, shared, common = 0, 0, 0
     corner = head[v]
     while corner >= 0:

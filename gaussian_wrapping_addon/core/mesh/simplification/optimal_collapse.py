@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Edge collapses with optimal placement, each checked before it is done (numba).
+"""Edge collapses with optimal placement, each validated before it is made (numba).
 
 The heap holds edges in six columns: costs, sequence numbers, stamps (the sum of both ends'), first
-and second ends, kinds of placement. An edge whose best place is refused is tried with its ends.
+and second ends, kinds of placement. If the optimal position is refused, the ends are tried.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -13,49 +13,50 @@ from typing import NamedTuple
 import numpy as np
 
 from ...kernels.compiled import kernel, part
-from .corners import drop_dead, merge
+from .corners import merge_vertices, unlink_dead_faces
 from .counters import DONE, EMPTY, FACES_LEFT, FULL, HEAP_ROOM, HEAP_SIZE, PAUSED, SEQUENCE
-from .heap import drop_first, take_in_last
+from .heap import pop_first, sift_up_last
 from .link_condition import link_allows, mark_ring
-from .optimal_placement import BEST, FIRST, SECOND, place_merged, within
+from .optimal_placement import FIRST, OPTIMAL, SECOND, on_planes_of, place_merged
 from .quadrics import area_vector
 
 POINT_WEIGHT = 1e-7
-"""Weight of the distance to the vertices beside the distance to the planes. A flat patch has a best
-point by it; more of it (1e-4) would make collapses across a thin plate cheaper than along it."""
+"""Weight of the distance to the vertices relative to the distance to the planes. It makes the
+optimum unique on flat patches; 1e-4 would make collapses across a thin plate cheaper than along it.
+"""
 
 MAX_RING = 48
-"""Faces around a merged vertex at most: fans of needles bake and subdivide badly."""
+"""Most faces around a merged vertex: fans of needles bake and subdivide badly."""
 
 HEAP_COLUMNS = 5
-"""Columns of integers of the heap."""
+"""Integer columns of the heap."""
 
 
 class Limits(NamedTuple):
-    """What a collapse may do to the faces around it."""
+    """Bounds on the faces around a collapsed edge."""
 
     turn_cos: float
-    """Cosine of the largest turn of a face in one collapse."""
+    """Cosine of the largest rotation of a face in one collapse."""
     fold_cos: float
-    """Cosine of the sharpest bend between neighbours that may come up: -1 is folded back flat."""
+    """Cosine of the sharpest new bend between neighbours: -1 is folded back flat."""
     min_shape: float
     """Least height of a new face over its longest edge, unless the face was narrower before."""
 
 
 @part(fast=False)
-def _push(u, v, first_kind, mesh, caps, heap, counts, work):
-    """Put an edge into the heap, where the merged vertex can go anywhere."""
+def _push(u, v, first_kind, mesh, caps, heap, counts, scratch):
+    """Push an edge onto the heap if a placement of the merged vertex exists."""
     cost, kind = np.inf, first_kind
-    if first_kind == BEST:
-        cost = place_merged(u, v, BEST, mesh, caps, work)
+    if first_kind == OPTIMAL:
+        cost = place_merged(u, v, OPTIMAL, mesh, caps, scratch)
     if not cost < np.inf and first_kind != SECOND:
-        cost, kind = place_merged(u, v, FIRST, mesh, caps, work), FIRST
-        other = place_merged(u, v, SECOND, mesh, caps, work)
+        cost, kind = place_merged(u, v, FIRST, mesh, caps, scratch), FIRST
+        other = place_merged(u, v, SECOND, mesh, caps, scratch)
         if other < cost:
-            # Ends exchanged, so that the cheaper one is always tried first.
+            # Exchange the ends, so that the cheaper one is always tried first.
             u, v, cost = v, u, other
     elif first_kind == SECOND:
-        cost = place_merged(u, v, SECOND, mesh, caps, work)
+        cost = place_merged(u, v, SECOND, mesh, caps, scratch)
     if not cost < np.inf:
         return
     stamps, slot = mesh[5], counts[HEAP_SIZE]
@@ -63,12 +64,12 @@ def _push(u, v, first_kind, mesh, caps, heap, counts, work):
     heap[2][slot] = stamps[u] + stamps[v]
     heap[3][slot], heap[4][slot], heap[5][slot] = u, v, kind
     counts[SEQUENCE] += 1
-    take_in_last(heap, counts)
+    sift_up_last(heap, counts)
 
 
 @part(fast=False)
-def _across(b, c, mesh, skip_u, skip_v):
-    """Return the face on the other side of the half-edge b -> c that holds neither end, or -1."""
+def _opposite_face(b, c, mesh, skip_u, skip_v):
+    """Return the face opposite the half-edge b -> c if it contains neither end, else -1."""
     faces, head, following = mesh[1], mesh[2], mesh[3]
     corner = head[b]
     while corner >= 0:
@@ -82,17 +83,17 @@ def _across(b, c, mesh, skip_u, skip_v):
 
 @part(fast=False)
 def _shapes_allow(u, v, mesh, limits, place, ring, ring_normals):
-    """Tell whether no face turns over, folds back onto a neighbour, or becomes a needle.
+    """Return the number of remaining faces, or -1 if a face violates the limits.
 
-    ``ring`` and ``ring_normals`` are filled with the outer edges and new unit normals of the faces
-    that stay.
+    A face must not turn over, fold back onto a neighbour or become a needle. ``ring`` and
+    ``ring_normals`` are filled with the outer edges and new unit normals of the remaining faces.
     """
     points, faces, head, following = mesh[0], mesh[1], mesh[2], mesh[3]
     turn_cos, fold_cos, min_shape = limits
     x, y, z = place[0], place[1], place[2]
     size = 0
-    for turn in range(2):
-        centre, other = (u, v) if turn == 0 else (v, u)
+    for side in range(2):
+        centre, other = (u, v) if side == 0 else (v, u)
         corner = head[centre]
         while corner >= 0:
             f, k = corner // 3, corner % 3
@@ -125,7 +126,7 @@ def _shapes_allow(u, v, mesh, limits, place, ring, ring_normals):
             ring[size, 0], ring[size, 1] = b, c
             ring_normals[size, 0], ring_normals[size, 1] = nx / new, ny / new
             ring_normals[size, 2] = nz / new
-            beyond = _across(b, c, mesh, u, v)
+            beyond = _opposite_face(b, c, mesh, u, v)
             if beyond >= 0:
                 a = faces[beyond, 0]
                 mx, my, mz = area_vector(
@@ -151,29 +152,29 @@ def _shapes_allow(u, v, mesh, limits, place, ring, ring_normals):
 
 @part(fast=False)
 def _merge(u, v, mesh, caps, counts, place):
-    """Let ``v`` become ``u``, at ``place``, on the planes of both."""
+    """Merge ``v`` into ``u`` at ``place``, on the planes of both."""
     points, planes, locked = mesh[0], caps[0], caps[1]
-    merge(u, v, mesh, counts)
-    if not within(planes, v, u):
+    merge_vertices(u, v, mesh, counts)
+    if not on_planes_of(planes, v, u):
         planes[u] = planes[v]
     points[u] = place
     locked[u] = locked[u] or locked[v]
 
 
 @kernel(fast=False)
-def push_edges(mesh, caps, heap, counts, work):
-    """Put every edge into the empty heap, which must have room for half of all corners."""
+def push_edges(mesh, caps, heap, counts, scratch):
+    """Push every edge onto the empty heap, which must have room for half of all corners."""
     faces = mesh[1]
     for f in range(len(faces)):
         if faces[f, 0] >= 0:
             for k in range(3):
                 u, v = faces[f, k], faces[f, (k + 1) % 3]
                 if u < v:
-                    _push(u, v, BEST, mesh, caps, heap, counts, work)
+                    _push(u, v, OPTIMAL, mesh, caps, heap, counts, scratch)
 
 
 @kernel(fast=False)
-def collapse_edges(mesh, caps, heap, counts, limits, work, target, budget):
+def collapse_edges(mesh, caps, heap, counts, limits, scratch, target, budget):
     """Collapse the cheapest edges until ``target`` faces are left.
 
     Parameters
@@ -185,13 +186,13 @@ def collapse_edges(mesh, caps, heap, counts, limits, work, target, budget):
     work : (8, 3) float64
         Scratch.
     budget : int
-        Entries looked at.
+        Greatest number of entries to pop.
     """
     faces, head, following, stamps = mesh[1], mesh[2], mesh[3], mesh[5]
     unused = np.empty(0, np.int64)
     ring = np.empty((MAX_RING + 4, 2), np.int64)
     ring_normals = np.empty((MAX_RING + 4, 3), np.float64)
-    place = work[0]
+    place = scratch[0]
     room = len(heap[0]) - HEAP_ROOM
     for _ in range(budget):
         if counts[FACES_LEFT] <= target:
@@ -202,21 +203,21 @@ def collapse_edges(mesh, caps, heap, counts, limits, work, target, budget):
             return FULL
         u, v, kind = heap[3][0], heap[4][0], heap[5][0]
         current = stamps[u] + stamps[v] == heap[2][0]
-        drop_first(heap, counts)
+        pop_first(heap, counts)
         if not current or head[u] < 0 or head[v] < 0:
             continue
-        drop_dead(u, faces, head, following)
-        drop_dead(v, faces, head, following)
+        unlink_dead_faces(u, faces, head, following)
+        unlink_dead_faces(v, faces, head, following)
         around, mark = mark_ring(u, mesh, counts, unused)
         if not link_allows(u, v, around, mark, MAX_RING, mesh, counts):
             continue
-        place_merged(u, v, kind, mesh, caps, work)
+        place_merged(u, v, kind, mesh, caps, scratch)
         size = _shapes_allow(u, v, mesh, limits, place, ring, ring_normals)
         if size < 0:
             if kind != SECOND:
-                _push(u, v, kind + 1, mesh, caps, heap, counts, work)
+                _push(u, v, kind + 1, mesh, caps, heap, counts, scratch)
             continue
         _merge(u, v, mesh, caps, counts, place)
         for i in range(size):
-            _push(u, ring[i, 0], BEST, mesh, caps, heap, counts, work)
+            _push(u, ring[i, 0], OPTIMAL, mesh, caps, heap, counts, scratch)
     return PAUSED

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where a merged vertex goes: to the least error, on the planes that its ends lie on (numba).
+"""Optimal position of a merged vertex: least error on the planes of its ends (numba).
 
 ``caps`` is the tuple of planes (v, 3) int64 that each vertex lies on (-1: none), locked (v,) bool,
 normals (k, 3) and offsets (k,) float64: inside is ``normal . x <= offset``.
@@ -13,13 +13,13 @@ import numpy as np
 from ...kernels.compiled import part
 from .quadrics import error_of_both
 
-BEST, FIRST, SECOND = 0, 1, 2
-"""Kinds of collapses: the merged vertex goes where the error is least, or to one of the ends."""
+OPTIMAL, FIRST, SECOND = 0, 1, 2
+"""Placements of the merged vertex: at the least error, or at one of the ends."""
 
 
 @part(fast=False)
-def within(planes, u, v):
-    """Tell whether ``v`` lies on every plane that ``u`` lies on."""
+def on_planes_of(planes, u, v):
+    """Return whether ``v`` lies on every plane that ``u`` lies on."""
     for i in range(3):
         if planes[u, i] >= 0:
             found = False
@@ -32,7 +32,12 @@ def within(planes, u, v):
 
 @part(fast=False)
 def _free_directions(planes, normals, v, basis):
-    """Fill the rows of ``basis`` with directions in which ``v`` may move; return their number."""
+    """Fill ``basis`` with an orthonormal basis of the directions in which ``v`` may move.
+
+    Returns
+    -------
+    Number of directions.
+    """
     count = 0
     for i in range(3):
         if planes[v, i] >= 0:
@@ -48,7 +53,7 @@ def _free_directions(planes, normals, v, basis):
         for i in range(1, 3):
             if abs(n[i]) < abs(n[axis]):
                 axis = i
-        # The coordinate axis most across the normal, without its part along the normal.
+        # The coordinate axis most orthogonal to the normal, projected onto the plane.
         for i in range(3):
             basis[0, i] = (1.0 if i == axis else 0.0) - n[axis] * n[i]
         length = np.sqrt(basis[0, 0] ** 2 + basis[0, 1] ** 2 + basis[0, 2] ** 2)
@@ -73,7 +78,7 @@ def _free_directions(planes, normals, v, basis):
 
 @part(fast=False)
 def _solve(matrix, right, size):
-    """Solve a small symmetric positive system in place by elimination; ``right`` is the answer."""
+    """Solve a small symmetric positive definite system in place; ``right`` becomes the solution."""
     for i in range(size):
         if not matrix[i, i] > 0.0:
             return False
@@ -90,19 +95,22 @@ def _solve(matrix, right, size):
 
 
 @part(fast=False)
-def place_merged(u, v, kind, mesh, caps, work):
-    """Put the merged vertex into ``work[0]``; return its error, infinite where it may not go."""
+def place_merged(u, v, kind, mesh, caps, scratch):
+    """Write the position of the merged vertex to ``scratch[0]``; return its error.
+
+    The error is infinite where the placement is not allowed.
+    """
     points, quadrics = mesh[0], mesh[4]
     planes, locked, normals, offsets = caps
-    place, basis, matrix = work[0], work[1:4], work[4:7]
-    right = work[7]
-    u_in_v = not locked[u] and within(planes, u, v)
-    v_in_u = not locked[v] and within(planes, v, u)
-    if kind == FIRST or (kind == BEST and locked[u]):
+    place, basis, matrix = scratch[0], scratch[1:4], scratch[4:7]
+    right = scratch[7]
+    u_in_v = not locked[u] and on_planes_of(planes, u, v)
+    v_in_u = not locked[v] and on_planes_of(planes, v, u)
+    if kind == FIRST or (kind == OPTIMAL and locked[u]):
         if not v_in_u:
             return np.inf
         place[:] = points[u]
-    elif kind == SECOND or (kind == BEST and locked[v]):
+    elif kind == SECOND or (kind == OPTIMAL and locked[v]):
         if not u_in_v:
             return np.inf
         place[:] = points[v]
@@ -132,7 +140,7 @@ def place_merged(u, v, kind, mesh, caps, work):
             edge += (points[u, i] - points[v, i]) ** 2
         for i in range(size):
             step += right[i] ** 2
-        # No further than the edge is long: a nearly flat patch does not say where along it.
+        # At most one edge length: on a nearly flat patch the optimum is ill-defined.
         share = 1.0 if step <= edge else np.sqrt(edge / step)
         for i in range(size):
             for j in range(3):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Quadric error metrics: squared distances to planes, by area (numba).
+"""Quadric error metrics: area-weighted squared distances to planes (numba).
 
 Garland and Heckbert, "Surface simplification using quadric error metrics" (1997). A quadric is
 stored as (xx, xy, xz, yy, yz, zz, bx, by, bz, c, w): the error at p is p'Ap - 2 b'p + c, and w is
-the weight of all planes together. Each policy evaluates it in its own order of operations, which
-its results depend on in the last digits.
+the total weight of the planes. Each collapse strategy evaluates it in its own order of operations,
+on which its results depend in the last digits.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -15,7 +15,7 @@ import numpy as np
 from ...kernels.compiled import kernel, part
 
 COLUMNS = 11
-"""Of a quadric."""
+"""Columns of a quadric."""
 
 WEIGHT = 10
 """Column of the planes' total weight."""
@@ -30,11 +30,11 @@ def add_face_quadrics(points, faces, quadrics, scale, point_weight):
     points : (v, 3) float64
     faces : (f, 3) int64
     quadrics : (v, 11) float64
-        Changed in place.
+        Modified in place.
     scale : float
-        Weight of a plane over the length of the area vector, which is twice the area.
+        Weight of a plane per length of the area vector, which is twice the area.
     point_weight : float
-        Weight of the squared distance to the corner itself beside that to the plane.
+        Weight of the squared distance to the corner itself relative to that of the plane.
     """
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]

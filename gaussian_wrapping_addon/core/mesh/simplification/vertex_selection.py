@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which vertices of a dense closed mesh a coarser one keeps: those that its shape needs.
+"""Simplify a dense closed mesh to a subset of its vertices, by half-edge collapses.
 
-Density alone cannot follow a surface that curves one way only (a wire, a fold): long triangles
-along it would do. Removing vertices one by one, the cheapest first, finds both the places and the
-directions in which edges may be long. No vertex moves, so all stay on the isosurface.
+Point density alone cannot adapt to a surface that curves in one direction only (a wire, a fold),
+where long triangles along it suffice. Removing the cheapest vertex first finds both where and in
+which directions edges may be long. No vertex moves, so all stay on the isosurface.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from .engine import Simplification
 from .half_edge_collapse import HEAP_COLUMNS, ShapeBounds, collapse_half_edges, push_vertices
 
 SHAPE_WEIGHT = 1e-6
-"""Price of length beside that of height, both squared: it decides where the surface is flat."""
+"""Weight of squared length relative to squared height in the cost: it decides on flat surfaces."""
 
 LEAST_ROUNDNESS = 0.03
-"""Height over the longest edge that a changed triangle must keep, unless it was narrower."""
+"""Least height over longest edge of a changed triangle, unless it was narrower before."""
 
 LEAST_COSINE = 0.3
-"""Between normals of a triangle before and after a change."""
+"""Least cosine between the normals of a triangle before and after a change."""
 
 _NO_LIMIT = np.iinfo(np.int64).max
 
@@ -30,8 +30,8 @@ def select_vertices(
 ) -> np.ndarray:
     """Collapse edges onto one of their ends until ``target`` vertices are left.
 
-    The price of a vertex is the sum of squared distances from the vertex that replaces it to the
-    planes of all faces that it has stood for, by area (quadric error). A closed 2-manifold stays
+    The cost of a vertex is its quadric error: the area-weighted sum of squared distances from the
+    vertex that replaces it to the planes of all faces that it represents. A closed 2-manifold stays
     one, with the same genus and parts; no face turns over or becomes narrow.
 
     Parameters
@@ -40,9 +40,9 @@ def select_vertices(
     faces : (f, 3) int
         A closed 2-manifold, every vertex used.
     target : int
-        Number of vertices; more stay where no vertex can go.
+        Number of vertices; more remain if no other can be removed.
     longest : float
-        No edge becomes longer.
+        Greatest length of a new edge.
 
     Returns
     -------
@@ -55,7 +55,7 @@ def select_vertices(
     unit = float((high - low).max())
     local = np.ascontiguousarray((vertices - (low + high) / 2) / unit)
     bounds = tuple(ShapeBounds((longest / unit) ** 2, SHAPE_WEIGHT, LEAST_ROUNDNESS, LEAST_COSINE))
-    # Planes weigh twice the area of their face; corners nothing.
+    # Planes are weighted by twice the area of their face; corners have no weight.
     run = Simplification(local, np.array(faces, np.int64, order="C"), 1.0, 0.0)
     heap = run.empty_heap(2 * len(vertices), HEAP_COLUMNS)
     push_vertices(run.mesh, heap, run.counts, bounds)

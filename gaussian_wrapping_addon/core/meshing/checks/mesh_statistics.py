@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Figures that tell whether a mesh is closed, manifold and in one piece."""
+"""Mesh statistics: topology, orientation, components and size."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class MeshStatistics:
     nonmanifold_vertices: int
     """Vertices whose faces form more than one fan."""
     inconsistent_edges: int
-    """Edges whose two faces disagree about the orientation."""
+    """Edges whose two faces have opposite orientations."""
     degenerate_faces: int
-    """Faces with two equal corners, or without area in float64."""
+    """Faces with two equal corners, or with no area in float64."""
     unused_vertices: int
     euler: int
     components: int
@@ -49,14 +49,14 @@ class MeshStatistics:
 
 
 def mesh_statistics(mesh: SurfaceMesh) -> MeshStatistics:
-    """Measure a mesh; any triangle mesh is accepted, an empty one too."""
+    """Measure a mesh; any triangle mesh is accepted, also an empty one."""
     vertices = np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
     begin, end = half_edges(faces)
     keys = edge_keys(begin, end, max(len(vertices), 1))
     edges, index, count = np.unique(keys, return_inverse=True, return_counts=True)
     forward = np.bincount(index, weights=begin < end, minlength=len(edges))
-    boundary, crowded = int((count == 1).sum()), int((count > 2).sum())
+    boundary, nonmanifold = int((count == 1).sum()), int((count > 2).sum())
     inconsistent = int(((count == 2) & (forward != 1)).sum())
     used = len(np.unique(faces))
     parts, part = face_components(len(vertices), faces)
@@ -64,14 +64,14 @@ def mesh_statistics(mesh: SurfaceMesh) -> MeshStatistics:
     _, areas = normals_and_areas(vertices, faces)
     repeated = (faces == faces[:, [1, 2, 0]]).any(1)
     fans = _fans(faces, keys)
-    closed = len(faces) > 0 and boundary == 0 and crowded == 0 and inconsistent == 0
+    closed = len(faces) > 0 and boundary == 0 and nonmanifold == 0 and inconsistent == 0
     euler = used - len(edges) + len(faces)
     manifold = closed and fans == used
     return MeshStatistics(
         vertices=len(vertices),
         faces=len(faces),
         boundary_edges=boundary,
-        nonmanifold_edges=crowded,
+        nonmanifold_edges=nonmanifold,
         nonmanifold_vertices=fans - used,
         inconsistent_edges=inconsistent,
         degenerate_faces=int((repeated | (areas <= 0)).sum()),
@@ -87,7 +87,7 @@ def mesh_statistics(mesh: SurfaceMesh) -> MeshStatistics:
 
 
 def _fans(faces: np.ndarray, keys: np.ndarray) -> int:
-    """Count fans: corners at one vertex, connected over shared edges."""
+    """Count fans: corners at one vertex, connected across shared edges."""
     corners = np.arange(faces.size)
     following = next_half_edges(corners)
     order = np.argsort(keys, kind="stable")

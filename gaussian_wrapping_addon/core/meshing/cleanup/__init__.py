@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From closed triangle sets to clean manifolds: repair, small handles, smoothing, boundaries.
+"""Mesh clean-up: manifold repair, small handles, degenerate faces, smoothing, open boundaries.
 
-In: a closed mesh. Out: a manifold without faces of no area.
+In: a closed mesh. Out: a manifold without degenerate faces.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a person may ask for after meshing: a smoother mesh, and one of fewer faces."""
+"""Optional post-processing of a mesh: smoothing and decimation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...field.isosurface_residual import level_errors
+from ...field.isosurface_residual import isosurface_residuals
 from ...mesh.simplification.decimation import decimate
 from ...mesh.surface_mesh import SurfaceMesh
 from ...progress import Progress
@@ -22,8 +22,8 @@ from .smoothing import smooth
 _logger = logging.getLogger(__name__)
 
 
-class CleanedUp(NamedTuple):
-    """A mesh as asked for, and the one with all its faces where some were taken away."""
+class CleanUpResult(NamedTuple):
+    """The processed mesh, and the one before decimation if it was decimated."""
 
     mesh: SurfaceMesh
     dense: SurfaceMesh | None
@@ -35,24 +35,24 @@ def clean_up(
     settings: MeshingSettings,
     vacancy: Any,
     progress: Progress,
-) -> CleanedUp:
-    """Smooth, then decimate, as the settings ask; without a request the mesh stays as it is.
+) -> CleanUpResult:
+    """Smooth, then decimate, as the settings request; otherwise return the mesh unchanged.
 
-    Both keep a closed 2-manifold closed and manifold, with its parts and their genus. Vertices then
-    lie off the isosurface by what was asked for: ``level_error_*`` of the provenance is measured
-    anew, at all vertices that are not on the region's boundary.
+    Both keep a closed 2-manifold closed and manifold, with its parts and their genus. They move
+    vertices off the isosurface, so ``level_error_*`` of the provenance is measured again, at all
+    vertices that are not on the region's boundary.
 
     Parameters
     ----------
     region : Region
         The region that the mesh was made in, same frame.
     settings : MeshingSettings
-        ``target_faces`` and ``smooth_steps`` are read.
+        ``target_faces`` and ``smooth_steps`` are used.
     vacancy : VacancyField
-        Or anything with ``vacancy(points)``.
+        Or any object with ``vacancy(points)``.
     """
     if settings.smooth_steps == 0 and not 0 < settings.target_faces < len(mesh.faces):
-        return CleanedUp(_with_request(mesh, settings), None)
+        return CleanUpResult(_with_request(mesh, settings), None)
     vertices, faces, colors = mesh.vertices, np.asarray(mesh.faces, np.int64), mesh.colors
     if settings.smooth_steps > 0:
         vertices = smooth(
@@ -70,7 +70,7 @@ def clean_up(
         if not result.reached:
             text = (
                 f"{len(faces)} faces are left of {len(mesh.faces)}, more than the "
-                f"{settings.target_faces} asked for: fewer would fold or tear the mesh."
+                f"{settings.target_faces} requested: fewer would fold or tear the mesh."
             )
             notes.append(ReportWarning("more-faces-left", text).to_json())
         _logger.info("Decimated %d faces to %d", len(mesh.faces), len(faces))
@@ -82,7 +82,7 @@ def clean_up(
         "smooth_steps": settings.smooth_steps,
         "target_faces": settings.target_faces,
         "faces_before_clean_up": len(mesh.faces),
-        **level_errors(vacancy, vertices[~capped]),
+        **isosurface_residuals(vacancy, vertices[~capped]),
         "vertices_on_surface": int((~capped).sum()),
         "vertices_on_region_boundary": int(capped.sum()),
         "vertices_at_end_of_sight": 0,
@@ -90,15 +90,15 @@ def clean_up(
     }
     progress.update(1.0, f"{len(faces)} faces")
     cleaned = SurfaceMesh(vertices, faces.astype(np.int32), colors, provenance)
-    return CleanedUp(cleaned, dense if len(faces) < len(mesh.faces) else None)
+    return CleanUpResult(cleaned, dense if len(faces) < len(mesh.faces) else None)
 
 
 def _with_request(mesh: SurfaceMesh, settings: MeshingSettings) -> SurfaceMesh:
-    """Say so where fewer faces were asked for than there are anyway."""
+    """Add a note if the requested number of faces is not below the present one."""
     if settings.target_faces == 0:
         return mesh
     text = (
-        f"The mesh has {len(mesh.faces)} faces, fewer than the {settings.target_faces} asked for: "
+        f"The mesh has {len(mesh.faces)} faces, fewer than the {settings.target_faces} requested: "
         "nothing was decimated."
     )
     note = ReportWarning("not-decimated", text).to_json()

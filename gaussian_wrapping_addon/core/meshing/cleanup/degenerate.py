@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Faces without area, removed from a closed manifold by flips and collapses."""
+"""Remove degenerate faces from a closed manifold by edge flips and collapses."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ SHORT_HEIGHTS = 2.0
 
 PATIENT_PASSES = 5
 MAX_SHORT_HEIGHTS = 64.0
-"""After some passes longer ones are as well, twice as long each time up to this: where several flat
-faces lie together, flips can go round in circles."""
+"""After these passes the length doubles each time, up to this: among several adjacent flat faces,
+flips can cycle."""
 
 
 def narrow_faces(vertices: np.ndarray, faces: np.ndarray, height: float) -> np.ndarray:
@@ -30,10 +30,10 @@ def narrow_faces(vertices: np.ndarray, faces: np.ndarray, height: float) -> np.n
 def remove_degenerate(
     vertices: np.ndarray, faces: np.ndarray, height: float, region: Region | None = None
 ) -> tuple[np.ndarray, int]:
-    """Remove faces narrower than ``height``: needles by collapse, flat ones by flipping.
+    """Remove faces narrower than ``height``: needles by edge collapses, flat ones by edge flips.
 
-    Every step keeps a closed 2-manifold closed and manifold; a face that no step can remove
-    stays. Vertices are not moved, so the surface changes by about ``height``.
+    Every step keeps a closed 2-manifold closed and manifold; faces that no step can remove
+    stay. Vertices are not moved, so the surface changes by about ``height``.
 
     Parameters
     ----------
@@ -41,15 +41,15 @@ def remove_degenerate(
     faces : (f, 3) int64
         A closed 2-manifold.
     region : Region, optional
-        No vertex on its boundary is merged into one that lies on fewer of its planes, and no edge
-        of its own is flipped, but for one beside a third point of it: caps stay on their planes.
+        Keeps caps on the region's planes: no vertex is merged into one that lies on fewer of these
+        planes, and no edge of the region is flipped unless the third vertex lies on it as well.
 
     Returns
     -------
     faces : (g, 3) int64
         Over the same vertices, some of which may be unused.
     left : int
-        Degenerate faces that stay.
+        Degenerate faces that remain.
     """
     narrow = narrow_faces(vertices, faces, height)
     planes = _plane_sets(vertices, faces, narrow, region)
@@ -59,11 +59,11 @@ def remove_degenerate(
         longer = 2.0 ** max(0, done - PATIENT_PASSES)
         short = height * min(SHORT_HEIGHTS * longer, MAX_SHORT_HEIGHTS)
         near, frozen = _surroundings(len(vertices), faces, narrow)
-        mesh = _Editable(faces[near], frozen)
+        mesh = _HalfEdgeMesh(faces[near], frozen)
         changed = False
         for face in np.searchsorted(near, narrow).tolist():
             if mesh.faces[face] is not None:
-                changed |= _improve(mesh, vertices, face, short, planes)
+                changed |= _remove_face(mesh, vertices, face, short, planes)
         if not changed:
             if short >= height * MAX_SHORT_HEIGHTS:
                 break
@@ -83,7 +83,7 @@ _NO_PLANES: frozenset[int] = frozenset()
 def _plane_sets(
     vertices: np.ndarray, faces: np.ndarray, narrow: np.ndarray, region: Region | None
 ) -> dict[int, frozenset[int]]:
-    """Return the region's planes that each corner of a narrow face lies on, where there are any."""
+    """Map corners of narrow faces to the region's planes that they lie on, if any."""
     if region is None or len(narrow) == 0:
         return {}
     corners = np.unique(faces[narrow])
@@ -97,11 +97,11 @@ def _plane_sets(
 
 
 def _surroundings(count: int, faces: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, set[int]]:
-    """Return indices of all faces around the chosen ones and their neighbours, increasing.
+    """Return increasing indices of the faces within two rings of the chosen ones.
 
-    A step looks at the faces around the corners of a narrow face and of its neighbours; the lists
-    that it edits would take ten times the memory of the mesh, if they held all of it. Also returns
-    the vertices that have faces beyond: steps that would need to know those wait for the next pass.
+    A step visits the faces around the corners of a narrow face and of its neighbours; editable
+    lists of the whole mesh would take ten times its memory. Also returns the vertices that have
+    faces beyond: steps that would need those wait for the next pass.
     """
     for _ in range(2):
         touched = np.zeros(count, np.bool_)
@@ -113,8 +113,8 @@ def _surroundings(count: int, faces: np.ndarray, chosen: np.ndarray) -> tuple[np
     return chosen, set(here[beyond[here]].tolist())
 
 
-class _Editable:
-    """Faces by half-edge, for a few local changes."""
+class _HalfEdgeMesh:
+    """Editable half-edge structure for local changes."""
 
     def __init__(self, faces: np.ndarray, frozen: set[int]) -> None:
         self.frozen = frozen
@@ -188,8 +188,8 @@ class _Editable:
         return next(v for v in face if v not in (begin, end))
 
 
-def _improve(
-    mesh: _Editable,
+def _remove_face(
+    mesh: _HalfEdgeMesh,
     vertices: np.ndarray,
     face: int,
     short: float,
@@ -211,8 +211,8 @@ def _improve(
         a, b = corners[shortest], corners[(shortest + 1) % 3]
         if merged(a, b) or merged(b, a):
             return True
-        # Both have a third neighbour in common. Often that is a tip whose three faces are a fin
-        # without volume, for its base is as short as this edge.
+        # The ends have a third neighbour in common. Often that is a tip whose three faces form a
+        # fin without volume, since its base is as short as this edge.
         for tip in corners:
             if (
                 len(mesh.around[tip]) == 3
@@ -223,6 +223,6 @@ def _improve(
     a, b = corners[longest], corners[(longest + 1) % 3]
     third = corners[(longest + 2) % 3]
     shared = planes.get(a, _NO_PLANES) & planes.get(b, _NO_PLANES)
-    # Three points of the region's edge: the other two sides run along it in place of this one.
+    # Three points on an edge of the region: the other two sides run along it instead.
     along = shared <= planes.get(third, _NO_PLANES)
     return (len(shared) < 2 or along) and mesh.flip(a, b)

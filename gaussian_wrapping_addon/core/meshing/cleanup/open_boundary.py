@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A closed mesh opened where its region cuts the solid: the faces on the region's planes go."""
+"""Open a closed mesh where its region cuts the solid, by removing the caps."""
 
 from __future__ import annotations
 
@@ -15,21 +15,24 @@ from ...mesh.surface_mesh import SurfaceMesh
 from ...mesh.topology import edge_keys, half_edges, next_half_edges, normals_and_areas
 from ...regions.cap_planes import ON_PLANE_SHARE, cap_planes
 from ...regions.convex_region import Region
-from .repair import APART_SHARE
+from .repair import SEPARATION_SHARE
 
-MOVED_SHARE = 1.5 * APART_SHARE
-"""A vertex that repair moved may be off its plane by this share of its face's longest edge."""
+MOVED_SHARE = 1.5 * SEPARATION_SHARE
+"""A vertex moved by the repair may be off its plane by this share of its face's longest edge."""
 
 ALONG_COSINE = 0.9
-"""With such a vertex a face belongs to a cap only if it still faces out of the region."""
+"""A face with such a vertex belongs to a cap only if its normal agrees with the plane's: least
+cosine."""
 
 
-def opened(mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0) -> SurfaceMesh:
-    """Return the mesh without the faces that close it at the region's boundary.
+def without_caps(
+    mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0
+) -> SurfaceMesh:
+    """Remove the caps: the faces that close a mesh at the region's boundary.
 
-    What stays is consistently oriented and manifold, with boundary edges on the region's planes
-    alone. A solid may fall into pieces by that; small ones are removed as floaters are.
-    ``provenance`` counts the faces left out, the pieces removed, and the parts that stay.
+    The result is consistently oriented and manifold, with boundary edges on the region's planes
+    alone. A solid may fall into pieces; small ones are removed like floaters. ``provenance`` counts
+    the removed faces, the removed pieces and the remaining parts.
 
     Parameters
     ----------
@@ -43,7 +46,7 @@ def opened(mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0) 
     Raises
     ------
     MeshingError
-        Nothing stays: the region lies within a solid.
+        No faces remain: the region lies within a solid.
     """
     vertices, faces = mesh.vertices.copy(), np.asarray(mesh.faces, np.int64)
     on_cap = np.zeros(len(faces), np.bool_)
@@ -52,8 +55,8 @@ def opened(mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0) 
     for normal, offset in zip(*region.half_spaces, strict=True):
         distance = (vertices - region.center) @ normal - offset  # (v,)
         cap = _cap_faces(vertices, faces, normal, distance, on_any, tolerance)
-        # Repair may have moved a vertex of the rim: it goes back, so that the rim is on the plane.
-        # One that lies on another plane stays there: between planes of a round body it would leave.
+        # Rim vertices moved by the repair are projected back onto the plane. Those on another plane
+        # stay there: between the planes of a round region they would leave it.
         rim = np.unique(faces[cap])
         rim = rim[~on_any[rim]]
         vertices[rim] -= distance[rim, None] * normal
@@ -62,7 +65,7 @@ def opened(mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0) 
     stays = faces[~on_cap]
     if len(stays) == 0:
         raise MeshingError(
-            f"Region {region.name!r} lies within a solid: without its boundary nothing is left.",
+            f"Region {region.name!r} lies within a solid: with an open boundary nothing is left.",
             "Draw the region around a surface, or keep the boundary closed.",
         )
     split, source = split_fans(stays)
@@ -88,7 +91,7 @@ def opened(mesh: SurfaceMesh, region: Region, min_component_share: float = 0.0) 
 
 
 def _within(points: np.ndarray, region: Region) -> np.ndarray:
-    """Move points (n, 3) that lie just outside of a region onto the plane that they crossed."""
+    """Project points (n, 3) just outside a region onto the plane that they crossed."""
     normals, offsets = region.half_spaces
     points = points.copy()
     for _ in range(len(normals)):
@@ -110,9 +113,9 @@ def _cap_faces(
     on_any: np.ndarray,
     tolerance: float,
 ) -> np.ndarray:
-    """Tell which faces lie on one plane of the region, (f,) bool.
+    """Return which faces lie on one plane of the region, (f,) bool.
 
-    A face of which repair has moved a corner counts, unless other corners lie on other planes.
+    A face with a corner moved by the repair counts, unless other corners lie on other planes.
     """
     exact = np.abs(distance) <= tolerance  # (v,)
     cap = exact[faces].all(1)
@@ -127,7 +130,7 @@ def _cap_faces(
 
 
 def split_fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give each fan of faces around a vertex its own vertex; edges may have one or two faces.
+    """Split vertices so that each fan of faces has its own; edges may have one or two faces.
 
     Returns
     -------
@@ -147,5 +150,5 @@ def split_fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     columns = np.concatenate([following[second], second])
     graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(faces.size,) * 2)
     _, label = connected_components(graph, directed=False)
-    _, place, number = np.unique(label, return_index=True, return_inverse=True)
-    return number.reshape(-1, 3), faces.reshape(-1)[place]
+    _, first_corner, number = np.unique(label, return_index=True, return_inverse=True)
+    return number.reshape(-1, 3), faces.reshape(-1)[first_corner]

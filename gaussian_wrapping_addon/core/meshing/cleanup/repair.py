@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Closed triangle sets made into 2-manifolds."""
+"""Turn closed triangle sets into 2-manifolds by splitting non-manifold edges and vertices."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from scipy.sparse.csgraph import connected_components
 from ...errors import MeshingError
 from ...mesh.topology import faces_per_edge, half_edges, next_half_edges
 
-APART_SHARE = 0.005
-"""Copies of a vertex move this share of the way to the middle of their own faces, so that the
+SEPARATION_SHARE = 0.005
+"""Copies of a vertex move this share of the way to the centroid of their own faces, so that the
 parts do not touch and programs that merge equal points do not join them again. With four times as
-much, coarse meshes of thin things left the isosurface: 99 % of a room's vertices were within 0.05
-of the level, not within 0.02."""
+much, coarse meshes of thin structures left the isosurface: 99 % of a room's vertices were within
+0.05 of the level, not within 0.02."""
 
 MAX_PASSES = 20
 
@@ -24,7 +24,7 @@ _DEFECT = "Send the job folder's log.txt with a bug report."
 
 
 @dataclass(frozen=True)
-class Repaired:
+class RepairResult:
     """A closed 2-manifold."""
 
     vertices: np.ndarray
@@ -32,19 +32,19 @@ class Repaired:
     faces: np.ndarray
     """(f, 3) int64."""
     origin: np.ndarray
-    """(v,) int64: the vertex it was, or -1 for middles of split edges."""
+    """(v,) int64: the original vertex, or -1 for midpoints of split edges."""
     split_vertices: int
     """Copies that were added."""
     split_edges: int
-    """Edges that needed a vertex in their middle."""
+    """Edges that were split at their midpoint."""
 
 
-def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> Repaired:
+def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> RepairResult:
     """Split edges with more than two faces, and vertices with more than one fan of faces.
 
     Around an edge, faces that bound the same wedge of the solid stay together. Where both copies
-    of such an edge would still join the same two vertices, they get a vertex of their own each in
-    the middle. No face is removed, so the enclosed solid stays.
+    of such an edge would still join the same two vertices, each is split at its midpoint. No face
+    is removed, so the enclosed solid is kept.
 
     Parameters
     ----------
@@ -66,10 +66,10 @@ def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> Repaired:
         partner = _partners(vertices, faces)
         new_faces, source = _fans(faces, partner)
         vertices, origin = vertices[source], origin[source]
-        bad = _crowded(new_faces)
+        bad = _nonmanifold_half_edges(new_faces)
         if not bad.any():
             break
-        pairs = _one_per_face(bad, partner)
+        pairs = _independent_pairs(bad, partner)
         middles = (vertices[new_faces.reshape(-1)[pairs]] + vertices[_ends(new_faces)[pairs]]) / 2
         new_faces = _split_at_middles(new_faces, pairs, partner, len(vertices))
         vertices = np.concatenate([vertices, middles])
@@ -81,8 +81,8 @@ def split_nonmanifold(vertices: np.ndarray, faces: np.ndarray) -> Repaired:
             "The surface could not be made manifold.",
             _DEFECT,
         )
-    moved = _apart(vertices, new_faces, origin)
-    return Repaired(moved, new_faces, origin, len(moved) - before - split_edges, split_edges)
+    moved = _separate_copies(vertices, new_faces, origin)
+    return RepairResult(moved, new_faces, origin, len(moved) - before - split_edges, split_edges)
 
 
 def _ends(faces: np.ndarray) -> np.ndarray:
@@ -90,7 +90,7 @@ def _ends(faces: np.ndarray) -> np.ndarray:
 
 
 def _partners(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return for each half-edge the opposite one that bounds the same wedge of the solid."""
+    """Pair each half-edge with the opposite one that bounds the same wedge of the solid."""
     begin, end = half_edges(faces)
     low, high = np.minimum(begin, end), np.maximum(begin, end)
     forward = begin < end
@@ -128,8 +128,8 @@ def _wedges(
     first = arms[0] / max(float(np.linalg.norm(arms[0])), 1e-300)
     angle = np.arctan2(arms @ np.cross(axis, first), arms @ first) % (2 * np.pi)
     order = np.argsort(angle, kind="stable")
-    # Seen along the axis (low -> high), a face that runs forward has the solid on the clockwise
-    # side of its arm, so a wedge ends at it and begins at a backward one: pair each backward face
+    # Seen along the axis (low -> high), a forward face has the solid on the clockwise side of its
+    # arm, so a wedge begins at a backward face and ends at a forward one: pair each backward face
     # with the next forward one, like brackets, cyclically.
     pairs: list[tuple[int, int]] = []
     waiting: list[int] = []
@@ -149,7 +149,7 @@ def _wedges(
 
 
 def _fans(faces: np.ndarray, partner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give each fan of faces around a vertex its own vertex.
+    """Split vertices so that each fan of faces has its own.
 
     Returns
     -------
@@ -160,7 +160,7 @@ def _fans(faces: np.ndarray, partner: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """
     corners = np.arange(faces.size)
     following = next_half_edges(corners)
-    # Half-edge h starts at corner h and ends at the next one; its partner runs the other way.
+    # Half-edge h leads from corner h to the next; its partner runs the other way.
     rows = np.concatenate([corners, following])
     columns = np.concatenate([following[partner], partner])
     graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(faces.size,) * 2)
@@ -173,12 +173,12 @@ def _fans(faces: np.ndarray, partner: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return rank[label].reshape(-1, 3), old[order]
 
 
-def _crowded(faces: np.ndarray) -> np.ndarray:
+def _nonmanifold_half_edges(faces: np.ndarray) -> np.ndarray:
     """(3f,) bool: half-edges whose edge still has more than two faces."""
     return faces_per_edge(faces, int(faces.max()) + 1) > 2
 
 
-def _one_per_face(bad: np.ndarray, partner: np.ndarray) -> np.ndarray:
+def _independent_pairs(bad: np.ndarray, partner: np.ndarray) -> np.ndarray:
     """Choose pairs (by their first half-edge) so that no face is split twice in one pass."""
     chosen: list[int] = []
     busy: set[int] = set()
@@ -204,8 +204,8 @@ def _split_at_middles(
     return np.concatenate([result, np.array(added, np.int64).reshape(-1, 3)])
 
 
-def _apart(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Move copies of vertices a little towards their own faces."""
+def _separate_copies(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Move copies of vertices slightly towards their own faces."""
     copies = np.bincount(origin[origin >= 0], minlength=int(origin.max(initial=0)) + 1)
     moving = np.where(origin >= 0, copies[origin] > 1, True)
     if not moving.any():
@@ -217,5 +217,5 @@ def _apart(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray) -> np.nd
         np.add.at(count, faces[:, k], 1.0)
     target = total / np.maximum(count, 1.0)[:, None]
     result = vertices.copy()
-    result[moving] += APART_SHARE * (target - vertices)[moving]
+    result[moving] += SEPARATION_SHARE * (target - vertices)[moving]
     return result

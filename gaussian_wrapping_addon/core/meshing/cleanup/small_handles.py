@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Handles smaller than the mesh resolves are closed: the patch around each becomes a disc."""
+"""Close handles below the mesh's resolution by replacing the patch around each by a disc."""
 
 from __future__ import annotations
 
@@ -15,56 +15,58 @@ from ...mesh.components import face_components
 from ...mesh.topology import edge_keys, half_edges
 
 BOX_EDGES = (2.0, 3.0, 4.5)
-"""Sides of the boxes in which handles are looked for, in edge lengths of the mesh, small ones
-first. Both loops of a handle, through it and around it, have to lie in one box: a tube is no handle
-there, nor is an opening that is wider than the box. A handle of half of the last side is found
-wherever it lies, a larger one where a box happens to hold it."""
+"""Sides of the boxes that are searched for handles, in edge lengths of the mesh, in increasing
+order. Both loops of a handle, through it and around it, must lie in one box: a tube is no handle
+there, nor is an opening wider than the box. A handle of half the last side is found wherever it
+lies, a larger one only where a box happens to contain it."""
 
 MAX_MOVE_EDGES = 2.25
-"""A vertex that goes lies at most so many edge lengths from the disc that takes the patch's place,
-half of the largest box: more is a thing of its own, not noise of the surface."""
+"""Greatest distance, in edge lengths, of a removed vertex from the disc that replaces the patch,
+half of the largest box: anything farther away is a structure of its own, not noise."""
 
-MAX_LOOP = 60
-"""A patch with more edges around it is left alone: its cover would not follow the surface."""
+MAX_LOOP_EDGES = 60
+"""Patches with a longer boundary are skipped: the disc would not follow the surface."""
 
 THIN = 1e-6
-"""A triangle whose area is a smaller share of the square of its side is a line: on the region's
-boundary points lie on lines."""
+"""A triangle whose area is a smaller share of its squared side is degenerate: points on the
+region's boundary can be collinear."""
 
 MAX_PASSES = 8
 
 
 @dataclass(frozen=True)
-class Closed:
-    """What :func:`without_small_handles` did."""
+class HandleClosure:
+    """Result of :func:`without_small_handles`."""
 
     faces: np.ndarray
     """(g, 3) int64."""
     closed: int
-    """Handles that are gone."""
+    """Handles that were closed."""
     left: int
     """Small handles that could not be closed without cutting something else; there may be more that
-    no box happens to hold."""
+    no box happens to contain."""
 
 
 @dataclass(frozen=True)
 class _Patches:
-    """Connected sets of faces with the same box."""
+    """Connected sets of faces in the same box."""
 
     of_face: np.ndarray
     """(f,) int64 label of each face."""
     handles: np.ndarray
-    """(p,) int64 genus of each; 0 too where the outline touches itself."""
+    """(p,) int64 genus of each; 0 also where the boundary touches itself."""
     loops: np.ndarray
-    """(p,) int64 closed curves around each."""
+    """(p,) int64 boundary loops of each."""
 
 
-def without_small_handles(vertices: np.ndarray, faces: np.ndarray, edge_length: float) -> Closed:
-    """Replace patches with handles in small boxes by discs with the same outline.
+def without_small_handles(
+    vertices: np.ndarray, faces: np.ndarray, edge_length: float
+) -> HandleClosure:
+    """Replace patches with handles in small boxes by discs with the same boundary.
 
-    A handle that small is below what the mesh resolves: noise of the isosurface, or of the labels
-    of thin tetrahedra. Vertices do not move, new ones are not made. A patch with more than one
-    outline stays, since a disc on each would cut what runs through it.
+    Such handles are below the mesh's resolution: noise of the isosurface or of the labels of thin
+    tetrahedra. Vertices are neither moved nor added. A patch with more than one boundary loop is
+    kept, since discs would cut what passes through it.
 
     Parameters
     ----------
@@ -72,17 +74,17 @@ def without_small_handles(vertices: np.ndarray, faces: np.ndarray, edge_length: 
     faces : (f, 3) int
         Closed 2-manifold, consistently oriented.
     edge_length : float
-        Of the mesh that is wanted, scene units.
+        Edge length of the final mesh, scene units.
     """
     faces = np.asarray(faces, np.int64)
     if _genus(len(vertices), faces) == 0:
-        return Closed(faces, 0, 0)
+        return HandleClosure(faces, 0, 0)
     closed = 0
     for share in BOX_EDGES:
         for _ in range(MAX_PASSES):
             found = 0
             for shift in product((0.0, 0.5), repeat=3):
-                faces, count = _one_grid(vertices, faces, share, edge_length, np.array(shift))
+                faces, count = _close_in_grid(vertices, faces, share, edge_length, np.array(shift))
                 found += count
             closed += found
             if found == 0:
@@ -91,17 +93,17 @@ def without_small_handles(vertices: np.ndarray, faces: np.ndarray, edge_length: 
     for shift in product((0.0, 0.5), repeat=3):
         patches = _patches(vertices, faces, BOX_EDGES[-1] * edge_length, np.array(shift))
         left = max(left, int(patches.handles.sum()))
-    return Closed(faces, closed, left)
+    return HandleClosure(faces, closed, left)
 
 
 def _genus(vertex_count: int, faces: np.ndarray) -> int:
-    """Return the genus of all parts of a closed 2-manifold together."""
+    """Return the total genus of a closed 2-manifold."""
     parts, _ = face_components(vertex_count, faces)
     euler = len(np.unique(faces)) - len(faces) // 2
     return (2 * parts - euler) // 2
 
 
-def _one_grid(
+def _close_in_grid(
     vertices: np.ndarray, faces: np.ndarray, share: float, edge_length: float, shift: np.ndarray
 ) -> tuple[np.ndarray, int]:
     """Close the handles in the boxes of one grid; return the faces and the number of handles."""
@@ -119,14 +121,16 @@ def _one_grid(
     closed = 0
     for label, (first, last) in zip(chosen.tolist(), bounds.tolist(), strict=True):
         rows = order[first:last]
-        loop = _outline(faces[rows])
-        if loop is None or len(loop) > MAX_LOOP:
+        loop = _boundary_loop(faces[rows])
+        if loop is None or len(loop) > MAX_LOOP_EDGES:
             continue
         pairs = edge_keys(loop[:, None], loop[None, :], count)  # (n, n)
-        taken = keys[np.minimum(np.searchsorted(keys, pairs), len(keys) - 1)] == pairs
-        taken &= ~np.isin(pairs, _edge_keys(faces[rows], count))
-        taken |= np.array([key in covered for key in pairs.ravel().tolist()]).reshape(pairs.shape)
-        cover = _cover(vertices[loop], loop, taken)
+        forbidden = keys[np.minimum(np.searchsorted(keys, pairs), len(keys) - 1)] == pairs
+        forbidden &= ~np.isin(pairs, _edge_keys(faces[rows], count))
+        forbidden |= np.array([key in covered for key in pairs.ravel().tolist()]).reshape(
+            pairs.shape
+        )
+        cover = _least_area_triangles(vertices[loop], loop, forbidden)
         if cover is None:
             continue
         gone = np.setdiff1d(faces[rows], loop)
@@ -140,7 +144,7 @@ def _one_grid(
 
 
 def _farthest(points: np.ndarray, triangles: np.ndarray) -> float:
-    """Return the largest distance of points (n, 3) to the middles and corners of (t, 3, 3)."""
+    """Return the largest distance of points (n, 3) to the centroids and corners of (t, 3, 3)."""
     if len(points) == 0:
         return 0.0
     near = np.concatenate([triangles.mean(1), triangles.reshape(-1, 3)])
@@ -148,7 +152,7 @@ def _farthest(points: np.ndarray, triangles: np.ndarray) -> float:
 
 
 def _patches(vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.ndarray) -> _Patches:
-    """Group neighbouring faces whose middles lie in the same box; count handles and outlines."""
+    """Group adjacent faces whose centroids lie in the same box; count handles and loops."""
     middle = vertices[faces].mean(1)
     box = np.floor((middle - middle.min(0)) / side + shift).astype(np.int64)  # (f, 3)
     size = box.max(0) + 1
@@ -162,7 +166,7 @@ def _patches(vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.nda
     graph = coo_matrix((np.ones(same.sum(), np.int8), (one[same], two[same])), (len(faces),) * 2)
     number, label = connected_components(graph, directed=False)
     label = label.astype(np.int64)
-    # Edges within a patch and on its outline; an edge between two patches is on both.
+    # Edges inside a patch and on its boundary; an edge between two patches belongs to both.
     low, high = begin[order[0::2]], end[order[0::2]]
     between = label[one] != label[two]
     outline_patch = np.concatenate([label[one[between]], label[two[between]]])
@@ -180,25 +184,27 @@ def _patches(vertices: np.ndarray, faces: np.ndarray, side: float, shift: np.nda
     )
     nodes, index, degree = np.unique(ends, return_inverse=True, return_counts=True)
     half = len(outline_patch)
-    rings = coo_matrix((np.ones(half, np.int8), (index[:half], index[half:])), (len(nodes),) * 2)
-    ring_number, ring = connected_components(rings, directed=False)
-    ring_patch = np.zeros(ring_number, np.int64)
-    ring_patch[ring] = nodes // count
-    loops = np.bincount(ring_patch, minlength=number)
+    loop_graph = coo_matrix(
+        (np.ones(half, np.int8), (index[:half], index[half:])), (len(nodes),) * 2
+    )
+    loop_count, loop_label = connected_components(loop_graph, directed=False)
+    loop_patch = np.zeros(loop_count, np.int64)
+    loop_patch[loop_label] = nodes // count
+    loops = np.bincount(loop_patch, minlength=number)
     touching = np.bincount(nodes[degree != 2] // count, minlength=number) > 0
-    # A patch without an outline is a whole small part: its handles are small too, but it has no
-    # disc to become.
+    # A patch without a boundary is a whole small part: its handles are small as well, but no disc
+    # can replace it.
     handles = np.where(touching | (loops == 0), 0, (2 - euler - loops) // 2)
     return _Patches(label, handles, loops)
 
 
 def _edge_keys(faces: np.ndarray, count: int) -> np.ndarray:
-    """Return the numbers of all half-edges, (3f,) int64."""
+    """Return the edge keys of all half-edges, (3f,) int64."""
     return edge_keys(*half_edges(faces), count)
 
 
-def _outline(faces: np.ndarray) -> np.ndarray | None:
-    """Return the vertices around a patch in the order of its half-edges, (n,) int64."""
+def _boundary_loop(faces: np.ndarray) -> np.ndarray | None:
+    """Return the boundary vertices of a patch in the order of its half-edges, (n,) int64."""
     half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()
     pairs = {(a, b) for a, b in half}
     following = {a: b for a, b in half if (b, a) not in pairs}
@@ -211,14 +217,16 @@ def _outline(faces: np.ndarray) -> np.ndarray | None:
     return np.array(loop, np.int64) if len(loop) == len(following) else None
 
 
-def _cover(points: np.ndarray, loop: np.ndarray, taken: np.ndarray) -> np.ndarray | None:
+def _least_area_triangles(
+    points: np.ndarray, loop: np.ndarray, forbidden: np.ndarray
+) -> np.ndarray | None:
     """Return the triangles of least area that span a loop, (n - 2, 3), or None.
 
     Parameters
     ----------
     points : (n, 3) float64
     taken : (n, n) bool
-        Pairs that may not be joined, since the mesh has that edge elsewhere.
+        Pairs that must not be joined, since the mesh has that edge elsewhere.
 
     Notes
     -----
@@ -231,7 +239,7 @@ def _cover(points: np.ndarray, loop: np.ndarray, taken: np.ndarray) -> np.ndarra
     for gap in range(2, count):
         for i in range(count - gap):
             j = i + gap
-            if gap < count - 1 and taken[i, j]:
+            if gap < count - 1 and forbidden[i, j]:
                 continue
             middle = np.arange(i + 1, j)
             arms = np.cross(points[middle] - points[i], points[j] - points[i])

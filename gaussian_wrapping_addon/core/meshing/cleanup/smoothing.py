@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Smoothing of closed meshes that keeps their volume; off unless asked for."""
+"""Volume-preserving Taubin smoothing of closed meshes; off by default."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from ...mesh.components import face_components, volumes_and_areas
-from ...mesh.topology import area_vectors, ends_of, faces_per_edge, half_edges
+from ...mesh.topology import area_vectors, faces_per_edge, half_edges, vertices_of_half_edges
 from ...progress import Progress
 from ...regions.cap_planes import CapPlanes, cap_planes
 from ...regions.convex_region import Region
 
 SHRINK = 0.5
-"""Share of the way to the mean of the neighbours, in the first half of a step."""
+"""Share of the way to the mean of the neighbours in the first half of a step."""
 
 GROW = -1.0 / (2.0 - 0.1)
 """Share of the second half: it undoes the shrinking of waves longer than about ten edges (the pass
 band of Taubin's filter, 1 / SHRINK + 1 / GROW = 0.1)."""
 
 MAX_TURN_COS = 0.5
-"""A move that would leave a face turned by more than 60 degrees since the start is not made at its
-corners: folds cannot come up, and wires of three or four faces around are not crushed."""
+"""A move that would turn a face by more than 60 degrees from its initial normal is not made at its
+corners: no folds arise, and wires of three or four faces around are not crushed."""
 
 MIN_AREA_SHARE = 0.2
-"""The same for a face that would be left with less than this share of its first area."""
+"""The same for a face that would be left with less than this share of its initial area."""
 
 VOLUME_ROUNDS = 5
-"""Newton steps along the normals that give each part its volume again."""
+"""Newton steps along the normals that restore the volume of each part."""
 
 MAX_VOLUME_CHANGE = 0.01
-"""A part that cannot be given its volume again to a per cent is not smoothed: it has too few faces
-for its shape, and the filter would crush it."""
+"""A part whose volume cannot be restored to 1 % is not smoothed: it has too few faces for its
+shape, and the filter would crush it."""
 
 
 def smooth(
@@ -42,12 +42,12 @@ def smooth(
     *,
     region: Region | None = None,
 ) -> np.ndarray:
-    """Return smoothed positions, (v, 3) float64; the faces stay as they are.
+    """Return smoothed positions, (v, 3) float64; the faces are unchanged.
 
-    Taubin's two-sided filter, with neighbours weighted by the inverse of their distance so that
-    uneven spacing does not drift. Each part then gets its volume again, or stays as it was where
-    it cannot. Vertices on the region's faces stay on them, those on a boundary stay where they are,
-    and none leaves the region.
+    Taubin's lambda-mu filter, with neighbours weighted by inverse distance so that uneven spacing
+    does not drift. The volume of each part is restored afterwards; parts where that fails keep
+    their original positions. Vertices on the region's faces stay on them, vertices at open edges do
+    not move, and none leaves the region.
 
     Parameters
     ----------
@@ -89,13 +89,13 @@ def smooth(
     crushed = np.abs(now - volume) > MAX_VOLUME_CHANGE * np.abs(volume)
     back = np.unique(faces[crushed[part]])
     points[back] = vertices[back] - origin
-    # A vertex that was not moved keeps its digits.
+    # Vertices that were not moved keep their exact coordinates.
     still = (points == vertices - origin).all(1)
     return np.asarray(np.where(still[:, None], vertices, points + origin))
 
 
 def _neighbour_weights(points: np.ndarray, faces: np.ndarray) -> csr_matrix:
-    """(v, v) rows that sum to 1: neighbours by the inverse of their distance."""
+    """Return (v, v) weights of neighbours by inverse distance; rows sum to 1."""
     begin, end = half_edges(faces)
     rows, columns = np.concatenate([begin, end]), np.concatenate([end, begin])
     length = np.linalg.norm(points[rows] - points[columns], axis=1)
@@ -107,7 +107,7 @@ def _neighbour_weights(points: np.ndarray, faces: np.ndarray) -> csr_matrix:
 
 
 def _at_open_edges(faces: np.ndarray, count: int) -> np.ndarray:
-    return ends_of(faces_per_edge(faces, count) == 1, faces, count)
+    return vertices_of_half_edges(faces_per_edge(faces, count) == 1, faces, count)
 
 
 def _safe_move(
@@ -120,8 +120,8 @@ def _safe_move(
 ) -> np.ndarray:
     """Move vertices, except where a face would turn or shrink too far, or leave the region.
 
-    A vertex that stays back may spoil another face, so all are looked at again until none is bad;
-    at worst everything stays where it was.
+    A vertex that is held back may spoil another face, so the check is repeated until no face is
+    bad; in the worst case nothing moves.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def _safe_move(
 
 
 def _in_planes(move: np.ndarray, caps: CapPlanes) -> np.ndarray:
-    """Take from each move what leads out of the planes that its vertex lies on."""
+    """Project each move onto the planes that its vertex lies on."""
     result = move.copy()
     count = (caps.planes >= 0).sum(1)
     one = np.flatnonzero(count == 1)
@@ -171,7 +171,7 @@ def _volume_move(
     caps: CapPlanes,
     free: np.ndarray,
 ) -> np.ndarray:
-    """Return moves along the normals that give each part its volume again, to first order."""
+    """Return moves along the normals that restore the volume of each part, to first order."""
     gradient = np.zeros_like(points)  # of the volume, (v, 3)
     vectors = area_vectors(points, faces) / 6.0
     for k in range(3):

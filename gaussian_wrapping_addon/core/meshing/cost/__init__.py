@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a mesh will take before it is made: points, faces, memory, time."""
+"""Cost estimates of meshing, before it starts: points, faces, memory, time."""

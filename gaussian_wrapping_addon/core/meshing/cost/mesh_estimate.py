@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a mesh of a region will take, before it is made: points, faces, memory, time."""
+"""Estimate points, faces, memory and time of primal adaptive meshing before it starts."""
 
 from __future__ import annotations
 
@@ -19,44 +19,43 @@ from ..points.resolution import (
     AUTOMATIC_POINTS,
     MIN_VERTICES,
     VERTICES_PER_UNIFORM,
-    Request,
+    ResolutionRequest,
     dense_points,
-    stay_of_dense,
+    kept_from_dense,
 )
 from ..points.spacing import LONGEST_SHARE
 from ..tiles.plan import TILE_POINTS, WHOLE_POINTS
 
 POINTS_PER_BOX = 8.0
-"""Boxes that are counted hold so many sightings: with fewer, some that the surface crosses hold
-none."""
+"""Mean depth samples per counted box: with fewer, some boxes that the surface crosses hold none."""
 BOXES_PER_SQUARE = 1.5
-"""A plane crosses so many boxes per square of their side, in the mean over its directions."""
+"""Boxes that a plane crosses per square of their side, on average over its directions."""
 
 AREA_LOW, AREA_HIGH = 0.8, 1.5
-"""The true area lay within these times the count on four trained scenes (0.86 to 1.11 times, and
-1.27 where a part of the surface is hidden from the cameras)."""
+"""Bounds of the true area as factors of the count. On four trained scenes the factor was 0.86 to
+1.11, and 1.27 where part of the surface is hidden from the cameras."""
 
 BUDGET_LOW, BUDGET_HIGH = 0.7, 1.4
-"""A number of points is met within these; the region's boundary comes on top."""
+"""A requested number of points is met within these factors; cap points come on top."""
 
 BOUNDARY_SAMPLES = 4096
 
 POINT_BYTES = 3_500
-"""Peak for each point of a mesh that is made whole, of the dense one with adaptive spacing:
+"""Peak per point of a mesh made in one piece (with adaptive spacing, of the dense mesh):
 tetrahedra, candidates, repair (145 000 points of a sphere took 3 100 each)."""
 JOINED_POINT_BYTES = 2_000
-"""The same of a tiled mesh, whose surface alone is held whole."""
+"""The same for a tiled mesh, of which only the surface is held in one piece."""
 SURROUNDINGS = 2.0
-"""Points in and around a tile, in points of the tile."""
+"""Points in and around a tile, as a multiple of its own."""
 BASE_BYTES = 800 << 20
-"""Python, compiled kernels, the Gaussians seen from each camera, the candidate surface."""
+"""Python, compiled kernels, the Gaussians projected into each camera, the candidate surface."""
 
 EVALUATIONS_PER_POINT = 45.0
-"""Vacancy is asked for so many times for each point of the mesh, all steps together."""
+"""Evaluations of vacancy per point of the mesh, over all steps."""
 POINT_S = 60e-6
-"""Everything else, for each point: triangulation, thinning, repair."""
+"""Everything else, per point: triangulation, thinning, repair."""
 FIXED_S = 6.0
-"""Pivots and the candidate surface."""
+"""Pivots and candidate surface."""
 SECONDS_LOW, SECONDS_HIGH = 0.5, 2.0
 
 PROBES = 20_000
@@ -64,62 +63,62 @@ PROBES = 20_000
 
 @dataclass(frozen=True)
 class MeshEstimate:
-    """Honest ranges: what is measured of a finished mesh should lie in them."""
+    """Ranges that the measured values of the finished mesh should lie in."""
 
     area: float
-    """Of the surface in the region, squared scene units."""
+    """Area of the surface in the region, squared scene units."""
     cap_area: float
-    """Of the region's boundary that closes the solid."""
+    """Area of the caps on the region's boundary."""
     by_edge: bool
-    """Asked for by an edge length, not by a number of points."""
+    """Requested by an edge length, not by a number of points."""
     adaptive: bool
     points_low: int
     points_high: int
     dense_low: int
     dense_high: int
-    """Points of the mesh that is made first, of which those stay; the same with uniform spacing.
-    They decide about time and memory."""
+    """Points of the dense mesh that is simplified to these; the same with uniform spacing. They
+    determine time and memory."""
     seconds_low: float
     seconds_high: float
     memory_bytes: int
-    """Peak of a mesh made whole, at the high end."""
+    """Peak without tiles, at the high end."""
     memory_low_bytes: int
-    """The same at the low end."""
+    """Peak without tiles, at the low end."""
     tiled_memory_bytes: int
-    """Peak of a mesh made in tiles, at the low end."""
+    """Peak with tiles, at the low end."""
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values."""
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """Return what people want to know, a line each."""
+        """Return the estimate as lines of text."""
         low, high = self.seconds_low, self.seconds_high
         sizes = (self.memory_low_bytes, self.memory_bytes, self.tiled_memory_bytes)
         gigabytes = [f"{size / 2**30:.1f}" for size in sizes]
         unit, share = ("s", 1.0) if high < 90 else ("min", 60.0)
         return [
-            f"triangles: {rounded(2 * self.points_low)} to {rounded(2 * self.points_high)}",
+            f"triangles: {two_digits(2 * self.points_low)} to {two_digits(2 * self.points_high)}",
             f"time: {max(1, round(low / share))} to {max(1, round(high / share))} {unit}",
             f"memory: {gigabytes[0]} to {gigabytes[1]} GB whole, from {gigabytes[2]} GB in tiles",
         ]
 
     def tiles_for(self, memory_bytes: int) -> bool:
-        """Tell whether the region is better meshed in tiles, with so much memory (0: unknown)."""
+        """Return whether to mesh the region in tiles, given the memory (0: unknown)."""
         return self.dense_high > WHOLE_POINTS or 0 < memory_bytes < self.memory_bytes
 
     def refuse(self, memory_bytes: int, *, tiled: bool) -> None:
-        """Refuse what passes the most points, or the memory, even at the low end.
+        """Refuse a request that exceeds the points limit or the memory even at the low end.
 
         Raises
         ------
         ResourceError
-            Names what would fit.
+            Its hint names what would fit.
         """
         if self.by_edge and self.dense_low > limits.MAX_MESH_POINTS:
             raise ResourceError(
-                f"This mesh needs at least {rounded(self.dense_low)} points; "
-                f"{rounded(limits.MAX_MESH_POINTS)} is the most.",
+                f"This mesh needs at least {two_digits(self.dense_low)} points; "
+                f"the limit is {two_digits(limits.MAX_MESH_POINTS)}.",
                 f"{self._coarser(limits.MAX_MESH_POINTS)}, or a smaller region.",
             )
         needed = self.tiled_memory_bytes if tiled else self.memory_low_bytes
@@ -141,28 +140,28 @@ class MeshEstimate:
         )
 
     def _coarser(self, dense: float) -> str:
-        """Return what to ask for so that the mesh made first has so many points."""
-        stay = stay_of_dense(dense) if self.adaptive else dense
-        before = stay_of_dense(self.dense_low) if self.adaptive else float(self.dense_low)
+        """Return the hint for a dense mesh of at most this many points."""
+        stay = kept_from_dense(dense) if self.adaptive else dense
+        before = kept_from_dense(self.dense_low) if self.adaptive else float(self.dense_low)
         factor = math.ceil(105.0 * math.sqrt(before / max(stay, 1.0))) / 100.0
-        return f"Use edges {factor:.2f} times longer (about {rounded(int(stay))} points)"
+        return f"Use edges {factor:.2f} times longer (about {two_digits(int(stay))} points)"
 
 
 def _tile_bytes(points: float) -> float:
-    """Return the peak of a tile at work."""
+    """Return the peak memory of a tile."""
     return SURROUNDINGS * points * POINT_BYTES
 
 
-def rounded(number: int) -> str:
-    """Return a number with two digits that count."""
+def two_digits(number: int) -> str:
+    """Format a number with two significant digits."""
     digits = max(0, len(str(max(number, 1))) - 2)
     return f"{round(number, -digits):_}".replace("_", " ")
 
 
-def area_of(points: np.ndarray) -> float:
-    """Return about the area of the surface that (n, 3) points lie on, by counting boxes.
+def box_counting_area(points: np.ndarray) -> float:
+    """Estimate the area of the surface that (n, 3) points lie on, by box counting.
 
-    Thinner things than a box count once, not twice: the count is low for those.
+    Both sides of a wall thinner than a box count once: the estimate is low for those.
     """
     if len(points) < 2 * POINTS_PER_BOX:
         return 0.0
@@ -181,8 +180,8 @@ def area_of(points: np.ndarray) -> float:
         side /= 1.25
 
 
-def occupied_boundary(region: Region, is_empty: Any) -> float:
-    """Return about the area of the region's boundary that lies in the solid."""
+def occupied_boundary_area(region: Region, is_empty: Any) -> float:
+    """Estimate the area of the region's boundary that lies in the solid, by sampling."""
     corners = np.concatenate(region.faces()).reshape(-1, 3)
     triangles = np.arange(len(corners)).reshape(-1, 3)
     points, _ = sample_triangles(corners, triangles, BOUNDARY_SAMPLES, np.random.default_rng(0))
@@ -190,11 +189,11 @@ def occupied_boundary(region: Region, is_empty: Any) -> float:
 
 
 def evaluation_seconds(vacancy: Any, points: np.ndarray) -> float:
-    """Return the time of one evaluation of vacancy near the surface, measured here and now."""
+    """Measure the time of one evaluation of vacancy near the surface."""
     if len(points) == 0:
         return 0.0
     some = points[:: max(1, len(points) // PROBES)]
-    vacancy.vacancy(some[:64])  # prepares the cameras, loads the kernels
+    vacancy.vacancy(some[:64])  # warm-up: prepares the cameras, loads the kernels
     begun_s = time.perf_counter()
     vacancy.vacancy(some)
     return (time.perf_counter() - begun_s) / len(some)
@@ -203,23 +202,23 @@ def evaluation_seconds(vacancy: Any, points: np.ndarray) -> float:
 def estimate_mesh(
     area: float,
     cap_area: float,
-    request: Request,
+    request: ResolutionRequest,
     *,
     adaptive: bool,
     evaluation_s: float = 0.0,
     resolved: np.ndarray | None = None,
 ) -> MeshEstimate:
-    """Return what a mesh will take.
+    """Estimate the cost of a mesh.
 
     Parameters
     ----------
     area, cap_area : float
-        From :func:`area_of` and :func:`occupied_boundary`.
+        From :func:`box_counting_area` and :func:`occupied_boundary_area`.
     evaluation_s : float
         From :func:`evaluation_seconds`.
     resolved : (n,) float64, optional
-        Shortest edge that the photos resolve at places spread over the surface, which limits
-        adaptive spacing; from :func:`..points.spacing.resolved_edges`.
+        Shortest edge that the photos resolve at samples of the surface, which limits adaptive
+        spacing; from :func:`..points.spacing.resolved_edges`.
     """
     by_edge = request.edge_length > 0
     if by_edge:
@@ -235,13 +234,13 @@ def estimate_mesh(
         middle = max(stay * even, MIN_VERTICES)
         share = middle / dense_points(middle)
         even = dense_points(middle)
-        # The area is not known yet, but a number of points decides about the dense mesh at once.
+        # The area is not known yet, but a number of points determines the dense mesh directly.
         low, high = BUDGET_LOW * even, BUDGET_HIGH * even
         if by_edge:
             low, high = dense_points(stay_low), dense_points(stay_high)
-    # A region within the solid has no surface but its own boundary.
+    # A region within the solid has no surface other than its caps.
     radius = math.sqrt(POINTS_PER_SQUARE * max(area, 0.1 * cap_area) / max(even, 1.0))
-    if by_edge:  # of the mesh that is made first
+    if by_edge:  # of the dense mesh
         radius = request.edge_length / EDGE_PER_RADIUS
         radius *= math.sqrt(share / VERTICES_PER_UNIFORM) if adaptive else 1.0
     caps = 0.0

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What meshing a region by pivots will take, from the Gaussians and sightings in it.
+"""Estimate the cost of pivot meshing from the Gaussians and depth samples in a region.
 
-The resolution is that of the Gaussians, so the points are counted, not asked for; each point has
-about six tetrahedra, as in any Delaunay triangulation of points near surfaces.
+The resolution is that of the Gaussians, so points are counted, not requested; each has about six
+tetrahedra, as in any Delaunay triangulation of points near surfaces.
 """
 
 from __future__ import annotations
@@ -11,51 +11,51 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ...errors import ResourceError
-from ...field.depth_samples import MAX_SIGHTINGS
+from ...field.depth_samples import MAX_DEPTH_SAMPLES
 from ...gaussians.model import GaussianArrays
 from ...regions.convex_region import Region
-from ..points.candidate_surface import own_points
+from ..points.candidate_surface import pivots_and_probes
 from ..points.pivots import PIVOTS
-from .mesh_estimate import BASE_BYTES, FIXED_S, rounded
+from .mesh_estimate import BASE_BYTES, FIXED_S, two_digits
 
 TETRAHEDRA_LOW, TETRAHEDRA_HIGH = 5.0, 8.0
-"""For each point, after the cut at the region (5.8 to 7.0 of spheres and tori)."""
+"""Per point, after clipping to the region (5.8 to 7.0 for spheres and tori)."""
 
 FACES_LOW, FACES_HIGH = 0.5, 3.0
-"""For each point of the Gaussians (1.2 with nine pivots, of which most lie off the surface, to 2.4
-with two; fewer where the region ends)."""
+"""Per pivot of the Gaussians (1.2 with nine pivots, most of which lie off the surface, to 2.4 with
+two; fewer at the region's boundary)."""
 PAIR_FACES_LOW, PAIR_FACES_HIGH = 3.0, 7.0
-"""For each point of the sightings, all next to the surface (5 to 6 on a trained scene)."""
+"""Per point from depth samples, all next to the surface (5 to 6 on a trained scene)."""
 
 POINT_LOW_BYTES, POINT_BYTES = 1_500, 6_500
-"""Peak for each point (1 900 with nine pivots to 5 900 with three)."""
+"""Peak per point (1 900 with nine pivots to 5 900 with three)."""
 
 EVALUATIONS_LOW, EVALUATIONS_HIGH = 2.0, 22.0
-"""Vacancy is asked for so often for each point, bisection of edges included (5.9 to 21.5). Where it
-is asked it may take less time than at the surface, where that is measured: to a quarter."""
+"""Evaluations of vacancy per point, bisection of edges included (5.9 to 21.5). An evaluation may
+take as little as a quarter of the time that is measured at the surface."""
 
 POINT_LOW_S, POINT_S = 15e-6, 120e-6
-"""Everything else, for each point."""
+"""Everything else, per point."""
 
 PAIRED_LOW, PAIRED_HIGH = 1.0, 4.0
-"""Points for each sighting that the estimate has: two where the inside is found behind it; a job
-looks from more cameras than an estimate."""
+"""Points per depth sample of the estimate: two where the inside is found behind it; a job uses more
+cameras than an estimate."""
 
 
 @dataclass(frozen=True)
 class PivotEstimate:
-    """Honest ranges, as :class:`~.mesh_estimate.MeshEstimate` gives them for the other method."""
+    """Ranges like those of :class:`~.mesh_estimate.MeshEstimate`, for pivot meshing."""
 
     gaussians: int
-    """That reach the region."""
+    """Gaussians that reach the region."""
     pivots_low: int
     pivots_high: int
-    """Points that are connected."""
+    """Points that are triangulated."""
     tetrahedra_low: int
     tetrahedra_high: int
     points_low: int
     points_high: int
-    """Of the mesh."""
+    """Vertices of the mesh."""
     seconds_low: float
     seconds_high: float
     memory_low_bytes: int
@@ -66,32 +66,32 @@ class PivotEstimate:
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """Return what people want to know, a line each."""
+        """Return the estimate as lines of text."""
         low_gb, high_gb = (
             f"{size / 2**30:.1f}" for size in (self.memory_low_bytes, self.memory_bytes)
         )
         return [
-            f"tetrahedra: {rounded(self.tetrahedra_low)} to {rounded(self.tetrahedra_high)}",
-            f"triangles: {rounded(2 * self.points_low)} to {rounded(2 * self.points_high)}",
+            f"tetrahedra: {two_digits(self.tetrahedra_low)} to {two_digits(self.tetrahedra_high)}",
+            f"triangles: {two_digits(2 * self.points_low)} to {two_digits(2 * self.points_high)}",
             f"time: {_span(self.seconds_low)} to {_span(self.seconds_high)}",
             f"memory: {low_gb} to {high_gb} GB",
         ]
 
     def refuse(self, memory_bytes: int) -> None:
-        """Refuse what does not fit into so much memory (0: unknown) even at the low end.
+        """Refuse a mesh that exceeds the memory (0: unknown) even at the low end.
 
         Raises
         ------
         ResourceError
-            Names what would fit.
+            Its hint names what would fit.
         """
         if memory_bytes <= 0 or self.memory_low_bytes <= memory_bytes:
             return
         raise ResourceError(
-            f"Meshing {rounded(self.gaussians)} Gaussians by pivots needs at least "
+            f"Meshing {two_digits(self.gaussians)} Gaussians by pivots needs at least "
             f"{self.memory_low_bytes / 2**30:.1f} GB of memory; {memory_bytes / 2**30:.1f} GB are "
             "free.",
-            "Draw a smaller region, use fewer pivots, or mesh it by the method pam.",
+            "Draw a smaller region, use fewer pivots, or use the method pam.",
         )
 
 
@@ -99,20 +99,20 @@ def _span(seconds: float) -> str:
     return f"{max(1, round(seconds))} s" if seconds < 90 else f"{round(seconds / 60)} min"
 
 
-def estimate_pivots(
-    arrays: GaussianArrays, region: Region, pivots: int, sightings: int, *,
+def estimate_pivot_mesh(
+    arrays: GaussianArrays, region: Region, pivots: int, depth_samples: int, *,
     evaluation_s: float = 0.0, seed: int = 0,
 ) -> PivotEstimate:  # fmt: skip
-    """Return what :func:`~..pivot_meshing.mesh_by_pivots` will take.
+    """Estimate the cost of :func:`~..pivot_meshing.mesh_by_pivots`.
 
     Parameters
     ----------
     arrays, region
         Same frame.
     pivots : int
-        Of each Gaussian.
-    sightings : int
-        How many there are in the region.
+        Number of pivots per Gaussian.
+    depth_samples : int
+        Number of depth samples in the region.
     evaluation_s : float
         Time of one evaluation of vacancy, from :func:`~.mesh_estimate.evaluation_seconds`.
 
@@ -121,9 +121,9 @@ def estimate_pivots(
     MeshingError
         No Gaussian reaches the region.
     """
-    own = own_points(arrays, region, seed, PIVOTS[pivots])
-    pairs_low = PAIRED_LOW * min(sightings, MAX_SIGHTINGS)
-    pairs_high = min(PAIRED_HIGH * sightings, 2.0 * MAX_SIGHTINGS)
+    own = pivots_and_probes(arrays, region, seed, PIVOTS[pivots])
+    pairs_low = PAIRED_LOW * min(depth_samples, MAX_DEPTH_SAMPLES)
+    pairs_high = min(PAIRED_HIGH * depth_samples, 2.0 * MAX_DEPTH_SAMPLES)
     low, high = len(own.points) + pairs_low, len(own.points) + pairs_high
     few = FACES_LOW * len(own.points) + PAIR_FACES_LOW * pairs_low
     many = FACES_HIGH * len(own.points) + PAIR_FACES_HIGH * pairs_high

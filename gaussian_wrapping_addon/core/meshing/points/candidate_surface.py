@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A first, coarse surface of a region: two-pivot marching tetrahedra.
+"""Candidate surface: a first, coarse isosurface by two-pivot marching tetrahedra.
 
 See docs/method.md, section 6.
 """
@@ -12,44 +12,44 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...errors import MeshingError
-from ...field.depth_samples import Sightings, bracket_pairs
+from ...field.depth_samples import DepthSamples, bracket_pairs
 from ...gaussians.model import GaussianArrays
 from ...progress import Progress
 from ...regions.convex_region import Region
-from ..tetrahedra.delaunay import delaunay, far_points
+from ..tetrahedra.delaunay import bounding_points, delaunay
 from ..tetrahedra.marching_tetrahedra import IsEmpty, bisect, marching_tetrahedra
-from .pivots import MAX_PIVOT_GAUSSIANS, reaching, representative, two_pivots
+from .pivots import MAX_PIVOT_GAUSSIANS, gaussians_reaching, representative_gaussians, two_pivots
 
 PROBES = 4096
-"""Points spread through the region besides the pivots: a Gaussian that is as large as the region
-may have both pivots outside it."""
+"""Sample points through the region besides the pivots: a Gaussian as large as the region may have
+both pivots outside it."""
 
 MARGIN_SHARE = 0.02
-"""Gaussians this share of the diagonal beyond the region take part, so that the surface near the
-boundary is not the hull of too few pivots."""
+"""Gaussians up to this share of the diagonal beyond the region are included, so that the surface
+near the boundary is not the hull of too few pivots."""
 
 HALO_SHARE = 0.5
-"""Pivots farther from the region than this share of its diagonal take no part: the far points alone
+"""Pivots farther from the region than this share of its diagonal are left out: the bounding points
 close the triangulation, and the field need not be known there."""
 
 NO_SURFACE_HINT = "Draw the region around something that was photographed."
 
 BRACKET_SHARE = 0.003
-"""Edges are bisected to this share of the region's diagonal; later steps find the surface."""
+"""Edges are bisected to this share of the region's diagonal; later steps refine the position."""
 
 
 @dataclass(frozen=True)
 class CandidateSurface:
-    """A triangle soup near the isosurface, inside the region and slightly beyond."""
+    """A triangle soup near the isosurface, in the region and slightly beyond it."""
 
     vertices: np.ndarray
     """(v, 3) float64."""
     faces: np.ndarray
-    """(f, 3) int64, towards the empty side."""
+    """(f, 3) int64, facing the empty side."""
     gaussians: int
     """Gaussians that reach the region."""
     pivots: int
-    """Pivots that were connected."""
+    """Points that were triangulated."""
 
 
 def candidate_surface(
@@ -59,54 +59,54 @@ def candidate_surface(
     tolerance: float,
     seed: int,
     progress: Progress,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> CandidateSurface:
-    """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and sighting.
+    """Extract the isosurface on the Delaunay edges of two pivots per Gaussian and depth sample.
 
     Parameters
     ----------
     tolerance : float
-        Length of the bracket on crossing edges; 0 takes :data:`BRACKET_SHARE`.
-    sightings : Sightings, optional
-        Of the cameras in the region: parts about as thin as a pixel are found by these alone.
+        Length of the bracket on crossing edges; 0 stands for :data:`BRACKET_SHARE`.
+    depth_samples : DepthSamples, optional
+        Of the region: parts about as thin as a pixel are found only by these.
 
     Raises
     ------
     MeshingError
-        No Gaussian reaches the region, or nothing in it is occupied.
+        No Gaussian reaches the region, or nothing in it is occupied by the solid.
     """
     margin = MARGIN_SHARE * region.diagonal
     is_empty = _within_halo(is_empty, region)
-    cloud = pivot_cloud(arrays, region, is_empty, seed, sightings)
+    cloud = pivot_cloud(arrays, region, is_empty, seed, depth_samples)
     pivots = cloud.points
-    points = np.concatenate([pivots, far_points(pivots, seed)])
+    points = np.concatenate([pivots, bounding_points(pivots, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
     progress.update(0.3, f"evaluating {len(pivots)} pivots")
-    inside = np.zeros(len(points), np.bool_)  # far points are empty by definition
+    inside = np.zeros(len(points), np.bool_)  # bounding points are empty by definition
     inside[: len(pivots)] = ~is_empty(pivots)
     edges, faces = marching_tetrahedra(_near(points, tetrahedra, region, margin), inside)
     if len(faces) == 0:
-        raise no_surface(region)
+        raise no_surface_error(region)
     tolerance = tolerance or BRACKET_SHARE * region.diagonal
     ends = bisect(points[edges[:, 0]], points[edges[:, 1]], is_empty, tolerance,
                   progress.span(0.6, 1.0))  # fmt: skip
     vertices = (ends[0] + ends[1]) / 2
     kept = region.distance(vertices[faces].mean(1)) <= margin
     if not kept.any():
-        raise no_surface(region)
+        raise no_surface_error(region)
     return CandidateSurface(vertices, faces[kept], cloud.gaussians, len(pivots))
 
 
 @dataclass(frozen=True)
 class PivotCloud:
-    """Points whose Delaunay edges the isosurface of a region is looked for on."""
+    """Points whose Delaunay edges are searched for the isosurface of a region."""
 
     points: np.ndarray
     """(p, 3) float64, all within :func:`halo_bounds`."""
     gaussians: int
     """Gaussians that reach the region."""
     chosen: int
-    """Those of them that gave pivots."""
+    """Those of them that contributed pivots."""
 
 
 def pivot_cloud(
@@ -114,31 +114,31 @@ def pivot_cloud(
     region: Region,
     is_empty: IsEmpty,
     seed: int,
-    sightings: Sightings | None,
+    depth_samples: DepthSamples | None,
     *,
     pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray] = two_pivots,
 ) -> PivotCloud:
-    """Collect pivots, probes and pairs across what the cameras see, in and around a region.
+    """Collect pivots, probes and pairs that bracket the visible surface, in and around a region.
 
     Raises
     ------
     MeshingError
         No Gaussian reaches the region.
     """
-    own = own_points(arrays, region, seed, pivots_of)
-    if sightings is None:
+    own = pivots_and_probes(arrays, region, seed, pivots_of)
+    if depth_samples is None:
         return own
-    points = np.concatenate(bracket_pairs(sightings, is_empty))
+    points = np.concatenate(bracket_pairs(depth_samples, is_empty))
     return replace(own, points=np.concatenate([own.points, _in_halo(points, region)]))
 
 
-def own_points(
+def pivots_and_probes(
     arrays: GaussianArrays,
     region: Region,
     seed: int,
     pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray],
 ) -> PivotCloud:
-    """Collect pivots and probes alone, in and around a region; asks no field.
+    """Collect pivots and probes alone, in and around a region, without evaluating the field.
 
     Raises
     ------
@@ -146,10 +146,10 @@ def own_points(
         No Gaussian reaches the region.
     """
     margin = MARGIN_SHARE * region.diagonal
-    index = reaching(arrays, region, margin)
+    index = gaussians_reaching(arrays, region, margin)
     if len(index) == 0:
         raise MeshingError(f"No Gaussian reaches region {region.name!r}.", NO_SURFACE_HINT)
-    chosen = representative(arrays, index, MAX_PIVOT_GAUSSIANS)
+    chosen = representative_gaussians(arrays, index, MAX_PIVOT_GAUSSIANS)
     pivots = pivots_of(arrays, chosen)
     near = pivots[region.distance(pivots) <= HALO_SHARE * region.diagonal]
     points = np.concatenate([near, _probes(region, margin, seed)])
@@ -162,14 +162,14 @@ def _in_halo(points: np.ndarray, region: Region) -> np.ndarray:
 
 
 def halo_bounds(region: Region) -> np.ndarray:
-    """Return the box, (2, 3) float64, that holds every point whose side matters for a region."""
+    """Return the box, (2, 3) float64, of all points whose label matters for a region."""
     low, high = region.bounds
     halo = HALO_SHARE * region.diagonal
     return np.stack([low - halo, high + halo])
 
 
 def _within_halo(is_empty: IsEmpty, region: Region) -> IsEmpty:
-    """Return ``is_empty`` for points in the halo; all others are empty, as the far points are."""
+    """Restrict ``is_empty`` to the halo; all other points are empty, as the bounding points are."""
     low, high = halo_bounds(region)
 
     def inside_only(points: np.ndarray) -> np.ndarray:
@@ -181,8 +181,8 @@ def _within_halo(is_empty: IsEmpty, region: Region) -> IsEmpty:
     return inside_only
 
 
-def no_surface(region: Region) -> MeshingError:
-    """Return the error for a region without a surface."""
+def no_surface_error(region: Region) -> MeshingError:
+    """Return the error of a region without a surface."""
     return MeshingError(f"Region {region.name!r} holds no surface.", NO_SURFACE_HINT)
 
 
@@ -199,7 +199,7 @@ def _probes(region: Region, margin: float, seed: int) -> np.ndarray:
 
 
 def _near(points: np.ndarray, tetrahedra: np.ndarray, region: Region, margin: float) -> np.ndarray:
-    """Leave out tetrahedra that lie wholly beyond one face of the region."""
+    """Drop the tetrahedra that lie wholly beyond one face of the region."""
     normals, offsets = region.half_spaces
     kept = np.ones(len(tetrahedra), np.bool_)
     for normal, offset in zip(normals, offsets, strict=True):

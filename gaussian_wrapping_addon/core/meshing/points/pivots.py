@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pivots of oriented Gaussians: two, three or nine each (docs/method.md, section 6.1)."""
+"""Pivots of oriented Gaussians: two, three or nine per Gaussian (docs/method.md, section 6.1)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ PIVOT_SIGMAS = 3.0
 """The outer pivot lies at this many standard deviations along the normal."""
 
 MAX_PIVOT_GAUSSIANS = 250_000
-"""With more, one Gaussian a cell and direction stands for its neighbours (memory)."""
+"""With more, one Gaussian per cell and direction represents its neighbours, to limit memory."""
 
 
-def reaching(arrays: GaussianArrays, region: Region, margin: float) -> np.ndarray:
-    """Return indices of the Gaussians whose 3-sigma body comes within ``margin`` of the region.
+def gaussians_reaching(arrays: GaussianArrays, region: Region, margin: float) -> np.ndarray:
+    """Return indices of the Gaussians whose 3-sigma ellipsoid is within ``margin`` of the region.
 
-    Gaussians that no kernel shows (opacity below 1/255), and those whose centre is farther away
-    than the region is large, are left out.
+    Gaussians too faint to be rendered (opacity below 1/255) are left out, as are those whose centre
+    is farther away than 1.5 diagonals of the region.
     """
     normals, offsets = region.half_spaces
     good = arrays.log_opacities > np.log(tolerances.ALPHA_MIN)
@@ -68,7 +68,7 @@ def three_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
 def _outer_steps(
     arrays: GaussianArrays, index: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return centres (k, 3), the way to the outer pivot (k, 3), and what is oriented (k,) bool."""
+    """Return centres (k, 3), offsets of the outer pivots (k, 3), and whether oriented (k,) bool."""
     means = arrays.means[index]
     normals = arrays.normals[index]
     length = np.linalg.norm(normals, axis=1)
@@ -83,7 +83,7 @@ def _outer_steps(
 def nine_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
     """Return centre and the corners of the 3-sigma box of the Gaussians ``index`` on their axes.
 
-    As Gaussian Opacity Fields places them; orientation plays no part (docs/method.md, section 6.1).
+    As in Gaussian Opacity Fields; the orientation is not used (docs/method.md, section 6.1).
 
     Returns
     -------
@@ -102,14 +102,14 @@ PIVOTS: dict[int, Callable[[GaussianArrays, np.ndarray], np.ndarray]] = {
     3: three_pivots,
     9: nine_pivots,
 }
-"""By their number."""
+"""Pivot functions by the number of pivots per Gaussian."""
 
 
-def representative(arrays: GaussianArrays, index: np.ndarray, limit: int) -> np.ndarray:
-    """Return at most about ``limit`` of the Gaussians ``index``, evenly over space and direction.
+def representative_gaussians(arrays: GaussianArrays, index: np.ndarray, limit: int) -> np.ndarray:
+    """Subsample the Gaussians ``index`` to at most ``limit``, evenly over space and direction.
 
-    In each cell the most opaque Gaussian of each octant of normals stays. Cells grow until the
-    rest is small enough.
+    Each cell keeps its most opaque Gaussian per octant of normals. Cells grow until few enough
+    are left.
     """
     if len(index) <= limit:
         return index

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Points on the boundary of a region where it cuts the solid, so that the mesh closes there."""
+"""Cap points: samples of a region's boundary where it cuts the solid, to close the mesh there."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from ..tetrahedra.marching_tetrahedra import IsEmpty, bisect
 from .spacing import Spacing
 
 MAX_CANDIDATES = 1_500_000
-"""Samples of the region's boundary; a finer request gets coarser caps, which are flat anyway."""
+"""Most samples of the region's boundary; finer requests get coarser caps, which are flat anyway."""
 
 OVERSAMPLING = 5.0
 RIM_TOLERANCE_SHARE = 1e-3
 """Length of the bracket around the rim of a cap, in edge lengths."""
 
 INNER_RADII = 2.0
-"""Spacing inside a cap, in local radii: it is flat."""
+"""Spacing inside a cap, in local radii: caps are flat."""
 
-# Corners first, then edges, rims, the inner part: what defines the shape stays.
+# Corners first, then edges, rims and the interior: the points that define the shape are kept.
 PRIORITY_CORNER, PRIORITY_EDGE, PRIORITY_RIM, PRIORITY_INNER = 0.0, 1.0, 2.0, 4.0
 
 
@@ -43,7 +43,7 @@ class Caps:
 
 
 def no_caps() -> Caps:
-    """Return the caps of a region whose boundary stays open."""
+    """Return empty caps, for a region whose boundary stays open."""
     return Caps(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
 
 
@@ -54,23 +54,23 @@ def cap_points(
     rng: np.random.Generator,
     progress: Progress,
 ) -> Caps:
-    """Sample the region's faces, sharp edges and corners where the field is occupied.
+    """Sample the region's faces, sharp edges and corners where they lie in the solid.
 
-    Where occupied and empty samples of one face are neighbours, the segment between them is
-    bisected: those points make up the rim, where the isosurface meets the face.
+    Segments between neighbouring occupied and empty samples of one face are bisected; the resulting
+    points form the rim, where the isosurface meets the face.
 
     Parameters
     ----------
     spacing : Spacing
-        Of the surface. Inside a cap it grows with the distance to the rim.
+        Spacing of the surface; inside a cap it grows with the distance to the rim.
     """
     radius = max(spacing.nominal, np.sqrt(region.area * OVERSAMPLING / MAX_CANDIDATES))
     points, normals, face = _face_samples(region, radius, rng)
-    progress.update(0.1, f"closing the region's boundary ({len(points)} samples)")
+    progress.update(0.1, f"sampling the region's boundary ({len(points)} samples)")
     empty = is_empty(points)
     rim_in, rim_out, rim_face = _face_crossings(points, empty, face, radius)
     edge_points, edge_in, edge_out, corner_points = _edge_samples(region, is_empty, radius)
-    progress.update(0.5, "closing the region's boundary")
+    progress.update(0.5, "sampling the region's boundary")
     inside, _ = bisect(
         np.concatenate([rim_in, edge_in]),
         np.concatenate([rim_out, edge_out]),
@@ -100,7 +100,7 @@ def cap_points(
 def _face_samples(
     region: Region, radius: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return thinned points of the whole boundary, their normals, and their planar face."""
+    """Return thinned samples of the whole boundary, their normals and planar faces."""
     count = int(min(MAX_CANDIDATES, OVERSAMPLING * region.area / radius**2)) + 16
     pieces = region.faces()
     corners = np.concatenate(pieces)  # (t, 3, 3)
@@ -116,7 +116,7 @@ def _face_samples(
 def _face_crossings(
     points: np.ndarray, empty: np.ndarray, face: np.ndarray, radius: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pair occupied with empty neighbours on the same planar face."""
+    """Pair occupied with empty neighbours on one planar face."""
     none = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
     occupied, vacant = np.flatnonzero(~empty), np.flatnonzero(empty)
     if len(occupied) == 0 or len(vacant) == 0:
@@ -133,7 +133,7 @@ def _face_crossings(
 def _edge_samples(
     region: Region, is_empty: IsEmpty, radius: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return occupied points on sharp edges, the crossing pairs between them, and corners."""
+    """Return occupied points on sharp edges, crossing segments on these, and occupied corners."""
     rows, owners = [], []
     for index, (begin, end) in enumerate(region.edges()):
         steps = max(1, round(float(np.linalg.norm(end - begin)) / radius / 1.2))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How densely a region is meshed: edge length, number of points, and their caps."""
+"""Resolution of a mesh: requested edge length or number of points, and their limits."""
 
 from __future__ import annotations
 
@@ -15,53 +15,53 @@ from ...regions.convex_region import Region
 from ...report_warning import ReportWarning
 
 AUTOMATIC_POINTS = 24_000
-"""Surface points where nothing is asked for: about 50 thousand faces (48 to 55 thousand in jobs;
-where the region cuts the solid, its boundary adds some)."""
+"""Surface points without a request: about 50 thousand faces (48 to 55 thousand in jobs; caps add
+some where the region cuts the solid)."""
 
 MIN_VERTICES = 100
-"""An adaptive mesh keeps at least so many."""
+"""Least number of vertices of an adaptive mesh."""
 
 COARSEST_SHARE = 1 / 8
 """Edges longer than this share of the diagonal would not show a region's contents."""
 
 DENSE_FACTOR = 6.0
-"""Vertices of the mesh from which adaptive spacing selects, for each one that stays. With fewer,
-the errors of that mesh are what is left; more cost time without lessening them much."""
+"""Vertices of the dense mesh per vertex that adaptive spacing keeps. With fewer, the errors of the
+dense mesh dominate; more cost time and lower the error little."""
 DENSE_POINTS, LEAST_DENSE_FACTOR = 200_000, 2.0
-"""Beyond so many points the factor falls, to this one: time stays in proportion to the request."""
+"""Beyond this many points the factor falls, to this minimum: time stays proportional to points."""
 
 VERTICES_PER_UNIFORM = 0.5
-"""Vertices of an adaptive mesh, of those of the uniform one with the requested edge length: it
-reaches the same distance to the surface with these (benchmarks/meshing_parts/spacing.py)."""
+"""Vertices of an adaptive mesh, as a share of the uniform mesh with the requested edge length; both
+have the same distance to the surface (benchmarks/meshing_parts/spacing.py)."""
 
 FINEST_SHARE = 1e-6
-"""Edges shorter than this share of the diagonal are refused without any computation."""
+"""Edges shorter than this share of the diagonal are refused outright."""
 
 
 @dataclass(frozen=True)
-class Request:
-    """What was asked for: an edge length, a number of points, or neither (0 and 0)."""
+class ResolutionRequest:
+    """A requested edge length or number of points, or neither (0 and 0)."""
 
     edge_length: float
     """Scene units."""
     points: int
     notes: tuple[ReportWarning, ...] = ()
-    """What was changed, for the report."""
+    """Changes to the request, for the report."""
 
 
-def checked_request(edge_length: float, points: int, region: Region) -> Request:
-    """Check a request before any work is done.
+def checked_request(edge_length: float, points: int, region: Region) -> ResolutionRequest:
+    """Validate a request before any work is done; clamp edges that are too long.
 
     Raises
     ------
     UsageError
-        Not a number, negative, or both given.
+        A value is not finite or negative, or both are given.
     ResourceError
-        Absurdly fine.
+        The resolution is too fine.
     """
     if not math.isfinite(edge_length) or edge_length < 0 or points < 0:
         raise UsageError(
-            f"Edge length {edge_length} with {points} points is not possible.",
+            f"Edge length {edge_length} with {points} points is invalid.",
             "Give a positive edge length, or a number of points, or leave both 0.",
         )
     if edge_length > 0 and points > 0:
@@ -80,12 +80,12 @@ def checked_request(edge_length: float, points: int, region: Region) -> Request:
     if edge_length > coarsest:
         share = f"1/{1 / COARSEST_SHARE:.0f} of the region's diagonal"
         text = f"The edge length was larger than {share} and was reduced to that."
-        return Request(coarsest, 0, (ReportWarning("edge-length-reduced", text),))
-    return Request(edge_length, points)
+        return ResolutionRequest(coarsest, 0, (ReportWarning("edge-length-reduced", text),))
+    return ResolutionRequest(edge_length, points)
 
 
-def thinning_radius(request: Request, area: float, region: Region) -> float:
-    """Return the thinning radius that answers the request with the same spacing everywhere.
+def thinning_radius(request: ResolutionRequest, area: float, region: Region) -> float:
+    """Return the thinning radius that meets the request with uniform spacing.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def thinning_radius(request: Request, area: float, region: Region) -> float:
     return min(radius, COARSEST_SHARE * region.diagonal)
 
 
-def check_expected(points: float, request: Request) -> None:
+def check_expected_points(points: float, request: ResolutionRequest) -> None:
     """Refuse an edge length that needs too many points.
 
     Raises
@@ -111,58 +111,58 @@ def check_expected(points: float, request: Request) -> None:
         factor = math.sqrt(points / limits.MAX_MESH_POINTS)
         raise ResourceError(
             f"This edge length needs about {points:.1e} surface points; "
-            f"{limits.MAX_MESH_POINTS:.0e} is the most.",
+            f"the limit is {limits.MAX_MESH_POINTS:.0e}.",
             f"Use edges at least {factor:.2g} times longer, or a smaller region.",
         )
 
 
 @dataclass(frozen=True)
-class Dense:
-    """The mesh from which the vertices of an adaptive one are selected."""
+class DenseRequest:
+    """Resolution of the dense mesh that an adaptive mesh is simplified from."""
 
-    request: Request
+    request: ResolutionRequest
     target: int
-    """Vertices that stay, for the surface alone."""
+    """Vertices to keep, for the surface without caps."""
     share: float
-    """The same, of the dense mesh: where the region cuts the solid, its boundary has some too."""
+    """The same as a share of the dense mesh, which also has vertices on caps."""
 
 
 def dense_points(stay: float) -> float:
-    """Return how many points a mesh has from which so many are selected."""
+    """Return the points of the dense mesh for a number of vertices to keep."""
     return max(min(DENSE_FACTOR * stay, DENSE_POINTS), LEAST_DENSE_FACTOR * stay)
 
 
-def stay_of_dense(points: float) -> float:
-    """Return how many stay, at most, of a mesh of so many points: the inverse of the above."""
+def kept_from_dense(points: float) -> float:
+    """Return the vertices kept, at most, of a dense mesh: the inverse of :func:`dense_points`."""
     return points / (LEAST_DENSE_FACTOR if points >= DENSE_POINTS else DENSE_FACTOR)
 
 
-def dense_request(request: Request, area: float, region: Region) -> Dense:
-    """Tell how dense a mesh to make, and how many of its vertices to keep, for a request.
+def dense_request(request: ResolutionRequest, area: float, region: Region) -> DenseRequest:
+    """Return the resolution of the dense mesh, and how many of its vertices to keep.
 
     Raises
     ------
     ResourceError
-        The dense mesh needs more points than the cap.
+        The dense mesh needs more points than the limit.
     """
     expected = POINTS_PER_SQUARE * area / thinning_radius(request, area, region) ** 2
     share = VERTICES_PER_UNIFORM if request.edge_length > 0 else 1.0
     target, notes = round(share * expected), request.notes
     if target < MIN_VERTICES:
-        asked = request.points or target  # with an edge length, what it comes to
+        asked = request.points or target  # with an edge length, the points that it implies
         text = (
-            f"An adaptive mesh has at least {MIN_VERTICES} surface points; {asked} were asked for."
+            f"An adaptive mesh has at least {MIN_VERTICES} surface points; {asked} were requested."
         )
         notes = (*notes, ReportWarning("points-raised", text))
         target = MIN_VERTICES
     dense = dense_points(target)
     if request.edge_length > 0:
-        check_expected(dense, request)
+        check_expected_points(dense, request)
         edge = request.edge_length * math.sqrt(expected / dense)
-        return Dense(Request(edge, 0, notes), target, target / dense)
-    return Dense(Request(0.0, round(dense), notes), target, target / dense)
+        return DenseRequest(ResolutionRequest(edge, 0, notes), target, target / dense)
+    return DenseRequest(ResolutionRequest(0.0, round(dense), notes), target, target / dense)
 
 
-def nominal_edge(request: Request, area: float, region: Region) -> float:
-    """Return the edge length of the uniform mesh that a request stands for."""
+def nominal_edge(request: ResolutionRequest, area: float, region: Region) -> float:
+    """Return the edge length of the uniform mesh that meets a request."""
     return EDGE_PER_RADIUS * thinning_radius(request, area, region)

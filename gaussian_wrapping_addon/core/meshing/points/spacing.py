@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Local distances of surface points: no closer than what the photos resolve, changing slowly."""
+"""Local spacing of surface points: no finer than the photos resolve, with bounded gradation."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from ...dataset.camera import Camera
 from ...mesh.surface_sampling import EDGE_PER_RADIUS
 
 EDGE_PER_PIXEL = 0.5
-"""Shortest edge, in pixels of the nearest camera. The finest pattern that a photo holds repeats
-after two pixels; four vertices show it."""
+"""Shortest edge, in pixels of the nearest camera. The finest pattern in a photo has a period of two
+pixels; four vertices represent it."""
 
 GRADING = 0.4
-"""Edges grow by at most this share of the distance: neighbouring triangles stay well shaped."""
+"""Edges lengthen by at most this share of the distance, so that triangles stay well shaped."""
 
 LONGEST_SHARE = 8.0
-"""Edges are lengthened to this many nominal ones at most, however near the only camera is."""
+"""Edges are lengthened to at most this many nominal ones, however far the nearest camera is."""
 
 
 def footprints(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the size of a pixel at each point in the camera that shows it largest, (n,).
+    """Return the smallest pixel footprint over the cameras at each point, (n,).
 
-    0 where no camera looks.
+    0 where no camera sees the point.
     """
     finest = np.full(len(points), np.inf)
     for camera in cameras:
@@ -39,33 +39,33 @@ def footprints(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def resolved_edges(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the shortest edge that the photos resolve at each point, (n,); 0 where none looks."""
+    """Return the shortest edge that the photos resolve at each point, (n,); 0 where unseen."""
     return EDGE_PER_PIXEL * footprints(points, cameras)
 
 
 @dataclass(frozen=True)
 class Spacing:
-    """Local thinning radii, known at some points of the surface."""
+    """Local thinning radii, sampled at points of the surface."""
 
     points: np.ndarray
     """(n, 3) float64."""
     radii: np.ndarray
     """(n,) float64."""
     nominal: float
-    """Radius where nothing limits it, the smallest one."""
+    """Radius where the photos do not limit it: the smallest one."""
     limited: float
-    """Share of the area where the photos resolve no finer edges."""
+    """Share of the area where the photos limit the radius."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_tree", cKDTree(self.points))
 
     @classmethod
     def uniform(cls, radius: float) -> Spacing:
-        """The same everywhere."""
+        """Return the same spacing everywhere."""
         return cls(np.zeros((1, 3)), np.array([radius]), radius, 0.0)
 
     def at(self, where: np.ndarray, threads: int = 1) -> np.ndarray:
-        """Return the radius at each of (m, 3) points, growing with the distance to known ones."""
+        """Return the radius at (m, 3) points; it grows with the distance to samples."""
         if len(self.points) == 1:
             return np.full(len(where), self.radii[0])
         k = min(4, len(self.points))
@@ -108,7 +108,7 @@ def graded(edges: np.ndarray, distance: np.ndarray, index: np.ndarray) -> np.nda
     result = edges
     step = GRADING * distance
     while True:
-        # Both ways: the nearest of a point need not have it among their own.
+        # In both directions: nearest-neighbour relations are not symmetric.
         lower = np.minimum(result, (result[index] + step).min(1))
         np.minimum.at(lower, index, lower[:, None] + step)
         if (lower > 0.99 * result).all():

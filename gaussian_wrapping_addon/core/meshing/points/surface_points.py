@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Evenly spread points on the isosurface, made from a candidate surface.
+"""Sample evenly spaced points on the isosurface, starting from a candidate surface.
 
 See docs/method.md, section 7.2.
 """
@@ -25,40 +25,41 @@ from ...report_warning import ReportWarning
 from ..tetrahedra.marching_tetrahedra import bisect
 from .candidate_surface import CandidateSurface
 from .region_caps import cap_points, no_caps
-from .resolution import Request, check_expected, thinning_radius
+from .resolution import ResolutionRequest, check_expected_points, thinning_radius
 from .spacing import Spacing, footprint_spacing
 
 KIND_SURFACE, KIND_CAP, KIND_JUMP = 0, 1, 2
-"""On the isosurface; on the region's boundary; where vacancy jumps over 0.5 (the end of what the
-cameras see)."""
+"""On the isosurface; on the region's boundary; where vacancy jumps across 0.5 (at the limit of what
+the cameras see)."""
 
 PRIORITY_SURFACE = 3.0
 """Between the rims and the inner part of the caps; see region_caps."""
 
 OVERSAMPLING = 20.0
-"""Candidates per point, before the first thinning."""
+"""Candidates per point before the first thinning."""
 FIRST_THINNING = 0.4
-"""Candidates closer than this share of the radius are not worth projecting. These two decide how
-even the points become (and sampling.POINTS_PER_SQUARE)."""
+"""Candidates closer than this share of the radius are not projected. These two constants determine
+how even the points are (and surface_sampling.POINTS_PER_SQUARE)."""
 MAX_BLOCK = 2_000_000
-"""Candidates drawn at a time (memory)."""
-SCOUTS = 20_000
-"""Even points on the candidate surface at which the photos' footprint is looked up."""
-NOTED_SHARE = 0.1
-"""Share of the surface from which on it is worth a note that the photos limit the edges."""
+"""Candidates drawn at a time, to limit memory."""
+FOOTPRINT_SAMPLES = 20_000
+"""Samples of the candidate surface at which the photos' pixel footprint is evaluated."""
+REPORTED_SHARE = 0.1
+"""The report notes that the photos limit the edges where they do so on more than this share of the
+surface."""
 
 MAX_PROJECTION_STEPS = 14
-"""Nearly all points need two or three; each further batch looks from all cameras again."""
+"""Nearly all points need two or three; each further step evaluates all cameras again."""
 
 SEARCH_SHARES = (0.25, -0.25, 0.5, -0.5, 1.0, -1.0)
-"""Distances along the normal, in radii, at which a point without a crossing looks for one."""
+"""Offsets along the normal, in radii, at which points that did not converge search a crossing."""
 BRACKET_SHARE = 1e-3
 """A found crossing is bracketed to this share of the radius."""
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points that become the vertices of the mesh."""
+    """Points to become vertices of the mesh."""
 
     points: np.ndarray
     """(n, 3) float64."""
@@ -69,14 +70,14 @@ class SurfacePoints:
     radii: np.ndarray
     """(n,) float64 local thinning radius."""
     radius: float
-    """The smallest of them, where nothing limits it."""
+    """Nominal thinning radius, the smallest."""
     notes: tuple[ReportWarning, ...]
     figures: dict[str, Any]
 
 
 @dataclass(frozen=True)
-class _Settled:
-    """Candidates that reached a surface."""
+class _ProjectedPoints:
+    """Candidates that converged to a surface."""
 
     points: np.ndarray
     """(n, 3) float64."""
@@ -88,7 +89,7 @@ class _Settled:
 
 
 class SurfaceSampler:
-    """Spreads points over a candidate surface and moves them onto the isosurface."""
+    """Samples a candidate surface and projects the points onto the isosurface."""
 
     def __init__(
         self,
@@ -100,7 +101,7 @@ class SurfaceSampler:
         *,
         cameras: Sequence[Camera] = (),
     ) -> None:
-        """Cameras, where given, limit how close points lie by what they resolve."""
+        """Limit the spacing to what ``cameras`` resolve, if any are given."""
         self._vacancy, self._vectors, self._region = vacancy, vectors, region
         self._cameras = cameras
         self._vertices = surface.vertices
@@ -113,21 +114,21 @@ class SurfaceSampler:
         self._threads = threads
 
     def spacing(
-        self, request: Request, rng: np.random.Generator
+        self, request: ResolutionRequest, rng: np.random.Generator
     ) -> tuple[Spacing, tuple[ReportWarning, ...]]:
-        """Return the local radii that answer to a request, and notes for the report.
+        """Return the local radii that meet a request, and notes for the report.
 
         Raises
         ------
         ResourceError
-            The request needs more points than the cap.
+            The request needs more points than the limit.
         """
         spacing, notes = self._spacing(request, rng)
-        check_expected(self._expected(spacing)[1], request)
+        check_expected_points(self._expected(spacing)[1], request)
         return spacing, notes
 
     def _expected(self, spacing: Spacing) -> tuple[np.ndarray, float]:
-        """Return the radius of each face as a share of the nominal one, and the points in all."""
+        """Return the radius at each face as a share of the nominal one, and the expected points."""
         share = spacing.at(self._vertices[self._faces].mean(1), self._threads) / spacing.nominal
         _, areas = normals_and_areas(self._vertices, self._faces)
         weight = float((areas * share**-2.0).sum())
@@ -135,7 +136,7 @@ class SurfaceSampler:
 
     def sample(
         self,
-        request: Request,
+        request: ResolutionRequest,
         rng: np.random.Generator,
         progress: Progress,
         *,
@@ -147,29 +148,29 @@ class SurfaceSampler:
         Parameters
         ----------
         spacing : Spacing, optional
-            Known already, from :meth:`spacing` of the whole surface.
+            Precomputed by :meth:`spacing` for the whole surface.
         owned : callable, optional
-            Maps (n, 3) points to (n,) bool: only these are kept, and the region's boundary gets no
-            points. For tiles, whose boundary is none of the solid's.
+            Maps (n, 3) points to (n,) bool: only these are kept, and no cap points are made. For
+            tiles, whose boundary does not bound the solid.
 
         Raises
         ------
         ResourceError
-            The request needs more points than the cap.
+            The request needs more points than the limit.
         """
         notes: tuple[ReportWarning, ...] = ()
         if spacing is None:
             spacing, notes = self._spacing(request, rng)
-        progress.update(0.0, "spreading points")
+        progress.update(0.0, "sampling the surface")
         share, expected = self._expected(spacing)
-        check_expected(expected, request)
+        check_expected_points(expected, request)
         points, face = self._candidates(
             spacing.nominal, share, int(OVERSAMPLING * expected) + 64, rng
         )
-        progress.update(0.1, f"moving {len(points)} points onto the surface")
+        progress.update(0.1, f"projecting {len(points)} points onto the surface")
         radii = spacing.at(points, self._threads)
-        settled = self._settled(points, face, radii, progress.span(0.1, 0.8))
-        moved, normals, kind = settled.points, settled.normals, settled.kind
+        projected = self._project(points, face, radii, progress.span(0.1, 0.8))
+        moved, normals, kind = projected.points, projected.normals, projected.kind
         caps = no_caps()
         if owned is None:
             caps = cap_points(
@@ -179,12 +180,12 @@ class SurfaceSampler:
             mine = owned(moved)
             moved, normals, kind = moved[mine], normals[mine], kind[mine]
         radii = spacing.at(moved, self._threads)
-        # Jumps last among surface points: where both are near, the isosurface is the better one.
+        # Jumps come last among surface points: points on the isosurface are preferred.
         priority = PRIORITY_SURFACE + 0.5 * (rng.random(len(moved)) + (kind == KIND_JUMP))
-        everything = np.concatenate([caps.points, moved])
+        all_points = np.concatenate([caps.points, moved])
         normals = np.concatenate([caps.normals, normals])
         radii = np.concatenate([caps.radii, radii])
-        kept = thin(everything, normals, radii, np.concatenate([caps.priority, priority]))
+        kept = thin(all_points, normals, radii, np.concatenate([caps.priority, priority]))
         kinds = np.concatenate([np.full(len(caps.points), KIND_CAP, np.uint8), kind])[kept]
         figures = {
             "candidates": len(points),
@@ -192,35 +193,35 @@ class SurfaceSampler:
             "surface_points": int((kinds == KIND_SURFACE).sum()),
             "jump_points": int((kinds == KIND_JUMP).sum()),
             "cap_points": int((kinds == KIND_CAP).sum()),
-            "projection_evaluations": settled.evaluations,
+            "projection_evaluations": projected.evaluations,
             "shortest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].min(initial=np.inf)),
             "longest_spacing_scene": EDGE_PER_RADIUS * float(radii[kept].max(initial=0.0)),
             "limited_by_photos_share": spacing.limited,
         }
         return SurfacePoints(
-            everything[kept], normals[kept], kinds, radii[kept], spacing.nominal, notes, figures
+            all_points[kept], normals[kept], kinds, radii[kept], spacing.nominal, notes, figures
         )
 
     def _spacing(
-        self, request: Request, rng: np.random.Generator
+        self, request: ResolutionRequest, rng: np.random.Generator
     ) -> tuple[Spacing, tuple[ReportWarning, ...]]:
-        """Choose the local radii, and tell where the photos limit them."""
+        """Choose the local radii, and note how much of the surface the photos limit."""
         radius = thinning_radius(request, self.area, self._region)
         if len(self._cameras) == 0:
             return Spacing.uniform(radius), ()
-        points, _ = sample_triangles(self._vertices, self._faces, SCOUTS, rng)
+        points, _ = sample_triangles(self._vertices, self._faces, FOOTPRINT_SAMPLES, rng)
         spacing = footprint_spacing(points, self._cameras, radius)
         notes: tuple[ReportWarning, ...] = ()
-        if spacing.limited > NOTED_SHARE:
+        if spacing.limited > REPORTED_SHARE:
             share = f"On {spacing.limited:.0%} of the surface"
-            text = f"{share} the photos resolve no finer edges; uniform spacing makes them."
+            text = f"{share} the photos resolve no shorter edges; uniform spacing would make them."
             notes = (ReportWarning("photos-limit-edges", text),)
         return spacing, notes
 
-    def _settled(
+    def _project(
         self, points: np.ndarray, face: np.ndarray, radii: np.ndarray, progress: Progress
-    ) -> _Settled:
-        """Move points of the candidate surface onto the isosurface, or where vacancy jumps."""
+    ) -> _ProjectedPoints:
+        """Project points of the candidate surface onto the isosurface or a jump of vacancy."""
         normals = self._normals_at(points, self._normals[face])
         found = project_to_isosurface(
             points,
@@ -232,7 +233,7 @@ class SurfaceSampler:
         kind = np.full(len(points), KIND_SURFACE, np.uint8)
         lost = np.flatnonzero(~found.on_surface)
         moved = found.points.copy()
-        searched, kind_of_lost = self._search(
+        searched, kind_of_lost = self._search_along_normals(
             points[lost], normals[lost], radii[lost], progress.span(0.8, 1.0)
         )
         moved[lost] = searched
@@ -241,12 +242,12 @@ class SurfaceSampler:
         kind[lost] = np.maximum(kind_of_lost, 0)
         good &= self._region.contains(moved, 0.0)
         normals = self._normals_at(moved[good], normals[good])
-        return _Settled(moved[good], normals, kind[good], int(found.vacancy_evaluations))
+        return _ProjectedPoints(moved[good], normals, kind[good], int(found.vacancy_evaluations))
 
     def _candidates(
         self, radius: float, share: np.ndarray, count: int, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw ``count`` points and thin them to what is worth projecting, block by block.
+        """Draw ``count`` candidates and thin them, block by block.
 
         Returns
         -------
@@ -279,21 +280,21 @@ class SurfaceSampler:
         return thin(points, self._normals[face], FIRST_THINNING * radii[face], priority)
 
     def _normals_at(self, points: np.ndarray, fallback: np.ndarray) -> np.ndarray:
-        """Outward directions of the field, or the triangle's normal where none is known or the
-        two disagree (the far side of a thin wall, a Gaussian that was oriented wrongly)."""
+        """Return the field's outward directions, or the triangle's normal where there is none or
+        the two disagree (the far side of a thin wall, a wrongly oriented Gaussian)."""
         outward = self._vectors.evaluate(points).outward  # (n, 3) unit or 0
         agree = (outward * fallback).sum(1) > 0  # false for NaN
         return np.where(agree[:, None], outward, fallback)
 
-    def _search(
+    def _search_along_normals(
         self, points: np.ndarray, normals: np.ndarray, radii: np.ndarray, progress: Progress
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Look for a crossing along the normal where the projection found none.
+        """Search a crossing along the normal where the projection found none.
 
         Returns
         -------
         points : (k, 3)
-            Middle of the bracket.
+            Midpoint of the bracket.
         kind : (k,) int
             :data:`KIND_SURFACE`, :data:`KIND_JUMP`, or -1 without a crossing.
         """
@@ -302,14 +303,14 @@ class SurfaceSampler:
         if len(points) == 0:
             return moved, kind
         start = self._vacancy.is_empty(points)
-        other, open_rows = points.copy(), np.arange(len(points))
+        other, pending = points.copy(), np.arange(len(points))
         for share in SEARCH_SHARES:
-            step = share * radii[open_rows, None]
-            trial = points[open_rows] + step * normals[open_rows]
-            hit = self._vacancy.is_empty(trial) != start[open_rows]
-            other[open_rows[hit]] = trial[hit]
-            kind[open_rows[hit]] = KIND_JUMP
-            open_rows = open_rows[~hit]
+            step = share * radii[pending, None]
+            trial = points[pending] + step * normals[pending]
+            hit = self._vacancy.is_empty(trial) != start[pending]
+            other[pending[hit]] = trial[hit]
+            kind[pending[hit]] = KIND_JUMP
+            pending = pending[~hit]
         rows = np.flatnonzero(kind >= 0)
         empty = start[rows, None]
         inside, outside = bisect(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tetrahedra: Delaunay, labels inside or outside, minimum cut, the faces between.
+"""Tetrahedra: Delaunay triangulation, inside/outside labels by minimum cut, boundary faces.
 
 In: points and vacancy. Out: labelled tetrahedra and their boundary faces.
 """

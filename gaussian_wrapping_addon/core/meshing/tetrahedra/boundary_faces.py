@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Neighbours of tetrahedra, and the faces between inside and outside."""
+"""Neighbours of tetrahedra, and the faces between inside and outside tetrahedra."""
 
 from __future__ import annotations
 

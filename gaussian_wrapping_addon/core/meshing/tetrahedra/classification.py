@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside or outside: progressive sampling of tetrahedra, and a minimum cut over the undecided."""
+"""Label tetrahedra inside or outside: progressive sampling, then a minimum cut.
+
+See docs/method.md, section 7.5.
+"""
 
 from __future__ import annotations
 
@@ -18,42 +21,42 @@ Vacancy = Callable[[np.ndarray], np.ndarray]
 """Maps (n, 3) points to (n,) vacancy."""
 
 ROUNDS = (1, 3, 6)
-"""Interior points added in each round: the centroid, then random ones (10 in all, as in PAM)."""
+"""Interior samples added in each round: the centroid, then random points (10 in all, as in PAM)."""
 
 DECIDED_MARGIN = 0.3
-"""A mean vacancy this far from 0.5 needs no further samples ..."""
-LONELY_NEIGHBOURS = 3
-"""... unless so many neighbours carry the other label."""
+"""A mean vacancy this far from 0.5 needs no further samples, ..."""
+DISAGREEING_NEIGHBOURS = 3
+"""... unless this many neighbours have the other label."""
 MIXED_DEVIATION = 0.1
-"""Samples that agree this well, near 0.5, come from a sliver on the surface: more of them tell
-nothing, and the minimum cut decides."""
+"""Samples near 0.5 whose standard deviation is below this come from a sliver on the surface: more
+samples add nothing, and the minimum cut decides."""
 
 SHEET_COSINE = 0.5
 SHEET_SLOPE = 0.2
 SHEET_EDGE = 12.0
-"""Normals at all corners of a flat tetrahedron agree at least this well, its edges rise at most so
-much along them, and are at most this many spacings long. With a slope of 0.4, edges that cross a
+"""Bounds for a flat tetrahedron: least cosine between the normals at its corners, largest slope of
+its edges along them, and greatest edge length in spacings. With a slope of 0.4, edges that cross a
 plate five times thinner than they are long counted as lying on one side: it got holes."""
 
 FIXED_MARGIN = 0.05
 """Tetrahedra at least this far from 0.5 after all rounds keep their label. With 0.25, smoothing
-took a tenth of the wheel's spokes: their insides have a vacancy of 0.2 to 0.4, and a thin tube has
-much area to save. From 0.1 to 0.05 the wheel's, the fence's and the torus's mean distances to the
-truth fall or stay, and fewer spokes break; with 0 the torus gets small parts of noise."""
+removed a tenth of the wheel's spokes: their interior has a vacancy of 0.2 to 0.4, and cutting a
+thin tube saves much area. From 0.1 to 0.05 the mean distances of wheel, fence and torus to the
+truth fall or stay, and fewer spokes break; with 0 the torus gets small noisy components."""
 DATA_WEIGHT = 1.0
-"""Cost of a label against the vote, in units of the tetrahedron's own mean face area."""
+"""Cost of a label against the samples, in units of the tetrahedron's own mean face area."""
 CAPACITY_STEPS = 4096.0
 """Integer steps of the median face area in the minimum cut."""
 LARGEST_CAPACITY = 2**27
-"""In the same steps, 32 768 median areas: larger faces count as that. Flow one way can double what
-the other way may carry, which must fit into 32 bits."""
+"""In the same steps, 32 768 median areas: larger faces are clamped to it. Flow along an arc can
+double the residual capacity of its reverse, which must fit into 32 bits."""
 
 POINTS_PER_CHUNK = 1 << 19
 
 
 @dataclass(frozen=True)
 class Classification:
-    """Labels of tetrahedra and how they came about."""
+    """Labels of tetrahedra and the statistics behind them."""
 
     inside: np.ndarray
     """(m,) bool."""
@@ -79,11 +82,11 @@ def classify(
 ) -> Classification:
     """Label tetrahedra by the vacancy of interior points (docs/method.md, section 7.5).
 
-    A tetrahedron whose corners lie on one smooth sheet is flat: inside or outside, the surface
-    stays the same up to the spacing squared. Those are labelled by the side of the sheet on which
-    their circumcentre lies, which yields the Delaunay triangulation restricted to the surface,
-    with well-shaped triangles. By interior points, a cylinder would get the long edges of a convex
-    hull.
+    A tetrahedron whose corners lie on one smooth sheet is flat: whichever its label, the surface
+    is the same up to the spacing squared. Flat tetrahedra are labelled by the side of the sheet
+    on which their circumcentre lies, which yields the Delaunay triangulation restricted to the
+    surface, with well-shaped triangles. Labelled by interior samples, a cylinder would get the long
+    edges of a convex hull.
 
     Parameters
     ----------
@@ -92,7 +95,7 @@ def classify(
     neighbours : (m, 4) int64
         Tetrahedron behind the face opposite each corner, -1 on the hull.
     outer : (m,) bool
-        Outside by definition (beyond the region); never sampled.
+        Outside by definition (beyond the region), not sampled.
     sheet : Sheet
         From :func:`on_one_sheet`.
     """
@@ -104,15 +107,15 @@ def classify(
     flat[sheet.rows] = True
     total[sheet.rows], samples[sheet.rows] = 0.5 + 0.5 * sheet.side, 1
     rows = np.flatnonzero(~outer & ~flat)
-    for turn, extra in enumerate(ROUNDS):
-        span = progress.span(0.8 * turn / len(ROUNDS), 0.8 * (turn + 1) / len(ROUNDS))
+    for index, extra in enumerate(ROUNDS):
+        span = progress.span(0.8 * index / len(ROUNDS), 0.8 * (index + 1) / len(ROUNDS))
         size = max(1, POINTS_PER_CHUNK // extra)
         for begin in range(0, len(rows), size):
             span.update(begin / len(rows), f"classifying {len(rows)} tetrahedra")
             part = rows[begin : begin + size]
-            weights = _interior_weights((extra, len(part)), turn == 0, rng)
+            weights = _interior_weights((extra, len(part)), index == 0, rng)
             where = np.einsum("ekc,kcx->ekx", weights, points[tetrahedra[part]])
-            # One call for all samples: it looks from every camera, however few the points.
+            # One call for all samples: each call visits every camera, however few the points.
             value = vacancy(where.reshape(-1, 3)).reshape(extra, -1).astype(np.float64)
             total[part] += value.sum(0)
             squares[part] += (value**2).sum(0)
@@ -120,9 +123,9 @@ def classify(
         mean = total / np.maximum(samples, 1)
         inside = (mean <= tolerances.ISO_LEVEL) & ~outer
         near = np.abs(mean - tolerances.ISO_LEVEL) < DECIDED_MARGIN
-        lonely = _disagreeing(inside, neighbours) >= LONELY_NEIGHBOURS
+        outvoted = _disagreeing(inside, neighbours) >= DISAGREEING_NEIGHBOURS
         mixed = squares > samples * (mean**2 + MIXED_DEVIATION**2)
-        rows = np.flatnonzero(((near & (mixed | (samples == 1))) | lonely) & ~outer & ~flat)
+        rows = np.flatnonzero(((near & (mixed | (samples == 1))) | outvoted) & ~outer & ~flat)
     progress.update(0.85, "smoothing labels")
     free = flat | (np.abs(mean - tolerances.ISO_LEVEL) < FIXED_MARGIN) & ~outer
     areas = face_areas(points, tetrahedra)
@@ -149,12 +152,12 @@ def on_one_sheet(
     outer: np.ndarray,
     radii: np.ndarray,
 ) -> Sheet:
-    """Find flat tetrahedra: normals agree at all corners, and the edges run across them.
+    """Find flat tetrahedra: normals agree at all corners and are nearly orthogonal to the edges.
 
     Parameters
     ----------
     normals : (k, 3) float64
-        Of the first k points; tetrahedra with other corners are ``outer``.
+        Normals at the first k points; tetrahedra with other corners are ``outer``.
     radii : (k,) float64
         Local spacing at the first k points.
     """
@@ -178,7 +181,7 @@ def on_one_sheet(
     cross = np.cross(b, c), np.cross(c, a), np.cross(a, b)
     volume = 2.0 * (a * cross[0]).sum(1)  # 12 times the tetrahedron's
     squares = [(edge**2).sum(1)[:, None] for edge in (a, b, c)]
-    # Where all four are coplanar the circumcentre is infinitely far; either side will do.
+    # The circumcentre of coplanar corners is infinitely far; either side will do.
     safe = np.where(np.abs(volume) > 1e-12 * radius**3, volume, 1e-12 * radius**3)
     offset = sum(s * x for s, x in zip(squares, cross, strict=True)) / safe[:, None]
     height = ((offset - (a + b + c) / 4) * up).sum(1)
@@ -196,7 +199,7 @@ def _interior_weights(
 
 
 def _disagreeing(inside: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    """(m,) number of neighbours with the other label; beyond the hull is outside."""
+    """Count the neighbours with the other label, (m,); space beyond the hull is outside."""
     theirs = np.where(neighbours >= 0, inside[neighbours], False)  # (m, 4)
     return (theirs != inside[:, None]).sum(1)
 
@@ -218,11 +221,11 @@ def regularised(
     areas: np.ndarray,
     progress: Progress | None = None,
 ) -> np.ndarray:
-    """Choose the labels of ``free`` tetrahedra by a minimum cut.
+    """Label the ``free`` tetrahedra by a minimum cut.
 
-    Minimises the area between the labels plus, for each tetrahedron labelled against its vote,
-    ``DATA_WEIGHT * 2 |vacancy - 0.5|`` times its mean face area. The other labels stay, so thin
-    parts that the field shows clearly cannot be smoothed away.
+    Minimises the area of the faces between different labels plus, for each tetrahedron labelled
+    against its samples, ``DATA_WEIGHT * 2 |vacancy - 0.5|`` times its mean face area. The other
+    labels are fixed, so thin parts that the field shows clearly cannot be smoothed away.
 
     Returns
     -------
@@ -233,35 +236,35 @@ def regularised(
         return inside.copy()
     own = np.full(len(free), -1, np.int32)
     own[nodes] = np.arange(len(nodes))
-    # Only the difference of what pulls a tetrahedron to either side matters.
-    links = np.empty((len(nodes), 4), np.int32)
-    capacity, pull = np.empty((len(nodes), 4), np.int32), np.empty(len(nodes), np.int64)
+    # Only the difference of source and sink capacity matters.
+    arcs = np.empty((len(nodes), 4), np.int32)
+    capacity, unary = np.empty((len(nodes), 4), np.int32), np.empty(len(nodes), np.int64)
     confidence = DATA_WEIGHT * 2 * np.abs(vacancy[nodes] - tolerances.ISO_LEVEL)
     steps = CAPACITY_STEPS / max(float(np.median(areas[nodes])), 1e-300)
-    _cut_kernel(
-        nodes, own, inside, confidence, neighbours, areas, steps, float(LARGEST_CAPACITY), links,
-        capacity, pull,
+    _graph_kernel(
+        nodes, own, inside, confidence, neighbours, areas, steps, float(LARGEST_CAPACITY), arcs,
+        capacity, unary,
     )  # fmt: skip
     result = inside.copy()
-    result[nodes] = minimum_cut(links, capacity, pull, progress)
+    result[nodes] = minimum_cut(arcs, capacity, unary, progress)
     return result
 
 
 @kernel(fast=False)
-def _cut_kernel(  # type: ignore[no-untyped-def]
-    nodes, own, inside, confidence, neighbours, areas, steps, limit, links, capacity, pull
+def _graph_kernel(  # type: ignore[no-untyped-def]
+    nodes, own, inside, confidence, neighbours, areas, steps, limit, arcs, capacity, unary
 ):
-    """Number the undecided, and round what links and pulls them to integers."""
+    """Build the graph of the free tetrahedra: arcs, integer capacities and unary terms."""
     for row in range(len(nodes)):
         i = nodes[row]
         mean = 0.0
         for k in range(4):
             mean += areas[i, k] / 4.0
-        towards = confidence[row] * mean if inside[i] else -confidence[row] * mean
+        term = confidence[row] * mean if inside[i] else -confidence[row] * mean
         for k in range(4):
             j = neighbours[i, k]
-            links[row, k] = own[j] if j >= 0 else -1
+            arcs[row, k] = own[j] if j >= 0 else -1
             capacity[row, k] = np.int32(np.rint(min(areas[i, k] * steps, limit)))
-            if links[row, k] < 0:
-                towards += areas[i, k] if j >= 0 and inside[j] else -areas[i, k]
-        pull[row] = np.int64(np.rint(min(max(towards * steps, -4.0 * limit), 4.0 * limit)))
+            if arcs[row, k] < 0:
+                term += areas[i, k] if j >= 0 and inside[j] else -areas[i, k]
+        unary[row] = np.int64(np.rint(min(max(term * steps, -4.0 * limit), 4.0 * limit)))

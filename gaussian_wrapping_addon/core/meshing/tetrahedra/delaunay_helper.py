@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Helper process: Qhull on ``points.npy``, tetrahedra to ``tetrahedra.npy``."""
+"""Helper process: triangulate ``points.npy`` with Qhull, write ``tetrahedra.npy``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def main(folder: Path) -> int:
-    """Connect the points of ``folder``; see :func:`.delaunay.qhull_tetrahedra`.
+    """Triangulate the points of ``folder``; see :func:`.delaunay.qhull_tetrahedra`.
 
     Raises
     ------
@@ -26,7 +26,7 @@ def main(folder: Path) -> int:
     except (QhullError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise MeshingError(
-            f"{len(points)} points could not be connected ({reason}).", "Choose another region."
+            f"{len(points)} points could not be triangulated ({reason}).", "Choose another region."
         ) from None
     np.save(folder / "tetrahedra.npy", tetrahedra)
     return 0

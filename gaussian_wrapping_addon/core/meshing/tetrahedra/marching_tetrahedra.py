@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Marching tetrahedra on labelled points, and bisection of the crossing edges.
+"""Marching tetrahedra on labelled points, and bisection of crossing edges.
 
 See docs/method.md, section 6.3.
 """
@@ -22,15 +22,15 @@ MAX_BISECTIONS = 40
 
 @functools.lru_cache(maxsize=1)
 def case_tables() -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangles of all 16 codes.
+    """Return the triangle table of all 16 cases.
 
-    Code: bit k is set where corner k is inside. The tables are derived on a reference
-    tetrahedron, so that every triangle of a positively oriented one faces the empty side.
+    Bit k of a case is set where corner k is inside. The table is derived from a reference
+    tetrahedron, so that triangles of positively oriented tetrahedra face the empty side.
 
     Returns
     -------
     counts : (16,) int64
-        Triangles of each code: 0, 1 or 2.
+        Triangles of each case: 0, 1 or 2.
     corners : (16, 2, 3, 2) int64
         For each triangle vertex the (inside, outside) corners of its edge.
     """
@@ -58,19 +58,19 @@ def case_tables() -> tuple[np.ndarray, np.ndarray]:
 def marching_tetrahedra(
     tetrahedra: np.ndarray, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Separate inside from outside points by triangles on the tetrahedra's edges.
+    """Triangulate the surface between inside and outside points, with vertices on edges.
 
     Parameters
     ----------
     tetrahedra : (m, 4) int64
         Positively oriented, face to face.
     inside : (n,) bool
-        Label of each point. The surface is closed where no point of the hull is inside.
+        Label of each point. The surface is closed if no point of the hull is inside.
 
     Returns
     -------
     edges : (e, 2) int64
-        The crossing edges, (inside point, outside point); vertex i of the mesh lies on edge i.
+        Crossing edges (inside point, outside point); vertex i of the mesh lies on edge i.
     faces : (f, 3) int64
         Triangles, counter-clockwise seen from the empty side.
     """
@@ -80,11 +80,10 @@ def marching_tetrahedra(
 def marching_closed(
     tetrahedra: np.ndarray, neighbours: np.ndarray, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bound the inside part of tetrahedra, on their hull as well.
+    """Triangulate the boundary of the inside part of tetrahedra, including caps on their hull.
 
-    The set of triangles is a closed 2-manifold if the tetrahedra are a 3-manifold with boundary:
-    signs alone decide, no sign is zero, so that the level meets every tetrahedron and every face of
-    the hull across.
+    The surface is a closed 2-manifold if the tetrahedra are a 3-manifold with boundary: no sign is
+    zero, so the isosurface crosses every tetrahedron and every face of the hull transversally.
 
     Parameters
     ----------
@@ -96,9 +95,9 @@ def marching_closed(
 
     Returns
     -------
-    pairs : (e, 2) int64
-        The crossing edge (inside point, outside point) that each vertex of the mesh lies on, or an
-        inside point on the hull twice.
+    edges : (e, 2) int64
+        For each vertex of the mesh its crossing edge (inside point, outside point), or an inside
+        point of the hull twice.
     faces : (f, 3) int64
         Triangles, counter-clockwise seen from outside.
     """
@@ -113,7 +112,7 @@ def marching_closed(
 
 
 def _separating(tetrahedra: np.ndarray, inside: np.ndarray) -> list[np.ndarray]:
-    """Return triangles between inside and outside points, arrays of (r, 3, 2) points."""
+    """Return triangles between inside and outside points as arrays of edges, (r, 3, 2)."""
     counts, corners = case_tables()
     codes = inside[tetrahedra] @ np.array([1, 2, 4, 8])  # (m,)
     pieces = []
@@ -140,9 +139,9 @@ _CAP_TRIANGLES = [_cap_triangles(code) for code in range(8)]
 
 
 def _indexed(pieces: list[np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Number the different pairs of points of triangles (r, 3, 2); make faces of the numbers."""
-    pairs = np.concatenate(pieces).reshape(-1, 2)  # (3f, 2)
-    keys = pairs[:, 0] * np.int64(count) + pairs[:, 1]
+    """Merge equal edges of triangles (r, 3, 2) to vertices; return edges and indexed faces."""
+    edges = np.concatenate(pieces).reshape(-1, 2)  # (3f, 2)
+    keys = edges[:, 0] * np.int64(count) + edges[:, 1]
     unique, index = np.unique(keys, return_inverse=True)
     return np.stack([unique // count, unique % count], 1), index.reshape(-1, 3)
 
@@ -154,16 +153,16 @@ def bisect(
     tolerance: float | np.ndarray,
     progress: Progress,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Halve segments until both ends of the sign change lie within ``tolerance``.
+    """Bisect segments until the sign change is bracketed within ``tolerance``.
 
-    Short segments stop early, so that no evaluation is spent on them.
+    Segments that are short enough stop early, which saves evaluations.
 
     Parameters
     ----------
     inside_points, outside_points : (n, 3) float64
         Occupied and empty ends.
     tolerance : float or (n,) float64
-        Length of the bracket that is small enough, of all or of each.
+        Largest final length of a bracket, one for all or one each.
 
     Returns
     -------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The cheapest cut through a mesh of tetrahedra, exact, for millions of them (push-relabel)."""
+"""Exact minimum cut on the dual graph of a tetrahedral mesh, by push-relabel (numba)."""
 
 from __future__ import annotations
 
@@ -8,51 +8,51 @@ import numpy as np
 from ...kernels.compiled import kernel
 from ...progress import Progress
 
-WORK_PER_NODE = 6
-"""Arcs looked at between two searches for the true heights, for each node. A search looks at four.
-The cut of trained scenes took as long with 2, and a quarter longer with 20."""
+ARCS_PER_NODE = 6
+"""Arcs scanned per node between two global relabellings, each of which scans four. The cut of
+trained scenes took as long with 2, and a quarter longer with 20."""
 
 
 def minimum_cut(
-    links: np.ndarray, capacity: np.ndarray, pull: np.ndarray, progress: Progress | None = None
+    arcs: np.ndarray, capacity: np.ndarray, unary: np.ndarray, progress: Progress | None = None
 ) -> np.ndarray:
-    """Return which nodes lie inside in the cheapest labelling.
+    """Return the inside nodes of the labelling with the least cost.
 
-    A labelling costs the capacity of all links between different labels, and for each node the
-    amount of its pull where it has the other label. Of several cheapest ones the one with the
-    fewest nodes inside is returned: it is unique, whatever the order of the computation.
+    The cost is the capacity of all arcs between different labels, plus for each node the magnitude
+    of its unary term where the label disagrees with its sign. Among minimum cuts the one with the
+    fewest inside nodes is returned: it is unique, whatever the order of the computation.
 
-    Flow is pushed from nodes that are pulled outside towards those that are pulled inside, along
-    shortest ways (Goldberg and Tarjan, "A new approach to the maximum-flow problem", 1988). Nodes
-    that can still pass flow on to one that wants more are inside. Memory and, on meshes, time are
-    in proportion to the nodes.
+    Flow is pushed from nodes with source capacity (negative terms) towards those with sink capacity
+    (positive terms) along shortest paths (Goldberg and Tarjan, "A new approach to the maximum-flow
+    problem", 1988). Nodes that can still reach remaining sink capacity are inside. Memory and, on
+    meshes, time grow linearly with the nodes; millions are practical.
 
     Parameters
     ----------
-    links : (k, 4) int
+    arcs : (k, 4) int
         Neighbours, -1 for none; mutual, each at most once in a row.
     capacity : (k, 4) int
-        Of each link, >= 0; the smaller of both directions counts. Below 2**30.
-    pull : (k,) int
-        Towards the inside where positive.
+        Capacity of each arc, >= 0 and below 2**30; the smaller of both directions counts.
+    unary : (k,) int
+        Unary term of each node; positive favours inside.
     progress : Progress, optional
-        Asked several times, so that the computation can be stopped.
+        Updated at each global relabelling, so that the computation can be cancelled.
 
     Returns
     -------
     (k,) bool
     """
     progress = progress or Progress()
-    count = len(links)
-    links = np.ascontiguousarray(links, np.int32)
+    count = len(arcs)
+    arcs = np.ascontiguousarray(arcs, np.int32)
     residual = np.ascontiguousarray(capacity, np.int32).copy()
-    back = np.zeros((count, 4), np.int8)
-    _pair_kernel(links, residual, back)
-    excess = -np.asarray(pull, np.int64)
+    reverse = np.zeros((count, 4), np.int8)
+    _reverse_arc_kernel(arcs, residual, reverse)
+    excess = -np.asarray(unary, np.int64)
     height, queue = np.empty(count, np.int32), np.empty(count, np.int32)
     queued = np.empty(count, np.bool_)
     while True:
-        _height_kernel(links, residual, back, excess, height, queue)
+        _relabel_kernel(arcs, residual, reverse, excess, height, queue)
         progress.update(0.0, "smoothing labels")
         active = np.flatnonzero((excess > 0) & (height < count))
         if len(active) == 0:
@@ -61,30 +61,33 @@ def minimum_cut(
         queued[:] = False
         queued[active] = True
         _push_kernel(
-            links, residual, back, excess, height, queue, queued, len(active),
-            WORK_PER_NODE * count,
+            arcs, residual, reverse, excess, height, queue, queued, len(active),
+            ARCS_PER_NODE * count,
         )  # fmt: skip
 
 
 @kernel(fast=False)
-def _pair_kernel(links, residual, back):  # type: ignore[no-untyped-def]
-    """Find each link in its neighbour's row; both directions get the smaller capacity."""
-    for i in range(len(links)):
+def _reverse_arc_kernel(arcs, residual, reverse):  # type: ignore[no-untyped-def]
+    """Find the reverse of each arc; both directions get the smaller capacity."""
+    for i in range(len(arcs)):
         for k in range(4):
-            j = links[i, k]
+            j = arcs[i, k]
             if j < 0:
                 continue
             for m in range(4):
-                if links[j, m] == i:
-                    back[i, k] = m
+                if arcs[j, m] == i:
+                    reverse[i, k] = m
                     residual[i, k] = min(residual[i, k], residual[j, m])
                     residual[j, m] = residual[i, k]
 
 
 @kernel(fast=False)
-def _height_kernel(links, residual, back, excess, height, queue):  # type: ignore[no-untyped-def]
-    """Links between each node and the nearest one that wants flow; the number of nodes if none."""
-    count = len(links)
+def _relabel_kernel(arcs, residual, reverse, excess, height, queue):  # type: ignore[no-untyped-def]
+    """Global relabelling: the residual distance of each node to sink capacity, or the node count.
+
+    Breadth-first search from the nodes with negative excess.
+    """
+    count = len(arcs)
     end = 0
     for i in range(count):
         height[i] = count
@@ -97,8 +100,8 @@ def _height_kernel(links, residual, back, excess, height, queue):  # type: ignor
         j = queue[begin]
         begin += 1
         for k in range(4):
-            i = links[j, k]
-            if i >= 0 and height[i] == count and residual[i, back[j, k]] > 0:
+            i = arcs[j, k]
+            if i >= 0 and height[i] == count and residual[i, reverse[j, k]] > 0:
                 height[i] = height[j] + 1
                 queue[end] = i
                 end += 1
@@ -106,10 +109,10 @@ def _height_kernel(links, residual, back, excess, height, queue):  # type: ignor
 
 @kernel(fast=False)
 def _push_kernel(  # type: ignore[no-untyped-def]
-    links, residual, back, excess, height, queue, queued, waiting, budget
+    arcs, residual, reverse, excess, height, queue, queued, waiting, budget
 ):
-    """Push flow down, first in first out, and lift nodes that are stuck, up to a budget of work."""
-    count = len(links)
+    """Push flow and relabel active nodes, first in first out, within a budget of arcs."""
+    count = len(arcs)
     begin = 0
     while waiting > 0 and budget > 0:
         i = queue[begin]
@@ -119,7 +122,7 @@ def _push_kernel(  # type: ignore[no-untyped-def]
         budget -= 4
         lowest = count
         for k in range(4):
-            j = links[i, k]
+            j = arcs[i, k]
             if j < 0 or residual[i, k] == 0:
                 continue
             if height[j] >= height[i]:
@@ -127,7 +130,7 @@ def _push_kernel(  # type: ignore[no-untyped-def]
                 continue
             flow = min(excess[i], np.int64(residual[i, k]))
             residual[i, k] -= flow
-            residual[j, back[i, k]] += flow
+            residual[j, reverse[i, k]] += flow
             excess[i] -= flow
             excess[j] += flow
             if excess[j] > 0 and not queued[j]:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tetrahedra cut by the planes of a region, face to face, so that a solid in them closes there.
+"""Clip a tetrahedral mesh to the planes of a region, keeping it conforming.
 
 Dropping tetrahedra that reach beyond the region would leave a ragged boundary (docs/method.md,
-section 6.5). Each that a plane crosses is divided instead: its part inside becomes up to three
-tetrahedra. Which diagonal divides a four-sided face follows from the numbers of its corners alone,
-so neighbours agree on it, whatever the rounding.
+section 6.5). Each that a plane crosses is split instead: its part inside becomes up to three
+tetrahedra. The diagonal of a four-sided face depends on the indices of its corners alone, so
+neighbours agree on it regardless of rounding.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ _PRISM_QUADS = ((0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5))
 
 @dataclass(frozen=True)
 class CutTetrahedra:
-    """Tetrahedra that fill the region, as far as the given ones did."""
+    """Tetrahedra clipped to a region."""
 
     points: np.ndarray
     """(n + k, 3) float64: the given points, then those on the region's planes."""
     tetrahedra: np.ndarray
-    """(m, 4) int64, face to face, oriented as the given ones."""
+    """(m, 4) int64, face to face, with the given orientation."""
 
 
 def cut_to_region(points: np.ndarray, tetrahedra: np.ndarray, region: Region) -> CutTetrahedra:
-    """Leave of tetrahedra what lies in a region.
+    """Clip tetrahedra to a region.
 
-    A new point lies on each edge that a plane crosses, on that plane. Points on a plane count as
-    inside. The result depends on numbers and sides of points alone, so that it is face to face also
-    where tetrahedra have no volume.
+    Each edge that a plane crosses gets a new point on that plane. Points on a plane count as
+    inside. Connectivity depends on the indices and sides of points alone, so the result is face to
+    face even where tetrahedra have no volume.
 
     Parameters
     ----------
@@ -54,13 +54,14 @@ def cut_to_region(points: np.ndarray, tetrahedra: np.ndarray, region: Region) ->
         if (code == 15).all():
             continue
         crossed = np.flatnonzero((code > 0) & (code < 15))
-        pairs, slots = _crossing_edges(tetrahedra[crossed], inside, len(local))
-        share = distance[pairs[:, 0]] / (distance[pairs[:, 0]] - distance[pairs[:, 1]])
-        made = local[pairs[:, 0]] + share[:, None] * (local[pairs[:, 1]] - local[pairs[:, 0]])
-        made -= (made @ normal - offset)[:, None] * normal  # long edges leave a rounding error
-        divided = _divide(tetrahedra[crossed], code[crossed], slots + len(local))
+        edges, numbers = _crossing_edges(tetrahedra[crossed], inside, len(local))
+        share = distance[edges[:, 0]] / (distance[edges[:, 0]] - distance[edges[:, 1]])
+        cut_points = local[edges[:, 0]] + share[:, None] * (local[edges[:, 1]] - local[edges[:, 0]])
+        # Long edges leave a rounding error.
+        cut_points -= (cut_points @ normal - offset)[:, None] * normal
+        divided = _split_crossed(tetrahedra[crossed], code[crossed], numbers + len(local))
         tetrahedra = np.concatenate([tetrahedra[code == 15], divided])
-        local = np.concatenate([local, made])
+        local = np.concatenate([local, cut_points])
     new = local[len(points) :] + region.center
     return CutTetrahedra(np.concatenate([points, new]), tetrahedra)
 
@@ -72,34 +73,34 @@ _EDGES = np.array(list(itertools.combinations(range(4), 2)))
 def _crossing_edges(
     tetrahedra: np.ndarray, inside: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the crossing edges (e, 2), inside point first, and the edge's number (m, 6) or -1."""
+    """Return the crossing edges (e, 2), inside point first, and their indices (m, 6) or -1."""
     ends = np.sort(tetrahedra[:, _EDGES], axis=2)  # (m, 6, 2)
     crossing = inside[ends[:, :, 0]] != inside[ends[:, :, 1]]  # (m, 6)
     keys = ends[crossing][:, 0] * np.int64(count) + ends[crossing][:, 1]
     unique, index = np.unique(keys, return_inverse=True)
-    slots = np.full(crossing.shape, -1, np.int64)
-    slots[crossing] = index
-    pairs = np.stack([unique // count, unique % count], 1)
-    turned = ~inside[pairs[:, 0]]
-    pairs[turned] = pairs[turned][:, ::-1]
-    return pairs, slots
+    numbers = np.full(crossing.shape, -1, np.int64)
+    numbers[crossing] = index
+    edges = np.stack([unique // count, unique % count], 1)
+    reversed_edges = ~inside[edges[:, 0]]
+    edges[reversed_edges] = edges[reversed_edges][:, ::-1]
+    return edges, numbers
 
 
-def _divide(tetrahedra: np.ndarray, codes: np.ndarray, made: np.ndarray) -> np.ndarray:
-    """Return the inside parts of crossed tetrahedra; ``made`` (m, 6) are the points on edges."""
-    nodes = np.concatenate([tetrahedra, made], 1)  # (m, 10) four corners, six edges
+def _split_crossed(tetrahedra: np.ndarray, codes: np.ndarray, cut_points: np.ndarray) -> np.ndarray:
+    """Return the inside parts of crossed tetrahedra, given the new points on their edges (m, 6)."""
+    nodes = np.concatenate([tetrahedra, cut_points], 1)  # (m, 10) four corners, six edges
     parts = []
     for code in range(1, 15):
         rows = np.flatnonzero(codes == code)
         if len(rows) == 0:
             continue
-        body = nodes[rows][:, _body(code)]  # (r, 4) or (r, 6)
-        if body.shape[1] == 4:
-            parts.append(body)
+        polyhedron = nodes[rows][:, _inside_part(code)]  # (r, 4) or (r, 6)
+        if polyhedron.shape[1] == 4:
+            parts.append(polyhedron)
             continue
-        lowest = body.argmin(1)
+        lowest = polyhedron.argmin(1)
         for first in range(6):
-            prism = body[lowest == first]
+            prism = polyhedron[lowest == first]
             for quad, diagonal, pieces in _prism_parts(first):
                 chosen = np.isin(prism[:, quad].argmin(1), diagonal)
                 parts.extend(prism[chosen][:, piece] for piece in pieces)
@@ -107,38 +108,39 @@ def _divide(tetrahedra: np.ndarray, codes: np.ndarray, made: np.ndarray) -> np.n
 
 
 @functools.lru_cache(maxsize=16)
-def _body(code: int) -> np.ndarray:
-    """Return what is inside: a tetrahedron (4,) or a prism (6,), as nodes, positively oriented."""
+def _inside_part(code: int) -> np.ndarray:
+    """Return the inside part as nodes: a tetrahedron (4,) or prism (6,), positively oriented."""
     edge = {frozenset(pair): 4 + k for k, pair in enumerate(_EDGES.tolist())}
     inside = [k for k in range(4) if code >> k & 1]
     outside = [k for k in range(4) if not code >> k & 1]
     if len(inside) == 1:
-        body = inside + [edge[frozenset((inside[0], k))] for k in outside]
+        polyhedron = inside + [edge[frozenset((inside[0], k))] for k in outside]
     elif len(inside) == 3:
-        body = [edge[frozenset((outside[0], k))] for k in inside] + inside
+        polyhedron = [edge[frozenset((outside[0], k))] for k in inside] + inside
     else:
-        body = [n for a in inside for n in (a, *(edge[frozenset((a, c))] for c in outside))]
-    where = np.concatenate([_REFERENCE, _REFERENCE[_EDGES].mean(1)])[body]  # (4 or 6, 3)
-    if np.linalg.det(where[[1, 2, len(body) - 1]] - where[0]) < 0:
-        half = len(body) // 2
+        polyhedron = [n for a in inside for n in (a, *(edge[frozenset((a, c))] for c in outside))]
+    where = np.concatenate([_REFERENCE, _REFERENCE[_EDGES].mean(1)])[polyhedron]  # (4 or 6, 3)
+    if np.linalg.det(where[[1, 2, len(polyhedron) - 1]] - where[0]) < 0:
+        half = len(polyhedron) // 2
         swap = [0, 1, 3, 2] if half == 2 else [0, 2, 1, 3, 5, 4]
-        body = [body[k] for k in swap]
-    return np.array(body)
+        polyhedron = [polyhedron[k] for k in swap]
+    return np.array(polyhedron)
 
 
 @functools.lru_cache(maxsize=8)
 def _prism_parts(
     first: int,
 ) -> tuple[tuple[list[int], list[int], tuple[list[int], ...]], ...]:
-    """Return how a prism whose corner ``first`` has the lowest number is divided.
+    """Return the splits of a prism whose corner ``first`` has the lowest index.
 
-    Of each four-sided face the corner with the lowest number gets the diagonal. That corner sees
-    the two faces that it does not lie on: a triangle and one four-sided face.
+    The diagonal of each four-sided face starts at its corner with the lowest index. Corner
+    ``first`` is joined to the two faces that it does not lie on: a triangle and one four-sided
+    face.
 
     Returns
     -------
-    Two times the far four-sided face, places in it that have the lowest number in this case, and
-    the three tetrahedra.
+    For each of the two cases: the opposite four-sided face, the positions in it that have its
+    lowest index in this case, and the three tetrahedra.
     """
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1.0]])
     triangle = [3, 4, 5] if first < 3 else [0, 1, 2]

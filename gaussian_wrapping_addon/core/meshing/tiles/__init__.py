@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Large regions, meshed tile by tile: memory stays bounded and the mesh has no seam."""
+"""Meshing of large regions tile by tile, with bounded memory and without seams."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What all tiles of a region share: candidate surface, spacing, borders, fillers, caps."""
+"""Plan of a tiled mesh: the candidate surface, spacing, borders and Steiner points of all tiles."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from ...regions.convex_region import Region
 from ...report_warning import ReportWarning
 from ..points.candidate_surface import CandidateSurface
 from ..points.region_caps import Caps, cap_points
-from ..points.resolution import Dense, Request, dense_request, nominal_edge
+from ..points.resolution import DenseRequest, ResolutionRequest, dense_request, nominal_edge
 from ..points.spacing import Spacing
 from ..points.surface_points import SurfaceSampler
-from .steiner_points import CLEAR_CAP_RADII, CLEAR_RADII, lattice, lattice_side
-from .tiling import Tiling, cut_evenly
+from .steiner_points import CLEARANCE_CAP_RADII, CLEARANCE_RADII, lattice_side, steiner_lattice
+from .tiling import Tiling, split_evenly
 
 TILE_POINTS = 75_000
-"""Surface points of a tile, at most, where the number of tiles is automatic: memory stays small
-beside that of the field, and a machine with several cores gets enough tiles to share out."""
+"""Most surface points of a tile if the number of tiles is automatic: its memory stays small
+compared with the field's, and machines with several cores get enough tiles to distribute."""
 
 WHOLE_POINTS = 400_000
-"""Regions with no more surface points are meshed whole, where memory allows it."""
+"""Regions with at most this many surface points are meshed without tiles, memory permitting."""
 
 JITTER_SHARE = 1e-6
-"""Shift of all points, as a share of the region's diagonal, while connectivity is decided: that of
-delaunay.JITTER_SHARE with its far points. Tiles must agree on it."""
+"""Perturbation of all points, as a share of the region's diagonal, for the triangulation: that of
+delaunay.JITTER_SHARE with its bounding points. Tiles must agree on it."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """Where surface points come from; duck-typed as in :func:`.primal_adaptive.mesh_region`."""
+    """The fields that define the surface; duck-typed as in :func:`.primal_adaptive.mesh_region`."""
 
     vacancy: Any
     vectors: Any
@@ -46,28 +46,28 @@ class Field:
 
 @dataclass(frozen=True)
 class TilePlan:
-    """Decided once, before any tile is worked on."""
+    """Data shared by all tiles, fixed before any tile is meshed."""
 
     region: Region
     surface: CandidateSurface
     area: float
-    """Of the candidate surface in the region."""
+    """Area of the candidate surface in the region."""
     spacing: Spacing
-    """Local thinning radii of the whole surface, of the denser mesh with adaptive spacing."""
+    """Local thinning radii of the whole surface; with adaptive spacing, of the dense mesh."""
     tiling: Tiling
-    fillers: np.ndarray
-    """(k, 3) float64, before any gives way."""
-    ball: float
-    """Largest empty ball that touches the region."""
+    steiner_points: np.ndarray
+    """(k, 3) float64, before those near surface points are removed. Stored as ``fillers``."""
+    ball_radius: float
+    """Greatest radius of an empty ball that touches the region. Stored as ``ball``."""
     caps: Caps
     seed: int
     notes: tuple[ReportWarning, ...]
     edge_length: float
-    """Of the uniform mesh that the request stands for."""
+    """Edge length of the uniform mesh that meets the request."""
     target: int
     share: float
-    """Vertices that stay, as for :func:`.primal_adaptive.selected`: 0 and 1 keep all."""
-    sightings: int = 0
+    """Vertices to keep, as for :func:`.primal_adaptive.simplified`: 0 and 1 keep all."""
+    depth_samples: int = 0
 
     @property
     def radius(self) -> float:
@@ -76,16 +76,17 @@ class TilePlan:
 
     @property
     def halo(self) -> float:
-        """Width of the surroundings from which a tile's tetrahedra are known exactly.
+        """Width of the neighbourhood that determines a tile's tetrahedra exactly.
 
-        A tetrahedron with a corner in the tile lies in a ball of radius ``ball`` through that
-        corner; twice that much again for balls that might hold a point.
+        A tetrahedron with a corner in the tile has a circumscribed ball of at most ``ball_radius``
+        through that corner, so points in that ball are at most its diameter away, plus the
+        perturbation.
         """
-        return 2.0 * self.ball + 2.0 * JITTER_SHARE * self.region.diagonal
+        return 2.0 * self.ball_radius + 2.0 * JITTER_SHARE * self.region.diagonal
 
 
-class _EvenCaps(Spacing):
-    """Spacing that does not grow inside a cap: its points bound the empty balls there."""
+class _CapSpacing(Spacing):
+    """Spacing that does not grow inside a cap, whose points bound the empty balls there."""
 
     def at(self, where: np.ndarray, threads: int = 1) -> np.ndarray:
         return np.minimum(super().at(where, threads), self.radii.max())
@@ -95,34 +96,36 @@ def make_plan(
     field: Field,
     region: Region,
     surface: CandidateSurface,
-    request: Request,
+    request: ResolutionRequest,
     progress: Progress,
     *,
     tiles: int,
     seed: int,
     cameras: Sequence[Camera],
     adaptive: bool,
-    sightings: int,
+    depth_samples: int,
 ) -> TilePlan:
-    """Decide everything that tiles share.
+    """Compute the data that tiles share.
 
     Parameters
     ----------
     tiles : int
-        Number of tiles; 0 makes as many as :data:`TILE_POINTS` asks for.
+        Number of tiles; 0 chooses it by :data:`TILE_POINTS`.
 
     Raises
     ------
     ResourceError
-        The request needs more points than the cap.
+        The request needs more points than the limit.
     """
     rng = np.random.default_rng(seed)
     sampler = SurfaceSampler(
         field.vacancy, field.vectors, region, surface, field.threads,
         cameras=cameras if adaptive else (),
     )  # fmt: skip
-    wanted = dense_request(request, sampler.area, region) if adaptive else Dense(request, 0, 1.0)
-    spacing, notes = sampler.spacing(wanted.request, rng)
+    dense = (
+        dense_request(request, sampler.area, region) if adaptive else DenseRequest(request, 0, 1.0)
+    )
+    spacing, notes = sampler.spacing(dense.request, rng)
     corners = surface.vertices[surface.faces]  # (f, 3, 3)
     centers = corners.mean(1)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -134,18 +137,20 @@ def make_plan(
             return count >= tiles
         return heaviest <= TILE_POINTS or count >= limits.MAX_TILES
 
-    tiling = cut_evenly(centers, expected, region.bounds, enough)
+    tiling = split_evenly(centers, expected, region.bounds, enough)
     caps = cap_points(
         region, field.vacancy.is_empty,
-        _EvenCaps(spacing.points, spacing.radii, spacing.nominal, spacing.limited), rng,
+        _CapSpacing(spacing.points, spacing.radii, spacing.nominal, spacing.limited), rng,
         progress,
     )  # fmt: skip
     largest = float(spacing.radii.max())
-    clearance = max(CLEAR_RADII * largest, CLEAR_CAP_RADII * float(caps.radii.max(initial=0.0)))
+    clearance = max(
+        CLEARANCE_RADII * largest, CLEARANCE_CAP_RADII * float(caps.radii.max(initial=0.0))
+    )
     side = lattice_side(region, largest, sampler.area / len(tiling))
-    fillers = lattice(region, side, clearance, seed)
+    steiner = steiner_lattice(region, side, clearance, seed)
     return TilePlan(
-        region, surface, sampler.area, spacing, tiling, fillers.points, fillers.ball, caps, seed,
-        (*wanted.request.notes, *notes), nominal_edge(request, sampler.area, region), wanted.target,
-        wanted.share, sightings,
+        region, surface, sampler.area, spacing, tiling, steiner.points, steiner.ball_radius, caps,
+        seed, (*dense.request.notes, *notes), nominal_edge(request, sampler.area, region),
+        dense.target, dense.share, depth_samples,
     )  # fmt: skip

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The files of a tiled mesh (docs/file-formats.md, Tiles); each is written whole or not at all."""
+"""Read and write the files of a tiled mesh (docs/file-formats.md, Tiles); writes are atomic."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..points.spacing import Spacing
 from ..points.surface_points import SurfacePoints
 from .plan import TilePlan
 from .tile_faces import TileFaces
-from .tile_points import AllPoints
+from .tile_points import GatheredPoints
 from .tiling import Tiling
 
 LIST_NAME = "tiles.json"
@@ -28,32 +28,32 @@ VERSION = 1
 
 
 def points_path(folder: Path, tile: int) -> Path:
-    """Return where the points of a tile lie."""
+    """Return the file of a tile's points."""
     return folder / f"points-{tile:04d}.npz"
 
 
 def faces_path(folder: Path, tile: int) -> Path:
-    """Return where the faces of a tile lie."""
+    """Return the file of a tile's faces."""
     return folder / f"faces-{tile:04d}.npz"
 
 
 def gathered_path(folder: Path) -> Path:
-    """Return where the points of all tiles lie."""
+    """Return the file of the gathered points."""
     return folder / "points.npz"
 
 
 def save_plan(folder: Path, plan: TilePlan, origin: dict[str, Any]) -> None:
-    """Write a plan; the list itself comes last.
+    """Write a plan; its JSON file comes last.
 
     Parameters
     ----------
     origin : dict
-        JSON values with which another process finds the Gaussians and cameras.
+        JSON values by which another process finds the Gaussians and cameras.
     """
     folder.mkdir(parents=True, exist_ok=True)
     _save(
         folder / "plan.npz",
-        vertices=plan.surface.vertices, faces=plan.surface.faces, fillers=plan.fillers,
+        vertices=plan.surface.vertices, faces=plan.surface.faces, fillers=plan.steiner_points,
         region=plan.region.vertices, cap_points=plan.caps.points, cap_normals=plan.caps.normals,
         cap_radii=plan.caps.radii, cap_priority=plan.caps.priority,
         spacing_points=plan.spacing.points, spacing_radii=plan.spacing.radii,
@@ -72,8 +72,8 @@ def save_plan(folder: Path, plan: TilePlan, origin: dict[str, Any]) -> None:
             "edge_length": plan.edge_length,
             "target": plan.target,
             "share": plan.share,
-            "sightings": plan.sightings,
-            "ball": plan.ball,
+            "sightings": plan.depth_samples,
+            "ball": plan.ball_radius,
             "area": plan.area,
             "gaussians": plan.surface.gaussians,
             "pivots": plan.surface.pivots,
@@ -93,7 +93,7 @@ def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
     Raises
     ------
     ParseError
-        The list is not of this version, or broken.
+        The JSON file has another version, or a file is damaged.
     """
     path = folder / LIST_NAME
     try:
@@ -142,15 +142,15 @@ def load_points(path: Path) -> SurfacePoints:
         return _cloud_of(arrays)
 
 
-def save_gathered(path: Path, everything: AllPoints) -> None:
+def save_gathered(path: Path, gathered: GatheredPoints) -> None:
     """Write the points of all tiles."""
-    _save(path, shifted=everything.shifted, inner=everything.inner, **_of_cloud(everything.cloud))
+    _save(path, shifted=gathered.shifted, inner=gathered.inner, **_of_cloud(gathered.cloud))
 
 
-def load_gathered(path: Path) -> AllPoints:
+def load_gathered(path: Path) -> GatheredPoints:
     """Read the points of all tiles."""
     with np.load(path, allow_pickle=False) as arrays:
-        return AllPoints(_cloud_of(arrays), arrays["shifted"], arrays["inner"])
+        return GatheredPoints(_cloud_of(arrays), arrays["shifted"], arrays["inner"])
 
 
 def save_faces(path: Path, part: TileFaces) -> None:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Labels of the tetrahedra of one tile, and its part of the faces between inside and outside.
+"""Label the tetrahedra of one tile and extract its part of the boundary faces.
 
-Each tetrahedron inside the region belongs to the tile of its corner with the smallest number. All
-tiles know it as the same one (:mod:`.steiner_points`), and only its owner says whether it is solid.
-So the faces of all tiles together bound a set of whole tetrahedra of one triangulation: they are
-closed, whatever the labels are.
+Each tetrahedron inside the region is owned by the tile of its corner with the smallest index. All
+tiles agree on the tetrahedron (:mod:`.steiner_points`), and only its owner labels it. So the faces
+of all tiles together bound a set of tetrahedra of one triangulation: they are closed, whatever the
+labels are.
 """
 
 from __future__ import annotations
@@ -18,51 +18,51 @@ from ...errors import MeshingError
 from ...progress import Progress
 from ..tetrahedra.boundary_faces import OUTWARD_FACES, tetrahedron_neighbours
 from ..tetrahedra.classification import classify, on_one_sheet
-from ..tetrahedra.delaunay import delaunay, far_points
+from ..tetrahedra.delaunay import bounding_points, delaunay
 from .plan import Field, TilePlan
-from .tile_points import AllPoints
+from .tile_points import GatheredPoints
 
 CONTEXT_RADII = 4.0
-"""Tetrahedra of others this close are labelled as well, so that the own ones have neighbours."""
+"""Tetrahedra of other tiles within this distance are labelled as well, as neighbours of the own."""
 
 
 @dataclass(frozen=True)
 class TileFaces:
-    """What a tile adds to the mesh; corners are numbers of the points of the whole region."""
+    """Faces of one tile; corners are indices into the gathered points of the region."""
 
     faces: np.ndarray
-    """(f, 3) int64: between two tetrahedra of the tile, outward."""
+    """(f, 3) int64: between two tetrahedra of the tile, oriented outward."""
     border: np.ndarray
-    """(b, 3) int64: faces of the tile's tetrahedra towards others, outward of the tile's."""
+    """(b, 3) int64: faces between the tile's tetrahedra and others, oriented out of the tile's."""
     solid: np.ndarray
     """(b,) bool: whether the tile's tetrahedron at that face is inside."""
     figures: dict[str, Any]
 
 
 def tile_faces(
-    field: Field, plan: TilePlan, everything: AllPoints, tile: int, progress: Progress
+    field: Field, plan: TilePlan, gathered: GatheredPoints, tile: int, progress: Progress
 ) -> TileFaces:
-    """Connect the points in and around a tile, label its tetrahedra, return its faces."""
-    numbers = np.flatnonzero(plan.tiling.within(tile, everything.shifted, plan.halo))
-    own = plan.tiling.owner(everything.cloud.points[numbers]) == tile
-    if not (own & everything.inner[numbers]).any():
-        return _nothing()
+    """Triangulate the points in and around a tile, label its tetrahedra, return its faces."""
+    numbers = np.flatnonzero(plan.tiling.within(tile, gathered.shifted, plan.halo))
+    own = plan.tiling.owner(gathered.cloud.points[numbers]) == tile
+    if not (own & gathered.inner[numbers]).any():
+        return _no_faces()
     seed = int(np.random.default_rng([plan.seed, tile, 2]).integers(2**31))
-    numbers, tetrahedra = local_tetrahedra(plan, everything, tile, seed, progress.span(0.0, 0.2))
-    # Beyond the tile's surroundings they may be others than those of the whole.
+    numbers, tetrahedra = local_tetrahedra(plan, gathered, tile, seed, progress.span(0.0, 0.2))
+    # Farther away they may differ from the triangulation of the whole region.
     near = np.zeros(len(numbers) + 8, np.bool_)
     near[: len(numbers)] = plan.tiling.within(
-        tile, everything.cloud.points[numbers], CONTEXT_RADII * plan.radius
+        tile, gathered.cloud.points[numbers], CONTEXT_RADII * plan.radius
     )
     tetrahedra = tetrahedra[near[tetrahedra].any(1)]
     neighbours = tetrahedron_neighbours(tetrahedra)
-    inner = np.append(everything.inner[numbers], np.zeros(8, np.bool_))
+    inner = np.append(gathered.inner[numbers], np.zeros(8, np.bool_))
     outer = ~inner[tetrahedra].all(1)
-    # Numbers of the region's points rise with the local ones.
+    # Indices of the region's points increase with the local ones.
     first = tetrahedra.min(1)
     owned = ~outer & np.append(own, np.zeros(8, np.bool_))[first]
-    # Only outer tetrahedra have far corners, and nobody asks where those are.
-    points = np.concatenate([everything.cloud.points[numbers], np.zeros((8, 3))])
+    # Only outer tetrahedra have bounding points as corners, whose positions are not used.
+    points = np.concatenate([gathered.cloud.points[numbers], np.zeros((8, 3))])
     labels = classify(
         points,
         tetrahedra,
@@ -71,9 +71,9 @@ def tile_faces(
         on_one_sheet(
             points,
             tetrahedra,
-            everything.cloud.normals[numbers],
+            gathered.cloud.normals[numbers],
             outer,
-            everything.cloud.radii[numbers],
+            gathered.cloud.radii[numbers],
         ),
         lambda where: field.vacancy.vacancy(where).filled,
         np.random.default_rng([plan.seed, tile, 3]),
@@ -96,49 +96,49 @@ def tile_faces(
 
 
 def local_tetrahedra(
-    plan: TilePlan, everything: AllPoints, tile: int, seed: int, progress: Progress
+    plan: TilePlan, gathered: GatheredPoints, tile: int, seed: int, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Connect the points in and around a tile.
+    """Triangulate the points in and around a tile.
 
-    Tetrahedra with a corner in the tile and one in the region are those of the whole.
+    Tetrahedra with a corner in the tile and one in the region are those of the whole region.
 
     Returns
     -------
     numbers : (n,) int64
-        Of the points, increasing.
+        Indices of the points, increasing.
     tetrahedra : (m, 4) int64
-        Indices into ``numbers``; n and more are points far away.
+        Indices into ``numbers``; n and above are bounding points.
     """
-    numbers = np.flatnonzero(plan.tiling.within(tile, everything.shifted, plan.halo))
-    shifted = everything.shifted[numbers]
-    shifted = np.concatenate([shifted, far_points(shifted, seed)])
+    numbers = np.flatnonzero(plan.tiling.within(tile, gathered.shifted, plan.halo))
+    shifted = gathered.shifted[numbers]
+    shifted = np.concatenate([shifted, bounding_points(shifted, seed)])
     tetrahedra = delaunay(shifted, seed=seed, progress=progress, jitter_share=0.0)
     return numbers, tetrahedra
 
 
 def circumradii(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the radii of the circumscribed balls, (m,)."""
+    """Return the circumradii, (m,)."""
     base = points[tetrahedra[:, 0]]
     edges = points[tetrahedra[:, 1:]] - base[:, None]  # (m, 3, 3)
     offsets = np.linalg.solve(2.0 * edges, (edges**2).sum(2)[:, :, None])[:, :, 0]
     return np.asarray(np.linalg.norm(offsets, axis=1))
 
 
-def _nothing() -> TileFaces:
+def _no_faces() -> TileFaces:
     none = np.zeros((0, 3), np.int64)
     return TileFaces(none, none, np.zeros(0, np.bool_), {})
 
 
 def joined_faces(parts: list[TileFaces]) -> np.ndarray:
-    """Return the faces of all tiles, (f, 3) int64.
+    """Join the faces of all tiles, (f, 3) int64.
 
-    A border face that two tiles name lies between their tetrahedra; one that a single tile names
-    has the region's outside behind it.
+    A border face listed by two tiles lies between their tetrahedra; one listed by a single tile
+    lies on the region's boundary.
 
     Raises
     ------
     MeshingError
-        Two tiles have connected the points near their border differently.
+        Two tiles have triangulated the points near their border differently.
     """
     border = np.concatenate([part.border for part in parts])
     solid = np.concatenate([part.solid for part in parts])
@@ -157,6 +157,6 @@ def joined_faces(parts: list[TileFaces]) -> np.ndarray:
 
 
 def _parity(faces: np.ndarray) -> np.ndarray:
-    """(f,) bool: whether the corners run like their sorted numbers, up to a rotation."""
+    """Return the parity of the permutation that sorts the corners of each face, (f,) bool."""
     a, b, c = faces.T
     return (a < b) ^ (b < c) ^ (c < a)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Surface points of one tile, and the points of all tiles brought together."""
+"""Sample the surface points of one tile, and gather the points of all tiles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from ...mesh.surface_sampling import EDGE_PER_RADIUS, thin
 from ...progress import Progress
-from ..points.resolution import Request
+from ..points.resolution import ResolutionRequest
 from ..points.surface_points import (
     KIND_CAP,
     KIND_JUMP,
@@ -18,23 +18,23 @@ from ..points.surface_points import (
     SurfaceSampler,
 )
 from .plan import JITTER_SHARE, Field, TilePlan
-from .steiner_points import CLEAR_CAP_RADII, CLEAR_RADII, clear_of
+from .steiner_points import CLEARANCE_CAP_RADII, CLEARANCE_RADII, outside_clearance
 
-KIND_FILLER = 4
-"""A filler that ended between inside and outside, where the field is undecided in depth."""
+KIND_STEINER = 4
+"""A Steiner point between inside and outside, where the field is ambiguous away from a surface."""
 
 MARGIN_RADII = 4.0
-"""Candidates this many of the largest radii beyond a tile may move into it."""
+"""Candidates up to this many of the largest radii beyond a tile may be projected into it."""
 
 PIECE_RADII = 8.0
-"""Triangles of the candidate surface that reach beyond are cut until edges are this short."""
-MAX_CUTS = 24
+"""Triangles of the candidate surface across the border are split until edges are this short."""
+MAX_SPLITS = 24
 
 
 def tile_points(field: Field, plan: TilePlan, tile: int, progress: Progress) -> SurfacePoints:
-    """Return the points that end up in a tile, thinned among themselves.
+    """Sample the points of a tile, thinned among themselves.
 
-    The same for any number of threads and on any machine of the same kind.
+    The result is the same for any number of threads and on any machine of the same kind.
     """
     low, high = plan.tiling.box(tile)
     margin = MARGIN_RADII * plan.radius
@@ -45,20 +45,20 @@ def tile_points(field: Field, plan: TilePlan, tile: int, progress: Progress) -> 
     inside = plan.region.contains(vertices[faces].mean(1), margin)
     faces = faces[inside]
     if len(faces) == 0:
-        return no_points(plan)
+        return empty_points(plan)
     surface = replace(plan.surface, vertices=vertices, faces=faces)
     sampler = SurfaceSampler(field.vacancy, field.vectors, plan.region, surface, field.threads)
     if sampler.area <= 0.0:
-        return no_points(plan)
+        return empty_points(plan)
     rng = np.random.default_rng([plan.seed, tile, 0])
     return sampler.sample(
-        Request(0.0, 0), rng, progress, spacing=plan.spacing,
+        ResolutionRequest(0.0, 0), rng, progress, spacing=plan.spacing,
         owned=lambda where: plan.tiling.owner(where) == tile,
     )  # fmt: skip
 
 
-def no_points(plan: TilePlan) -> SurfacePoints:
-    """Return the points of a tile without surface."""
+def empty_points(plan: TilePlan) -> SurfacePoints:
+    """Return the points of a tile that holds no surface."""
     none = np.zeros((0, 3))
     return SurfacePoints(
         none, none, np.zeros(0, np.uint8), np.zeros(0), plan.spacing.nominal, (), {}
@@ -68,13 +68,13 @@ def no_points(plan: TilePlan) -> SurfacePoints:
 def pieces_in_box(
     vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray, length: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a soup of triangles that covers the part of a surface in a box, and little more.
+    """Return a triangle soup that covers the part of a surface in a box, and little more.
 
-    Triangles across the border are halved along their longest edge until it is shorter than
-    ``length``; pieces outside are left out.
+    Triangles across the border are bisected at their longest edge until it is shorter than
+    ``length``; pieces outside are dropped.
     """
     corners = vertices[faces]  # (f, 3, 3)
-    for _ in range(MAX_CUTS):
+    for _ in range(MAX_SPLITS):
         lowest, highest = corners.min(1), corners.max(1)
         corners = corners[((highest >= low) & (lowest <= high)).all(1)]
         edges = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=2)  # (f, 3)
@@ -92,19 +92,19 @@ def pieces_in_box(
 
 
 @dataclass(frozen=True)
-class AllPoints:
-    """The points of the whole region: few bytes each, held by every worker."""
+class GatheredPoints:
+    """The points of the whole region: a few bytes each, held by every worker."""
 
     cloud: SurfacePoints
-    """Surface points, caps, and fillers (normal 0, ``KIND_FILLER``)."""
+    """Surface points, cap points and Steiner points (normal 0, ``KIND_STEINER``)."""
     shifted: np.ndarray
-    """(n, 3) float64: where they are while connectivity is decided."""
+    """(n, 3) float64: perturbed positions for the triangulation."""
     inner: np.ndarray
-    """(n,) bool: not a filler beyond the region."""
+    """(n,) bool: false for Steiner points beyond the region."""
 
 
-def gather(plan: TilePlan, parts: list[SurfacePoints]) -> AllPoints:
-    """Thin the points of all tiles together with the caps, and let fillers give way.
+def gather(plan: TilePlan, parts: list[SurfacePoints]) -> GatheredPoints:
+    """Thin the points of all tiles together with the caps; drop Steiner points near them.
 
     Parameters
     ----------
@@ -118,34 +118,38 @@ def gather(plan: TilePlan, parts: list[SurfacePoints]) -> AllPoints:
     radii = np.concatenate([caps.radii, *(part.radii for part in parts)])
     kind = np.full(len(points), KIND_CAP, np.uint8)
     kind[len(caps.points) :] = np.concatenate([part.kind for part in parts])
-    # As within a tile: jumps last among surface points.
+    # As within a tile: jumps come last among surface points.
     priority = PRIORITY_SURFACE + 0.5 * (rng.random(len(points)) + (kind == KIND_JUMP))
     priority[: len(caps.points)] = caps.priority
     kept = thin(points, normals, radii, priority)
     points, normals, radii, kind = points[kept], normals[kept], radii[kept], kind[kept]
     is_cap = kind == KIND_CAP
-    free = clear_of(plan.fillers, points[~is_cap], CLEAR_RADII * radii[~is_cap])
-    free &= clear_of(plan.fillers, points[is_cap], CLEAR_CAP_RADII * radii[is_cap])
-    fillers = plan.fillers[free]
+    free = outside_clearance(plan.steiner_points, points[~is_cap], CLEARANCE_RADII * radii[~is_cap])
+    free &= outside_clearance(
+        plan.steiner_points, points[is_cap], CLEARANCE_CAP_RADII * radii[is_cap]
+    )
+    steiner_points = plan.steiner_points[free]
     figures = {
         "surface_points": int((~is_cap).sum()),
         "cap_points": int(is_cap.sum()),
-        "fillers": len(fillers),
+        "fillers": len(steiner_points),
         "limited_by_photos_share": plan.spacing.limited,
         "shortest_spacing_scene": EDGE_PER_RADIUS * float(radii.min(initial=np.inf)),
         "longest_spacing_scene": EDGE_PER_RADIUS * float(radii.max(initial=0.0)),
     }
     for name in ("candidates", "dropped_candidates", "jump_points", "projection_evaluations"):
         figures[name] = sum(part.figures.get(name, 0) for part in parts)
-    inner = np.concatenate([np.ones(len(points), np.bool_), plan.region.distance(fillers) < 0])
+    inner = np.concatenate(
+        [np.ones(len(points), np.bool_), plan.region.distance(steiner_points) < 0]
+    )
     cloud = SurfacePoints(
-        np.concatenate([points, fillers]),
-        np.concatenate([normals, np.zeros_like(fillers)]),
-        np.concatenate([kind, np.full(len(fillers), KIND_FILLER, np.uint8)]),
-        np.concatenate([radii, np.full(len(fillers), np.inf)]),
+        np.concatenate([points, steiner_points]),
+        np.concatenate([normals, np.zeros_like(steiner_points)]),
+        np.concatenate([kind, np.full(len(steiner_points), KIND_STEINER, np.uint8)]),
+        np.concatenate([radii, np.full(len(steiner_points), np.inf)]),
         plan.spacing.nominal,
         plan.notes,
         figures,
     )
     shift = JITTER_SHARE * plan.region.diagonal * rng.uniform(-1.0, 1.0, cloud.points.shape)
-    return AllPoints(cloud, cloud.points + shift, inner)
+    return GatheredPoints(cloud, cloud.points + shift, inner)

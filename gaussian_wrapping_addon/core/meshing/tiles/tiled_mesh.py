@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The steps of a tiled mesh: plan, points of each tile, all points, faces of each tile, join."""
+"""Tiled meshing: plan, sample each tile, gather the points, label each tile, join the faces."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ...dataset.camera import Camera
 from ...errors import MeshingError
-from ...field.depth_samples import Sightings
+from ...field.depth_samples import DepthSamples
 from ...gaussians.model import GaussianArrays
 from ...mesh.surface_mesh import SurfaceMesh
 from ...progress import Progress
@@ -19,10 +19,16 @@ from ...regions.convex_region import Region
 from ...settings import MeshingSettings
 from ..points.candidate_surface import candidate_surface
 from ..points.resolution import checked_request
-from ..primal_adaptive import counts, distance_to_level, finished, selected, tidied
+from ..primal_adaptive import (
+    made_manifold,
+    residuals_on_surface,
+    simplified,
+    small_handles_closed,
+    vertex_counts,
+)
 from .plan import Field, TilePlan, make_plan
 from .tile_faces import TileFaces, joined_faces, tile_faces
-from .tile_points import KIND_FILLER, AllPoints, gather, tile_points
+from .tile_points import KIND_STEINER, GatheredPoints, gather, tile_points
 
 _logger = logging.getLogger(__name__)
 
@@ -38,31 +44,31 @@ def plan_tiles(
     tiles: int,
     seed: int,
     edge_length_scene: float = 0.0,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> TilePlan:
-    """Find the region's candidate surface and cut it into tiles.
+    """Extract the region's candidate surface and split it into tiles.
 
     Parameters
     ----------
     tiles : int
-        0 makes as many as the request needs.
+        Number of tiles; 0 chooses it by the request.
 
     Raises
     ------
     MeshingError
         The region holds no surface.
     UsageError, ResourceError
-        The request makes no sense, or needs more points than the cap.
+        The request is invalid, or needs more points than the limit.
     """
     request = checked_request(edge_length_scene, settings.points, region)
     surface = candidate_surface(
         arrays, region, field.vacancy.is_empty, 0.5 * request.edge_length, seed,
-        progress.span(0.0, 0.6), sightings,
+        progress.span(0.0, 0.6), depth_samples,
     )  # fmt: skip
     plan = make_plan(
         field, region, surface, request, progress.span(0.6, 1.0), tiles=tiles, seed=seed,
         cameras=cameras, adaptive=settings.spacing == "adaptive",
-        sightings=0 if sightings is None else len(sightings),
+        depth_samples=0 if depth_samples is None else len(depth_samples),
     )  # fmt: skip
     _logger.info("Region %s is meshed in %d tiles", region.name, len(plan.tiling))
     return plan
@@ -71,15 +77,15 @@ def plan_tiles(
 def join_tiles(
     field: Field,
     plan: TilePlan,
-    everything: AllPoints,
+    gathered: GatheredPoints,
     parts: list[TileFaces],
     settings: MeshingSettings,
     progress: Progress,
 ) -> SurfaceMesh:
-    """Join the faces of all tiles into one closed 2-manifold, and keep the vertices that it needs.
+    """Join the faces of all tiles into one closed 2-manifold and simplify it.
 
-    The joined surface is held whole: memory is in proportion to it, not to a tile, but the
-    tetrahedra, many times larger, are never there at once.
+    The joined surface is held in one piece: memory is proportional to it, not to a tile, but the
+    tetrahedra, which are many times larger, never exist all at once.
 
     Parameters
     ----------
@@ -89,19 +95,19 @@ def join_tiles(
     Raises
     ------
     MeshingError
-        The region holds no solid, or tiles do not fit together.
+        The region holds no solid, or tiles do not agree on their border.
     """
     faces = joined_faces(parts)
     progress.update(0.1, f"joining {len(plan.tiling)} tiles")
-    cloud = everything.cloud
-    vertices, faces, kind, figures = finished(
+    cloud = gathered.cloud
+    vertices, faces, kind, figures = made_manifold(
         cloud.points, faces, cloud, plan.region, settings, progress
     )
     figures["dense_vertices"] = len(vertices)
-    progress.update(0.95, f"choosing from {len(vertices)} vertices")
-    vertices, faces, kind = selected(vertices, faces, kind, plan.target, plan.share, plan.region)
-    vertices, faces, kind, handles = tidied(vertices, faces, kind)
-    figures |= handles | counts(kind)
+    progress.update(0.95, f"simplifying {len(vertices)} vertices")
+    vertices, faces, kind = simplified(vertices, faces, kind, plan.target, plan.share, plan.region)
+    vertices, faces, kind, handles = small_handles_closed(vertices, faces, kind)
+    figures |= handles | vertex_counts(kind)
     sums = ("tetrahedra", "interior_samples", "relabelled_tetrahedra", "undecided_tetrahedra")
     provenance: dict[str, Any] = {
         "method": "primal adaptive meshing",
@@ -110,7 +116,7 @@ def join_tiles(
         "edge_length_scene": plan.edge_length,
         "gaussians_in_region": plan.surface.gaussians,
         "pivots": plan.surface.pivots,
-        "sightings": plan.sightings,
+        "sightings": plan.depth_samples,
         "candidate_area": plan.area,
         "spacing": settings.spacing,
         "notes": [note.to_json() for note in plan.notes],
@@ -118,8 +124,8 @@ def join_tiles(
         **cloud.figures,
         **{name: sum(part.figures.get(name, 0) for part in parts) for name in sums},
         **figures,
-        "vertices_of_fillers": int((kind == KIND_FILLER).sum()),
-        **distance_to_level(field.vacancy, vertices, kind),
+        "vertices_of_fillers": int((kind == KIND_STEINER).sum()),
+        **residuals_on_surface(field.vacancy, vertices, kind),
     }
     progress.update(1.0, f"{len(faces)} faces")
     _logger.info("Meshed region %s: %d faces", plan.region.name, len(faces))
@@ -139,18 +145,18 @@ def mesh_in_tiles(
     seed: int,
     threads: int,
     edge_length_scene: float = 0.0,
-    sightings: Sightings | None = None,
+    depth_samples: DepthSamples | None = None,
 ) -> SurfaceMesh:
-    """Mesh a region tile by tile in this process alone; see :func:`~.primal_adaptive.mesh_region`.
+    """Mesh a region tile by tile in this process; see :func:`~.primal_adaptive.mesh_region`.
 
-    The mesh is one closed 2-manifold. Of another number of tiles it differs as of another seed.
+    The mesh is one closed 2-manifold. It varies with the number of tiles as with the seed.
     """
     if len(cameras) == 0:
-        raise MeshingError("There are no cameras to look from.", "Check the scene.")
+        raise MeshingError("The scene has no cameras.", "Check the scene.")
     field = Field(vacancy, vectors, threads)
     plan = plan_tiles(
         field, arrays, cameras, region, settings, progress.span(0.0, 0.3), tiles=tiles, seed=seed,
-        edge_length_scene=edge_length_scene, sightings=sightings,
+        edge_length_scene=edge_length_scene, depth_samples=depth_samples,
     )  # fmt: skip
     count = len(plan.tiling)
     sampling, labelling = progress.span(0.3, 0.6), progress.span(0.6, 0.9)
@@ -158,9 +164,9 @@ def mesh_in_tiles(
         tile_points(field, plan, tile, sampling.span(tile / count, (tile + 1) / count))
         for tile in range(count)
     ]
-    everything = gather(plan, points)
+    gathered = gather(plan, points)
     parts = [
-        tile_faces(field, plan, everything, tile, labelling.span(tile / count, (tile + 1) / count))
+        tile_faces(field, plan, gathered, tile, labelling.span(tile / count, (tile + 1) / count))
         for tile in range(count)
     ]
-    return join_tiles(field, plan, everything, parts, settings, progress.span(0.9, 1.0))
+    return join_tiles(field, plan, gathered, parts, settings, progress.span(0.9, 1.0))

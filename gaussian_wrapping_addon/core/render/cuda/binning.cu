@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Which tiles each Gaussian's ellipse reaches: the counts and the unsorted list of pairs, for a
-// band of tile rows. Formulas and float64 of tile_kernels.py; torch sorts the pairs by tile.
+// The tiles that each Gaussian's ellipse reaches: counts and unsorted list of intersections of a
+// band of tile rows. Formulas and float64 of tile_kernels.py; torch sorts them by tile.
 
-// First and last tile column of Gaussian i in a row of tiles.
+// First and last tile column of Gaussian i in a tile row.
 __device__ __forceinline__ void tile_columns(
     int row, const int* range, float4 box, float skew_px, int* first, int* last) {
     *first = range[2] / TILE;
@@ -41,7 +41,7 @@ __device__ __forceinline__ void tile_columns(
     *last = (int)last_px / TILE;
 }
 
-// First and last row, first and last column of the pixels whose centre lies in the box.
+// First and last row, first and last column of the pixels whose centres lie in the box.
 __device__ __forceinline__ void pixel_range(float4 box, int width, int height, int* range) {
     range[0] = (int)fmax(ceil((double)box.y - 0.5), 0.0);
     range[1] = (int)fmin(floor((double)box.w - 0.5), height - 1.0);

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Shared by all kernels: a tile's threads, the ray's value of one Gaussian, reductions of a warp.
+// Shared by all kernels: threads of a tile, one Gaussian evaluated on a ray, warp reductions.
 //
-// One text for NVRTC and, behind a shim that defines CUDA's words, for a host compiler. The
-// constants in capitals are written in front of it by source.py.
+// One source for NVRTC and, with a shim that defines CUDA's keywords, for a host compiler. The
+// constants in capitals are prepended by source.py.
 
 typedef long long int64;
 
@@ -12,10 +12,10 @@ typedef long long int64;
 #define ROW_QUADS 6 // float4 values of one row of params
 
 struct CameraValues {
-    double v[22]; // as projection.pack_camera writes it
+    double v[22]; // as written by projection.pack_camera
 };
 
-// A warp of 32 threads covers 8 x 4 pixels of the tile: compact, so that many lanes do the same.
+// A warp of 32 threads covers 8 x 4 pixels of the tile: compact, so that few lanes diverge.
 __device__ __forceinline__ int pixel_column(int thread) {
     return ((thread >> 5) & 1) * 8 + (thread & 7);
 }
@@ -33,7 +33,7 @@ struct Hit {
     float raw;      // opacity on the ray before the cap
 };
 
-// Written with explicit fused operations, so that every kernel rounds alike.
+// Written with explicit fused operations, so that every kernel rounds identically.
 __device__ __forceinline__ Hit evaluate(const float4 a, const float4 b, const float4 c, float x, float y) {
     Hit hit;
     const float dx = x - a.x, dy = y - a.y;
@@ -67,7 +67,7 @@ __device__ __forceinline__ float warp_max(float value) {
 }
 
 // One halving of the values that every lane of a warp holds: lanes whose bit `offset` is set keep
-// the upper half, the others the lower one, each with its partner's share added.
+// the upper half, the others the lower one, each plus its partner's values.
 template <int COUNT>
 __device__ __forceinline__ void halve(float* values, int lane, int offset) {
     const bool upper = (lane & offset) != 0;

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""NVRTC, the CUDA C compiler that comes with a CUDA torch, through ctypes."""
+"""Compile CUDA C with NVRTC, the runtime compiler shipped with CUDA builds of torch."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MAX_FOLDER_DEPTH = 4
 
 @dataclass(frozen=True)
 class CompiledText:
-    """What the driver loads, and what the compiler said."""
+    """Compiled code for the driver, and the compiler log."""
 
     image: bytes
     """Machine code of one architecture, or PTX ending in a zero byte."""
@@ -31,16 +31,16 @@ class CompiledText:
 
 @functools.cache
 def find_nvrtc(cuda_major: int | None = None) -> Path | None:
-    """Return the NVRTC library to use, or ``None`` where there is none.
+    """Return the NVRTC library to use, or ``None`` if there is none.
 
-    Looked for in the ``nvidia`` wheels that torch depends on, in torch's own folder (Windows),
-    and in the CUDA toolkit that ``CUDA_PATH`` or ``CUDA_HOME`` names.
+    Searched in the ``nvidia`` wheels that torch depends on, in torch's own folder (Windows),
+    and in the CUDA toolkit of ``CUDA_PATH`` or ``CUDA_HOME``.
 
     Parameters
     ----------
     cuda_major : int, optional
-        Major version of torch's CUDA, which the driver surely supports: preferred. Otherwise the
-        newest.
+        Major version of torch's CUDA, which the driver is known to support: preferred. Otherwise
+        the newest is returned.
     """
     found = []
     for path in _library_files():
@@ -57,8 +57,8 @@ def compile_text(
 ) -> CompiledText:
     """Compile CUDA C for one compute capability.
 
-    An architecture newer than the compiler gets PTX for the newest one it knows, which the driver
-    translates.
+    For an architecture newer than the compiler, PTX of the newest known one is returned, which the
+    driver translates.
 
     Parameters
     ----------
@@ -68,13 +68,13 @@ def compile_text(
     library : Path
         From :func:`find_nvrtc`.
     verbose : bool
-        Have registers, shared memory and spills of every kernel in the log.
+        Log registers, shared memory and spills of every kernel.
 
     Raises
     ------
     DeviceError
-        If the compiler cannot be loaded, knows no architecture this old, or refuses the text;
-        the message holds its log.
+        If the compiler cannot be loaded, supports no architecture this old, or rejects the source;
+        the message contains its log.
     """
     nvrtc = _load(library)
     wanted = capability[0] * 10 + capability[1]
@@ -82,7 +82,7 @@ def compile_text(
     usable = [number for number in known if number <= wanted]
     if not usable:
         raise DeviceError(
-            f"{library.name} compiles for no GPU as old as compute capability "
+            f"{library.name} does not support a GPU as old as compute capability "
             f"{capability[0]}.{capability[1]}.",
             "Render on the CPU.",
         )
@@ -104,8 +104,8 @@ def compile_text(
         log = _read(nvrtc, program, "ProgramLog").rstrip(b"\0").decode(errors="replace").strip()
         if result != 0:
             raise DeviceError(
-                f"NVRTC {library.name} refused the kernels for compute capability "
-                f"{capability[0]}.{capability[1]}: {log or _words(nvrtc, result)}",
+                f"NVRTC {library.name} rejected the kernels for compute capability "
+                f"{capability[0]}.{capability[1]}: {log or _error_text(nvrtc, result)}",
                 "Report this message; rendering on the CPU works meanwhile.",
             )
         return CompiledText(_read(nvrtc, program, "CUBIN" if exact else "PTX"), log)
@@ -117,23 +117,23 @@ def _library_files() -> Iterable[Path]:
     folders: list[Path] = []
     for package in ("nvidia", "torch"):
         spec = importlib.util.find_spec(package)
-        for place in (spec.submodule_search_locations or ()) if spec is not None else ():
-            folders.append(Path(place) / "lib" if package == "torch" else Path(place))
+        for location in (spec.submodule_search_locations or ()) if spec is not None else ():
+            folders.append(Path(location) / "lib" if package == "torch" else Path(location))
     for variable in ("CUDA_PATH", "CUDA_HOME"):
         if os.environ.get(variable):
             folders += [Path(os.environ[variable]) / name for name in ("bin", "lib64", "lib")]
     for folder in folders:
-        for place, inside, names in os.walk(folder):
-            if len(Path(place).relative_to(folder).parts) >= _MAX_FOLDER_DEPTH:
-                inside.clear()
-            yield from (Path(place) / name for name in names if "nvrtc" in name)
+        for location, subfolders, names in os.walk(folder):
+            if len(Path(location).relative_to(folder).parts) >= _MAX_FOLDER_DEPTH:
+                subfolders.clear()
+            yield from (Path(location) / name for name in names if "nvrtc" in name)
 
 
 @functools.cache
 def _load(library: Path) -> ctypes.CDLL:
     try:
         if sys.platform == "win32":
-            # Where its own parts are found.
+            # Its own libraries are found there.
             with os.add_dll_directory(str(library.parent)):
                 nvrtc = ctypes.CDLL(str(library))
         else:
@@ -160,10 +160,10 @@ def _read(nvrtc: ctypes.CDLL, program: ctypes.c_void_p, what: str) -> bytes:
     return buffer.raw
 
 
-def _words(nvrtc: ctypes.CDLL, result: int) -> str:
+def _error_text(nvrtc: ctypes.CDLL, result: int) -> str:
     return str((nvrtc.nvrtcGetErrorString(result) or b"unknown error").decode())
 
 
 def _check(nvrtc: ctypes.CDLL, result: int) -> None:
     if result != 0:
-        raise DeviceError(f"NVRTC failed: {_words(nvrtc, result)}.", _HINT)
+        raise DeviceError(f"NVRTC failed: {_error_text(nvrtc, result)}.", _HINT)

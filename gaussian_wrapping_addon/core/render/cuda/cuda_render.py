@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The fast renderer on a GPU: the same images, depth, gradients and statistics as on the CPU.
 
-Nothing that is per Gaussian or per pixel crosses the bus, except the statistics where asked for.
+No per-Gaussian or per-pixel data is copied to the host, except requested statistics.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from .tile_lists import (
 
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits", "sh", "orientation")
 _BUDGET_SHARE = 0.5
-"""Of the GPU's memory that is free, for pairs of Gaussian and tile."""
+"""Share of the free GPU memory used for tile intersections."""
 
 
 def render_cuda(
@@ -46,7 +46,7 @@ def render_cuda(
 ) -> Render:
     """Render on the GPU that holds the Gaussians; see :func:`~.render.render`.
 
-    Bitwise the same in every run on the same GPU.
+    Bitwise reproducible on the same GPU.
 
     Parameters
     ----------
@@ -55,18 +55,18 @@ def render_cuda(
     camera : Camera
         In the scene frame.
     options : RenderOptions, optional
-        ``threads`` is not used.
+        ``threads`` is ignored.
     budget_bytes : int
-        GPU memory for pairs of Gaussian and tile; 0 takes half of what is free.
+        GPU memory for tile intersections; 0 uses half of what is free.
 
     Raises
     ------
     UsageError
         If the tensors are not float32 or not on one GPU.
     DeviceError
-        If compiler or driver are missing or fail.
+        If the compiler or the driver is missing or fails.
     ResourceError
-        If the GPU's memory does not suffice.
+        If the GPU memory does not suffice.
     """
     device = gaussians.means.device
     if device.type != "cuda":
@@ -83,7 +83,7 @@ def render_with(
     options: RenderOptions | None,
     budget_bytes: int,
 ) -> Render:
-    """Render with the given kernels, on the device of the tensors; see :func:`render_cuda`."""
+    """Render with the given kernels on the tensors' device; see :func:`render_cuda`."""
     options = options or RenderOptions()
     device = gaussians.means.device
     for name, tensor in gaussians.tensors():
@@ -95,7 +95,7 @@ def render_with(
     count = len(gaussians)
     statistics = _empty_statistics(count) if options.statistics else None
     tensors = [getattr(gaussians, name) for name in _TRAINED]
-    with _enough_memory(camera):
+    with _translate_out_of_memory(camera):
         images = _Rasterize.apply(
             *tensors, kernels, gaussians, camera, options, statistics, budget_bytes
         )
@@ -104,20 +104,20 @@ def render_with(
 
 
 @contextlib.contextmanager
-def _enough_memory(camera: Camera) -> Iterator[None]:
-    """Turn torch's error of the GPU's memory into ours."""
+def _translate_out_of_memory(camera: Camera) -> Iterator[None]:
+    """Translate torch's out-of-memory error into a ``ResourceError``."""
     try:
         yield
     except torch.OutOfMemoryError as error:
         raise ResourceError(
-            f"The GPU's memory does not suffice for view {camera.name!r}: {error}.",
+            f"GPU memory does not suffice for view {camera.name!r}: {error}.",
             "Use smaller images or fewer Gaussians, or render on the CPU.",
         ) from None
 
 
 @dataclass(frozen=True)
 class _Images:
-    """What the kernels write, float32."""
+    """Images that the kernels write, float32."""
 
     color: Tensor  # (h, w, 3)
     normal: Tensor  # (h, w, 3)
@@ -162,13 +162,13 @@ class _Rasterize(torch.autograd.Function):
         ctx.camera, ctx.options, ctx.statistics = camera, options, statistics
         ctx.slope = images.slope
         outputs = (images.color, images.normal, images.geometric, images.alpha, images.depth)
-        # Saved, so that autograd refuses to run backward after one was changed in place.
+        # Saved so that autograd refuses to run backward after one was modified in place.
         ctx.save_for_backward(means, log_scales, quats, opacity_logits, sh, orientation, *outputs)
         return outputs
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        with _enough_memory(ctx.camera):
+        with _translate_out_of_memory(ctx.camera):
             return (*_backward(ctx, grads), *[None] * 6)
 
 
@@ -186,24 +186,26 @@ def _backward(ctx: Any, grads: tuple[Tensor | None, ...]) -> list[Tensor]:
     params = ctx.screen.params
     grad_params = torch.zeros_like(params)  # (n, 24)
     for band in ctx.bands:
-        pairs = params.new_empty((len(band.gaussian_ids), ROW_VALUES))
+        intersections = params.new_empty((len(band.gaussian_ids), ROW_VALUES))
         kernels.launch(
             name,
             band.tiles,
             params,
             band.start,
             band.gaussian_ids,
-            band.pair_slots,
+            band.intersection_slots,
             band.masks,
-            *_place(ctx.camera, band),
+            *_band_geometry(ctx.camera, band),
             *outputs,
             ctx.slope,
             *incoming,
-            pairs,
+            intersections,
         )
         blocks = -(-len(params) // WARPS)
-        kernels.launch("sum_pairs", blocks, len(params), pairs, band.pair_offsets, grad_params)
-    # A row that float32 could not hold counts as nothing.
+        kernels.launch(
+            "sum_pairs", blocks, len(params), intersections, band.intersection_offsets, grad_params
+        )
+    # Rows that overflow float32 are dropped.
     grad_params.masked_fill_(~grad_params.isfinite().all(1, keepdim=True), 0.0)
     if statistics is not None:
         # In float64: squares of float32 overflow beyond 1e19.
@@ -231,7 +233,7 @@ def _blend(
     images: _Images,
     sums: _WeightSums | None,
 ) -> None:
-    pair_weights = screen.params.new_zeros((len(band.gaussian_ids) if sums else 0, 2))
+    intersection_weights = screen.params.new_zeros((len(band.gaussian_ids) if sums else 0, 2))
     kernels.launch(
         "forward_tiles_weights" if sums else "forward_tiles",
         band.tiles,
@@ -240,24 +242,24 @@ def _blend(
         screen.skews,
         band.start,
         band.gaussian_ids,
-        band.pair_slots,
-        *_place(camera, band),
+        band.intersection_slots,
+        *_band_geometry(camera, band),
         *(float(value) for value in options.background),
         images.color,
         images.normal,
         images.geometric,
         images.alpha,
         band.masks,
-        pair_weights,
+        intersection_weights,
         images.strongest,
     )
     if sums:
-        sums.reached.logical_or_(band.pair_offsets.diff() > 0)
+        sums.reached.logical_or_(band.intersection_offsets.diff() > 0)
         kernels.launch_each(
             "sum_weights",
             len(screen.params),
-            pair_weights,
-            band.pair_offsets,
+            intersection_weights,
+            band.intersection_offsets,
             sums.weight_sum,
             sums.weight_max,
         )
@@ -269,7 +271,7 @@ def _blend(
             band.start,
             band.gaussian_ids,
             band.masks,
-            *_place(camera, band),
+            *_band_geometry(camera, band),
             float(options.depth_valid_transmittance),
             images.alpha,
             images.depth,
@@ -279,7 +281,7 @@ def _blend(
 
 @dataclass(frozen=True)
 class _WeightSums:
-    """Blending weights per Gaussian, gathered over bands; all (n,)."""
+    """Blending weights per Gaussian, accumulated over bands; all (n,)."""
 
     reached: Tensor  # bool
     weight_sum: Tensor
@@ -294,14 +296,14 @@ class _WeightSums:
         )
 
 
-def _place(camera: Camera, band: Band) -> tuple[int, int, int, int]:
-    """Return tiles in a row, the band's first row of tiles, and the image size in pixels."""
+def _band_geometry(camera: Camera, band: Band) -> tuple[int, int, int, int]:
+    """Return tiles per row, the band's first tile row, and the image size in pixels."""
     tiles_x = -(-camera.width // tolerances.TILE_PX)
     return tiles_x, band.first_row, camera.width, camera.height
 
 
 def _allocate(camera: Camera, options: RenderOptions, device: torch.device) -> _Images:
-    """Return images that the kernels fill; depth 0 where it is not solved."""
+    """Return images for the kernels to fill; depth is 0 unless it is solved."""
     shape = (camera.height, camera.width)
     return _Images(
         torch.empty((*shape, 3), device=device),
@@ -316,7 +318,7 @@ def _allocate(camera: Camera, options: RenderOptions, device: torch.device) -> _
 
 def _free_bytes(device: torch.device) -> int:
     free, _ = torch.cuda.mem_get_info(device)
-    # torch keeps freed memory for itself.
+    # torch caches freed memory.
     kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return int(_BUDGET_SHARE * (free + kept))
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The few functions of the CUDA driver API that load and launch kernels, through ctypes.
+"""Load and launch kernels through the CUDA driver API (ctypes).
 
-Kernels run in the device's primary context, which torch uses as well, so they read and write
-torch's memory and queue on its streams.
+Kernels run in the device's primary context, which torch uses as well, so they can access torch's
+memory and use its streams.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 from ...errors import DeviceError
 
-_HINT = "Update NVIDIA's driver, or render on the CPU."
+_HINT = "Update the NVIDIA driver, or render on the CPU."
 
 
 class DriverModule:
@@ -23,7 +23,7 @@ class DriverModule:
     Parameters
     ----------
     device_index : int
-        As torch counts.
+        Device index of torch.
     image : bytes
         From the compiler.
     names : sequence of str
@@ -32,7 +32,7 @@ class DriverModule:
     Raises
     ------
     DeviceError
-        If the driver is missing or refuses.
+        If the driver is missing or fails.
     """
 
     def __init__(self, device_index: int, image: bytes, names: Sequence[str]) -> None:
@@ -63,12 +63,12 @@ class DriverModule:
     def launch(
         self, name: str, blocks: int, threads: int, parameters: ctypes.Array, stream: int
     ) -> None:
-        """Queue a kernel; ``parameters`` points at the values of its arguments, in order.
+        """Queue a kernel; ``parameters`` points to the values of its arguments, in order.
 
         Raises
         ------
         DeviceError
-            If it cannot be queued. What goes wrong while it runs, torch reports later.
+            If it cannot be queued. Errors during execution are reported later, by torch.
         """
         self._enter()
         try:
@@ -94,18 +94,18 @@ class DriverModule:
 
 @functools.cache
 def load_driver() -> ctypes.CDLL:
-    """Return NVIDIA's driver library, initialised.
+    """Return the NVIDIA driver library, initialised.
 
     Raises
     ------
     DeviceError
-        If this machine has none.
+        If the driver is not installed.
     """
     name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
     try:
         cuda = ctypes.CDLL(name)
     except OSError:
-        raise DeviceError(f"NVIDIA's driver library {name} is not here.", _HINT) from None
+        raise DeviceError(f"The NVIDIA driver library {name} was not found.", _HINT) from None
     _check(cuda, "cuInit", 0)
     return cuda
 
@@ -113,7 +113,7 @@ def load_driver() -> ctypes.CDLL:
 def _check(cuda: ctypes.CDLL, function: str, *arguments: object) -> None:
     result = getattr(cuda, function)(*arguments)
     if result != 0:
-        words = ctypes.c_char_p()
-        cuda.cuGetErrorString(result, ctypes.byref(words))
-        text = (words.value or b"unknown error").decode(errors="replace")
-        raise DeviceError(f"{function} of NVIDIA's driver failed: {text} ({result}).", _HINT)
+        description = ctypes.c_char_p()
+        cuda.cuGetErrorString(result, ctypes.byref(description))
+        text = (description.value or b"unknown error").decode(errors="replace")
+        raise DeviceError(f"{function} of the NVIDIA driver failed: {text} ({result}).", _HINT)

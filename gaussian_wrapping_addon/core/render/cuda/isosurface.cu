@@ -2,9 +2,9 @@
 // z-depth where the transmittance along each pixel's ray crosses 0.5
 // (docs/method.md, sections 2.4 and 2.5).
 //
-// A warp solves its 8 x 4 pixels alone, walking the tile's list again for every Newton step: no
-// lists per pixel, whose length has no bound, and no barrier. The masks of the blending jump over
-// pairs that none of its open pixels sees, and the walk ends at the last Gaussian that can matter.
+// A warp solves its 8 x 4 pixels alone, traversing the tile's list for every Newton step: no lists
+// per pixel, whose length has no bound, and no barrier. The masks of the blending skip those that
+// none of its open pixels intersects; traversal ends at the last Gaussian that can contribute.
 
 // Call visit(position, row) in blending order for the contributors of this lane's pixel, as far
 // as the pixel's bit is set in `wanted`.
@@ -43,10 +43,10 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
     bool open = final <= limit && final < ISO_LEVEL;
     float t = 0.0f, slope = 1.0f;
 
-    // First walk: the Gaussian at which the blending crosses 0.5, and the bracket.
+    // First traversal: the Gaussian at which the blending crosses 0.5, and the bracket.
     float through = 1.0f, high = 0.0f, nearest = FARTHEST, sharpest = 0.0f;
     float cross_before = 0.0f, cross_alpha = 0.0f, cross_peak = 0.0f, cross_sharpness = TINY;
-    int needed = 0; // pairs from `begin` on that can matter
+    int needed = 0; // intersections from `begin` on that can contribute
     const unsigned candidates = __ballot_sync(ALL_LANES, open);
     walk(params, gaussian_ids, masks, begin, end, warp, lane, candidates, [&](int64 at, const float4* row) {
         const float4 b = row[1], c = row[2];
@@ -57,7 +57,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
         const float front = c.z - FRONT_SIGMAS * row[5].z;
         const float before = through, beyond = fmaxf(peak - high, 0.0f);
         through = fmaf(-alpha, through, through);
-        // Behind the bracket a Gaussian must be seen from its end to count.
+        // Behind the bracket a Gaussian contributes only if its density reaches the bracket's end.
         if (before > ISO_LEVEL || sharpness * beyond * beyond < NEGLIGIBLE)
             sharpest = fmaxf(sharpest, sharpness);
         nearest = fminf(nearest, front);
@@ -76,14 +76,14 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
     sharpest = sqrtf(fmaxf(sharpest, TINY));
     const float alone = sqrtf(fmaxf(cross_sharpness, TINY));
     if (open) {
-        // Alone, that Gaussian lets 0.5 through where exp(-s d^2 / 2) = ratio.
+        // That Gaussian alone reaches T = 0.5 where exp(-s d^2 / 2) = ratio.
         const float ratio = (cross_before - ISO_LEVEL) / fmaxf(cross_alpha * cross_before, TINY);
         const float ahead = -2.0f * logf(fminf(fmaxf(ratio, TINY), 1.0f)) / fmaxf(cross_sharpness, TINY);
         t = cross_peak - sqrtf(fmaxf(ahead, 0.0f));
         if (!(t > low && t < high)) t = 0.5f * (low + high);
     }
 
-    // T, the slope of -log T and its growth at the depth `where` of every pixel in `wanted`.
+    // T and the first two derivatives of -log T at the depth `where` of every pixel in `wanted`.
     float product = 1.0f, steep = 0.0f, growth = 0.0f;
     auto transmit = [&](float where, unsigned wanted) {
         product = 1.0f;
@@ -94,7 +94,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
             const float ahead = fmaxf(peak_depth(hit, b, c.z) - where, 0.0f);
             const float sharpness = ahead > 0.0f ? row[3].x * hit.den : 0.0f;
             const float pull = sharpness * ahead, fall = 0.5f * pull * ahead;
-            if (!(fall < FALL_END)) return; // nothing yet; the square below could overflow
+            if (!(fall < FALL_END)) return; // no contribution; the square below could overflow
             const float density = fminf(hit.raw * __expf(-fall), ALPHA_MAX);
             const float keep = 1.0f - density;
             const float odds = __fdividef(density, keep);
@@ -103,7 +103,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
             growth = fmaf(odds, __fdividef(pull * pull, keep) - sharpness, growth);
         });
     };
-    // Some Gaussian may reach the camera: light must pass at depth 0 for a crossing to exist.
+    // Some Gaussian may reach the camera: a crossing needs T > 0.5 at depth 0.
     const unsigned inner = __ballot_sync(ALL_LANES, open && nearest <= 0.0f);
     if (inner != 0u) {
         transmit(0.0f, inner);
@@ -127,18 +127,18 @@ extern "C" __global__ void __launch_bounds__(BLOCK) isosurface_tiles(
         if (sigmas < SOLVER_STEP_SIGMAS || fabsf(excess) <= SOLVER_LEVEL_MARGIN
             || high - low <= SOLVER_BRACKET_SHARE * high) {
             const bool lost = fabsf(excess) > SOLVER_LEVEL_FAR && slope < SOLVER_FLAT * alone;
-            // A longer step would leave the place at which the slope is known.
+            // A longer step would leave the depth at which the slope is known.
             if (sigmas < SOLVER_POLISH_SIGMAS) {
                 const float moved = fminf(fmaxf(t + step, low), high);
                 slope = fmaf(growth, moved - t, slope);
                 t = moved;
             }
-            // A layer thinner than a rounding of the depth has no gradient to trust.
+            // A layer thinner than the depth's rounding error has no reliable gradient.
             if (lost) slope = 2.0f * alone;
             open = false;
             continue;
         }
-        // Long enough to close the bracket; a layer that is steep may end before the level.
+        // Long enough to close the bracket; a steep layer may end before the level.
         const float least = SOLVER_LEAST_SHARE * t;
         const float moved = t + (fabsf(step) > least ? step : copysignf(least, excess));
         // After some Newton steps every second one is a bisection, which bounds their number.

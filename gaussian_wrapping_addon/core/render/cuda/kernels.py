@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Launching the kernels by name with torch tensors as arguments, and whether that can work here."""
+"""Launch CUDA kernels by name with torch tensors as arguments; check CUDA availability."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ Argument = Tensor | int | float | CameraValues
 
 
 class Kernels(ABC):
-    """Something that runs the kernels of the CUDA text on tensors of one device."""
+    """Runs the kernels of the CUDA source on tensors of one device."""
 
     def launch(self, name: str, blocks: int, *arguments: Argument) -> None:
-        """Run a kernel with :data:`THREADS_PER_BLOCK` threads a block; 0 blocks do nothing.
+        """Run a kernel with :data:`THREADS_PER_BLOCK` threads per block; 0 blocks do nothing.
 
-        Tensors are passed as the addresses of their memory, which must be contiguous; whole
-        numbers as ``int``, others as ``float``.
+        Tensors must be contiguous and are passed by address; integers are passed as ``int``, other
+        numbers as ``float``.
         """
         if blocks == 0:
             return
@@ -48,7 +48,7 @@ class Kernels(ABC):
         self._run(name, blocks, pointers)
 
     def launch_each(self, name: str, count: int, *arguments: Argument) -> None:
-        """Run a kernel with one thread for each of ``count`` items, the first argument."""
+        """Run a kernel with one thread per item; ``count`` is its first argument."""
         self.launch(name, -(-count // THREADS_PER_BLOCK), count, *arguments)
 
     @abstractmethod
@@ -56,7 +56,7 @@ class Kernels(ABC):
 
 
 class DeviceKernels(Kernels):
-    """The kernels compiled for, and run on, one GPU."""
+    """The kernels, compiled for and run on one GPU."""
 
     def __init__(self, device_index: int) -> None:
         library = find_nvrtc(_torch_cuda_major())
@@ -82,13 +82,13 @@ def device_kernels(device_index: int) -> DeviceKernels:
     Raises
     ------
     DeviceError
-        If compiler or driver are missing or fail.
+        If the compiler or the driver is missing or fails.
     """
     return DeviceKernels(device_index)
 
 
 def cuda_available() -> tuple[bool, str]:
-    """Return whether the renderer can run on a GPU here, and in one sentence why or why not."""
+    """Return whether the renderer can run on a GPU of this machine, and the reason."""
     if torch.version.cuda is None:
         return False, "This PyTorch was built without CUDA."
     if not torch.cuda.is_available():

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Raw Gaussians onto the screen, one thread each, in float64: the formulas of
-// projection_kernels.py, where they are derived. By a rough count 1500 operations, which even at
-// a consumer GPU's float64 rate should be little beside the raster loops (not measured).
+// Projection of raw Gaussians, one thread each, in float64: the formulas of
+// projection_kernels.py, where they are derived. Roughly 1500 operations, which even at a consumer
+// GPU's float64 rate should be cheap compared to the raster loops (not measured).
 
 // Rotation of a quaternion, row by row; returns its norm, or 0 where it is degenerate.
 __device__ __forceinline__ double rotation_from_quat(const float* quat, double* r) {
@@ -42,7 +42,7 @@ __device__ __forceinline__ void to_camera(const CameraValues& camera, const doub
             + camera.v[3 * row + 2] * m[2] + camera.v[9 + row];
 }
 
-// Sums over the axes that everything is built of; names as in projection_backward.py.
+// Sums over the axes that all outputs depend on; names as in projection_backward.py.
 struct ShapeSums {
     double a0, hx, hy, hz, bxx, bxy, byy, fxx, fxy, fyy;
     double cov_xx, cov_xy, cov_yy, cov_xz, cov_yz, cov_zz;
@@ -135,7 +135,7 @@ __device__ __forceinline__ bool project_shape(
     const double dr = s.bxx * inverse_a0 / (fx * fx), ds = 2.0 * s.bxy * inverse_a0 / (fx * fy);
     const double dt = s.byy * inverse_a0 / (fy * fy);
     const double sigma_z = sqrt(s.cov_zz);
-    // Hidden where float32 could not hold what rendering makes of the row (docs/architecture.md).
+    // Hidden if rendering the row would overflow float32 (docs/architecture.md).
     const double reach_x = fmax(fabs(at_x), fabs(width - at_x)) + TILE;
     const double reach_y = fmax(fabs(at_y), fabs(height - at_y)) + TILE;
     const double num = qa * reach_x * reach_x + fabs(qb) * reach_x * reach_y + qc * reach_y * reach_y;
@@ -231,7 +231,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_gaussians(
         for (int channel = 0; channel < 3; ++channel) {
             const double value = harmonics_color(
                 sh + (int64)i * coefficients * 3, (degree + 1) * (degree + 1), basis, channel);
-            seen = seen && value <= FINITE_COLOR; // not so for NaN
+            seen = seen && value <= FINITE_COLOR; // false for NaN
             row[13 + channel] = (float)fmax(value, 0.0);
         }
         const double n0 = orientation[4 * (int64)i], n1 = orientation[4 * (int64)i + 1];

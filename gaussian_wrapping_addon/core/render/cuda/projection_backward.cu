@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Gradient of the projection, one thread a Gaussian, in float64: the formulas of
+// Gradient of the projection, one thread per Gaussian, in float64: the formulas of
 // projection_backward.py, where they are derived. Column 22 (a bound) carries no gradient.
 
 // From the gradient on one row of params to axes, effective log scales and mean, camera frame.
@@ -101,8 +101,8 @@ __device__ __forceinline__ void harmonics_pull(
         + SH_C3E * (xx - yy) * c[14];
 }
 
-// Writes the rows of visible Gaussians; the others must hold 0 before, and so stay those whose
-// gradient float32 cannot hold.
+// Writes the rows of visible Gaussians. All rows must be 0 before; the others, and those whose
+// gradient overflows float32, stay 0.
 extern "C" __global__ void __launch_bounds__(BLOCK) project_backward(
     int count, const float* means, const float* log_scales, const float* quats,
     const float* opacity_logits, const float* sh, int coefficients, int degree,
@@ -121,7 +121,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_backward(
         grad[4 * quad + 2] = part.z;
         grad[4 * quad + 3] = part.w;
     }
-    // The activations of the forward pass again; cheaper than keeping them.
+    // Recompute the activations of the forward pass; cheaper than storing them.
     const double m[3] = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
     double local[3], rotation[9], axes[9], variances[3], kept[3];
     to_camera(camera, m, local);
@@ -188,12 +188,12 @@ extern "C" __global__ void __launch_bounds__(BLOCK) project_backward(
         g_orientation[3] = (1.0 - gain * gain) * toward;
     }
 
-    // The mean and the log scales last, in place; then all at once, or nothing.
+    // Mean and log scales last, in place; then all gradients are written, or none.
     const double g_logit = g_log_opacity * fade;
     double total = fabs(g_logit) + BASIS_MAX * (fabs(g_color[0]) + fabs(g_color[1]) + fabs(g_color[2]));
 #pragma unroll
     for (int k = 0; k < 3; ++k) {
-        // d(effective log scale) = kept d(log scale); the filter also dims the opacity.
+        // d(effective log scale) = kept * d(log scale); the filter also reduces the opacity.
         grad_logs[k] = kept[k] * grad_logs[k] + (1.0 - kept[k]) * g_log_opacity;
         d[k] = camera.v[k] * grad_local[0] + camera.v[3 + k] * grad_local[1]
             + camera.v[6 + k] * grad_local[2] + (g[k] - along * d[k]) / distance;

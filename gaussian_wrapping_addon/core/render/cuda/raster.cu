@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Blending of tiles, front to back: one block a tile, one thread a pixel. Beside the images it
-// leaves, for each pair and warp, the mask of the pixels that the Gaussian contributed to. Depth
-// and gradient follow these masks, so all three agree on who contributes, and skip the rest.
+// Blending of tiles, front to back: one block per tile, one thread per pixel. Besides the images
+// it writes, for each intersection and warp, the mask of the pixels that the Gaussian contributed
+// to. Depth and gradient use these masks: all three share their contributors and skip the rest.
 
 #define FORWARD_BATCH 64
 
@@ -70,7 +70,7 @@ __device__ __forceinline__ void forward_tile(
     float best = 0.0f;
     int best_id = -1;
     for (int64 first = begin; first < end; first += FORWARD_BATCH) {
-        // Also keeps the loads below from what the last batch still reads.
+        // Also keeps the loads below from overwriting what the last batch still reads.
         if (__syncthreads_and(through < TRANSMITTANCE_MIN)) break;
         const int listed = (int)(end - first < FORWARD_BATCH ? end - first : FORWARD_BATCH);
         for (int j = thread; j < listed * ROW_QUADS; j += BLOCK)
@@ -145,7 +145,7 @@ __device__ __forceinline__ void forward_tile(
     params, boxes, skews, start, gaussian_ids, pair_slots, tiles_x, first_row, width, height, red, \
         green, blue, color, normal, geometric, alpha_image, masks, pair_weights, strongest
 
-// `masks (pairs, 8)` and, with weights, `pair_weights (pairs, 2)` must hold 0 before.
+// `masks (intersections, 8)` and, with weights, `pair_weights (intersections, 2)` must be 0 before.
 extern "C" __global__ void __launch_bounds__(BLOCK) forward_tiles(FORWARD_PARAMETERS) {
     __shared__ ForwardShared shared;
     forward_tile<false>(shared, (WeightShared*)0, FORWARD_ARGUMENTS);
@@ -156,8 +156,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK) forward_tiles_weights(FORWAR
     forward_tile<true>(shared, &weighed, FORWARD_ARGUMENTS);
 }
 
-// Sum and largest of the blending weights of each Gaussian's pairs, in the order of its slots,
-// added to what other bands left.
+// Sum and maximum of the blending weights of each Gaussian over its intersections, in the order of
+// its slots, accumulated over bands.
 extern "C" __global__ void __launch_bounds__(BLOCK) sum_weights(
     int count, const float* pair_weights, const int64* pair_offsets, float* weight_sum, float* weight_max) {
     const int i = blockIdx.x * BLOCK + threadIdx.x;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Gradient of blending and depth, front to back, one block a tile: the formulas of
-// raster_backward.py. Each warp sums its pixels, each block its warps in order, each pair writes
-// its own slot, each Gaussian sums its slots in order: no atomics, the same bits in every run.
+// Gradient of blending and depth, front to back, one block per tile: the formulas of
+// raster_backward.py. Each warp sums its pixels, each block its warps in order, each intersection
+// writes its own slot, each Gaussian sums its slots in order: no atomics, bitwise reproducible.
 
 #define BACKWARD_BATCH 16
 
@@ -31,7 +31,7 @@ __device__ __forceinline__ void backward_tile(
             g[c] = g_color[3 * pixel + c];
             g[3 + c] = g_normal[3 * pixel + c];
             g[6 + c] = g_geometric[3 * pixel + c];
-            // The colour holds the background, so its part of the final T is included.
+            // The colour includes the background, and with it the final transmittance.
             remaining += g[c] * color[3 * pixel + c] + g[3 + c] * normal[3 * pixel + c]
                 + g[6 + c] * geometric[3 * pixel + c];
         }
@@ -75,7 +75,7 @@ __device__ __forceinline__ void backward_tile(
                     const float peak = line * hit.inverse * c.z;
                     const float ahead = fmaxf(peak - surface, 0.0f);
                     const float density = hit.raw * __expf(-0.5f * sharpness * ahead * ahead);
-                    // On log G, through log(1 - G).
+                    // Gradient on log G, through log(1 - G).
                     const float g_log = density < ALPHA_MAX ? -pull * __fdividef(density, 1.0f - density) : 0.0f;
                     const float g_peak = -g_log * sharpness * ahead;
                     const float g_sharpness = -0.5f * g_log * ahead * ahead;
@@ -145,8 +145,8 @@ BACKWARD_KERNEL(backward_tiles_depth, true, false)
 BACKWARD_KERNEL(backward_tiles_absolute, false, true)
 BACKWARD_KERNEL(backward_tiles_depth_absolute, true, true)
 
-// Add the pair rows of each Gaussian to its row, in the order of the slots: one warp a Gaussian,
-// one lane a column, so that every read is one line of memory.
+// Add each Gaussian's intersection rows to its row, in the order of the slots: one warp per
+// Gaussian, one lane per column, so that reads are coalesced.
 extern "C" __global__ void __launch_bounds__(BLOCK) sum_pairs(
     int count, const float* pairs, const int64* pair_offsets, float* grad_params) {
     const int i = blockIdx.x * WARPS + (threadIdx.x >> 5), column = threadIdx.x & 31;

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The one CUDA C text: constants of the method in front, then the parts in their order."""
+"""CUDA C source of all kernels: the constants of the method, followed by the ``.cu`` files."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ KERNELS = (
     "locate_points",
     "transmittance_tiles",
 )
-"""Names of the text's entry points."""
+"""Names of the kernels (entry points)."""
 
 THREADS_PER_BLOCK = 256
 
@@ -110,7 +110,7 @@ _INTEGER = {"TILE": tolerances.TILE_PX, "SOLVER_NEWTON_STEPS": 8, "SOLVER_MAX_ST
 
 @functools.cache
 def cuda_source() -> str:
-    """Return the whole text; compilers report errors by the parts' names and lines."""
+    """Return the whole source; compiler errors name the file and line of each part."""
     folder = Path(__file__).resolve().parent
     lines = [f"#define {name} {value}" for name, value in _INTEGER.items()]
     lines += [f"#define {name} {value!r}" for name, value in _DOUBLE.items()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Projection and binning on the device: what of a view comes before its pixels, as tensors."""
+"""Projection and tile binning on the GPU, as tensors: what precedes rasterisation."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from .source import THREADS_PER_BLOCK
 WARPS = THREADS_PER_BLOCK // 32
 ROW_VALUES = 24
 KEPT_BYTES = 4 + 4 + 4 * WARPS
-"""Of each pair between forward and backward: Gaussian, slot, masks of contributing pixels."""
+"""Memory per intersection kept for the backward pass: Gaussian, slot, contribution masks."""
 PASSING_BYTES = 4 * ROW_VALUES
-"""Of each pair of a band at a time: its gradient row; binning needs less."""
-_MAX_PAIRS = 2**31 - 1
+"""Temporary memory per intersection of one band: its gradient row; binning needs less."""
+_MAX_INTERSECTIONS = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class DeviceScreen:
-    """Screen Gaussians as ``projection.ScreenGaussians``, on the device."""
+    """Screen Gaussians like ``projection.ScreenGaussians``, on the device."""
 
     params: Tensor  # (n, 24) float32
     boxes: Tensor  # (n, 4) float32
@@ -40,16 +40,16 @@ class DeviceScreen:
 
 @dataclass(frozen=True)
 class Band:
-    """Tile lists of some rows of tiles, as ``tiles.TileLists``, on the device."""
+    """Tile lists of a band of tile rows like ``tiles.TileLists``, on the device."""
 
     first_row: int
-    """First row of tiles; the tiles are numbered from its first one."""
+    """First tile row; the tiles are numbered from its first one."""
     tiles: int
     start: Tensor  # (tiles + 1,) int64
-    gaussian_ids: Tensor  # (pairs,) int32
-    pair_slots: Tensor  # (pairs,) int32
-    pair_offsets: Tensor  # (n + 1,) int64
-    masks: Tensor  # (pairs, 8) int32: pixels of each warp that the Gaussian contributed to
+    gaussian_ids: Tensor  # (intersections,) int32
+    intersection_slots: Tensor  # (intersections,) int32
+    intersection_offsets: Tensor  # (n + 1,) int64
+    masks: Tensor  # (intersections, 8) int32: pixels of each warp that the Gaussian contributed to
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class RawTensors:
 
 
 def project(kernels: Kernels, raw: RawTensors) -> DeviceScreen:
-    """Activate and project, in float64 as ``projection.project_gaussians``."""
+    """Activate and project in float64, like ``projection.project_gaussians``."""
     count, device = len(raw.gaussians), raw.gaussians.means.device
     screen = DeviceScreen(
         torch.empty((count, ROW_VALUES), device=device),
@@ -111,54 +111,56 @@ def project(kernels: Kernels, raw: RawTensors) -> DeviceScreen:
 def bin_bands(
     kernels: Kernels, screen: DeviceScreen, camera: Camera, budget_bytes: int
 ) -> Iterator[Band]:
-    """Yield the tile lists of a view, in as few bands of tile rows as the budget allows.
+    """Yield the tile lists of a view in bands of tile rows, as few as the budget allows.
 
     Parameters
     ----------
     budget_bytes : int
-        Half of it is for what all bands keep until the gradient, half for the gradient rows of
+        Half of it is for what all bands keep for the backward pass, half for the gradient rows of
         one band at a time.
 
     Raises
     ------
     ResourceError
-        If one row of tiles, or all lists together, need more.
+        If one tile row, or all lists together, exceed it.
     """
     tile = tolerances.TILE_PX
     tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)
-    # Invisible rows have infinite depth and come last; ties keep the order of indices.
+    # Invisible rows have infinite depth and come last; ties are ordered by index.
     order = torch.sort(screen.depths, stable=True).indices  # (n,) int64
     half = budget_bytes // 2
-    pairs_at_once = min(half // PASSING_BYTES, _MAX_PAIRS)
+    max_band_intersections = min(half // PASSING_BYTES, _MAX_INTERSECTIONS)
     kept = 0
     waiting = [(0, tiles_y)]
     while waiting:
         first_row, end_row = waiting.pop()
         counts = _count(kernels, screen, camera, first_row, end_row)
-        pairs = int(counts.sum())
-        if pairs > pairs_at_once:
+        intersections = int(counts.sum())
+        if intersections > max_band_intersections:
             if end_row - first_row == 1:
                 raise ResourceError(
-                    f"One row of tiles of view {camera.name!r} holds {pairs} pairs of Gaussian "
-                    f"and tile, {pairs_at_once} fit.",
+                    f"One row of tiles of view {camera.name!r} holds {intersections} tile "
+                    f"intersections; {max_band_intersections} fit.",
                     "Use smaller images or fewer Gaussians, or render on the CPU.",
                 )
             middle = (first_row + end_row) // 2
             waiting += [(middle, end_row), (first_row, middle)]
             continue
-        kept += pairs * KEPT_BYTES
+        kept += intersections * KEPT_BYTES
         if kept > half:
             raise ResourceError(
-                f"The tile lists of view {camera.name!r} need more than {half} bytes of the GPU.",
+                f"The tile lists of view {camera.name!r} need over {half} bytes of GPU memory.",
                 "Use smaller images or fewer Gaussians, or render on the CPU.",
             )
-        yield _list(kernels, screen, camera, order, counts, pairs, (tiles_x, first_row, end_row))
+        yield _list(
+            kernels, screen, camera, order, counts, intersections, (tiles_x, first_row, end_row)
+        )
 
 
 def _count(
     kernels: Kernels, screen: DeviceScreen, camera: Camera, first_row: int, end_row: int
 ) -> Tensor:
-    """(n,) int64 tiles that each Gaussian reaches in rows of tiles."""
+    """(n,) int64 number of tiles that each Gaussian reaches in some tile rows."""
     count = len(screen.params)
     counts = torch.empty(count, dtype=torch.int64, device=screen.params.device)
     kernels.launch_each(
@@ -182,20 +184,20 @@ def _list(
     camera: Camera,
     order: Tensor,
     counts: Tensor,
-    pairs: int,
-    place: tuple[int, int, int],
+    intersections: int,
+    tile_rows: tuple[int, int, int],
 ) -> Band:
-    tiles_x, first_row, end_row = place
+    tiles_x, first_row, end_row = tile_rows
     device = order.device
-    pair_offsets = _offsets(counts)
+    intersection_offsets = _offsets(counts)
     rank_offsets = _offsets(counts[order])
-    unsorted = torch.empty((3, pairs), dtype=torch.int32, device=device)
+    unsorted = torch.empty((3, intersections), dtype=torch.int32, device=device)
     kernels.launch_each(
         "list_pairs",
         len(order),
         order,
         rank_offsets,
-        pair_offsets,
+        intersection_offsets,
         screen.boxes,
         screen.skews,
         camera.width,
@@ -206,7 +208,7 @@ def _list(
         *unsorted.unbind(),
     )
     tiles = tiles_x * (end_row - first_row)
-    # Short keys take half as many passes of the radix sort.
+    # Short keys need half as many passes of the radix sort.
     keys = unsorted[0].to(torch.int16 if tiles < 2**15 else torch.int32)
     by_tile = torch.sort(keys, stable=True)
     edges = torch.arange(tiles + 1, dtype=keys.dtype, device=device)
@@ -216,13 +218,13 @@ def _list(
         torch.searchsorted(by_tile.values, edges),
         unsorted[1][by_tile.indices],
         unsorted[2][by_tile.indices],
-        pair_offsets,
-        torch.zeros((pairs, WARPS), dtype=torch.int32, device=device),
+        intersection_offsets,
+        torch.zeros((intersections, WARPS), dtype=torch.int32, device=device),
     )
 
 
 def _offsets(counts: Tensor) -> Tensor:
-    """(n + 1,) int64 running sum that begins at 0."""
+    """(n + 1,) int64 exclusive running sum."""
     offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
     torch.cumsum(counts, 0, out=offsets[1:])
     return offsets

@@ -2,22 +2,22 @@
 // Transmittance from one camera to points anywhere (docs/method.md, section 5.3): formulas,
 // lists and cut-offs of vacancy_kernels.py, where they are explained.
 //
-// A warp takes 32 points of one tile that lie close together on the screen. It looks through the
-// tile's list 32 Gaussians at a time, a lane each, and evaluates those whose footprint reaches the
-// box of its points. No shared memory and no barrier, so that warps end when they are done.
+// A warp takes 32 points of one tile that lie close together on the screen. It scans the tile's
+// list 32 Gaussians at a time, one per lane, and evaluates those whose footprint reaches the box of
+// its points. No shared memory and no barrier, so that warps end independently.
 
-#define CELL_SHIFT 4 // a tile is divided 16 times each way, only to order its points
+#define CELL_SHIFT 4 // a tile has 16 x 16 cells, only to order its points
 #define LEFT_OUT 0x7fffffff
 
-// Bits of 0..15, each moved to twice its place.
+// Spread the bits of 0..15 to even positions.
 __device__ __forceinline__ int spread_bits(int value) {
     value = (value | value << 2) & 0x33;
     return (value | value << 1) & 0x55;
 }
 
-// One thread a point: pixel and z-depth, and the key that orders points by tile and, within it,
+// One thread per point: pixel and z-depth, and the key that orders points by tile and, within it,
 // along a Z-curve. Points that are settled, off the image or in a masked pixel get LEFT_OUT. In
-// mask mode 2 ("background") a masked pixel settles its points as empty.
+// mask mode 2 ("background") points in a masked pixel are settled as empty.
 extern "C" __global__ void __launch_bounds__(BLOCK) locate_points(
     int count, const double* points, CameraValues camera, float settled, int tile_px, int tiles_x,
     int tiles_y, const unsigned char* mask, int mask_mode, int mask_width, int mask_height,
@@ -28,14 +28,14 @@ extern "C" __global__ void __launch_bounds__(BLOCK) locate_points(
     if (best[p] > settled) return;
     const double x = points[3 * (int64)p], y = points[3 * (int64)p + 1], z = points[3 * (int64)p + 2];
     const double w = camera.v[6] * x + camera.v[7] * y + camera.v[8] * z + camera.v[11];
-    if (!(w > camera.v[21])) return; // also where a coordinate is NaN
+    if (!(w > camera.v[21])) return; // also if a coordinate is NaN
     const double across = camera.v[0] * x + camera.v[1] * y + camera.v[2] * z + camera.v[9];
     const double along = camera.v[3] * x + camera.v[4] * y + camera.v[5] * z + camera.v[10];
     const double u = camera.v[15] * across / w + camera.v[17];
     const double v = camera.v[16] * along / w + camera.v[18];
     if (!(u >= 0.0 && v >= 0.0 && u <= camera.v[19] && v <= camera.v[20])) return;
     if (mask_mode != 0) {
-        // From rounded pixels, as on the processor.
+        // From rounded pixels, as on the CPU.
         const int column = min((int)((float)u * (mask_width / camera.v[19])), mask_width - 1);
         const int row = min((int)((float)v * (mask_height / camera.v[20])), mask_height - 1);
         if (!mask[(int64)row * mask_width + column]) {
@@ -69,8 +69,8 @@ __device__ __forceinline__ float let_through(const float4* row, float x, float y
     const float den = fmaf(linear, dx, fmaf(fmaf(c.y, dy, 2.0f * b.z), dy, 1.0f));
     const float sharpness = fmaxf(den, DENOMINATOR_MIN);
     const float inverse = __fdividef(1.0f, sharpness);
-    const float foot = num < 0.0f ? 0.0f : __fmul_rn(num, inverse); // a NaN stays one
-    // Written so that a NaN lets everything through.
+    const float foot = num < 0.0f ? 0.0f : __fmul_rn(num, inverse); // NaN is preserved
+    // Written so that NaN gives full transmittance.
     if (!(foot <= d.y && depth >= d.z)) return 1.0f;
     const float peak = __fmul_rn(__fmul_rn(fmaf(b.y, dx, fmaf(b.z, dy, 1.0f)), inverse), c.z);
     const float ahead = fmaxf(peak - depth, 0.0f);
@@ -89,7 +89,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) transmittance_tiles(
     const int lane = threadIdx.x & 31;
     const int64 group = (int64)blockIdx.x * WARPS + (threadIdx.x >> 5);
     if (group >= group_start[tiles]) return;
-    int tile = 0, beyond = tiles; // the last tile that does not begin behind the group
+    int tile = 0, beyond = tiles; // the last tile that does not begin after the group
     while (beyond - tile > 1) {
         const int middle = (tile + beyond) >> 1;
         if (group_start[middle] <= group) tile = middle;
@@ -124,7 +124,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) transmittance_tiles(
             pending &= pending - 1u;
             product *= let_through(rows + 4 * i, x, y, depth);
         }
-        if (__ballot_sync(ALL_LANES, product >= to_beat) == 0u) break; // nobody can win any more
+        if (__ballot_sync(ALL_LANES, product >= to_beat) == 0u) break; // no point can be raised any more
     }
     if (!used) return;
     const float value = product < TRANSMITTANCE_LOST ? 0.0f : product;

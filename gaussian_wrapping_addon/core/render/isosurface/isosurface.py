@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled solver of the 0.5-isosurface depth of a block of pixels, from its list of visits.
+"""Compiled solver of the 0.5-isosurface depth of a block of pixels, from its contributor list.
 
 Along a pixel's ray ``T(t) = prod_i (1 - min(0.99, alpha_i exp(-s_i max(t_i - t, 0)^2 / 2)))`` falls
 with t; the depth is where it crosses 0.5 (docs/method.md, section 2.4). Each pixel keeps a bracket,
 starts where the Gaussian at which the blending crosses 0.5 would cross it alone, and takes Halley
-steps on log T; a step that leaves the bracket, or too many steps, is replaced by bisection.
+steps on log T. A step that leaves the bracket, or every second one after the first few, is replaced
+by bisection.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from .isosurface_steps import (
     approach_16,
     compact_8,
     compact_16,
+    drop_occluded_8,
+    drop_occluded_16,
     evaluate_8,
     evaluate_16,
-    lit_8,
-    lit_16,
     open_8,
     open_16,
     step_8,
@@ -35,9 +36,9 @@ from .isosurface_steps import (
 )
 
 _NEWTON_STEPS = 8
-"""From here on every second step is a bisection, which bounds the number of steps."""
+"""After these, every second step is a bisection, which bounds the number of steps."""
 _MAX_STEPS = 80
-_NOBODY = np.uint64(0)
+_NO_PIXELS = np.uint64(0)
 
 
 @inline
@@ -49,31 +50,31 @@ def solve_block(lanes: Any, m: Any, b: Any, lists: Any, count: Any) -> None:
     lanes : int
         8 or 16.
     m : (n,) float32
-        The tile's scratch, where blending left brackets and first guesses; depth and slope are
+        The tile's scratch, with brackets and initial guesses from blending; depth and slope are
         written.
     b : int
-        Where the block begins in each plane.
+        Start of the block in each plane.
     lists : (n,) float32
-        Entries of the block, ``count`` of them; none where no pixel has an isosurface. Reordered.
+        Entries of the block, ``count`` of them; none if no pixel has an isosurface. Reordered.
     """
-    is_open = _NOBODY
+    is_open = _NO_PIXELS
     if count > 0:
         is_open = open_16(m) if lanes == 16 else open_8(m)
-    if is_open != _NOBODY and m[NEAREST] <= ZERO:
-        # Some Gaussian may reach the camera: light must pass at depth 0 for a crossing to exist.
+    if is_open != _NO_PIXELS and m[NEAREST] <= ZERO:
+        # Some Gaussian may reach the camera: a crossing needs T > 0.5 at depth 0.
         if lanes == 16:
             evaluate_16(m, lists, count, ZERO)
-            is_open = lit_16(m)
+            is_open = drop_occluded_16(m)
         else:
             evaluate_8(m, lists, count, ZERO)
-            is_open = lit_8(m)
-    if is_open != _NOBODY:
+            is_open = drop_occluded_8(m)
+    if is_open != _NO_PIXELS:
         if lanes == 16:
             approach_16(m, lists, count)
         else:
             approach_8(m, lists, count)
     steps = 0
-    while is_open != _NOBODY and steps < _MAX_STEPS:
+    while is_open != _NO_PIXELS and steps < _MAX_STEPS:
         bisect = ONE if steps >= _NEWTON_STEPS and steps & 1 else ZERO
         narrowed = steps > 0 and steps & 1 == 0
         if lanes == 16:

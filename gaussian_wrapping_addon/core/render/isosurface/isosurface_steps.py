@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vector code of the isosurface solver: one block of pixels against its list of visits."""
+"""Vector code of the isosurface solver: one block of pixels and its contributor list."""
 
 from __future__ import annotations
 
@@ -20,78 +20,78 @@ LIST_VALUES = 3
 """Values per entry: opacity before the cap (0 where none), z-depth of the peak, sharpness
 (1 / sigma^2 along the ray)."""
 
-# One vector each, behind the planes of the tile's scratch array.
+# One vector each, after the planes of the tile's scratch array.
 AT_DEPTH, SLOPES = FORWARD_PLANES * STRIDE, FORWARD_PLANES * STRIDE + TILE
 _LOW, _HIGH, _OPEN = AT_DEPTH + 2 * TILE, AT_DEPTH + 3 * TILE, AT_DEPTH + 4 * TILE
 _PRODUCT, _FIRST, _SECOND = AT_DEPTH + 5 * TILE, AT_DEPTH + 6 * TILE, AT_DEPTH + 7 * TILE
 _SHARPEST, NEAREST = AT_DEPTH + 8 * TILE, AT_DEPTH + 9 * TILE
 _PREFIX = AT_DEPTH + 10 * TILE
-"""Product of the Gaussians that lie wholly before the brackets."""
+"""Transmittance of the Gaussians that lie wholly in front of the brackets."""
 _AT_CROSSING = AT_DEPTH + 11 * TILE
 """1/sigma of the Gaussian at which the blending crosses 0.5."""
 SOLVER_VALUES = 12 * TILE
 
 _NEWTON_FLOOR = 1e-6
 _LOG_2 = math.log(2.0)
-_LEAST_DEPTH = 1e-3
-"""Of -log T, where its logarithm is taken: far from 0.5 no slope is extrapolated."""
-_ROUGH_STEPS = 2
-"""Newton steps on a cheap likeness of T first: half the cost of a true one each."""
-# Halley's correction of a Newton step stays within these factors.
-_LEAST_BEND, _MOST_BEND = 0.5, 2.0
+_MIN_OPTICAL_DEPTH = 1e-3
+"""Lower bound of -log T where its logarithm is taken: far from 0.5 no slope is extrapolated."""
+_APPROXIMATE_STEPS = 2
+"""Initial Newton steps on a cheap approximation of T, at half the cost of an exact step each."""
+# Bounds of Halley's correction factor of a Newton step.
+_MIN_CORRECTION, _MAX_CORRECTION = 0.5, 2.0
 # Converged: the cube of the step, in units of the thinnest Gaussian's sigma along the ray, is below
-# this share of the depth, and the step itself small enough to extrapolate the slope ...
+# this fraction of the depth, and the step itself small enough to extrapolate the slope ...
 _CUBE_SHARE, _STEP_SIGMAS = 2e-7, 0.003
 _STEP_SIGMAS_ALONE = 1e-5
-# ... or the step is below the rounding of the depth, and not because a layer is steep that may
-# end before the level is reached ...
+# ... or the step is below the rounding error of the depth, and not because of a steep layer that
+# may end before the level is reached ...
 _STEP_SHARE, _LEVEL_NEAR = 2.5e-7, 1e-3
-# ... or the transmittance equal to 0.5 within its own rounding.
+# ... or the transmittance equals 0.5 within its own rounding error.
 _LEVEL_MARGIN = 3e-7
 _LEVEL_FAR, _FLAT = 0.05, 0.02
 _COARSE = 8e3
-"""Depth in sigmas from which on a rounding of a float32 depth is over 1e-3 of a sigma."""
+"""Depth in sigmas beyond which the rounding of a float32 depth exceeds 1e-3 sigma."""
 # exp(-x / 2) is below 3e-7 beyond this x = sharpness d^2.
 NEGLIGIBLE = 30.0
 _TINY = 1e-30
 
 
-def entry_place(block: Block, number: Any) -> Any:
-    """Return where an entry of a list begins."""
+def entry_index(block: Block, number: Any) -> Any:
+    """Return the index of the first value of a list entry."""
     size = block.index(LIST_VALUES * block.lanes)
     return block.builder.mul(number, size, flags=("nuw", "nsw"))
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where the blending of each pixel crossed 0.5: the Gaussian there, and what it stood in."""
+    """Where the blending of each pixel crossed 0.5: the Gaussian there and the transmittances."""
 
     before: Vector  # transmittance in front of that Gaussian; 0 where nothing crosses
     alpha: Vector
     peak: Vector
     sharpness: Vector
-    final: Vector  # transmittance behind everything
+    final: Vector  # final transmittance
     high: Vector  # deepest peak up to the crossing
 
 
 def start_solver(
     block: Block, state: Any, crossing: Crossing, sharpest: Vector, nearest: Any, limit: Any
 ) -> Any:
-    """Write brackets and first guesses; return which pixels have an isosurface, as bits."""
+    """Write brackets and initial guesses; return as bits which pixels have an isosurface."""
     crossed = (
         (crossing.before > 0.0)
         & (crossing.final <= block.splat(limit))
         & (crossing.final < constants.ISO_LEVEL)
     )
-    # Alone, the Gaussian at the crossing lets 0.5 through where exp(-s d^2 / 2) = ratio.
+    # The Gaussian at the crossing alone reaches T = 0.5 where exp(-s d^2 / 2) = ratio.
     light = crossing.alpha.min(float(constants.ALPHA_MAX)) * crossing.before
     ratio = ((crossing.before - float(constants.ISO_LEVEL)) / light.max(_TINY)).max(_TINY).min(1.0)
     ahead = (ratio.log() * -2.0 / crossing.sharpness.max(_TINY)).max(0.0).sqrt()
     low = block.splat(nearest).max(0.0)
     guess = crossing.peak - ahead
-    guess = (guess > low).choose(guess, (low + crossing.high) * 0.5)
+    guess = (guess > low).select(guess, (low + crossing.high) * 0.5)
     for value, plane in (
-        (crossed.choose(guess, 0.0), AT_DEPTH),
+        (crossed.select(guess, 0.0), AT_DEPTH),
         (1.0, SLOPES),
         (low, _LOW),
         (crossing.high, _HIGH),
@@ -99,14 +99,14 @@ def start_solver(
         (low, NEAREST),
         (1.0, _PREFIX),
         (crossing.sharpness.max(0.0).sqrt(), _AT_CROSSING),
-        (crossed.choose(1.0, 0.0), _OPEN),
+        (crossed.select(1.0, 0.0), _OPEN),
     ):
         block.store(value, state, block.index(plane))
     return crossed.bits()
 
 
 class _Solver:
-    """The vectors of the solver in the scratch array, and the entries of its block."""
+    """Access to the solver's vectors in the scratch array and to the entries of its block."""
 
     def __init__(self, lanes: int, context: Any, builder: Any, sig: Any, args: Any) -> None:
         self.block = Block(lanes, context, builder)
@@ -117,23 +117,23 @@ class _Solver:
         return self.block.load(self.state, self.block.index(plane))
 
     def write(self, value: Vector | float, plane: int) -> None:
-        """Keep a vector of the solver's state."""
+        """Store a vector of the solver's state."""
         self.block.store(value, self.state, self.block.index(plane))
 
     def entry(self, lists: Any, number: Any) -> tuple[list[Any], list[Vector]]:
-        """Return the places of an entry's columns, and the columns."""
+        """Return the offsets of an entry's columns, and the columns."""
         block = self.block
-        base = entry_place(block, number)
-        places = [block.offset(base, column * block.lanes) for column in range(LIST_VALUES)]
-        return places, [block.load(lists, place) for place in places]
+        base = entry_index(block, number)
+        offsets = [block.offset(base, column * block.lanes) for column in range(LIST_VALUES)]
+        return offsets, [block.load(lists, offset) for offset in offsets]
 
     def is_open(self) -> Mask:
-        """Return which pixels are not solved."""
+        """Return which pixels are not yet solved."""
         return self.read(_OPEN) > 0.0
 
     def set_open(self, is_open: Mask) -> Any:
-        """Keep which pixels are not solved; return them as bits."""
-        self.write(is_open.choose(1.0, 0.0), _OPEN)
+        """Store which pixels are not yet solved; return them as bits."""
+        self.write(is_open.select(1.0, 0.0), _OPEN)
         return is_open.bits()
 
 
@@ -144,7 +144,7 @@ def _evaluate_intrinsic(lanes: int) -> Any:
             solver = _Solver(lanes, context, builder, sig, args)
             block, entries = solver.block, solver.block.data(sig.args[1], args[1])
             t = solver.read(AT_DEPTH) * block.splat(args[3])
-            product, slope, bend = (
+            product, slope, curvature = (
                 State(block, solver.read(_PREFIX)),
                 State(block, 0.0),
                 State(block, 0.0),
@@ -153,20 +153,20 @@ def _evaluate_intrinsic(lanes: int) -> Any:
             def multiply(n: Any) -> None:
                 _, (alpha, peak, sharpness) = solver.entry(entries, n)
                 ahead = (peak - t).max(0.0)
-                pull = sharpness * ahead
-                density = (alpha * exp_wide(pull * ahead, 0.5)).min(float(constants.ALPHA_MAX))
+                log_slope = sharpness * ahead
+                density = (alpha * exp_wide(log_slope * ahead, 0.5)).min(float(constants.ALPHA_MAX))
                 keep = 1.0 - density
-                rise = density * pull  # d(density) / dt
-                growth = density * (pull * pull - (ahead > 0.0).choose(sharpness, 0.0))
+                rise = density * log_slope  # d(density) / dt
+                growth = density * (log_slope * log_slope - (ahead > 0.0).select(sharpness, 0.0))
                 p, d = product.get(), slope.get()
-                bend.set(bend.get() * keep - (d * 2.0 * rise + p * growth))
+                curvature.set(curvature.get() * keep - (d * 2.0 * rise + p * growth))
                 slope.set(d * keep - p * rise)
                 product.set(p * keep)
 
             block.repeat(args[2], multiply)
             solver.write(product.get(), _PRODUCT)
             solver.write(slope.get(), _FIRST)
-            solver.write(bend.get(), _SECOND)
+            solver.write(curvature.get(), _SECOND)
             return context.get_dummy_value()
 
         index = types.intp
@@ -176,7 +176,7 @@ def _evaluate_intrinsic(lanes: int) -> Any:
 
 
 def _log_of_twice(product: Vector) -> Vector:
-    """Return log(2 product) by the series of artanh: exact near 0.5, monotone elsewhere."""
+    """Return log(2 product) by the artanh series: accurate near 0.5, monotonic elsewhere."""
     twice = product * 2.0
     y = (twice - 1.0) / (twice + 1.0)
     square = y * y
@@ -196,33 +196,33 @@ def _approach_intrinsic(lanes: int) -> Any:
             def multiply(n: Any) -> None:
                 _, (alpha, peak, sharpness) = solver.entry(entries, n)
                 ahead = (peak - guess.get()).max(0.0)
-                pull = sharpness * ahead
-                # (1 - x / 8)^8 in place of exp(-x).
-                fall = (1.0 - pull * ahead * (0.5 / 8.0)).max(0.0)
+                log_slope = sharpness * ahead
+                # (1 - x / 8)^8 approximates exp(-x).
+                fall = (1.0 - log_slope * ahead * (0.5 / 8.0)).max(0.0)
                 fall = fall * fall
                 fall = fall * fall
                 density = (alpha * (fall * fall)).min(float(constants.ALPHA_MAX))
                 keep = 1.0 - density
-                slope.set(slope.get() * keep - product.get() * (density * pull))
+                slope.set(slope.get() * keep - product.get() * (density * log_slope))
                 product.set(product.get() * keep)
 
-            def turn(_: Any) -> None:
+            def iterate(_: Any) -> None:
                 product.set(1.0)
                 slope.set(0.0)
                 block.repeat(args[2], multiply)
                 t, light = guess.get(), product.get().max(_TINY)
                 above = light > constants.ISO_LEVEL
-                low.set(above.choose(t, low.get()))
-                high.set(above.choose(high.get(), t))
+                low.set(above.select(t, low.get()))
+                high.set(above.select(high.get(), t))
                 excess = _log_of_twice(light)
                 moved = t + excess * light / (slope.get() * -1.0).max(
                     sharpest * light * _NEWTON_FLOOR
                 )
                 inside = (moved > low.get()) & (moved < high.get())
-                guess.set(inside.choose(moved, (low.get() + high.get()) * 0.5))
+                guess.set(inside.select(moved, (low.get() + high.get()) * 0.5))
 
-            block.repeat(block.index(_ROUGH_STEPS), turn)
-            solver.write(solver.is_open().choose(guess.get(), 0.0), AT_DEPTH)
+            block.repeat(block.index(_APPROXIMATE_STEPS), iterate)
+            solver.write(solver.is_open().select(guess.get(), 0.0), AT_DEPTH)
             return context.get_dummy_value()
 
         return types.void(m, lists, types.intp), generate
@@ -246,11 +246,11 @@ def _compact_intrinsic(lanes: int) -> Any:
                 changes = (peak > low) & (alpha > 0.0) & (sharpness * behind * behind < NEGLIGIBLE)
                 matters = (changes & is_open).any()
                 target = builder.load(kept)
-                places, _ = solver.entry(entries, target)
-                for place, value in zip(places, (alpha, peak, sharpness), strict=True):
-                    block.store(value, entries, place)
+                offsets, _ = solver.entry(entries, target)
+                for offset, value in zip(offsets, (alpha, peak, sharpness), strict=True):
+                    block.store(value, entries, offset)
                 builder.store(builder.add(target, builder.zext(matters, target.type)), kept)
-                passed = (peak <= low).choose(1.0 - alpha.min(float(constants.ALPHA_MAX)), 1.0)
+                passed = (peak <= low).select(1.0 - alpha.min(float(constants.ALPHA_MAX)), 1.0)
                 factor = builder.select(matters, block.vector(1.0).value, passed.value)
                 prefix.set(prefix.get() * Vector(block, factor))
 
@@ -264,18 +264,18 @@ def _compact_intrinsic(lanes: int) -> Any:
     return compact
 
 
-def _lit_intrinsic(lanes: int) -> Any:
+def _drop_occluded_intrinsic(lanes: int) -> Any:
     @intrinsic
-    def lit(typingctx, m):  # type: ignore[no-untyped-def]
+    def drop_occluded(typingctx, m):  # type: ignore[no-untyped-def]
         def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
             solver = _Solver(lanes, context, builder, sig, args)
             is_open = solver.is_open() & (solver.read(_PRODUCT) > constants.ISO_LEVEL)
-            solver.write(is_open.choose(solver.read(AT_DEPTH), 0.0), AT_DEPTH)
+            solver.write(is_open.select(solver.read(AT_DEPTH), 0.0), AT_DEPTH)
             return solver.set_open(is_open)
 
         return types.uint64(m), generate
 
-    return lit
+    return drop_occluded
 
 
 def _open_intrinsic(lanes: int) -> Any:
@@ -298,18 +298,19 @@ def _step_intrinsic(lanes: int) -> Any:
             t, low, high = solver.read(AT_DEPTH), solver.read(_LOW), solver.read(_HIGH)
             sharpest, product = solver.read(_SHARPEST), solver.read(_PRODUCT).max(_TINY)
             excess = _log_of_twice(product)
-            # The slope of -log T, its growth with depth, and Halley's correction of the Newton
-            # step with them.
+            # First and second derivative of -log T, and Halley's correction of the Newton step.
             inverse = 1.0 / product
             slope = solver.read(_FIRST) * inverse * -1.0
             growth = slope * slope - solver.read(_SECOND) * inverse
             floored = slope.max(sharpest * _NEWTON_FLOOR)
-            turns = 1.0 / floored
-            newton = excess * turns
-            move = newton / (newton * growth * turns * 0.5 + 1.0).max(_LEAST_BEND).min(_MOST_BEND)
+            inverse_slope = 1.0 / floored
+            newton = excess * inverse_slope
+            move = newton / (newton * growth * inverse_slope * 0.5 + 1.0).max(_MIN_CORRECTION).min(
+                _MAX_CORRECTION
+            )
             above = excess > 0.0
-            low = above.choose(t, low)
-            high = above.choose(high, t)
+            low = above.select(t, low)
+            high = above.select(high, t)
             moved = t + move
             size = move.abs()
             inside = (moved > low) & (moved < high) & (block.splat(args[1]) <= 0.0)
@@ -320,29 +321,29 @@ def _step_intrinsic(lanes: int) -> Any:
             done = done | (sigmas < _STEP_SIGMAS_ALONE)
             done = done | ((size <= t * _STEP_SHARE) & (level < _LEVEL_NEAR))
             done = done | (level <= _LEVEL_MARGIN) | (high - low <= high * _STEP_SHARE)
-            # A small last step is taken, and the slope extrapolated over it: log(-log T) is a
-            # parabola before a single Gaussian. Else, or where a rounding of the depth is much of
-            # a sigma, the pixel stays where the slope is known, for its gradient must be that of
-            # the depth that is stored. Rounding may put the step on the bracket's end, hence no
-            # test for inside.
-            settled = small.choose(moved.max(low).min(high), t)
-            moved = done.choose(settled, inside.choose(moved, (low + high) * 0.5))
+            # A small last step is taken and the slope extrapolated over it: log(-log T) is a
+            # parabola in front of a single Gaussian. Otherwise, or if the depth's rounding error is
+            # a large part of a sigma, the pixel stays where the slope is known, because the
+            # gradient must be that of the stored depth. Rounding may put the step on the bracket's
+            # end, hence no test for inside.
+            settled = small.select(moved.max(low).min(high), t)
+            moved = done.select(settled, inside.select(moved, (low + high) * 0.5))
             over = settled - t
-            depth = (_LOG_2 - excess).max(_LEAST_DEPTH)
+            depth = (_LOG_2 - excess).max(_MIN_OPTICAL_DEPTH)
             ratio = slope / depth
-            curl = (growth / depth - ratio * ratio) * over
-            gain = (ratio + curl * 0.5) * over
-            final = (ratio + curl) * depth * ((gain * 0.5 + 1.0) * gain + 1.0)
-            final = small.choose(final, slope)
-            # A layer thinner than a rounding of the depth: T jumps over 0.5 where it is flat.
-            # Its gradient is lost; rather let it be too small than a thousand times too large.
+            ratio_change = (growth / depth - ratio * ratio) * over
+            gain = (ratio + ratio_change * 0.5) * over
+            final = (ratio + ratio_change) * depth * ((gain * 0.5 + 1.0) * gain + 1.0)
+            final = small.select(final, slope)
+            # For a layer thinner than the depth's rounding error, T jumps past 0.5 from a flat part
+            # and the gradient is lost: too small is better than a thousand times too large.
             alone = solver.read(_AT_CROSSING)
             lost = (level > _LEVEL_FAR) & (slope < alone * _FLAT)
-            final = lost.choose(alone * 2.0, final.max(alone * tolerances.SLOPE_FLOOR))
+            final = lost.select(alone * 2.0, final.max(alone * tolerances.SLOPE_FLOOR))
             solver.write(low, _LOW)
             solver.write(high, _HIGH)
-            solver.write(is_open.choose(moved, t), AT_DEPTH)
-            solver.write(is_open.choose(final, solver.read(SLOPES)), SLOPES)
+            solver.write(is_open.select(moved, t), AT_DEPTH)
+            solver.write(is_open.select(final, solver.read(SLOPES)), SLOPES)
             return solver.set_open(is_open & ~done)
 
         return types.uint64(m, types.float32), generate
@@ -354,5 +355,5 @@ approach_8, approach_16 = _approach_intrinsic(8), _approach_intrinsic(16)
 evaluate_8, evaluate_16 = _evaluate_intrinsic(8), _evaluate_intrinsic(16)
 compact_8, compact_16 = _compact_intrinsic(8), _compact_intrinsic(16)
 open_8, open_16 = _open_intrinsic(8), _open_intrinsic(16)
-lit_8, lit_16 = _lit_intrinsic(8), _lit_intrinsic(16)
+drop_occluded_8, drop_occluded_16 = _drop_occluded_intrinsic(8), _drop_occluded_intrinsic(16)
 step_8, step_16 = _step_intrinsic(8), _step_intrinsic(16)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussians to rows of screen Gaussians, and the analytic gradient back.
+"""Projection of Gaussians to screen Gaussians, and its analytic gradient.
 
 In: Gaussians and a camera. Out: ``params (n, 24)``, boxes, depths (docs/architecture.md).
 """

@@ -3,7 +3,7 @@
 
 Order and signs are those of 3D Gaussian splatting files (Condon-Shortley phase): the bands are
 ``1``, ``-y z -x``, then degree 2 and 3 with ``m`` from ``-l`` to ``l``. All degrees are always
-evaluated: a few dozen packed operations, cheaper than choosing.
+evaluated: a few dozen packed operations, cheaper than branching.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _C3E = math.sqrt(105.0 / (16.0 * math.pi))
 
 @inline
 def write_basis(m: Any, at: Any, lane: Any, x: Any, y: Any, z: Any) -> None:
-    """Write the 16 basis values at the unit direction (x, y, z) into the planes from ``at`` on."""
+    """Write the 16 basis values at the unit direction (x, y, z) to the planes from ``at`` on."""
     xx, yy, zz = x * x, y * y, z * z
     m[at + lane] = _C0
     m[at + 1 * BLOCK + lane] = -_C1 * y
@@ -53,10 +53,10 @@ def write_basis(m: Any, at: Any, lane: Any, x: Any, y: Any, z: Any) -> None:
 
 @inline
 def direction_gradient(m: Any, at: Any, lane: Any, x: Any, y: Any, z: Any) -> Any:
-    """Return the gradient with respect to (x, y, z) of a sum of weighted basis functions.
+    """Return the gradient with respect to (x, y, z) of a weighted sum of basis functions.
 
-    The 16 weights stand in the planes from ``at`` on. x, y and z count as independent; the caller
-    projects onto the sphere's tangent plane.
+    The 16 weights are in the planes from ``at`` on. x, y and z are treated as independent; the
+    caller projects onto the sphere's tangent plane.
     """
     xx, yy, zz = x * x, y * y, z * z
     w4, w5 = _C2A * m[at + 4 * BLOCK + lane], -_C2A * m[at + 5 * BLOCK + lane]

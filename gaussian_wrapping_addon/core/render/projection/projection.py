@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussians and a camera in, rows of screen Gaussians out, with an analytic way back."""
+"""Projection of Gaussians onto the screen of a camera, and its analytic gradient."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .projection_kernels import (
 class RawArrays:
     """The raw parameters of :class:`OrientedGaussians` as C-contiguous arrays of one float type.
 
-    float32 and float64 are both read as they are; nothing is converted per call.
+    float32 and float64 are both read without conversion.
     """
 
     means: np.ndarray  # (n, 3)
@@ -44,7 +44,7 @@ class RawArrays:
 
     @classmethod
     def from_gaussians(cls, gaussians: OrientedGaussians) -> RawArrays:
-        """Share the memory of CPU tensors that are contiguous; copy the others."""
+        """Share the memory of contiguous CPU tensors; copy others."""
 
         def array(tensor: Tensor) -> np.ndarray:
             return tensor.detach().cpu().contiguous().numpy()
@@ -52,7 +52,7 @@ class RawArrays:
         return cls(**{name: array(tensor) for name, tensor in gaussians.tensors()})
 
     def arguments(self) -> tuple[np.ndarray, ...]:
-        """Return the arrays in the order in which kernels take them."""
+        """Return the arrays in the argument order of the kernels."""
         return (
             self.means, self.log_scales, self.quats, self.opacity_logits, self.sh,
             self.orientation, self.filter_3d,
@@ -82,23 +82,23 @@ class ScreenGaussians:
     """Gaussians on the screen of one camera; layout in ``docs/architecture.md``.
 
     Of Gaussians that are not visible only ``visible`` and ``depths`` (inf) are written. Their other
-    rows hold whatever the arrays held before, which is finite: 0, or another view's values.
+    values are those that the arrays held before, which are finite: 0, or another view's values.
     """
 
     params: np.ndarray
-    """(n, 24) float32; where not visible, anything."""
+    """(n, 24) float32; undefined where not visible."""
     boxes: np.ndarray
     """(n, 4) float32: x0 y0 x1 y1 of the ellipse ``alpha >= 1/255``, pixels, rounded outwards;
-    where not visible, anything."""
+    undefined where not visible."""
     visible: np.ndarray
-    """(n,) bool: the box holds a pixel centre of the image."""
+    """(n,) bool: the box contains a pixel centre of the image."""
     depths: np.ndarray
-    """(n,) float32: distance from the camera to the mean, what the blending order is sorted by;
-    inf where not visible."""
+    """(n,) float32: distance from the camera to the mean, the sort key of the blending order; inf
+    where not visible."""
     skews: np.ndarray
     """(n,) float32: x offset from the box's centre to the ellipse's lowest point (largest y),
-    pixels; inf where the ellipse is unbounded and the box is the whole image; where not visible,
-    anything."""
+    pixels; inf where the ellipse is unbounded and the box is the whole image; undefined where not
+    visible."""
 
     def __len__(self) -> int:
         return len(self.params)
@@ -115,12 +115,12 @@ class ScreenGaussians:
         )
 
     def arguments(self) -> tuple[np.ndarray, ...]:
-        """Return the arrays in the order in which kernels take them."""
+        """Return the arrays in the argument order of the kernels."""
         return self.params, self.boxes, self.visible, self.depths, self.skews
 
 
 def pack_camera(camera: Camera, near_z: float) -> np.ndarray:
-    """Return the (22,) float64 vector the projection kernels read."""
+    """Return the (22,) float64 camera vector of the projection kernels."""
     values = np.zeros(CAMERA_VALUES)
     values[0:9] = camera.rotation.reshape(-1)
     values[9:12] = camera.cam_from_world[:, 3]
@@ -131,7 +131,7 @@ def pack_camera(camera: Camera, near_z: float) -> np.ndarray:
 
 
 def used_degree(coefficients: int, options: RenderOptions) -> int:
-    """Return the harmonics' degree that a rendering uses.
+    """Return the degree of the harmonics that a rendering uses.
 
     Raises
     ------
@@ -161,15 +161,15 @@ def project_gaussians(
     camera : Camera
         In the scene frame.
     options : RenderOptions
-        ``near_z``, ``sh_degree`` and ``threads`` are read.
+        ``near_z``, ``sh_degree`` and ``threads`` are used.
     out : ScreenGaussians, optional
-        Arrays to write into, of the same length; nothing but a few kilobytes is allocated then.
+        Output arrays of the same length; then only a few kilobytes are allocated.
 
     Returns
     -------
     ScreenGaussians
-        Rows behind ``near_z``, fainter than 1/255, off the image, smaller than the gap between
-        pixel centres, or with values that are not finite, are not visible.
+        Not visible are Gaussians nearer than ``near_z``, fainter than 1/255, outside the image,
+        between pixel centres, or with non-finite values.
     """
     count = len(gaussians)
     screen = _output(count, out)
@@ -230,25 +230,25 @@ def project_backward(
     grad_params: np.ndarray,
     grads_out: RawGradients,
 ) -> None:
-    """Add the gradient with respect to the raw parameters to ``grads_out``, in float64 inside.
+    """Add the gradient with respect to the raw parameters to ``grads_out``; computed in float64.
 
     Parameters
     ----------
     gaussians, camera, options
-        What :func:`project_gaussians` was called with.
+        Arguments of :func:`project_gaussians`.
     screen : ScreenGaussians
-        What it returned, unchanged since; only the rows of visible Gaussians are read. A colour of
-        0 there was clamped and passes no gradient.
+        Its unmodified result; only rows of visible Gaussians are read. A colour of 0 there was
+        clamped and has no gradient.
     grad_params : (n, 24) float32 or float64
         Gradient with respect to ``screen.params``. Column 23 is ignored.
     grads_out : RawGradients
-        Accumulated into. A direction of length 0 and a degenerate quaternion receive 0.
+        Accumulated into. A direction of length 0 and a degenerate quaternion have gradient 0.
     """
     _backward(gaussians, camera, options, screen, grad_params, None, grads_out)
 
 
 def allocate_visible(gaussians: RawArrays, count: int) -> VisibleGradients:
-    """Return scratch for the gradients of up to ``count`` visible Gaussians."""
+    """Return arrays for the gradients of up to ``count`` visible Gaussians."""
     coefficients = gaussians.sh.shape[1]
     return VisibleGradients(
         np.zeros(count, np.int32),
@@ -270,20 +270,20 @@ def project_backward_visible(
     ids: np.ndarray,
     out: VisibleGradients | None = None,
 ) -> VisibleGradients:
-    """Write the gradient with respect to the raw parameters of some Gaussians, one row for each.
+    """Write the gradient with respect to the raw parameters of some Gaussians, one row each.
 
     Parameters
     ----------
     gaussians, camera, options
-        What :func:`project_gaussians` was called with.
+        Arguments of :func:`project_gaussians`.
     screen : ScreenGaussians
-        What it returned, unchanged since.
+        Its unmodified result.
     grad_params : (n, 24) float32 or float64
         Gradient with respect to ``screen.params``; only the rows ``ids`` are read.
     ids : (v,) int32
-        Gaussians wanted, increasing. Those that are not visible get rows of 0.
+        Indices of Gaussians, increasing. Those that are not visible get rows of 0.
     out : VisibleGradients, optional
-        Scratch of at least v rows (:func:`allocate_visible`); any content is overwritten.
+        Arrays of at least v rows (:func:`allocate_visible`); overwritten.
 
     Returns
     -------
@@ -293,7 +293,7 @@ def project_backward_visible(
     Raises
     ------
     UsageError
-        If ``out`` holds fewer than v rows or another number of harmonics coefficients.
+        If ``out`` has fewer than v rows or another number of harmonics coefficients.
     """
     count = len(ids)
     if out is None:
@@ -329,7 +329,7 @@ def _backward(
     ids: np.ndarray | None,
     grads_out: RawGradients | VisibleGradients,
 ) -> None:
-    """Run the backward kernel: rows of ``ids`` written, or those of all Gaussians added to."""
+    """Run the backward kernel: write the rows of ``ids``, or add to those of all Gaussians."""
     count = len(gaussians) if ids is None else len(ids)
     packed = pack_camera(camera, options.near_z)
     degree = used_degree(gaussians.sh.shape[1], options)

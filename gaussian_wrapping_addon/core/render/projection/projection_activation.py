@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled activation of blocks of raw Gaussians: what projection and its gradient begin with.
+"""Compiled activation of blocks of raw Gaussians, the first step of projection and its gradient.
 
-Also the planes of their scratch array that both know (``projection_math.py``).
+Also the layout of the scratch planes that both use (``projection_math.py``).
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from ...kernels.compiled import inline, part
 from .harmonics_kernels import BASIS_COUNT, write_basis
 from .projection_math import BLOCK, exp_parts, exp_wide
 
-# As loaded:
+# Loaded:
 MEAN = 0
 QUAT = 3 * BLOCK
 ORIENTATION = 7 * BLOCK
-"""Direction and sign; activation makes the direction a unit vector and puts 1 / length, or 0 where
-it has none, in the place of the sign."""
+"""Direction and sign; activation normalises the direction and replaces the sign by 1 / length, or
+by 0 if the length is 0."""
 SCALE = 11 * BLOCK
 """Log scales; activation turns them into variances, filter included."""
 LOGIT = 14 * BLOCK
 FILTER = 15 * BLOCK
-# As activated:
-TURN = 16 * BLOCK
+# Activated:
+ROTATION = 16 * BLOCK
 """Rotation, row by row."""
-KEPT = 25 * BLOCK
-"""Share of each variance that is not the filter's."""
+RAW_SHARE = 25 * BLOCK
+"""Ratio of the raw to the filtered variance of each axis."""
 OPACITY = 28 * BLOCK
 TRANSPARENCY = 29 * BLOCK
 """1 - sigmoid(logit)."""
@@ -38,13 +38,13 @@ TANH = 30 * BLOCK
 SLOPE = 31 * BLOCK
 """1 - tanh^2 of the sign."""
 RAY = 32 * BLOCK
-"""Three planes of the unit vector from the camera's centre to the mean, one of 1 / distance."""
+"""Unit vector from the camera centre to the mean (three planes), then 1 / distance."""
 BASIS = 36 * BLOCK
 ACTIVATED_PLANES = 36 + BASIS_COUNT
 
 _QUATERNION_MIN_SQ = tolerances.QUATERNION_MIN_NORM**2
 _DIRECTION_MIN_NORM = tolerances.DIRECTION_MIN_NORM
-# tanh is 1 to float64 beyond.
+# Beyond, tanh is 1 in float64.
 _SIGN_END = 20.0
 
 
@@ -60,7 +60,7 @@ def load_raw(
     orientation: Any,
     filter_3d: Any,
 ) -> None:
-    """Load all raw parameters of Gaussian i but its harmonics."""
+    """Load all raw parameters of Gaussian i except its harmonics."""
     m[MEAN + lane] = means[i, 0]
     m[MEAN + BLOCK + lane] = means[i, 1]
     m[MEAN + 2 * BLOCK + lane] = means[i, 2]
@@ -81,7 +81,7 @@ def load_raw(
 
 @part(fast=False, fused=True)
 def activate_block(m: np.ndarray, camera: np.ndarray) -> None:
-    """Fill all planes from ``TURN`` on, and the variances, of a block that was loaded.
+    """Compute all planes from ``ROTATION`` on, and the variances, of a loaded block.
 
     ``camera (22,)`` is the packed camera of ``projection_kernels.py``.
     """
@@ -96,35 +96,39 @@ def activate_block(m: np.ndarray, camera: np.ndarray) -> None:
         sx, sy, sz = s * x, s * y, s * z
         wx, wy, wz = sx * w, sy * w, sz * w
         xx, xy, xz, yy, yz, zz = sx * x, sx * y, sx * z, sy * y, sy * z, sz * z
-        m[TURN + lane] = 1.0 - (yy + zz)
-        m[TURN + BLOCK + lane] = xy - wz
-        m[TURN + 2 * BLOCK + lane] = xz + wy
-        m[TURN + 3 * BLOCK + lane] = xy + wz
-        m[TURN + 4 * BLOCK + lane] = 1.0 - (xx + zz)
-        m[TURN + 5 * BLOCK + lane] = yz - wx
-        m[TURN + 6 * BLOCK + lane] = xz - wy
-        m[TURN + 7 * BLOCK + lane] = yz + wx
-        m[TURN + 8 * BLOCK + lane] = 1.0 - (xx + yy)
+        m[ROTATION + lane] = 1.0 - (yy + zz)
+        m[ROTATION + BLOCK + lane] = xy - wz
+        m[ROTATION + 2 * BLOCK + lane] = xz + wy
+        m[ROTATION + 3 * BLOCK + lane] = xy + wz
+        m[ROTATION + 4 * BLOCK + lane] = 1.0 - (xx + zz)
+        m[ROTATION + 5 * BLOCK + lane] = yz - wx
+        m[ROTATION + 6 * BLOCK + lane] = xz - wy
+        m[ROTATION + 7 * BLOCK + lane] = yz + wx
+        m[ROTATION + 8 * BLOCK + lane] = 1.0 - (xx + yy)
     # Raw variances of the three axes, one after the other.
-    for place in range(3 * BLOCK):
-        m[KEPT + place] = exp_wide(2.0 * m[SCALE + place])
+    for at in range(3 * BLOCK):
+        m[RAW_SHARE + at] = exp_wide(2.0 * m[SCALE + at])
     for lane in range(BLOCK):
         filter_sq = m[FILTER + lane] * m[FILTER + lane]
-        raw0, raw1, raw2 = m[KEPT + lane], m[KEPT + BLOCK + lane], m[KEPT + 2 * BLOCK + lane]
+        raw0, raw1, raw2 = (
+            m[RAW_SHARE + lane],
+            m[RAW_SHARE + BLOCK + lane],
+            m[RAW_SHARE + 2 * BLOCK + lane],
+        )
         variance0, variance1, variance2 = raw0 + filter_sq, raw1 + filter_sq, raw2 + filter_sq
         m[SCALE + lane] = variance0
         m[SCALE + BLOCK + lane] = variance1
         m[SCALE + 2 * BLOCK + lane] = variance2
         kept0, kept1, kept2 = raw0 / variance0, raw1 / variance1, raw2 / variance2
-        m[KEPT + lane] = kept0
-        m[KEPT + BLOCK + lane] = kept1
-        m[KEPT + 2 * BLOCK + lane] = kept2
+        m[RAW_SHARE + lane] = kept0
+        m[RAW_SHARE + BLOCK + lane] = kept1
+        m[RAW_SHARE + 2 * BLOCK + lane] = kept2
         odds = exp_wide(-m[LOGIT + lane])
         sigmoid = 1.0 / (1.0 + odds)
         m[OPACITY + lane] = math.sqrt(kept0 * kept1 * kept2) * sigmoid
         m[TRANSPARENCY + lane] = odds * sigmoid
     for lane in range(BLOCK):
-        # tanh(s) = (e - 1) / (e + 1) with e = exp(2 s), right for the smallest s too.
+        # tanh(s) = (e - 1) / (e + 1) with e = exp(2 s), accurate for the smallest s too.
         sign = m[ORIENTATION + 3 * BLOCK + lane]
         sign = -_SIGN_END if sign < -_SIGN_END else sign
         sign = _SIGN_END if sign > _SIGN_END else sign

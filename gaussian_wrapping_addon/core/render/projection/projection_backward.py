@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Compiled analytic gradient of the projection, the reverse of ``projection_kernels.py``.
 
-With ``weight_k = 1 / scale_k^2`` everything the forward writes is built of
+With ``weight_k = 1 / scale_k^2`` all outputs of the forward pass are functions of
 
     e_k = axis_k . w0,           h = sum_k axis_k e_k weight_k,     a0 = sum_k e_k^2 weight_k,
     B = sum_k (r0, r1)_k (r0, r1)_k^T weight_k,
     F = sum_k f_k f_k^T weight_i weight_j,   f_k = (r0 - u r2, r1 - v r2)_k,   (i, j) != k;
 
-the gradient is gathered on a0, h, B, F and (u, v, z) first, then on axes and log weights. Like the
-forward it works on blocks of Gaussians (``projection_math.py``).
+the gradient is accumulated on a0, h, B, F and (u, v, z) first, then on axes and log weights. Like
+the forward pass it works on blocks of Gaussians (``projection_math.py``).
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from .harmonics_kernels import BASIS_COUNT, direction_gradient
 from .projection_activation import (
     ACTIVATED_PLANES,
     BASIS,
-    KEPT,
     MEAN,
     OPACITY,
     ORIENTATION,
     QUAT,
+    RAW_SHARE,
     RAY,
+    ROTATION,
     SCALE,
     SLOPE,
     TANH,
     TRANSPARENCY,
-    TURN,
     activate_block,
     load_raw,
 )
@@ -44,8 +44,8 @@ from .projection_math import BLOCK, QUEUE, block_scratch
 _QUATERNION_MIN_SQ = tolerances.QUATERNION_MIN_NORM**2
 _USED_COLUMNS = 23
 
-# Planes of the scratch array behind those of the activation: gradients on the columns of params, on
-# the basis functions, and on what is trained. The rotation's takes the rotation's place.
+# Planes of the scratch array after those of the activation: gradients on the columns of params, on
+# the basis functions, and on trained parameters. That on the rotation overwrites the rotation.
 _GRAD = ACTIVATED_PLANES * BLOCK
 _WEIGHT = _GRAD + _USED_COLUMNS * BLOCK
 _GRAD_MEAN = _WEIGHT + BASIS_COUNT * BLOCK
@@ -57,8 +57,8 @@ _PLANES = _GRAD_LOGIT // BLOCK + 1
 _WRITTEN_PLANES = _PLANES - _GRAD_MEAN // BLOCK
 
 _GRADIENT_MAX = 1e38
-"""Gradients beyond are not held: a third of float32's largest number, so that squared lengths and
-sums of a few views stay within float64 and float32."""
+"""Larger gradients are dropped: a third of the largest float32, so that squared norms fit float64
+and sums of a few views fit float32."""
 _BASIS_MAX = 3.0  # no basis function is larger on the sphere
 
 
@@ -67,7 +67,7 @@ def _axis_gradient(
     r: Any, e: Any, f0: Any, f1: Any, weight: Any, others: Any, spread: Any,
     g_a0: Any, g_h: Any, g_b: Any, g_f: Any,
 ) -> Any:  # fmt: skip
-    """Return one axis' gradients: on e, f0, f1, on its own r0 r1 r2 directly, on two log weights.
+    """Return one axis' gradients: on e, f0, f1, directly on its r0 r1 r2, on two log weights.
 
     ``g_h`` (3), ``g_b`` and ``g_f`` (xx, xy, yy) are on h, B and F; ``spread`` is the gradient on
     ``cov_zz`` times the axis' variance.
@@ -78,7 +78,7 @@ def _axis_gradient(
     b0, b1 = 2.0 * r[0] * g_b[0] + r[1] * g_b[1], r[0] * g_b[1] + 2.0 * r[1] * g_b[2]
     k0, k1 = 2.0 * f0 * g_f[0] + f1 * g_f[1], f0 * g_f[1] + 2.0 * f1 * g_f[2]
     along = r[2] * spread
-    # B and F are quadratic: half of position times slope is their share of the sum.
+    # B and F are quadratic: their part of the sum is half of value times slope.
     log_self = 2.0 * (r[2] * along - scaled * (h_dot + e * g_a0)) - weight * (r[0] * b0 + r[1] * b1)
     log_others = -others * (f0 * k0 + f1 * k1)
     return (
@@ -91,7 +91,7 @@ def _axis_gradient(
 
 @part(fast=False, fused=True)
 def _shape_gradients(m: Any, camera: Any) -> None:
-    """From the gradients on columns 0-12 and 19-22 to those on mean, log scales and rotation."""
+    """Propagate gradients from columns 0-12 and 19-22 to mean, log scales and rotation."""
     c = load_camera_axes(camera)
     t0, t1, t2 = camera[9], camera[10], camera[11]
     fx, fy = camera[15], camera[16]
@@ -101,12 +101,20 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         x, y, z = x + t0, y + t1, z + t2
         inverse_z = 1.0 / z
         u, v = x * inverse_z, y * inverse_z
-        a = in_camera(c, m[TURN + lane], m[TURN + 3 * BLOCK + lane], m[TURN + 6 * BLOCK + lane])
+        a = in_camera(
+            c, m[ROTATION + lane], m[ROTATION + 3 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
+        )
         b = in_camera(
-            c, m[TURN + BLOCK + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
+            c,
+            m[ROTATION + BLOCK + lane],
+            m[ROTATION + 4 * BLOCK + lane],
+            m[ROTATION + 7 * BLOCK + lane],
         )
         d = in_camera(
-            c, m[TURN + 2 * BLOCK + lane], m[TURN + 5 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
+            c,
+            m[ROTATION + 2 * BLOCK + lane],
+            m[ROTATION + 5 * BLOCK + lane],
+            m[ROTATION + 8 * BLOCK + lane],
         )
         var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
         w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
@@ -131,7 +139,7 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         fyy = fa1 * fa1 * others0 + fb1 * fb1 * others1 + fd1 * fd1 * others2
         cov_zz = a[2] * a[2] * var0 + b[2] * b[2] * var1 + d[2] * d[2] * var2
 
-        # Gradient on the sums.
+        # Gradients on the sums.
         ia = 1.0 / a0
         zz = z * z
         scale_xx, scale_xy, scale_yy = ia * ifx * ifx, ia * ifx * ify, ia * ify * ify
@@ -164,7 +172,7 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         g_b, g_f = (g_bxx, g_bxy, g_byy), (g_fxx, g_fxy, g_fyy)
         g_cov = 0.5 * m[_GRAD + 22 * BLOCK + lane] / math.sqrt(cov_zz)
 
-        # Down to axes, weights and the ray through the mean.
+        # Gradients on axes, weights and the ray through the mean.
         ga = _axis_gradient(a, e0, fa0, fa1, w0, others0, var0 * g_cov, g_a0, g_h, g_b, g_f)
         gb = _axis_gradient(b, e1, fb0, fb1, w1, others1, var1 * g_cov, g_a0, g_h, g_b, g_f)
         gd = _axis_gradient(d, e2, fd0, fd1, w2, others2, var2 * g_cov, g_a0, g_h, g_b, g_f)
@@ -183,24 +191,24 @@ def _shape_gradients(m: Any, camera: Any) -> None:
         # The rotation's columns are the axes in the scene frame.
         x, y = ga[3] + ga[1] + u * ga[0], ga[4] + ga[2] + v * ga[0]
         z = ga[5] + ga[0] - u * ga[1] - v * ga[2]
-        m[TURN + lane] = c[0] * x + c[3] * y + c[6] * z
-        m[TURN + 3 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
-        m[TURN + 6 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+        m[ROTATION + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[ROTATION + 3 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[ROTATION + 6 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
         x, y = gb[3] + gb[1] + u * gb[0], gb[4] + gb[2] + v * gb[0]
         z = gb[5] + gb[0] - u * gb[1] - v * gb[2]
-        m[TURN + BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
-        m[TURN + 4 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
-        m[TURN + 7 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+        m[ROTATION + BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[ROTATION + 4 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[ROTATION + 7 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
         x, y = gd[3] + gd[1] + u * gd[0], gd[4] + gd[2] + v * gd[0]
         z = gd[5] + gd[0] - u * gd[1] - v * gd[2]
-        m[TURN + 2 * BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
-        m[TURN + 5 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
-        m[TURN + 8 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
+        m[ROTATION + 2 * BLOCK + lane] = c[0] * x + c[3] * y + c[6] * z
+        m[ROTATION + 5 * BLOCK + lane] = c[1] * x + c[4] * y + c[7] * z
+        m[ROTATION + 8 * BLOCK + lane] = c[2] * x + c[5] * y + c[8] * z
 
 
 @part(fast=False, fused=True)
 def _raw_gradients(m: Any) -> None:
-    """From the gradients on activated values to those on raw ones, and the viewing direction's."""
+    """Propagate gradients from activated to raw values, including those of the view direction."""
     for lane in range(BLOCK):
         w, x = m[QUAT + lane], m[QUAT + BLOCK + lane]
         y, z = m[QUAT + 2 * BLOCK + lane], m[QUAT + 3 * BLOCK + lane]
@@ -209,10 +217,14 @@ def _raw_gradients(m: Any) -> None:
         inverse = 1.0 / math.sqrt(square)
         inverse = 0.0 if degenerate else inverse
         w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-        g00, g11, g22 = m[TURN + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
-        g01, g10 = m[TURN + BLOCK + lane], m[TURN + 3 * BLOCK + lane]
-        g02, g20 = m[TURN + 2 * BLOCK + lane], m[TURN + 6 * BLOCK + lane]
-        g12, g21 = m[TURN + 5 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
+        g00, g11, g22 = (
+            m[ROTATION + lane],
+            m[ROTATION + 4 * BLOCK + lane],
+            m[ROTATION + 8 * BLOCK + lane],
+        )
+        g01, g10 = m[ROTATION + BLOCK + lane], m[ROTATION + 3 * BLOCK + lane]
+        g02, g20 = m[ROTATION + 2 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
+        g12, g21 = m[ROTATION + 5 * BLOCK + lane], m[ROTATION + 7 * BLOCK + lane]
         skew_x, skew_y, skew_z = g21 - g12, g02 - g20, g10 - g01
         sum_xy, sum_xz, sum_yz = g01 + g10, g02 + g20, g12 + g21
         gw = x * skew_x + y * skew_y + z * skew_z
@@ -226,10 +238,14 @@ def _raw_gradients(m: Any) -> None:
         m[_GRAD_QUAT + 2 * BLOCK + lane] = (gy - along * y) * inverse
         m[_GRAD_QUAT + 3 * BLOCK + lane] = (gz - along * z) * inverse
     for lane in range(BLOCK):
-        # d(effective log scale) = kept d(log scale); the filter also dims the opacity.
+        # d(effective log scale) = raw share * d(log scale); the filter also reduces the opacity.
         g = m[_GRAD + 11 * BLOCK + lane] * m[OPACITY + lane]
         m[_GRAD_LOGIT + lane] = g * m[TRANSPARENCY + lane]
-        k0, k1, k2 = m[KEPT + lane], m[KEPT + BLOCK + lane], m[KEPT + 2 * BLOCK + lane]
+        k0, k1, k2 = (
+            m[RAW_SHARE + lane],
+            m[RAW_SHARE + BLOCK + lane],
+            m[RAW_SHARE + 2 * BLOCK + lane],
+        )
         m[_GRAD_SCALE + lane] = k0 * m[_GRAD_SCALE + lane] + (1.0 - k0) * g
         m[_GRAD_SCALE + BLOCK + lane] = k1 * m[_GRAD_SCALE + BLOCK + lane] + (1.0 - k1) * g
         m[_GRAD_SCALE + 2 * BLOCK + lane] = k2 * m[_GRAD_SCALE + 2 * BLOCK + lane] + (1.0 - k2) * g
@@ -256,9 +272,9 @@ def _raw_gradients(m: Any) -> None:
 
 @part(fast=False, fused=True)
 def _drop_overflows(m: Any) -> None:
-    """Set what is written of a Gaussian to 0 where float32 cannot hold all of it."""
+    """Set all gradients of a Gaussian to 0 if any of them overflows float32."""
     for lane in range(BLOCK):
-        # NaN and infinity survive a sum of sizes.
+        # NaN and infinity propagate through a sum of absolute values.
         red, green = m[_GRAD + 13 * BLOCK + lane], m[_GRAD + 14 * BLOCK + lane]
         blue = m[_GRAD + 15 * BLOCK + lane]
         size = _BASIS_MAX * (abs(red) + abs(green) + abs(blue))
@@ -300,9 +316,9 @@ def backward_range(
 ) -> None:
     """Write the gradients of the Gaussians ``begin .. end``, or of ``ids[begin .. end]``.
 
-    Those that are not visible, or whose gradient float32 cannot hold, have none. With ``compact``
-    row k of the ``grad_`` arrays is overwritten with the gradient of ``ids[k]``; without, ``ids``
-    is not read and the gradient of Gaussian i is added to row i.
+    The gradient is 0 for Gaussians that are not visible or if it overflows float32. With
+    ``compact`` row k of the ``grad_`` arrays is overwritten with the gradient of ``ids[k]``;
+    without, ``ids`` is not read and the gradient of Gaussian i is added to row i.
     """
     m = block_scratch(_PLANES)
     m[_WEIGHT : _WEIGHT + BASIS_COUNT * BLOCK] = 0.0
@@ -340,7 +356,7 @@ def backward_range(
             for lane in range(min(BLOCK, count - first)):
                 row = queue[first + lane]
                 i = np.int64(ids[row]) if compact else row
-                # A colour clamped at 0 does not move.
+                # A colour clamped to 0 has no gradient.
                 red = m[_GRAD + 13 * BLOCK + lane] if params[i, 13] > 0.0 else 0.0
                 green = m[_GRAD + 14 * BLOCK + lane] if params[i, 14] > 0.0 else 0.0
                 blue = m[_GRAD + 15 * BLOCK + lane] if params[i, 15] > 0.0 else 0.0

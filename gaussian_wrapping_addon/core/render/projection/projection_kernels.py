@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled forward projection: Gaussians of any depth-to-size ratio onto one screen, in float64.
+"""Compiled forward projection of Gaussians of any depth-to-size ratio, in float64.
 
 Notation of docs/method.md, section 2.3, with ``w0 = (u, v, 1)`` the ray through the mean (camera
 frame), ``axis_k`` the Gaussian's axes and ``e_k = axis_k . w0``. The inverse covariance of the
@@ -7,12 +7,12 @@ exact projection is written as a sum of squares,
 
     Q = z^2 / a0 * sum_k (s_i s_j)^-2 g_k g_k^T,   (i, j) the other two axes,
 
-so neither a grazing disc nor an anisotropy of 1e6 cancels. The screen box is that of the ellipse
-``alpha >= 1/255``, from the dual conic of the ellipsoid: it is bounded exactly while the whole
-ellipsoid lies in front of the camera plane.
+so neither a grazing disc nor an anisotropy of 1e6 suffers from cancellation. The screen box is that
+of the ellipse ``alpha >= 1/255``, from the dual conic of the ellipsoid: it is bounded exactly while
+the whole ellipsoid lies in front of the camera plane.
 
-A cheap first pass leaves out what is behind, too faint, or certainly off the image; what remains
-is projected in blocks (``projection_math.py``).
+A cheap first pass culls Gaussians behind the camera, too faint, or certainly outside the image; the
+others are projected in blocks (``projection_math.py``).
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from .projection_activation import (
     MEAN,
     OPACITY,
     ORIENTATION,
+    ROTATION,
     SCALE,
     TANH,
-    TURN,
     activate_block,
     load_raw,
 )
@@ -45,24 +45,24 @@ CAMERA_VALUES = 22
 
 _ALPHA_MIN = tolerances.ALPHA_MIN
 _TILE = float(tolerances.TILE_PX)
-# An ellipsoid that touches the camera plane within rounding is treated as crossing it.
+# An ellipsoid that touches the camera plane within rounding error is treated as crossing it.
 _PLANE_MARGIN = 1e-12
 _FLOAT32_MAX = 3.0e38
 _FLOAT32_STEP = 2.0**-23
-# Boxes end here so that pixel ranges always fit an int32.
+# Boxes are clipped here so that pixel ranges always fit an int32.
 _FARTHEST_PX = 1.0e9
 # Whatever its scales, a Gaussian with a smaller logit is fainter than 1/255; 1e-3 below the limit.
-_FAINT_LOGIT = -math.log(1.0 / _ALPHA_MIN - 1.0) - 1e-3
-# Half axes of the ellipsoid at 1/255 in standard deviations, at most; with a margin for rounding.
+_MIN_LOGIT = -math.log(1.0 / _ALPHA_MIN - 1.0) - 1e-3
+# Largest half axis of the ellipsoid at 1/255 in standard deviations; with a margin for rounding.
 _REACH = math.sqrt(-2.0 * math.log(_ALPHA_MIN)) * (1.0 + 1e-6)
 
-# Planes of the scratch array behind those of the activation: columns of params, boxes, the rest.
+# Planes of the scratch array after those of the activation: columns of params, boxes, others.
 _PARAM = ACTIVATED_PLANES * BLOCK
 _BOX = _PARAM + PARAM_COLUMNS * BLOCK
 _DEPTH = _BOX + 4 * BLOCK
 _SKEW = _DEPTH + BLOCK
-_SEEN = _SKEW + BLOCK
-_PLANES = _SEEN // BLOCK + 1
+_VISIBLE = _SKEW + BLOCK
+_PLANES = _VISIBLE // BLOCK + 1
 
 
 @inline
@@ -76,7 +76,7 @@ def load_camera_axes(camera: Any) -> Any:
 
 @inline
 def in_camera(c: Any, a: Any, b: Any, d: Any) -> Any:
-    """Return the vector (a, b, d) turned by the rotation ``c``."""
+    """Return the vector (a, b, d) rotated by ``c``."""
     return (
         c[0] * a + c[1] * b + c[2] * d,
         c[3] * a + c[4] * b + c[5] * d,
@@ -94,7 +94,7 @@ def _outward(value: Any, side: Any) -> Any:
 
 @part(fast=False, fused=True)
 def _project_shapes(m: Any, camera: Any) -> None:
-    """Fill all of a block but its colours, and whether each is seen."""
+    """Compute all of a block except colours, and which Gaussians are visible."""
     c = load_camera_axes(camera)
     t0, t1, t2 = camera[9], camera[10], camera[11]
     fx, fy, cx, cy = camera[15], camera[16], camera[17], camera[18]
@@ -108,13 +108,19 @@ def _project_shapes(m: Any, camera: Any) -> None:
         inverse_z = 1.0 / z
         u, v = x * inverse_z, y * inverse_z
         r00, r10, r20 = in_camera(
-            c, m[TURN + lane], m[TURN + 3 * BLOCK + lane], m[TURN + 6 * BLOCK + lane]
+            c, m[ROTATION + lane], m[ROTATION + 3 * BLOCK + lane], m[ROTATION + 6 * BLOCK + lane]
         )
         r01, r11, r21 = in_camera(
-            c, m[TURN + BLOCK + lane], m[TURN + 4 * BLOCK + lane], m[TURN + 7 * BLOCK + lane]
+            c,
+            m[ROTATION + BLOCK + lane],
+            m[ROTATION + 4 * BLOCK + lane],
+            m[ROTATION + 7 * BLOCK + lane],
         )
         r02, r12, r22 = in_camera(
-            c, m[TURN + 2 * BLOCK + lane], m[TURN + 5 * BLOCK + lane], m[TURN + 8 * BLOCK + lane]
+            c,
+            m[ROTATION + 2 * BLOCK + lane],
+            m[ROTATION + 5 * BLOCK + lane],
+            m[ROTATION + 8 * BLOCK + lane],
         )
         var0, var1, var2 = m[SCALE + lane], m[SCALE + BLOCK + lane], m[SCALE + 2 * BLOCK + lane]
         w0, w1, w2 = 1.0 / var0, 1.0 / var1, 1.0 / var2
@@ -170,7 +176,7 @@ def _project_shapes(m: Any, camera: Any) -> None:
         threshold = 2.0 * log_wide(opacity * (1.0 / _ALPHA_MIN))
         scale = zz - threshold * cov_zz
         bounded = scale > _PLANE_MARGIN * zz
-        # The silhouette's dual conic, seen from (u, v): centre and half axes of the ellipse.
+        # The silhouette's dual conic, relative to (u, v): centre and half axes of the ellipse.
         share = threshold / scale
         middle_x = fx * (u - share * cov_xz) + cx
         middle_y = fy * (v - share * cov_yz) + cy
@@ -191,7 +197,7 @@ def _project_shapes(m: Any, camera: Any) -> None:
         m[_BOX + 3 * BLOCK + lane] = bottom
         m[_SKEW + lane] = skew if bounded else math.inf
 
-        # Seen if the box holds the centre of a pixel of the image.
+        # Visible if the box contains a pixel centre of the image.
         first_x, last_x = np.ceil(left - 0.5), np.floor(right - 0.5)
         first_y, last_y = np.ceil(top - 0.5), np.floor(bottom - 0.5)
         first_x = 0.0 if first_x < 0.0 else first_x
@@ -200,13 +206,13 @@ def _project_shapes(m: Any, camera: Any) -> None:
         last_y = height - 1.0 if last_y > height - 1.0 else last_y
         seen = (first_x <= last_x) & (first_y <= last_y)
         seen = seen & (z > near_z) & (opacity > _ALPHA_MIN)
-        m[_SEEN + lane] = 1.0 if seen else 0.0
+        m[_VISIBLE + lane] = 1.0 if seen else 0.0
     for lane in range(BLOCK):
         tanh = m[TANH + lane]
         m[_PARAM + 16 * BLOCK + lane] = tanh * m[ORIENTATION + lane]
         m[_PARAM + 17 * BLOCK + lane] = tanh * m[ORIENTATION + BLOCK + lane]
         m[_PARAM + 18 * BLOCK + lane] = tanh * m[ORIENTATION + 2 * BLOCK + lane]
-        # Not seen where float32 cannot hold what rendering makes of it (docs/architecture.md).
+        # Not visible if rendering would overflow float32 (docs/architecture.md).
         u, v, z = m[_PARAM + lane], m[_PARAM + BLOCK + lane], m[_PARAM + 10 * BLOCK + lane]
         reach_x = max(abs(u), abs(width - u)) + _TILE
         reach_y = max(abs(v), abs(height - v)) + _TILE
@@ -218,7 +224,7 @@ def _project_shapes(m: Any, camera: Any) -> None:
         den += 2.0 * abs(m[_PARAM + 5 * BLOCK + lane]) * reach_x
         den += 2.0 * abs(m[_PARAM + 6 * BLOCK + lane]) * reach_y
         a0, sigma_z = m[_PARAM + 12 * BLOCK + lane], m[_PARAM + 22 * BLOCK + lane]
-        # NaN and infinity survive a sum of sizes.
+        # NaN and infinity propagate through a sum of absolute values.
         total = m[_DEPTH + lane] + abs(m[_BOX + lane]) + abs(m[_BOX + BLOCK + lane])
         total += abs(m[_BOX + 2 * BLOCK + lane]) + abs(m[_BOX + 3 * BLOCK + lane])
         total += abs(m[_PARAM + 16 * BLOCK + lane]) + abs(m[_PARAM + 17 * BLOCK + lane])
@@ -226,13 +232,13 @@ def _project_shapes(m: Any, camera: Any) -> None:
         total += abs(m[_PARAM + 20 * BLOCK + lane]) + abs(m[_PARAM + 21 * BLOCK + lane])
         skew = m[_SKEW + lane]
         total += 0.0 if skew == math.inf else abs(skew)
-        holds = (reach_x <= tolerances.FINITE_OFFSET_PX) & (reach_y <= tolerances.FINITE_OFFSET_PX)
-        holds &= (num <= tolerances.FINITE_NUM) & (den <= tolerances.FINITE_DEN)
-        holds &= a0 * sigma_z * sigma_z <= tolerances.FINITE_SPREAD
-        holds &= a0 * den * z <= tolerances.FINITE_PULL
-        holds &= (z >= tolerances.FINITE_Z_MIN) & (z <= tolerances.FINITE_Z_MAX)
-        holds &= (sigma_z <= tolerances.FINITE_SIGMA_Z) & (total < _FLOAT32_MAX)
-        m[_SEEN + lane] = m[_SEEN + lane] if holds else 0.0
+        finite = (reach_x <= tolerances.FINITE_OFFSET_PX) & (reach_y <= tolerances.FINITE_OFFSET_PX)
+        finite &= (num <= tolerances.FINITE_NUM) & (den <= tolerances.FINITE_DEN)
+        finite &= a0 * sigma_z * sigma_z <= tolerances.FINITE_SPREAD
+        finite &= a0 * den * z <= tolerances.FINITE_PULL
+        finite &= (z >= tolerances.FINITE_Z_MIN) & (z <= tolerances.FINITE_Z_MAX)
+        finite &= (sigma_z <= tolerances.FINITE_SIGMA_Z) & (total < _FLOAT32_MAX)
+        m[_VISIBLE + lane] = m[_VISIBLE + lane] if finite else 0.0
 
 
 @inline
@@ -269,7 +275,7 @@ def project_raw_range(
     depths: np.ndarray,
     skews: np.ndarray,
 ) -> None:
-    """Project the raw Gaussians ``begin .. end``; of those not seen only that is written."""
+    """Project the raw Gaussians ``begin .. end``; hidden ones only get visibility and depth."""
     m = block_scratch(_PLANES)
     queue = np.empty(QUEUE + BLOCK, np.int64)
     coefficients = (degree + 1) * (degree + 1)
@@ -290,7 +296,7 @@ def project_raw_range(
             depths[i] = np.inf
             m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
             z = camera[6] * m0 + camera[7] * m1 + camera[8] * m2 + camera[11]
-            if not z > camera[21] or opacity_logits[i] < _FAINT_LOGIT:
+            if not z > camera[21] or opacity_logits[i] < _MIN_LOGIT:
                 continue
             x = camera[0] * m0 + camera[1] * m1 + camera[2] * m2 + camera[9]
             y = camera[3] * m0 + camera[4] * m1 + camera[5] * m2 + camera[10]
@@ -299,7 +305,7 @@ def project_raw_range(
                 max((-fy * y - cy * z) * top, (fy * y - (height - cy) * z) * bottom),
             )
             if outside > 0.0:
-                # Far enough outside one plane, and wholly in front of the camera's.
+                # Entirely outside one side plane, and entirely in front of the camera plane.
                 largest = max(np.float64(log_scales[i, 0]), np.float64(log_scales[i, 1]))
                 largest = max(largest, np.float64(log_scales[i, 2]))
                 blur = np.float64(filter_3d[i])
@@ -319,7 +325,7 @@ def project_raw_range(
             activate_block(m, camera)
             _project_shapes(m, camera)
             for lane in range(min(BLOCK, count - first)):
-                if m[_SEEN + lane] == 0.0:
+                if m[_VISIBLE + lane] == 0.0:
                     continue
                 i = queue[first + lane]
                 red = green = blue = 0.5
@@ -328,7 +334,7 @@ def project_raw_range(
                     red += value * np.float64(sh[i, k, 0])
                     green += value * np.float64(sh[i, k, 1])
                     blue += value * np.float64(sh[i, k, 2])
-                brightest = tolerances.FINITE_COLOR  # which NaN is not below; max() would lose it
+                brightest = tolerances.FINITE_COLOR  # NaN fails the test; max() would drop it
                 if not (red <= brightest and green <= brightest and blue <= brightest):
                     continue
                 m[_PARAM + 13 * BLOCK + lane] = max(red, 0.0)
@@ -367,7 +373,7 @@ def project_activated_range(
                 m[SCALE + axis * BLOCK + lane] = scales[i, axis] * scales[i, axis]
                 m[ORIENTATION + axis * BLOCK + lane] = normals[i, axis]
                 for column in range(3):
-                    m[TURN + (3 * axis + column) * BLOCK + lane] = rotations[i, axis, column]
+                    m[ROTATION + (3 * axis + column) * BLOCK + lane] = rotations[i, axis, column]
             m[TANH + lane] = 1.0
             m[OPACITY + lane] = math.exp(log_opacities[i])
         _project_shapes(m, camera)
@@ -375,5 +381,5 @@ def project_activated_range(
             i = first + lane
             visible[i] = False
             depths[i] = np.inf
-            if m[_SEEN + lane] != 0.0:
+            if m[_VISIBLE + lane] != 0.0:
                 _write_row(m, lane, i, params, boxes, visible, depths, skews)

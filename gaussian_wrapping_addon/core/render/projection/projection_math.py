@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the projection kernels share: blocks of float64, and exponential and logarithm in them.
+"""Blocks of float64 for the projection kernels, with vectorisable exponential and logarithm.
 
 Gaussians are projected in blocks of 8. Every value of a block is a *plane* of 8 float64 inside one
 scratch array; loops over a block have a constant trip count, constant offsets in that one array
-and no branches, which is what lets LLVM vectorise them. A block that is not
-full is padded with copies of its last Gaussian, so that no value depends on its neighbours.
+and no branches, which is what lets LLVM vectorise them. A partial block is padded with copies of
+its last Gaussian, so that no value depends on its neighbours.
 
-No vector library is at hand, and one scalar call would undo the vectorisation, so the exponential
-and the logarithm are polynomials (minimax in relative error, found with 50 digits).
+No vector math library is available, and one scalar call would prevent vectorisation, so the
+exponential and the logarithm are polynomials (minimax in relative error, found with 50 digits).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ...kernels.compiled import inline
 
 BLOCK = 8
 QUEUE = 256
-"""Gaussians that are looked at for culling before those that remain are projected in blocks."""
+"""Number of Gaussians left after culling that are collected before they are projected."""
 _LINE_VALUES = 8  # float64 in a cache line
 
 # exp(x) underflows to 0 below and overflows to infinity above; in between 2^n is a normal number.
@@ -32,7 +32,7 @@ _EXP_LOW, _EXP_HIGH = -708.0, 709.0
 _LOG2_E = 1.0 / math.log(2.0)
 # ln 2 in two parts; the first has 20 zero bits at its end, so that its multiples are exact.
 _LN2_HIGH, _LN2_LOW = 0.6931471804855391, 7.440617110012397e-11
-# Adding this rounds to an integer and leaves it in the lowest bits.
+# Adding this rounds to an integer, which is then in the lowest bits.
 _ROUNDER = 1.5 * 2.0**52
 # (exp(r) - 1 - r) / r^2 for |r| <= ln(2) / 2; error of exp(r) - 1 is 5e-17 relative.
 _E2, _E3, _E4, _E5 = 1 / 2, 1 / 6, 0.04166666666662412, 0.008333333333322207
@@ -97,7 +97,7 @@ def exp_wide(x: Any) -> Any:
 @inline
 def log_wide(x: Any) -> Any:
     """Return ln(x) for a positive normal x, to 4e-16 of the larger of 1 and the result."""
-    # Mantissa in [sqrt(1/2), sqrt(2)); the exponent becomes a float as the lowest bits of one.
+    # Mantissa in [sqrt(1/2), sqrt(2)); the exponent is converted via the lowest bits of a float.
     shifted: Any = _bits_of(x) - _SQRT_HALF_BITS  # type: ignore[call-arg]
     mantissa: Any = _float_of((shifted & _MANTISSA) + _SQRT_HALF_BITS)
     biased = (shifted + _ONE_BITS) >> 52
@@ -110,7 +110,7 @@ def log_wide(x: Any) -> Any:
 
 @inline
 def block_scratch(planes: Any) -> Any:
-    """Return that many planes of one block, beginning at a cache line, with any content."""
+    """Return uninitialised planes of one block, aligned to a cache line."""
     values = np.empty(planes * BLOCK + _LINE_VALUES, np.float64)
     offset = -(values.ctypes.data >> 3) & (_LINE_VALUES - 1)
     return values[offset : offset + planes * BLOCK]

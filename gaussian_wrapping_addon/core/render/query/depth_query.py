@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Isosurface depth and transmittance of a view at any sub-pixel positions, and their gradients.
+"""Isosurface depth and transmittance of a view at sub-pixel positions, and their gradients.
 
 The depth is that of the image, at positions instead of pixel centres (docs/method.md, section 2.9):
-the multi-view terms follow a surface point into a neighbouring view and ask for the depth where it
-lands. That place moves with the Gaussians too, so the answers are differentiable with respect to
-the positions as well.
+the multi-view terms project a surface point into a neighbouring view and query the depth there.
+This position moves with the Gaussians too, so the results are differentiable with respect to the
+positions as well.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from ..projection.projection import RawArrays, RawGradients, ScreenGaussians, pr
 from ..raster.blend import ScreenView
 from ..tiling.area_lists import AreaLists, SortedPositions, list_areas, sort_positions
 from ..types.options import RenderOptions
-from .depth_query_gradient import add_pair_gradients, pull_range
+from .depth_query_gradient import add_intersection_gradients, query_gradient_range
 from .depth_query_kernels import query_kernel
 from .fine_screen import project_finely
 from .query_spans import GEOMETRY
 
 _DEEPEST = 1e18
-"""Depths beyond this count as this; squares of it still fit a float32."""
+"""Depths are clamped to this, the square of which still fits a float32."""
 _POSITION_COST = 256
-"""What a position costs besides the Gaussians that it walks, in Gaussians."""
+"""Fixed cost of a position, in Gaussians that it evaluates."""
 _TRAINED = ("means", "log_scales", "quats", "opacity_logits")
 
 
 @dataclass(frozen=True)
 class QueryView:
-    """A view that can be asked any number of times."""
+    """A projected view, for any number of queries."""
 
     gaussians: RawArrays
     camera: Camera
@@ -57,12 +57,12 @@ class QueryView:
 
 @dataclass(frozen=True)
 class QueryResult:
-    """Answers for m positions, and what their gradient needs."""
+    """Results at m positions, and what the backward pass needs."""
 
     values: np.ndarray
-    """(m,) float32: depth in scene units, or transmittance; 0 where there is no answer."""
+    """(m,) float32: depth in scene units, or transmittance; 0 where there is none."""
     positions: SortedPositions
-    at: np.ndarray  # (k,) float32 depth of the isosurface, or the depth asked for; sorted
+    at: np.ndarray  # (k,) float32 depth of the isosurface, or the requested one; sorted
     found: np.ndarray  # (k,) float32 the values, sorted
     slopes: np.ndarray  # (k,) float32 -d(log T)/dt there, floored where it is a depth's
     stops: np.ndarray  # (k,) int32
@@ -70,7 +70,7 @@ class QueryResult:
 
 
 def query_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> QueryView:
-    """Project Gaussians for queries only, also those that lie between pixel centres.
+    """Project Gaussians for queries only, including those between pixel centres.
 
     Parameters
     ----------
@@ -79,15 +79,15 @@ def query_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> 
     camera : Camera
         In the scene frame.
     options : RenderOptions
-        ``near_z``, ``depth_valid_transmittance`` and ``threads`` are read.
+        ``near_z``, ``depth_valid_transmittance`` and ``threads`` are used.
 
     Raises
     ------
     ResourceError
-        If the tile lists grow beyond what can be addressed.
+        If the tile lists are too long to be indexed.
     """
     threads = options.threads or default_threads()
-    # Colours do not matter here.
+    # Colours are not needed.
     lean = dataclasses.replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, :1]))
     screen = project_finely(lean, camera, options)
     lists = list_areas(screen, camera.width, camera.height, threads)
@@ -95,24 +95,23 @@ def query_view(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> 
 
 
 def query_view_of(view: ScreenView) -> QueryView:
-    """Return a view for queries that shares the projection of a view that is rendered.
+    """Return a view for queries that shares the projection of a rendered view.
 
-    Gradients on its ``screen.params`` add to those of
-    :func:`~..raster.blend.blend_backward`. It holds
-    only the Gaussians whose box holds a pixel centre: of those that pass between pixel centres
-    the image knows nothing, and neither do queries of this view.
+    Gradients on its ``screen.params`` add to those of :func:`~..raster.blend.blend_backward`. It
+    contains only the Gaussians whose box contains a pixel centre: those that pass between pixel
+    centres affect neither the image nor queries of this view.
     """
     lists = list_areas(view.screen, view.camera.width, view.camera.height, view.threads)
     return QueryView(view.gaussians, view.camera, view.options, view.screen, lists, view.threads)
 
 
 def solve_depths(view: QueryView, positions: np.ndarray) -> QueryResult:
-    """Find the 0.5-isosurface at positions of a view.
+    """Solve the depth of the 0.5-isosurface at positions of a view.
 
     The definition is that of :func:`~..reference.reference.render_reference`: contributors have
     ``alpha >= 1/255`` and a transmittance of at least 1e-4 before them; there is no depth where
-    the final transmittance exceeds ``depth_valid_transmittance`` or where less than half of the
-    light reaches depth 0.
+    the final transmittance exceeds ``depth_valid_transmittance`` or where the transmittance at
+    depth 0 is below one half.
 
     Parameters
     ----------
@@ -123,22 +122,22 @@ def solve_depths(view: QueryView, positions: np.ndarray) -> QueryResult:
     Returns
     -------
     QueryResult
-        z-depths; 0 where there is none, off ``[0, width] x [0, height]`` and for NaN.
+        z-depths; 0 where there is none, outside ``[0, width] x [0, height]`` and for NaN.
     """
     sorted_positions = _sorted(view, positions)
     return _query(view, sorted_positions, np.zeros(len(sorted_positions.order), np.float32), True)
 
 
 def solve_transmittances(view: QueryView, positions: np.ndarray, depths: np.ndarray) -> QueryResult:
-    """Evaluate what the contributors at positions let through up to z-depths.
+    """Evaluate the transmittance of the contributors at positions up to z-depths.
 
     ``T(t) = prod_i (1 - G_i(t))``, over the same contributors and with the same cap of 0.99 as the
     isosurface, so that T is 0.5 at the depth of :func:`solve_depths`. The vacancy of
     :class:`~.vacancy.VacancyField` is the largest T of several cameras, with two
-    differences: it counts all Gaussians with ``alpha >= 1/255`` and calls a product below 1e-4
-    zero, where this leaves out what lies behind 1e-4 and can be slightly above 0; and it does not
+    differences: it includes all Gaussians with ``alpha >= 1/255`` and sets a product below 1e-4 to
+    zero, whereas this omits what lies behind 1e-4 and can be slightly above 0; and it does not
     cap G, so this is larger by up to 1 % of T per Gaussian whose G exceeds 0.99. Around the
-    surface, where no G exceeds 0.5, they are the same up to rounding.
+    surface, where no G exceeds 0.5, they are equal up to rounding.
 
     Parameters
     ----------
@@ -146,23 +145,23 @@ def solve_transmittances(view: QueryView, positions: np.ndarray, depths: np.ndar
     positions : (m, 2) array
         Pixels; rounded to float32.
     depths : (m,) array
-        z-depths, scene units; negative ones count as 0.
+        z-depths, scene units; negative ones are clamped to 0.
 
     Returns
     -------
     QueryResult
-        In [0, 1]; 0 off the image and where a position or depth is NaN.
+        In [0, 1]; 0 outside the image and where a position or depth is NaN.
     """
-    asked = np.asarray(depths, np.float64)
-    if asked.shape != (len(positions),):
+    requested = np.asarray(depths, np.float64)
+    if requested.shape != (len(positions),):
         raise UsageError(
-            f"{len(positions)} positions came with depths of shape {asked.shape}.",
-            "Give one depth a position.",
+            f"{len(positions)} positions came with depths of shape {requested.shape}.",
+            "Give one depth per position.",
         )
-    known = ~np.isnan(asked)
-    places = np.where(known[:, None], np.asarray(positions), np.nan)
-    sorted_positions = _sorted(view, places)
-    at = np.clip(asked[sorted_positions.order], 0.0, _DEEPEST).astype(np.float32)
+    known = ~np.isnan(requested)
+    coordinates = np.where(known[:, None], np.asarray(positions), np.nan)
+    sorted_positions = _sorted(view, coordinates)
+    at = np.clip(requested[sorted_positions.order], 0.0, _DEEPEST).astype(np.float32)
     return _query(view, sorted_positions, at, False)
 
 
@@ -177,18 +176,18 @@ def add_query_gradients(
     Parameters
     ----------
     view : QueryView
-        What ``result`` was asked of.
+        The view of the query.
     result : QueryResult
     grads : (m,) array
-        On ``result.values``; those of positions without an answer are ignored.
+        On ``result.values``; ignored for positions without a result.
     grad_params : (n, 24) float32
-        Accumulated into; columns from 13 on are not touched.
+        Accumulated into; columns from 13 on are unchanged.
 
     Returns
     -------
     grad_positions : (m, 2) float32
     grad_depths : (m,) float32
-        On the depths that a transmittance was asked for; 0 for depths.
+        On the depths of a transmittance query; 0 for a depth query.
     """
     positions, lists = result.positions, view.lists
     incoming = np.asarray(grads)[positions.order].astype(np.float32)  # (k,)
@@ -198,26 +197,29 @@ def add_query_gradients(
     else:
         weights = incoming * result.found
         pull = -weights * result.slopes
-    pair_grads = np.zeros((len(lists.gaussian_ids), GEOMETRY), np.float32)
-    grad_places = np.zeros((len(positions.order), 2), np.float32)
+    intersection_grads = np.zeros((len(lists.gaussian_ids), GEOMETRY), np.float32)
+    grad_coordinates = np.zeros((len(positions.order), 2), np.float32)
 
     def run(first: int, end: int) -> None:
-        pull_range(
+        query_gradient_range(
             first, end, view.screen.params, view.screen.boxes, view.screen.skews, lists.start,
-            lists.gaussian_ids, lists.pair_slots, lists.tiles_x, positions.shift, positions.start,
-            positions.places, result.at, weights, result.stops, pair_grads, grad_places,
+            lists.gaussian_ids, lists.intersection_slots, lists.tiles_x, positions.shift,
+            positions.start, positions.coordinates, result.at, weights, result.stops,
+            intersection_grads, grad_coordinates,
         )  # fmt: skip
 
     bounds = balanced_bounds(_tile_costs(view, positions), view.threads * CHUNKS_PER_THREAD)
     run_chunks(run, bounds, view.threads)
 
     def combine(first: int, end: int) -> None:
-        add_pair_gradients(first, end, pair_grads, lists.pair_offsets, grad_params)
+        add_intersection_gradients(
+            first, end, intersection_grads, lists.intersection_offsets, grad_params
+        )
 
     run_chunks(combine, even_bounds(len(view.screen), view.threads), view.threads)
     count = len(result.values)
     grad_positions, grad_depths = np.zeros((count, 2), np.float32), np.zeros(count, np.float32)
-    grad_positions[positions.order] = grad_places
+    grad_positions[positions.order] = grad_coordinates
     grad_depths[positions.order] = pull
     return grad_positions, grad_depths
 
@@ -228,10 +230,10 @@ def query_depth(
     positions_px: Tensor,
     options: RenderOptions | None = None,
 ) -> Tensor:
-    """Return the isosurface depth at any positions; see :func:`solve_depths`.
+    """Return the isosurface depth at sub-pixel positions; see :func:`solve_depths`.
 
-    Differentiable with respect to means, log_scales, quats, opacity_logits and positions. It does
-    not depend on harmonics and orientation.
+    Differentiable with respect to means, log_scales, quats, opacity_logits and positions;
+    independent of harmonics and orientation.
 
     Parameters
     ----------
@@ -246,7 +248,7 @@ def query_depth(
     Returns
     -------
     (m,) float32 tensor
-        z-depth in scene units; 0 where there is none, off the image and for NaN.
+        z-depth in scene units; 0 where there is none, outside the image and for NaN.
 
     Raises
     ------
@@ -277,7 +279,7 @@ def query_transmittance(
     Returns
     -------
     (m,) float32 tensor
-        In [0, 1]; 0 off the image and for NaN.
+        In [0, 1]; 0 outside the image and for NaN.
 
     Raises
     ------
@@ -306,15 +308,15 @@ class _Query(torch.autograd.Function):
         options: RenderOptions,
     ) -> Tensor:
         view = query_view(RawArrays.from_gaussians(gaussians), camera, options)
-        places = positions.detach().cpu().numpy()
+        coordinates = positions.detach().cpu().numpy()
         if depths is None:
-            result = solve_depths(view, places)
+            result = solve_depths(view, coordinates)
         else:
-            result = solve_transmittances(view, places, depths.detach().cpu().numpy())
+            result = solve_transmittances(view, coordinates, depths.detach().cpu().numpy())
         ctx.view, ctx.result = view, result
         ctx.types = positions.dtype, depths.dtype if depths is not None else None
-        # The backward pass reads their memory; saved, so that autograd refuses to run it after
-        # one of them was changed in place.
+        # The backward pass reads their memory; saved so that autograd refuses to run after one of
+        # them was modified in place.
         ctx.save_for_backward(means, log_scales, quats, opacity_logits)
         return torch.from_numpy(result.values)
 
@@ -345,16 +347,16 @@ class _Query(torch.autograd.Function):
 
 
 def _sorted(view: QueryView, positions: np.ndarray) -> SortedPositions:
-    places = np.asarray(positions)
-    if places.ndim != 2 or places.shape[1] != 2:
+    coordinates = np.asarray(positions)
+    if coordinates.ndim != 2 or coordinates.shape[1] != 2:
         raise UsageError(
-            f"Positions have the shape {places.shape}.", "Give (m, 2) pixel coordinates."
+            f"Positions have the shape {coordinates.shape}.", "Give (m, 2) pixel coordinates."
         )
-    return sort_positions(places, view.camera.width, view.camera.height)
+    return sort_positions(coordinates, view.camera.width, view.camera.height)
 
 
 def _tile_costs(view: QueryView, positions: SortedPositions) -> np.ndarray:
-    """(tiles,) about what the positions of each tile cost."""
+    """(tiles,) approximate cost of the positions of each tile."""
     lengths = np.diff(view.lists.start)
     counts = np.diff(positions.start[:: 1 << (2 * positions.shift)])
     walked = lengths >> (2 * positions.shift)
@@ -365,18 +367,18 @@ def _query(view: QueryView, positions: SortedPositions, at: np.ndarray, solve: b
     count = len(positions.order)
     found, slopes = np.zeros(count, np.float32), np.ones(count, np.float32)
     stops = np.zeros(count, np.int32)
-    answer = query_kernel(solve)
+    query_range = query_kernel(solve)
     limit = np.float32(view.options.depth_valid_transmittance)
 
     def run(first: int, end: int) -> None:
-        answer(
+        query_range(
             first, end, view.screen.params, view.screen.boxes, view.screen.skews, view.lists.start,
             view.lists.gaussian_ids, view.lists.tiles_x, positions.shift, positions.start,
-            positions.places, limit, at, found, slopes, stops,
+            positions.coordinates, limit, at, found, slopes, stops,
         )  # fmt: skip
 
     bounds = balanced_bounds(_tile_costs(view, positions), view.threads * CHUNKS_PER_THREAD)
     run_chunks(run, bounds, view.threads)
-    values = np.zeros(positions.given, np.float32)
+    values = np.zeros(positions.input_count, np.float32)
     values[positions.order] = found
     return QueryResult(values, positions, found if solve else at, found, slopes, stops, solve)

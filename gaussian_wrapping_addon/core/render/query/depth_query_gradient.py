@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled gradients of ``log T`` at depths and positions: per pair of tile and Gaussian, summed.
+"""Compiled gradients of ``log T`` at depths and positions, summed per tile intersection.
 
 A depth's gradient is one of these over the slope of ``log T`` (docs/method.md, section 2.5).
 """
@@ -44,15 +44,15 @@ from .query_spans import (
     longest_list,
 )
 
-# Columns of a span behind the Gaussians': the gradients on them.
+# Columns of a span after those of the Gaussians: the gradients on them.
 _G = GEOMETRY * SPAN
 _COLUMNS = 2 * GEOMETRY
 _INDEX = np.arange(SPAN, dtype=np.float32)
 
 
 @inline
-def _pull_span(span: Any, x: Any, y: Any, t: Any, weight: Any, stop: Any) -> Any:
-    """Add the gradient of ``weight log T(t)`` on a span; return that on the position."""
+def _span_gradient(span: Any, x: Any, y: Any, t: Any, weight: Any, stop: Any) -> Any:
+    """Add the gradient of ``weight log T(t)`` to a span's; return that on the position."""
     sum_x, sum_y = ZERO, ZERO
     for j in range(SPAN):
         qa, qb, qc = span[QA + j], span[QB + j], span[QC + j]
@@ -102,7 +102,7 @@ def _pull_span(span: Any, x: Any, y: Any, t: Any, weight: Any, stop: Any) -> Any
 
 
 @kernel(fast=True)
-def pull_range(
+def query_gradient_range(
     first_tile: int,
     end_tile: int,
     params: np.ndarray,
@@ -110,16 +110,16 @@ def pull_range(
     skews: np.ndarray,
     start: np.ndarray,
     gaussian_ids: np.ndarray,
-    pair_slots: np.ndarray,
+    intersection_slots: np.ndarray,
     tiles_x: int,
     shift: int,
     cell_start: np.ndarray,
-    places: np.ndarray,
+    coordinates: np.ndarray,
     depths: np.ndarray,
     weights: np.ndarray,
     stops: np.ndarray,
-    pair_grads: np.ndarray,
-    grad_places: np.ndarray,
+    intersection_grads: np.ndarray,
+    grad_coordinates: np.ndarray,
 ) -> None:
     """Write the gradient of ``sum weights * log T(depths)`` for the positions of tiles.
 
@@ -128,22 +128,22 @@ def pull_range(
     depths, weights : (k,) float32
     stops : (k,) int32
         As :func:`~.depth_query_kernels.query_kernel` wrote them.
-    pair_grads : (pairs, 13) float32
-        Zero; each pair adds up at its slot, cell after cell.
-    grad_places : (k, 2) float32
+    intersection_grads : (intersections, 13) float32
+        Zero on entry; each intersection accumulates at its slot, cell by cell.
+    grad_coordinates : (k, 2) float32
     """
     longest = longest_list(first_tile, end_tile, start, shift, cell_start)
     room = (longest + SPAN - 1) // SPAN
     tile_spans = np.empty((room, TILE_COLUMNS * SPAN), np.float32)
     spans = np.empty((room, _COLUMNS * SPAN), np.float32)
-    fronts = np.empty(room + 1, np.float32)
+    nearest_depths = np.empty(room + 1, np.float32)
     members = np.empty(longest, np.int64)
     filled = -1
     for cell in range(first_tile << (2 * shift), end_tile << (2 * shift)):
         idle = True
         for p in range(cell_start[cell], cell_start[cell + 1]):
-            grad_places[p, 0] = ZERO
-            grad_places[p, 1] = ZERO
+            grad_coordinates[p, 0] = ZERO
+            grad_coordinates[p, 1] = ZERO
             idle &= weights[p] == ZERO
         if idle:
             continue
@@ -153,7 +153,7 @@ def pull_range(
             filled = tile
         total = fill_cell(
             _COLUMNS, cell & ((1 << (2 * shift)) - 1), shift,
-            start[tile + 1] - start[tile], tile_spans, spans, fronts, members,
+            start[tile + 1] - start[tile], tile_spans, spans, nearest_depths, members,
         )  # fmt: skip
         for at in range((total + SPAN - 1) // SPAN):
             spans[at, _G:] = ZERO
@@ -161,20 +161,20 @@ def pull_range(
         for p in range(cell_start[cell], cell_start[cell + 1]):
             if weights[p] == ZERO:
                 continue
-            x, y, t = places[p, 0], places[p, 1], depths[p]
+            x, y, t = coordinates[p, 0], coordinates[p, 1], depths[p]
             sum_x, sum_y = ZERO, ZERO
             for at in range((total + SPAN - 1) // SPAN):
-                if fronts[at] >= t or at * SPAN >= stops[p]:
+                if nearest_depths[at] >= t or at * SPAN >= stops[p]:
                     break
                 stop = np.float32(stops[p] - at * SPAN)
                 reached = max(reached, at + 1)
-                g_x, g_y = _pull_span(spans[at], x, y, t, weights[p], stop)
+                g_x, g_y = _span_gradient(spans[at], x, y, t, weights[p], stop)
                 sum_x += g_x
                 sum_y += g_y
-            grad_places[p, 0] = sum_x
-            grad_places[p, 1] = sum_y
+            grad_coordinates[p, 0] = sum_x
+            grad_coordinates[p, 1] = sum_y
         for g in range(min(total, reached * SPAN)):
-            out = pair_grads[pair_slots[start[tile] + members[g]]]
+            out = intersection_grads[intersection_slots[start[tile] + members[g]]]
             span = spans[g // SPAN]
             lane = g % SPAN
             for column in range(10):
@@ -185,17 +185,21 @@ def pull_range(
 
 
 @kernel(fast=False)
-def add_pair_gradients(
-    first: int, end: int, pair_grads: np.ndarray, pair_offsets: np.ndarray, grad_params: np.ndarray
+def add_intersection_gradients(
+    first: int,
+    end: int,
+    intersection_grads: np.ndarray,
+    intersection_offsets: np.ndarray,
+    grad_params: np.ndarray,
 ) -> None:
-    """Add the pairs of the Gaussians ``first .. end``, in the order of their slots."""
+    """Add the gradients of the Gaussians ``first .. end`` over their slots, in order."""
     total = np.zeros(GEOMETRY, np.float32)
     for i in range(first, end):
-        if pair_offsets[i] == pair_offsets[i + 1]:
+        if intersection_offsets[i] == intersection_offsets[i + 1]:
             continue
         total[:] = ZERO
-        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
+        for slot in range(intersection_offsets[i], intersection_offsets[i + 1]):
             for column in range(GEOMETRY):
-                total[column] += pair_grads[slot, column]
+                total[column] += intersection_grads[slot, column]
         for column in range(GEOMETRY):
             grad_params[i, column] += total[column]

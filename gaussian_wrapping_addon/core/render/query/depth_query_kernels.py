@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled answers at positions of a view: the depth of the isosurface, or the transmittance."""
+"""Compiled query at positions of a view: the depth of the isosurface, or the transmittance."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ from .query_spans import (
 )
 from .ray_solver import NEGLIGIBLE, TINY, evaluate_ray, solve_ray
 
-# Columns of a span behind the Gaussians': what they are on the ray of the position at hand.
+# Columns of a span after those of the Gaussians: their values on the ray of the current position.
 _RAW, _PEAK, _SHARPNESS = 13 * SPAN, 14 * SPAN, 15 * SPAN
 _COLUMNS = 16
 
 
 @inline
-def _cast(span: Any, x: Any, y: Any) -> None:
+def _evaluate_span(span: Any, x: Any, y: Any) -> None:
     """Evaluate a span on the ray of a position; opacity 0 where it is below 1/255."""
     for j in range(SPAN):
         dx = x - span[U + j]
@@ -70,12 +70,12 @@ def _cast(span: Any, x: Any, y: Any) -> None:
 
 @functools.cache
 def query_kernel(solve: bool) -> Any:
-    """Return the kernel that answers positions, compiled on first call.
+    """Return the query kernel, compiled on first call.
 
     Parameters
     ----------
     solve : bool
-        Find the depth of the isosurface; otherwise evaluate the transmittance at given depths.
+        Solve the depth of the isosurface; otherwise evaluate the transmittance at given depths.
     """
 
     @kernel(fast=True)
@@ -90,23 +90,23 @@ def query_kernel(solve: bool) -> Any:
         tiles_x: int,
         shift: int,
         cell_start: np.ndarray,
-        places: np.ndarray,
+        coordinates: np.ndarray,
         limit: float,
         depths: np.ndarray,
         values: np.ndarray,
         slopes: np.ndarray,
         stops: np.ndarray,
     ) -> None:
-        """Answer the positions of tiles: write ``values`` and ``slopes``, read ``depths``.
+        """Query the positions of tiles: write ``values`` and ``slopes``, read ``depths``.
 
-        ``depths (k,)`` is what is written where the depth is solved. ``stops (k,) int32`` receives
-        the number of Gaussians of the cell's list that come before the light is used up.
+        If the depth is solved, ``depths (k,)`` is the array that is written. ``stops (k,) int32``
+        receives the number of Gaussians of the cell's list up to the one that makes the ray opaque.
         """
         longest = longest_list(first_tile, end_tile, start, shift, cell_start)
         room = (longest + SPAN - 1) // SPAN
         tile_spans = np.empty((room, TILE_COLUMNS * SPAN), np.float32)
         spans = np.empty((room, _COLUMNS * SPAN), np.float32)
-        fronts = np.empty(room + 1, np.float32)
+        nearest_depths = np.empty(room + 1, np.float32)
         members = np.empty(longest, np.int64)
         alphas = np.empty(room * SPAN, np.float32)
         peaks = np.empty(room * SPAN, np.float32)
@@ -123,24 +123,28 @@ def query_kernel(solve: bool) -> Any:
                 filled = tile
             total = fill_cell(
                 _COLUMNS, cell & ((1 << (2 * shift)) - 1), shift,
-                start[tile + 1] - start[tile], tile_spans, spans, fronts, members,
+                start[tile + 1] - start[tile], tile_spans, spans, nearest_depths, members,
             )  # fmt: skip
             for p in range(cell_start[cell], cell_start[cell + 1]):
-                x, y = places[p, 0], places[p, 1]
-                through, high = ONE, ZERO
+                x, y = coordinates[p, 0], coordinates[p, 1]
+                transmittance, high = ONE, ZERO
                 before_crossing, crossing = ZERO, 0
                 count: Any = 0
                 stop: Any = total
                 end = depths[p]
                 for at in range((total + SPAN - 1) // SPAN):
                     if solve:
-                        if through <= limit and through < ISO_LEVEL and fronts[at] >= high:
+                        if (
+                            transmittance <= limit
+                            and transmittance < ISO_LEVEL
+                            and nearest_depths[at] >= high
+                        ):
                             break
-                    elif fronts[at] >= end:
+                    elif nearest_depths[at] >= end:
                         break
                     span = spans[at]
-                    _cast(span, x, y)
-                    spent = False
+                    _evaluate_span(span, x, y)
+                    saturated = False
                     for run in range(0, SPAN, RUN):
                         hits = positive_run(RUN, span, _RAW + run)
                         while hits != np.uint64(0):
@@ -150,20 +154,20 @@ def query_kernel(solve: bool) -> Any:
                             alphas[count] = raw
                             peaks[count] = peak
                             sharpnesses[count] = span[_SHARPNESS + j]
-                            before = through
-                            through -= min(raw, ALPHA_MAX) * through
+                            before = transmittance
+                            transmittance -= min(raw, ALPHA_MAX) * transmittance
                             if solve and before > ISO_LEVEL:
                                 high = max(high, peak)
-                                if through <= ISO_LEVEL:
+                                if transmittance <= ISO_LEVEL:
                                     before_crossing, crossing = before, count
                             count += 1
-                            if through < TRANSMITTANCE_MIN:
+                            if transmittance < TRANSMITTANCE_MIN:
                                 stop = at * SPAN + j + 1
-                                spent = True
+                                saturated = True
                                 break
-                        if spent:
+                        if saturated:
                             break
-                    if spent:
+                    if saturated:
                         break
                 stops[p] = stop
                 if not solve:
@@ -172,7 +176,9 @@ def query_kernel(solve: bool) -> Any:
                     )
                     continue
                 values[p], slopes[p] = ZERO, ONE
-                if not (before_crossing > ZERO and through <= limit and through < ISO_LEVEL):
+                if not (
+                    before_crossing > ZERO and transmittance <= limit and transmittance < ISO_LEVEL
+                ):
                     continue
                 sharpest = ZERO
                 kept = 0
@@ -188,14 +194,14 @@ def query_kernel(solve: bool) -> Any:
                     if matters:
                         sharpest = max(sharpest, sharpness)
                         kept += 1
-                if fronts[0] <= ZERO:
-                    # Some Gaussian may reach the camera: light must pass at depth 0.
+                if nearest_depths[0] <= ZERO:
+                    # Some Gaussian may reach the camera: a crossing needs T > 0.5 at depth 0.
                     product, _ = evaluate_ray(False, kept, ZERO, alphas, peaks, sharpnesses)
                     if product <= ISO_LEVEL:
                         continue
-                # Alone, the Gaussian at the crossing lets 0.5 through where its fall-off is ratio.
-                light = min(alphas[crossing], ALPHA_MAX) * before_crossing
-                ratio = min(max((before_crossing - ISO_LEVEL) / max(light, TINY), ZERO), ONE)
+                # The Gaussian at the crossing alone reaches T = 0.5 where its fall-off is ratio.
+                weight = min(alphas[crossing], ALPHA_MAX) * before_crossing
+                ratio = min(max((before_crossing - ISO_LEVEL) / max(weight, TINY), ZERO), ONE)
                 log_ratio = math.log(max(ratio, TINY))
                 ahead = math.sqrt(max(-TWO * log_ratio / max(sharpnesses[crossing], TINY), ZERO))
                 guess = peaks[crossing] - ahead

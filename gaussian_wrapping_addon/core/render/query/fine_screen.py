@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Projection that keeps the Gaussians between pixel centres, by way of a finer screen.
+"""Projection that keeps the Gaussians between pixel centres, using a finer screen.
 
-Projection drops what reaches no pixel centre. Positions between the centres need it, so Gaussians
-are projected onto a screen many times as fine and their rows brought back to pixels.
+Projection drops Gaussians that reach no pixel centre. Queries between the centres need them, so
+Gaussians are projected onto a much finer screen and their rows scaled back to pixels.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from ..types.options import RenderOptions
 
 _FINE_SIDE_PX = 65536
 """Longer side of the screen that Gaussians are projected onto for queries. Projection drops those
-that lie between pixel centres; at this size that loses none that matters."""
+between pixel centres; at this size none of them is relevant."""
 _BOX_END = 0.999e9
-"""Projection cuts boxes off at 1e9 pixels."""
+"""Projection clips boxes at 1e9 pixels."""
 
 
 def project_finely(gaussians: RawArrays, camera: Camera, options: RenderOptions) -> ScreenGaussians:
-    """Project onto a finer screen, by a power of two, and bring the rows back to pixels.
+    """Project onto a screen finer by a power of two, and scale the rows back to pixels.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def project_finely(gaussians: RawArrays, camera: Camera, options: RenderOptions)
     Returns
     -------
     ScreenGaussians
-        In pixels of ``camera``; what rendering hides there is hidden.
+        In pixels of ``camera``; Gaussians that rendering hides at that size are hidden.
     """
     threads = options.threads or default_threads()
     scale = 1
@@ -58,20 +58,20 @@ def project_finely(gaussians: RawArrays, camera: Camera, options: RenderOptions)
         )  # fmt: skip
 
     run_chunks(shrink, even_bounds(len(screen), threads), threads)
-    _add_far_ones(gaussians, camera, options, scale, screen)
+    _add_distant(gaussians, camera, options, scale, screen)
     return screen
 
 
-def _add_far_ones(
+def _add_distant(
     gaussians: RawArrays,
     camera: Camera,
     options: RenderOptions,
     scale: int,
     screen: ScreenGaussians,
 ) -> None:
-    """Add what is hidden only because the finer screen numbers its pixels no farther.
+    """Add Gaussians that are hidden only because they exceed the pixel range of the finer screen.
 
-    These project more than a hundred images aside.
+    They project more than a hundred image sizes off the image.
     """
     hidden = np.flatnonzero(~screen.visible)
     pose = camera.cam_from_world
@@ -106,15 +106,15 @@ def _shrink_range(
     skews: np.ndarray,
     visible: np.ndarray,
 ) -> None:
-    """Turn the rows ``begin .. end`` of a screen ``scale`` times as fine into pixels.
+    """Scale the rows ``begin .. end`` of a screen ``scale`` times as fine to pixels.
 
-    Rows that the image of ``width`` x ``height`` hides, because float32 could not hold what
-    rendering makes of them (docs/architecture.md), are hidden.
+    Rows that the image of ``width`` x ``height`` hides because rendering them would overflow
+    float32 (docs/architecture.md) are hidden.
     """
     for i in range(begin, end):
         if not visible[i]:
             continue
-        # No column but these depends on the size of a pixel.
+        # Only these columns depend on the pixel size.
         u, v = params[i, 0] / scale, params[i, 1] / scale
         reach_x = max(abs(u), abs(width - u)) + TILE
         reach_y = max(abs(v), abs(height - v)) + TILE
@@ -136,6 +136,6 @@ def _shrink_range(
         skews[i] /= scale
         for column in range(4):
             if abs(boxes[i, column]) > _BOX_END:
-                # Cut off, far beyond the image: no longer the box of the ellipse.
+                # Clipped, far outside the image: no longer the box of the ellipse.
                 skews[i] = math.inf
             boxes[i, column] /= scale

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Gaussians that reach a cell of a tile, laid out so that loops over them are vectors.
+"""The Gaussians that reach a cell of a tile, in a layout for vectorised loops.
 
-Vectors run over the Gaussians of a cell, not over positions, so that one position costs no more
-than one of many. The Gaussians that reach a cell are laid out in *spans* of 32: 32 values of one
-column after those of another, all of a span inside one array at constant offsets, which is what
-lets LLVM vectorise.
+Vectors run over the Gaussians of a cell, not over positions, so that a single position costs no
+more than one of many. The Gaussians of a cell are stored in *spans* of 32, column by column with 32
+values each, in one array at constant offsets, which is what lets LLVM vectorise.
 """
 
 from __future__ import annotations
@@ -24,18 +23,18 @@ GEOMETRY = 13
 
 SPAN = 32
 RUN = 16
-"""Values of a span that are tested at once."""
-# Columns of a span: the Gaussians; kernels add columns of their own behind these.
+"""Values of a span tested at once."""
+# Columns of a span: the Gaussians; kernels append columns of their own.
 U, V, QA, QB, QC = 0, SPAN, 2 * SPAN, 3 * SPAN, 4 * SPAN
 PX, PY, R, S, T = 5 * SPAN, 6 * SPAN, 7 * SPAN, 8 * SPAN, 9 * SPAN
 Z, OPACITY, A0 = 10 * SPAN, 11 * SPAN, 12 * SPAN
-# Columns of a span of a tile: the Gaussians, where they begin in depth, and their ellipses.
-_FRONT, _CENTER_X, _CENTER_Y, _SKEW = 13 * SPAN, 14 * SPAN, 15 * SPAN, 16 * SPAN
+# Columns of a tile's span: the Gaussians, the nearest depth they reach, and their ellipses.
+_NEAREST, _CENTER_X, _CENTER_Y, _SKEW = 13 * SPAN, 14 * SPAN, 15 * SPAN, 16 * SPAN
 _EXTREME, _INVERSE, _ACROSS, _MARGIN = 17 * SPAN, 18 * SPAN, 19 * SPAN, 20 * SPAN
-_TOUCHED = 21 * SPAN
+_INTERSECTS = 21 * SPAN
 TILE_COLUMNS = 22
 _FLOAT_MARGIN = np.float32(4e-6)
-"""Several roundings of a float32, in shares of what is rounded."""
+"""A few float32 rounding errors, relative."""
 
 
 @part(fast=False)
@@ -49,7 +48,7 @@ def fill_tile(
     gaussian_ids: np.ndarray,
     spans: np.ndarray,
 ) -> None:
-    """Lay out the Gaussians of a tile and their ellipses in ``spans (s, 22 * 32) float32``."""
+    """Store the Gaussians of a tile and their ellipses in ``spans (s, 22 * 32) float32``."""
     left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
     count = start[tile + 1] - start[tile]
     for k in range(count):
@@ -60,12 +59,12 @@ def fill_tile(
         lane = k % SPAN
         for column in range(GEOMETRY):
             span[column * SPAN + lane] = params[i, column]
-        span[_FRONT + lane] = params[i, 10] - FRONT_SIGMAS * params[i, 22]
+        span[_NEAREST + lane] = params[i, 10] - FRONT_SIGMAS * params[i, 22]
         half_x = 0.5 * (np.float64(boxes[i, 2]) - np.float64(boxes[i, 0]))
         half_y = 0.5 * (np.float64(boxes[i, 3]) - np.float64(boxes[i, 1]))
         skew = np.float64(skews[i])
         if math.isinf(skew) or not (half_x > 0.0 and half_y > 0.0):
-            # No ellipse that could rule a cell out.
+            # No ellipse that could exclude a cell.
             span[_CENTER_X + lane] = span[_CENTER_Y + lane] = span[_SKEW + lane] = ZERO
             span[_EXTREME + lane] = span[_INVERSE + lane] = span[_MARGIN + lane] = ZERO
             span[_ACROSS + lane] = FAR
@@ -83,13 +82,13 @@ def fill_tile(
         span = spans[k // SPAN]
         for column in range(TILE_COLUMNS):
             span[column * SPAN + k % SPAN] = ZERO
-        span[_FRONT + k % SPAN] = FAR
+        span[_NEAREST + k % SPAN] = FAR
         span[_CENTER_X + k % SPAN] = -FAR
 
 
 @inline
-def _touch(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
-    """Mark by 1 the ellipses of a span that reach a rectangle, see ``area_lists.strip_span``."""
+def _mark_intersecting(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
+    """Mark with 1 the ellipses of a span that reach a rectangle, see ``area_lists.strip_span``."""
     for j in range(SPAN):
         inverse, center_y = span[_INVERSE + j], span[_CENTER_Y + j]
         first = max((y0 - center_y) * inverse - _FLOAT_MARGIN, -ONE)
@@ -100,9 +99,9 @@ def _touch(span: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> None:
         t = min(max(-extreme, first), last)
         left = skew * t - across * math.sqrt(max(ONE - t * t, ZERO))
         center_x, margin = span[_CENTER_X + j], span[_MARGIN + j]
-        touched = (first <= last) & (center_x + right + margin >= x0)
-        touched = touched & (center_x + left - margin <= x1)
-        span[_TOUCHED + j] = ONE if touched else ZERO
+        intersects = (first <= last) & (center_x + right + margin >= x0)
+        intersects = intersects & (center_x + left - margin <= x1)
+        span[_INTERSECTS + j] = ONE if intersects else ZERO
 
 
 @part(fast=True)
@@ -113,28 +112,28 @@ def fill_cell(
     count: int,
     tile_spans: np.ndarray,
     spans: np.ndarray,
-    fronts: np.ndarray,
+    nearest_depths: np.ndarray,
     members: np.ndarray,
 ) -> int:
-    """Lay out those Gaussians of a tile that reach one of its cells; return their number.
+    """Store the Gaussians of a tile that reach one of its cells; return their number.
 
     Parameters
     ----------
     columns : int
         Columns of ``spans``.
     part : int
-        Number of the cell within its tile.
+        Index of the cell within its tile.
     count : int
         Gaussians of the tile.
     tile_spans : (t, 22 * 32) float32
         From :func:`fill_tile`.
     spans : (s, columns * 32) float32
-        The last span is filled up with Gaussians of no opacity.
-    fronts : (s + 1,) float32
-        Receives the z-depth before which no Gaussian of this span or a later one has a density
-        worth counting.
+        The last span is padded with Gaussians of opacity 0.
+    nearest_depths : (s + 1,) float32
+        Receives the z-depth in front of which every Gaussian of this span and later ones has
+        negligible density.
     members : (g,) int64
-        Receives the place of each Gaussian in the tile's list.
+        Receives the index of each Gaussian in the tile's list.
     """
     cell_px = TILE >> shift
     margin = np.float32(PIXEL_MARGIN)
@@ -145,12 +144,12 @@ def fill_cell(
     for at in range((count + SPAN - 1) // SPAN):
         source = tile_spans[at]
         if shift > 0:
-            _touch(source, x0, y0 - margin, x1, y1 + margin)
+            _mark_intersecting(source, x0, y0 - margin, x1, y1 + margin)
         else:
             for lane in range(SPAN):
-                source[_TOUCHED + lane] = ONE if at * SPAN + lane < count else ZERO
+                source[_INTERSECTS + lane] = ONE if at * SPAN + lane < count else ZERO
         for run in range(0, SPAN, RUN):
-            hits = positive_run(RUN, source, _TOUCHED + run)
+            hits = positive_run(RUN, source, _INTERSECTS + run)
             while hits != np.uint64(0):
                 j = run + np.int64(lowest_bit(hits))
                 hits &= hits - np.uint64(1)
@@ -158,17 +157,17 @@ def fill_cell(
                 lane = total % SPAN
                 for column in range(GEOMETRY):
                     target[column * SPAN + lane] = source[column * SPAN + j]
-                front, to = source[_FRONT + j], total // SPAN
-                fronts[to] = front if lane == 0 else min(fronts[to], front)
+                nearest, to = source[_NEAREST + j], total // SPAN
+                nearest_depths[to] = nearest if lane == 0 else min(nearest_depths[to], nearest)
                 members[total] = at * SPAN + j
                 total += 1
     last = (total + SPAN - 1) // SPAN
     for k in range(total, last * SPAN):
         for column in range(columns):
             spans[last - 1, column * SPAN + k % SPAN] = ZERO
-    fronts[last] = FAR
+    nearest_depths[last] = FAR
     for at in range(last - 1, -1, -1):
-        fronts[at] = min(fronts[at], fronts[at + 1])
+        nearest_depths[at] = min(nearest_depths[at], nearest_depths[at + 1])
     return total
 
 
@@ -176,7 +175,7 @@ def fill_cell(
 def longest_list(
     first_tile: int, end_tile: int, start: np.ndarray, shift: int, cell_start: np.ndarray
 ) -> int:
-    """Return the length of the longest list of those tiles that hold positions."""
+    """Return the length of the longest list of the tiles that contain positions."""
     longest = 0
     for tile in range(first_tile, end_tile):
         if cell_start[tile << (2 * shift)] < cell_start[(tile + 1) << (2 * shift)]:

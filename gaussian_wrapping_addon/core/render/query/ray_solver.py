@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Transmittance along a ray past its contributors, and where it falls to 0.5.
+"""Solver of the 0.5-isosurface depth along a single ray.
 
-The contributors are three arrays, moved together: opacities before the cap of 0.99, z-depths of
-the peaks, sharpnesses 1 / sigma^2 along the ray. The crossing is solved by Newton steps on
+The contributors are three parallel arrays: opacities before the cap of 0.99, z-depths of the peaks,
+sharpnesses 1 / sigma^2 along the ray. The crossing is solved by Newton steps on
 ``log T`` inside a bracket (docs/method.md, section 2.4).
 """
 
@@ -16,33 +16,33 @@ from ... import tolerances
 from ...kernels.compiled import inline
 from ..simd.raster_math import ALPHA_MAX, HALF, ONE, TWO, WIDE_END, ZERO, exp_wide
 
-# Converged: a step so small beside the thinnest Gaussian's sigma along the ray that log T is its
-# Taylor series, to second order, to float32's precision ...
+# Converged: a step so small relative to the thinnest Gaussian's sigma along the ray that the
+# second-order Taylor series of log T is exact in float32 ...
 _STEP_SIGMAS = np.float32(5e-4)
-# ... or a transmittance equal to 0.5 within its own rounding ...
+# ... or a transmittance equal to 0.5 within its own rounding error ...
 _LEVEL_MARGIN = np.float32(1.2e-7)
-# ... or a bracket of one rounding of the depth. A step below that rounding alone proves nothing:
-# a layer may be steep there and yet end before the level is reached.
+# ... or a bracket as narrow as the rounding error of the depth. A step below that error is not
+# sufficient: a layer may be steep there and yet end before the level is reached.
 _BRACKET_SHARE = np.float32(1.25e-7)
-_LEAST_SHARE = np.float32(1.25e-7)
-"""Steps are at least this share of the depth, so that they can close the bracket."""
+_MIN_STEP_SHARE = np.float32(1.25e-7)
+"""Minimum step relative to the depth, so that steps can close the bracket."""
 _POLISH_SIGMAS = np.float32(3e-3)
-"""A last step is taken up to this length. A longer one would leave the place at which the slope is
-known, by which gradients at the stored depth are divided; where T is all but flat, its rounding
-would lead far astray."""
+"""Longest final step. A longer one would leave the depth at which the slope is known, by which
+gradients are divided; where T is nearly flat, its rounding error would make the step far too
+long."""
 _LEVEL_FAR, _FLAT = np.float32(0.05), np.float32(0.02)
-"""A layer thinner than a rounding of the depth: T jumps over 0.5 from where it is flat. Its
-gradient is lost; rather let it be too small than a thousand times too large."""
-_LEAST_SLOPE = np.float32(1e-12)
-"""Keeps a step finite; it leaves the bracket then."""
-# Halley's correction of a Newton step stays within these factors.
-_LEAST_BEND, _MOST_BEND = HALF, TWO
+"""For a layer thinner than the depth's rounding error, T jumps past 0.5 from a flat part and the
+gradient is lost: too small is better than a thousand times too large."""
+_MIN_SLOPE = np.float32(1e-12)
+"""Keeps a step finite; such a step leaves the bracket."""
+# Bounds of Halley's correction factor of a Newton step.
+_MIN_CORRECTION, _MAX_CORRECTION = HALF, TWO
 _NEWTON_STEPS = 8
-"""From here on every second step is a bisection, which bounds the number of steps."""
+"""After these, every second step is a bisection, which bounds the number of steps."""
 _MAX_STEPS = 80
 SLOPE_FLOOR = np.float32(tolerances.SLOPE_FLOOR)
-"""Floor of -d(log T)/dt in shares of the 1/sigma along the ray of the Gaussian at which the
-blending crosses 0.5 (docs/method.md, section 2.5)."""
+"""Floor of -d(log T)/dt relative to 1/sigma along the ray of the Gaussian at which the blending
+crosses 0.5 (docs/method.md, section 2.5)."""
 _THIRD, _FIFTH = np.float32(1.0 / 3.0), np.float32(0.2)
 # exp(-x / 2) is below 3e-7 beyond this x = sharpness d^2.
 NEGLIGIBLE = np.float32(30.0)
@@ -51,46 +51,46 @@ TINY = np.float32(1e-30)
 
 @inline
 def evaluate_ray(capped: Any, count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
-    """Return T and -d(log T)/dt at depth t; ``capped``: what is capped at 0.99 has no slope."""
+    """Return T and -d(log T)/dt at depth t; if ``capped``, densities above 0.99 have no slope."""
     product, slope = ONE, ZERO
     for c in range(count):
         ahead = max(peaks[c] - t, ZERO)
-        pull = sharpnesses[c] * ahead
-        raw = alphas[c] * exp_wide(HALF * pull * ahead)
+        log_slope = sharpnesses[c] * ahead
+        raw = alphas[c] * exp_wide(HALF * log_slope * ahead)
         density = min(raw, ALPHA_MAX)
         keep = ONE - density
         product *= keep
-        steep = density * pull / keep
+        rate = density * log_slope / keep
         if capped:
-            steep = steep if raw < ALPHA_MAX else ZERO
-        slope += steep
+            rate = rate if raw < ALPHA_MAX else ZERO
+        slope += rate
     return product, slope
 
 
 @inline
 def _log_twice(value: Any) -> Any:
-    """Return log(2 value), exactly near 0.5 and with the right sign and order elsewhere."""
+    """Return log(2 value), accurate near 0.5, with correct sign and monotonic elsewhere."""
     y = (TWO * value - ONE) / (TWO * value + ONE)
     square = y * y
     return TWO * y * (ONE + square * (_THIRD + square * _FIFTH))
 
 
 @inline
-def _bend(count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
-    """Return T, the slope -d(log T)/dt and its growth with t, at depth t."""
+def _log_derivatives(count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
+    """Return T, the slope -d(log T)/dt and the derivative of the slope, at depth t."""
     product, slope, growth = ONE, ZERO, ZERO
     for c in range(count):
         ahead = max(peaks[c] - t, ZERO)
         fall = HALF * sharpnesses[c] * ahead * ahead
         density = min(alphas[c] * exp_wide(fall), ALPHA_MAX)
-        # 0 where nothing changes with t; far behind, the square below could overflow.
+        # 0 where the density does not depend on t; far behind, the square below could overflow.
         sharpness = sharpnesses[c] if ahead > ZERO and fall <= WIDE_END else ZERO
-        pull = sharpness * ahead
+        log_slope = sharpness * ahead
         keep = ONE - density
         product *= keep
         odds = density / keep
-        slope += odds * pull
-        growth += odds * (pull * pull / keep - sharpness)
+        slope += odds * log_slope
+        growth += odds * (log_slope * log_slope / keep - sharpness)
     return product, slope, growth
 
 
@@ -102,16 +102,18 @@ def solve_ray(
     """Return where T crosses 0.5 between 0 and ``high``, and -d(log T)/dt there, floored."""
     t, low, found_slope = guess, ZERO, ZERO
     for number in range(_MAX_STEPS):
-        product, slope, growth = _bend(count, t, alphas, peaks, sharpnesses)
+        product, slope, growth = _log_derivatives(count, t, alphas, peaks, sharpnesses)
         excess = _log_twice(max(product, TINY))
         if excess > ZERO:
             low = t
         else:
             high = t
-        turns = ONE / max(slope, _LEAST_SLOPE)
-        newton = excess * turns
-        bend = min(max(ONE + HALF * newton * growth * turns, _LEAST_BEND), _MOST_BEND)
-        step = newton / bend
+        inverse_slope = ONE / max(slope, _MIN_SLOPE)
+        newton = excess * inverse_slope
+        correction = min(
+            max(ONE + HALF * newton * growth * inverse_slope, _MIN_CORRECTION), _MAX_CORRECTION
+        )
+        step = newton / correction
         size = abs(step)
         sigmas = size * sharpest
         found_slope = slope
@@ -126,7 +128,7 @@ def solve_ray(
             if abs(excess) > _LEVEL_FAR and slope < _FLAT * alone:
                 found_slope = TWO * alone
             break
-        least = _LEAST_SHARE * t
+        least = _MIN_STEP_SHARE * t
         moved = t + (step if size > least else (least if excess > ZERO else -least))
         newton_next = moved > low and moved < high
         newton_next = newton_next and (number < _NEWTON_STEPS or number % 2 == 0)

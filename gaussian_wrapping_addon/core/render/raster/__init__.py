@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blending of tiles, forward and backward: here a Gaussian becomes pixels.
+"""Rasterisation of tiles: alpha blending and isosurface depth, forward and backward.
 
-In: screen Gaussians and tile lists. Out: planes of colour, normals, alpha and depth; gradients.
+In: screen Gaussians and tile lists. Out: images of colour, normals, alpha and depth; gradients.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blending the tiles of a view, forward and backward: the raster kernels over threads."""
+"""Blend the tiles of a view, forward and backward: multithreaded raster kernels."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from ..projection.projection import RawArrays, ScreenGaussians
 from ..simd.raster_math import ROW_VALUES, TILE, aligned_zeros
 from ..tiling.tiles import TileLists
 from ..types.options import RenderOptions
-from .raster_backward import BACKWARD_SCRATCH, backward_kernel, sum_pairs
+from .contributors import CONTRIBUTORS_PADDING
+from .raster_backward import BACKWARD_SCRATCH, backward_kernel, sum_intersections
 from .raster_forward import FORWARD_SCRATCH, forward_kernel
-from .visits import VISITS_ROOM
 
 _MOST_BLOCKS = 32
-"""Blocks of a tile where they have eight pixels."""
+"""Blocks of a tile if a block has eight pixels."""
 
 
 def _take(pool: list[np.ndarray], count: int, make: Callable[[int], np.ndarray]) -> np.ndarray:
-    """Return an array of at least ``count`` values from a pool, or a new one with some to spare."""
+    """Return an array of at least ``count`` values from a pool, or a new, larger one."""
     try:
         kept = pool.pop()
     except IndexError:
@@ -36,51 +36,53 @@ def _take(pool: list[np.ndarray], count: int, make: Callable[[int], np.ndarray])
 
 @dataclass
 class RenderBuffers:
-    """Large scratch arrays kept from call to call.
+    """Pools of large scratch arrays, kept between calls.
 
-    Taken and given back with the atomic ``list.pop`` and ``list.append``, so renderings in several
-    threads never share one.
+    Taken and returned with the atomic ``list.pop`` and ``list.append``, so that concurrent
+    renderings never share one.
     """
 
     scratch: list[np.ndarray] = field(default_factory=list)
     lists: list[np.ndarray] = field(default_factory=list)
-    visits: list[np.ndarray] = field(default_factory=list)
-    pairs: list[np.ndarray] = field(default_factory=list)
+    contributors: list[np.ndarray] = field(default_factory=list)
+    intersections: list[np.ndarray] = field(default_factory=list)
     renderers: list[Any] = field(default_factory=list)
     """Idle :class:`~..view_renderer.ViewRenderer` with their memory."""
 
     def reserve(self, threads: int, longest: int, *, depth: bool) -> None:
-        """Have memory for every thread, so that it is not a matter of timing who allocates it.
+        """Allocate memory for every thread, so that allocation does not depend on timing.
 
-        ``longest`` is the number of pairs of the fullest tile; only the depth needs lists.
+        ``longest`` is the largest number of intersections of a tile; only depth needs lists.
         """
         spare = [
             (self.scratch, self.take_scratch()),
             (self.lists, self.take_lists(longest if depth else 0)),
-            (self.visits, self.take_visits(longest)),
+            (self.contributors, self.take_contributors(longest)),
         ]
         for pool, array in spare:
             pool.append(array)
             while len(pool) < threads:
-                pool.append(array.copy() if pool is self.visits else aligned_zeros(len(array)))
+                pool.append(
+                    array.copy() if pool is self.contributors else aligned_zeros(len(array))
+                )
 
     def take_scratch(self) -> np.ndarray:
-        """Return the state of one thread's tile, with any content."""
+        """Return the uninitialised state of one thread's tile."""
         return _take(self.scratch, max(FORWARD_SCRATCH, BACKWARD_SCRATCH), aligned_zeros)
 
     def take_lists(self, longest: int) -> np.ndarray:
-        """Return room for the list of a block of a tile of ``longest`` pairs, with any content."""
+        """Return an uninitialised depth list for a block of a tile of ``longest`` intersections."""
         return _take(self.lists, longest * LIST_VALUES * TILE, aligned_zeros)
 
-    def take_visits(self, longest: int) -> np.ndarray:
-        """Return room for the pairs that reach each block of such a tile, with any content."""
-        count = _MOST_BLOCKS * (longest + VISITS_ROOM)
-        return _take(self.visits, count, lambda size: np.zeros(size, np.int32))
+    def take_contributors(self, longest: int) -> np.ndarray:
+        """Return uninitialised contributor lists for all blocks of such a tile."""
+        count = _MOST_BLOCKS * (longest + CONTRIBUTORS_PADDING)
+        return _take(self.contributors, count, lambda size: np.zeros(size, np.int32))
 
-    def take_pairs(self, count: int) -> np.ndarray:
-        """Return at least ``count`` rows of pair gradients with any content."""
+    def take_intersections(self, count: int) -> np.ndarray:
+        """Return at least ``count`` uninitialised rows of intersection gradients."""
         try:
-            kept = self.pairs.pop()
+            kept = self.intersections.pop()
         except IndexError:
             kept = np.zeros((0, ROW_VALUES), np.float32)
         if len(kept) >= count:
@@ -90,7 +92,7 @@ class RenderBuffers:
 
 @dataclass(frozen=True)
 class ScreenView:
-    """One view, or a part of its tiles, between projection and gradient."""
+    """One view, or a band of its tiles: state between projection and backward pass."""
 
     gaussians: RawArrays
     camera: Camera
@@ -98,22 +100,22 @@ class ScreenView:
     screen: ScreenGaussians
     lists: TileLists
     lanes: int
-    masks: np.ndarray  # (pairs,) uint32: blocks of the tile that the ellipse reaches
+    masks: np.ndarray  # (intersections,) uint32: blocks of the tile that the ellipse reaches
     bounds: np.ndarray  # tiles of about equal cost
     threads: int
 
     def arguments(self) -> tuple[np.ndarray | int, ...]:
-        """Return what the raster kernels read of a view, in their order."""
+        """Return the view's arguments of the raster kernels, in order."""
         lists, camera = self.lists, self.camera
         return (
-            self.screen.params, lists.start, lists.gaussian_ids, lists.pair_slots, self.masks,
-            lists.tiles_x, camera.width, camera.height,
+            self.screen.params, lists.start, lists.gaussian_ids, lists.intersection_slots,
+            self.masks, lists.tiles_x, camera.width, camera.height,
         )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Images:
-    """What the forward kernel writes, image layout, float32."""
+    """Images that the forward kernel writes, float32."""
 
     color: np.ndarray  # (h, w, 3)
     normal: np.ndarray  # (h, w, 3)
@@ -130,10 +132,10 @@ class Images:
         options: RenderOptions,
         take: Callable[[str, tuple[int, ...], Any], np.ndarray] | None = None,
     ) -> Images:
-        """Return images of the camera's size, all 0.
+        """Return zero images of the camera's size.
 
-        With ``take(name, shape, dtype)`` they lie in the memory it returns, with any content where
-        :func:`blend` writes every pixel.
+        With ``take(name, shape, dtype)`` they use the memory it returns; images of which
+        :func:`blend` writes every pixel are not cleared then.
         """
         if take is None:
 
@@ -157,7 +159,7 @@ class Images:
         return images
 
     def arguments(self) -> tuple[np.ndarray, ...]:
-        """Return the images that the gradient reads too, in the raster kernels' order."""
+        """Return the images that both passes use, in the order of the raster kernels."""
         return self.color, self.normal, self.geometric, self.alpha, self.depth, self.slope
 
 
@@ -165,24 +167,25 @@ def blend(
     view: ScreenView,
     images: Images,
     buffers: RenderBuffers,
-    pair_weights: np.ndarray | None = None,
+    intersection_weights: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Blend the tiles of a view into ``images`` and solve their isosurface depth.
+    """Blend the tiles of a view into ``images`` and solve the isosurface depth.
 
     Parameters
     ----------
-    pair_weights : (pairs, 2) float32, optional
-        Where the weights are written; by default a new array.
+    intersection_weights : (intersections, 2) float32, optional
+        Receives the weights; by default a new array.
 
     Returns
     -------
-    (pairs, 2) float32
-        Sum and maximum of the blending weight of each pair, by slot; (0, 2) without statistics.
+    (intersections, 2) float32
+        Sum and maximum of the blending weight of each intersection, by slot; (0, 2) without
+        statistics.
     """
     options, lists = view.options, view.lists
     depth, weights = options.depth, options.statistics
-    if pair_weights is None:
-        pair_weights = np.zeros((len(lists.gaussian_ids) if weights else 0, 2), np.float32)
+    if intersection_weights is None:
+        intersection_weights = np.zeros((len(lists.gaussian_ids) if weights else 0, 2), np.float32)
     forward = forward_kernel(view.lanes, depth, weights)
     background = np.asarray(options.background, np.float32)
     limit = np.float32(options.depth_valid_transmittance)
@@ -192,7 +195,7 @@ def blend(
     def run(first: int, end: int) -> None:
         scratch = buffers.take_scratch()
         entries = buffers.take_lists(longest if depth else 0)
-        visits = buffers.take_visits(longest)
+        contributors = buffers.take_contributors(longest)
         forward(
             first,
             end,
@@ -201,33 +204,33 @@ def blend(
             limit,
             scratch,
             entries,
-            visits,
+            contributors,
             *images.arguments(),
-            pair_weights,
+            intersection_weights,
             images.strongest,
         )
         buffers.scratch.append(scratch)
         buffers.lists.append(entries)
-        buffers.visits.append(visits)
+        buffers.contributors.append(contributors)
 
     run_chunks(run, view.bounds, view.threads)
-    return pair_weights
+    return intersection_weights
 
 
-def pair_gradients(
+def write_intersection_gradients(
     view: ScreenView,
     images: Images,
     grads: list[np.ndarray],
     buffers: RenderBuffers,
-    pairs: np.ndarray,
+    intersections: np.ndarray,
     *,
     depth: bool,
     absolute: bool,
 ) -> None:
-    """Write the gradients of all pairs of a view's tiles at their slots of ``pairs (p, 24)``.
+    """Write the gradients of a view's tile intersections to their slots.
 
-    ``depth`` tells that the gradient of the depth is not all 0, ``absolute`` that the sums of
-    absolute values are wanted.
+    ``intersections (p, 24)`` receives them. Set ``depth`` if the gradient of the depth is not all
+    0, ``absolute`` to include the sums of absolute values.
     """
     backward = backward_kernel(view.lanes, view.options.depth and depth, absolute)
 
@@ -240,7 +243,7 @@ def pair_gradients(
             *images.arguments(),
             *grads,
             scratch,
-            pairs,
+            intersections,
         )
         buffers.scratch.append(scratch)
 
@@ -255,18 +258,22 @@ def blend_backward(
     *,
     absolute: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the gradient on params (n, 24), and its length on (u, v) plain and absolute (n,)."""
+    """Return the gradient on params (n, 24), and its signed and absolute norms on (u, v), (n,)."""
     lists, count = view.lists, len(view.screen)
-    pairs = buffers.take_pairs(len(lists.gaussian_ids))
+    intersections = buffers.take_intersections(len(lists.gaussian_ids))
     depth = bool(grads[4].any())
-    pair_gradients(view, images, grads, buffers, pairs, depth=depth, absolute=absolute)
+    write_intersection_gradients(
+        view, images, grads, buffers, intersections, depth=depth, absolute=absolute
+    )
     grad_params = np.zeros((count, ROW_VALUES), np.float32)
     grad_px = np.zeros(count, np.float32)
     grad_abs_px = np.zeros(count, np.float32)
 
     def combine(first: int, end: int) -> None:
-        sum_pairs(first, end, pairs, lists.pair_offsets, grad_params, grad_px, grad_abs_px)
+        sum_intersections(
+            first, end, intersections, lists.intersection_offsets, grad_params, grad_px, grad_abs_px
+        )
 
     run_chunks(combine, even_bounds(count, view.threads), view.threads)
-    buffers.pairs.append(pairs)
+    buffers.intersections.append(intersections)
     return grad_params, grad_px, grad_abs_px

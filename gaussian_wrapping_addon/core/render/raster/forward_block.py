@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vector code that blends all Gaussians of a block of pixels, with the block's state in registers.
+"""Vector code of the forward pass: blends all Gaussians of a block of pixels in registers.
 
-For the depth, each Gaussian that can matter leaves an entry in the block's list: one that any pixel
-meets before its transmittance has crossed 0.5, or whose front reaches back before the deepest peak
-in front of that crossing.
+For the depth, each Gaussian that can affect it is appended to the block's list: those met before
+the transmittance of some pixel has crossed 0.5, and those whose density reaches back in front of
+the deepest peak before that crossing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..isosurface.isosurface_steps import (
     LIST_VALUES,
     NEGLIGIBLE,
     Crossing,
-    entry_place,
+    entry_index,
     start_solver,
 )
 from ..simd import raster_math as constants
@@ -35,78 +35,83 @@ from ..simd.raster_math import (
     TRANSMITTANCE_MIN,
 )
 from ..simd.simd import Block, Mask, State, Vector
-from ..simd.simd_math import Sight, first_pixel, peak_depth, see
+from ..simd.simd_math import RayEvaluation, evaluate_rays, first_pixel, peak_depth
 
 _COLOR_COLUMN, _SHARPNESS_COLUMN = 13, 12
 
 
 class _DepthRecord:
-    """What blending keeps for the depth: the list of entries and where 0.5 was crossed."""
+    """State that blending keeps for the depth solver: the list of entries and the 0.5 crossing."""
 
     def __init__(self, block: Block, lists: Any) -> None:
         self.block, self.lists = block, lists
         self.count = cgutils.alloca_once_value(block.builder, block.index(0))
         self.high, self.sharpest = State(block, 0.0), State(block, 0.0)
-        # Transmittance before, then the entry, of the Gaussian at the crossing.
+        # Of the Gaussian at the crossing: the transmittance in front of it, then its entry.
         self.crossing = [State(block, 0.0) for _ in range(1 + LIST_VALUES)]
 
-    def sharpen(self, sight: Sight, contributes: Mask) -> Vector:
-        """Note and return a Gaussian's sharpness along the rays."""
-        sharpness = sight.den * sight.row[_SHARPNESS_COLUMN]
+    def sharpen(self, rays: RayEvaluation, contributes: Mask) -> Vector:
+        """Return a Gaussian's sharpness along the rays; update the maximum."""
+        sharpness = rays.den * rays.row[_SHARPNESS_COLUMN]
         known = self.sharpest.get()
-        self.sharpest.set((contributes & (sharpness > known)).choose(sharpness, known))
+        self.sharpest.set((contributes & (sharpness > known)).select(sharpness, known))
         return sharpness
 
-    def add_before(self, sight: Sight, contributes: Mask, before: Vector, after: Vector) -> None:
-        """Note a Gaussian while some pixel has not crossed 0.5."""
-        peak, sharpness = peak_depth(sight), self.sharpen(sight, contributes)
+    def add_before(
+        self, rays: RayEvaluation, contributes: Mask, before: Vector, after: Vector
+    ) -> None:
+        """Record a Gaussian while some pixel has not crossed 0.5."""
+        peak, sharpness = peak_depth(rays), self.sharpen(rays, contributes)
         above = before > constants.ISO_LEVEL
         high = self.high.get()
-        self.high.set((contributes & above & (peak > high)).choose(peak, high))
-        values = contributes.choose(sight.raw, 0.0), peak, sharpness
+        self.high.set((contributes & above & (peak > high)).select(peak, high))
+        values = contributes.select(rays.raw, 0.0), peak, sharpness
         crosses = above & (after <= constants.ISO_LEVEL)
         for kept, value in zip(self.crossing, (before, *values), strict=True):
-            kept.set(crosses.choose(value, kept.get()))
+            kept.set(crosses.select(value, kept.get()))
         self._append(values, contributes)
 
-    def add_behind(self, sight: Sight, contributes: Mask) -> None:
-        """Note a Gaussian behind all crossings, if its front reaches back to the brackets."""
-        peak, sharpness = peak_depth(sight), self.sharpen(sight, contributes)
+    def add_behind(self, rays: RayEvaluation, contributes: Mask) -> None:
+        """Record a Gaussian behind all crossings if its density reaches back to the brackets."""
+        peak, sharpness = peak_depth(rays), self.sharpen(rays, contributes)
         behind = (peak - self.high.get()).max(0.0)
         matters = contributes & (sharpness * behind * behind < NEGLIGIBLE)
-        self._append((contributes.choose(sight.raw, 0.0), peak, sharpness), matters)
+        self._append((contributes.select(rays.raw, 0.0), peak, sharpness), matters)
 
     def _append(self, values: tuple[Vector, ...], matters: Mask) -> None:
         block, builder = self.block, self.block.builder
         count = builder.load(self.count)
-        place = entry_place(block, count)
+        base = entry_index(block, count)
         for column, value in enumerate(values):
-            block.store(value, self.lists, block.offset(place, column * block.lanes))
+            block.store(value, self.lists, block.offset(base, column * block.lanes))
         builder.store(builder.add(count, builder.zext(matters.any(), count.type)), self.count)
 
 
 @dataclass(frozen=True)
 class _Weights:
-    """Where blending gathers weights: per pair, and the strongest Gaussian of each pixel."""
+    """Blending weights per intersection, and the strongest Gaussian of each pixel."""
 
-    pair_weights: Any
-    pair_slots: Any
+    intersection_weights: Any
+    intersection_slots: Any
     begin: Any
     best: State
     best_at: State
 
-    def add(self, block: Block, weight: Vector, pair: Any) -> None:
-        """Note the weights of one pair in one block."""
+    def add(self, block: Block, weight: Vector, intersection: Any) -> None:
+        """Add the weights of one intersection in one block."""
         builder = block.builder
         best = self.best.get()
         stronger = weight > best
-        self.best.set(stronger.choose(weight, best))
-        number = builder.sitofp(builder.sub(pair, self.begin), ir.FloatType())
-        self.best_at.set(stronger.choose(block.splat(number), self.best_at.get()))
+        self.best.set(stronger.select(weight, best))
+        number = builder.sitofp(builder.sub(intersection, self.begin), ir.FloatType())
+        self.best_at.set(stronger.select(block.splat(number), self.best_at.get()))
         slot = builder.sext(
-            builder.load(builder.gep(self.pair_slots, [pair], inbounds=True)), pair.type
+            builder.load(builder.gep(self.intersection_slots, [intersection], inbounds=True)),
+            intersection.type,
         )
-        total = builder.gep(self.pair_weights, [builder.mul(slot, block.index(2))], inbounds=True)
+        total = builder.gep(
+            self.intersection_weights, [builder.mul(slot, block.index(2))], inbounds=True
+        )
         largest = builder.gep(total, [block.index(1)], inbounds=True)
         builder.store(builder.fadd(builder.load(total), weight.total()), total)
         now, before = weight.largest(), builder.load(largest)
@@ -117,16 +122,16 @@ class _Weights:
 def _blend_intrinsic(lanes: int, depth: bool, weights: bool) -> Any:
     @intrinsic
     def blend(  # type: ignore[no-untyped-def]
-        typingctx, m, number, params, gaussian_ids, pair_slots, visits, first, count, begin, x, y,
-        lists, fronts, limit, pair_weights,
+        typingctx, m, number, params, gaussian_ids, intersection_slots, contributors, first, count,
+        begin, x, y, lists, nearest_depths, limit, intersection_weights,
     ):  # fmt: skip
         def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
             block = Block(lanes, context, builder)
-            m_data, params_data, ids, slots, list_of_visits, entries, front_data, sums = (
-                block.data(sig.args[place], args[place]) for place in (0, 2, 3, 4, 5, 11, 12, 14)
+            m_data, params_data, ids, slots, contributor_list, entries, nearest_data, sums = (
+                block.data(sig.args[k], args[k]) for k in (0, 2, 3, 4, 5, 11, 12, 14)
             )
             number_, first_, count_, begin_, x_, y_, limit_ = (
-                args[place] for place in (1, 6, 7, 8, 9, 10, 13)
+                args[k] for k in (1, 6, 7, 8, 9, 10, 13)
             )
             left, top = first_pixel(block, number_, x_, y_)
             planes = builder.mul(number_, block.index(lanes), flags=("nuw", "nsw"))
@@ -134,11 +139,11 @@ def _blend_intrinsic(lanes: int, depth: bool, weights: bool) -> Any:
             def plane(which: int) -> Any:
                 return block.offset(planes, which * STRIDE)
 
-            def pair_of(n: Any) -> Any:
-                place = builder.gep(list_of_visits, [builder.add(first_, n)], inbounds=True)
-                return builder.sext(builder.load(place), first_.type)
+            def contributor_at(n: Any) -> Any:
+                pointer = builder.gep(contributor_list, [builder.add(first_, n)], inbounds=True)
+                return builder.sext(builder.load(pointer), first_.type)
 
-            light = State(block, block.load(m_data, plane(TRANSMITTANCE)))
+            transmittance = State(block, block.load(m_data, plane(TRANSMITTANCE)))
             features = [State(block, 0.0) for _ in range(FEATURES)]
             gathered = (
                 _Weights(sums, slots, begin_, State(block, 0.0), State(block, 0.0))
@@ -146,56 +151,58 @@ def _blend_intrinsic(lanes: int, depth: bool, weights: bool) -> Any:
                 else None
             )
 
-            def visit(n: Any) -> tuple[Sight, Mask, Vector, Vector]:
-                """Blend one Gaussian; return also the light before and behind it."""
-                pair = pair_of(n)
-                which = builder.load(builder.gep(ids, [pair], inbounds=True))
-                sight = see(block, params_data, builder.sext(which, pair.type), left, top)
-                before = light.get()
-                contributes = (sight.alpha >= float(ALPHA_MIN)) & (
+            def blend_one(n: Any) -> tuple[RayEvaluation, Mask, Vector, Vector]:
+                """Blend one Gaussian; return also the transmittance before and behind it."""
+                intersection = contributor_at(n)
+                which = builder.load(builder.gep(ids, [intersection], inbounds=True))
+                rays = evaluate_rays(
+                    block, params_data, builder.sext(which, intersection.type), left, top
+                )
+                before = transmittance.get()
+                contributes = (rays.alpha >= float(ALPHA_MIN)) & (
                     before >= float(TRANSMITTANCE_MIN)
                 )
-                weight = contributes.choose(sight.alpha.times(before), 0.0)
+                weight = contributes.select(rays.alpha.times(before), 0.0)
                 after = before - weight
-                light.set(after)
+                transmittance.set(after)
                 for feature, state in enumerate(features):
-                    state.set(state.get() + weight * sight.row[_COLOR_COLUMN + feature])
+                    state.set(state.get() + weight * rays.row[_COLOR_COLUMN + feature])
                 if gathered is not None:
-                    gathered.add(block, weight, pair)
-                return sight, contributes, before, after
+                    gathered.add(block, weight, intersection)
+                return rays, contributes, before, after
 
             always = ir.Constant(ir.IntType(1), 1)
-            place = cgutils.alloca_once_value(builder, block.index(0))
+            cursor = cgutils.alloca_once_value(builder, block.index(0))
             record = _DepthRecord(block, entries) if depth else None
             if record is not None:
 
                 def cross(n: Any) -> Any:
-                    sight, contributes, before, after = visit(n)
-                    record.add_before(sight, contributes, before, after)
+                    rays, contributes, before, after = blend_one(n)
+                    record.add_before(rays, contributes, before, after)
                     return (after > constants.ISO_LEVEL).any()
 
                 def trail(n: Any) -> Any:
-                    sight, contributes, _, _ = visit(n)
-                    record.add_behind(sight, contributes)
+                    rays, contributes, _, _ = blend_one(n)
+                    record.add_behind(rays, contributes)
                     return always
 
-                block.walk(place, count_, cross, lambda n: always)
-                # No front of the pairs that come reaches back to the last bracket: record no more.
+                block.walk(cursor, count_, cross, lambda n: always)
+                # Stop recording once no later intersection reaches back to the last bracket.
                 deepest = record.high.get().largest()
 
                 def reaches_back(n: Any) -> Any:
-                    offset = builder.sub(pair_of(n), begin_)
-                    front = builder.load(builder.gep(front_data, [offset], inbounds=True))
+                    offset = builder.sub(contributor_at(n), begin_)
+                    front = builder.load(builder.gep(nearest_data, [offset], inbounds=True))
                     return builder.fcmp_ordered("<", front, deepest)
 
-                block.walk(place, count_, trail, reaches_back)
+                block.walk(cursor, count_, trail, reaches_back)
 
             def finish(n: Any) -> Any:
-                _, _, _, after = visit(n)
+                _, _, _, after = blend_one(n)
                 return (after >= float(TRANSMITTANCE_MIN)).any()
 
-            block.walk(place, count_, finish, lambda n: always)
-            block.store(light.get(), m_data, plane(TRANSMITTANCE))
+            block.walk(cursor, count_, finish, lambda n: always)
+            block.store(transmittance.get(), m_data, plane(TRANSMITTANCE))
             for feature, state in enumerate(features):
                 block.store(state.get(), m_data, plane(F0 + feature))
             if gathered is not None:
@@ -204,28 +211,30 @@ def _blend_intrinsic(lanes: int, depth: bool, weights: bool) -> Any:
             if record is None:
                 return block.index(0)
             before, alpha, peak, sharpness = (kept.get() for kept in record.crossing)
-            crossing = Crossing(before, alpha, peak, sharpness, light.get(), record.high.get())
-            nearest = builder.load(front_data)
+            crossing = Crossing(
+                before, alpha, peak, sharpness, transmittance.get(), record.high.get()
+            )
+            nearest = builder.load(nearest_data)
             opened = start_solver(block, m_data, crossing, record.sharpest.get(), nearest, limit_)
-            # Nobody open, nothing to solve: no entries.
-            nobody = builder.icmp_unsigned("==", opened, block.index(0))
-            return builder.select(nobody, block.index(0), builder.load(record.count))
+            # Without a pixel to solve there are no entries.
+            none_open = builder.icmp_unsigned("==", opened, block.index(0))
+            return builder.select(none_open, block.index(0), builder.load(record.count))
 
         index, single = types.intp, types.float32
         signature = types.intp(
-            m, index, params, gaussian_ids, pair_slots, visits, index, index, index, single, single,
-            lists, fronts, single, pair_weights,
+            m, index, params, gaussian_ids, intersection_slots, contributors, index, index,
+            index, single, single, lists, nearest_depths, single, intersection_weights,
         )  # fmt: skip
         return signature, generate
 
     return blend
 
 
-_plain_16 = _blend_intrinsic(16, False, False)
+_base_16 = _blend_intrinsic(16, False, False)
 _depth_16 = _blend_intrinsic(16, True, False)
 _weights_16 = _blend_intrinsic(16, False, True)
 _both_16 = _blend_intrinsic(16, True, True)
-_plain_8 = _blend_intrinsic(8, False, False)
+_base_8 = _blend_intrinsic(8, False, False)
 _depth_8 = _blend_intrinsic(8, True, False)
 _weights_8 = _blend_intrinsic(8, False, True)
 _both_8 = _blend_intrinsic(8, True, True)
@@ -234,27 +243,27 @@ _both_8 = _blend_intrinsic(8, True, True)
 @inline
 def blend_block(
     lanes: Any, depth: Any, weights: Any, m: Any, block: Any, params: Any, ids: Any, slots: Any,
-    visits: Any, first: Any, count: Any, begin: Any, x: Any, y: Any, lists: Any, fronts: Any,
-    limit: Any, pair_weights: Any,
+    contributors: Any, first: Any, count: Any, begin: Any, x: Any, y: Any, lists: Any,
+    nearest_depths: Any, limit: Any, intersection_weights: Any,
 ) -> Any:  # fmt: skip
-    """Blend the pairs ``visits[first .. first + count]`` into a block; return its list's length.
+    """Blend ``contributors[first .. first + count]`` into a block; return its list's length.
 
     Parameters
     ----------
     lanes : int
     depth, weights : bool
-        Write the list and begin to solve it; gather blending weights.
+        Write the list and initialise the solver; collect blending weights.
     m : (n,) float32
         The tile's scratch.
     block : int
     begin : int
-        First pair of the tile; places of the strongest Gaussians count from it.
+        First intersection of the tile; indices of the strongest Gaussians are relative to it.
     x, y : float32
         Centre of the tile's first pixel, pixels.
     lists : (n,) float32
         Receives the entries.
-    fronts : (n,) float32
-        For each pair of the tile, the nearest z-depth that it or a later one reaches back to.
+    nearest_depths : (n,) float32
+        For each intersection of the tile, the nearest z-depth that it or a later one reaches.
     limit : float32
         Largest final transmittance of a pixel that has a depth.
     """
@@ -262,38 +271,38 @@ def blend_block(
         if depth:
             if weights:
                 return _both_16(
-                    m, block, params, ids, slots, visits, first, count, begin, x, y, lists, fronts,
-                    limit, pair_weights,
+                    m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
+                    nearest_depths, limit, intersection_weights,
                 )  # fmt: skip
             return _depth_16(
-                m, block, params, ids, slots, visits, first, count, begin, x, y, lists, fronts,
-                limit, pair_weights,
+                m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
+                nearest_depths, limit, intersection_weights,
             )  # fmt: skip
         if weights:
             return _weights_16(
-                m, block, params, ids, slots, visits, first, count, begin, x, y, lists, fronts,
-                limit, pair_weights,
+                m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
+                nearest_depths, limit, intersection_weights,
             )  # fmt: skip
-        return _plain_16(
-            m, block, params, ids, slots, visits, first, count, begin, x, y, lists, fronts,
-            limit, pair_weights,
+        return _base_16(
+            m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
+            nearest_depths, limit, intersection_weights,
         )  # fmt: skip
     if depth:
         if weights:
             return _both_8(
-                m, block, params, ids, slots, visits, first, count, begin, x, y, lists, fronts,
-                limit, pair_weights,
+                m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
+                nearest_depths, limit, intersection_weights,
             )  # fmt: skip
         return _depth_8(
-            m, block, params, ids, slots, visits, first, count, begin, x, y, lists, fronts,
-            limit, pair_weights,
+            m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
+            nearest_depths, limit, intersection_weights,
         )  # fmt: skip
     if weights:
         return _weights_8(
-            m, block, params, ids, slots, visits, first, count, begin, x, y, lists, fronts,
-            limit, pair_weights,
+            m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
+            nearest_depths, limit, intersection_weights,
         )  # fmt: skip
-    return _plain_8(
-        m, block, params, ids, slots, visits, first, count, begin, x, y, lists, fronts,
-        limit, pair_weights,
+    return _base_8(
+        m, block, params, ids, slots, contributors, first, count, begin, x, y, lists,
+        nearest_depths, limit, intersection_weights,
     )  # fmt: skip

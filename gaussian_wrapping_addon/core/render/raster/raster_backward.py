@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled gradient of the blending and of the isosurface depth, front to back.
+"""Compiled backward pass of blending and isosurface depth, front to back.
 
 One scalar per pixel replaces the list of contributors: with ``q_i`` the loss gradient along
 Gaussian i's features, ``remaining = sum_{j > i} w_j q_j + ...`` starts from the images and is
-used up on the way. The depth's gradient is that of the implicit function: each
-contributor adds ``g / a dlog(1 - G_i(t))`` (docs/method.md, section 2.5). Per Gaussian and tile
-only moments of the gradient on ``num``, ``den`` and ``1 + p.d`` are summed over pixels; the
-gradient on the row of params follows from them. Each pair writes its own slot, so the sum per
-Gaussian has a fixed order. Blocks are visited as in the forward pass, a chunk of pairs at a time.
+reduced on the way. The depth's gradient is that of the implicit function: each contributor adds
+``g / a dlog(1 - G_i(t))`` (docs/method.md, section 2.5). Per Gaussian and tile only moments of the
+gradient on ``num``, ``den`` and ``1 + p.d`` are summed over pixels; the gradient on the row of
+params follows from them. Each intersection writes its own slot, so the sum per Gaussian has a fixed
+order. Blocks are processed as in the forward pass, a chunk of intersections at a time.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ from ..simd.vector_runs import prefetch_row
 from .backward_block import (
     ALONG,
     BACKWARD_PLANES,
+    BASE_SUMS,
     DEN,
     DEPTH_SUMS,
     DISTANCE,
     FEATURE,
     LIN,
     NUM,
-    PLAIN_SUMS,
     TRANSMITTANCE,
-    gradient_of_pair,
+    sum_intersection_gradient,
 )
+from .contributors import active_blocks
 from .tile_io import read_row
-from .visits import lit_blocks
 
 ABS_U, ABS_V = 22, 23
-"""Columns of the pair gradients that hold sums of absolute values, not gradients of params."""
+"""Columns of the intersection gradients with sums of absolute values instead of gradients."""
 
 _SUMS = BACKWARD_PLANES * STRIDE
 BACKWARD_SCRATCH = _SUMS + 2 * TILE
 
 
 @inline
-def _write_pair(
+def _write_intersection(
     depth: Any, absolute: Any, m: Any, s: Any, params: Any, i: Any, out: Any, slot: Any
 ) -> None:  # fmt: skip
-    """Turn a pair's totals at ``m[s]`` into the gradient on its row of params."""
+    """Turn an intersection's totals at ``m[s]`` into the gradient on its row of params."""
     qa, qb, qc = params[i, 2], params[i, 3], params[i, 4]
     px, py, qr, qs, qt = params[i, 5], params[i, 6], params[i, 7], params[i, 8], params[i, 9]
     den, den_x, den_y = m[s + DEN], m[s + DEN + 1], m[s + DEN + 2]
@@ -82,7 +82,7 @@ def _write_pair(
     out[slot, 12] = along
     for feature in range(FEATURES):
         out[slot, 13 + feature] = m[s + FEATURE + feature]
-    first = DEPTH_SUMS if depth else PLAIN_SUMS
+    first = DEPTH_SUMS if depth else BASE_SUMS
     out[slot, ABS_U] = m[s + first] if absolute else ZERO
     out[slot, ABS_V] = m[s + first + 1] if absolute else ZERO
 
@@ -96,7 +96,7 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
     lanes : int
         8 or 16.
     depth : bool
-        Also the gradient of the depth image.
+        Include the gradient of the depth image.
     absolute : bool
         Also sum the absolute gradients on (u, v) per pixel (AbsGS).
     """
@@ -109,7 +109,7 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
         params: np.ndarray,
         start: np.ndarray,
         gaussian_ids: np.ndarray,
-        pair_slots: np.ndarray,
+        intersection_slots: np.ndarray,
         masks: np.ndarray,
         tiles_x: int,
         width: int,
@@ -126,9 +126,9 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
         g_alpha: np.ndarray,
         g_depth: np.ndarray,
         m: np.ndarray,
-        pairs: np.ndarray,
+        intersections: np.ndarray,
     ) -> None:
-        """Write the gradients of all pairs of the tiles at their slots of ``pairs (p, 24)``."""
+        """Write the gradients of the tiles' intersections to their slots, (p, 24)."""
         images = (color, normal, geometric, alpha_image, depth_image, slope_image)
         grads = (g_color, g_normal, g_geometric, g_alpha, g_depth)
         for tile in range(first_tile, end_tile):
@@ -143,51 +143,51 @@ def backward_kernel(lanes: int, depth: bool, absolute: bool) -> Any:
             live_rows = min(height - tile_y, TILE)
             live_columns = min(width - tile_x, TILE)
             for row in range(TILE):
-                place = (
+                offset = (
                     row // block_height * BLOCK_COLUMNS * lanes + row % block_height * BLOCK_WIDTH
                 )
                 inside = live_columns if row < live_rows else 0
                 at = (tile_y + row) * width + tile_x
-                read_row(lanes, depth, m, place, inside, images, grads, at)
+                read_row(lanes, depth, m, offset, inside, images, grads, at)
             live = np.uint64(0)
             for k in range(begin, begin + count):
                 if (k - begin) % LIVENESS_EVERY == 0:
-                    live = lit_blocks(lanes, m, TRANSMITTANCE * STRIDE)
+                    live = active_blocks(lanes, m, TRANSMITTANCE * STRIDE)
                 ahead: Any = min(k + PREFETCH_AHEAD, begin + count - 1)
                 prefetch_row(params, np.int64(gaussian_ids[ahead]))
-                prefetch_row(pairs, np.int64(pair_slots[ahead]))
+                prefetch_row(intersections, np.int64(intersection_slots[ahead]))
                 i = np.int64(gaussian_ids[k])
-                slot = np.int64(pair_slots[k])
+                slot = np.int64(intersection_slots[k])
                 bits = np.uint64(masks[k]) & live
-                gradient_of_pair(
+                sum_intersection_gradient(
                     lanes, depth, absolute, m, bits, params, i, origin_x, origin_y, _SUMS
                 )
-                _write_pair(depth, absolute, m, _SUMS, params, i, pairs, slot)
+                _write_intersection(depth, absolute, m, _SUMS, params, i, intersections, slot)
 
     return backward_range
 
 
 @kernel(fast=False)
-def sum_pairs(
+def sum_intersections(
     first: int,
     end: int,
-    pairs: np.ndarray,
-    pair_offsets: np.ndarray,
+    intersections: np.ndarray,
+    intersection_offsets: np.ndarray,
     grad_params: np.ndarray,
     grad_px: np.ndarray,
     grad_abs_px: np.ndarray,
 ) -> None:
-    """Sum the pair gradients of the Gaussians ``first .. end`` into ``grad_params (n, 24)``.
+    """Sum the intersection gradients of the Gaussians ``first .. end`` into ``grad_params``.
 
-    Columns 22 and 23 become 0; ``grad_px (n,)`` and ``grad_abs_px (n,)`` receive the lengths of
-    the gradient on (u, v) and of its sum of absolute values.
+    Columns 22 and 23 of ``grad_params (n, 24)`` become 0; ``grad_px (n,)`` and ``grad_abs_px (n,)``
+    receive the norms of the gradient on (u, v) and of its sum of absolute values.
     """
     total = np.zeros(ROW_VALUES, np.float32)
     for i in range(first, end):
         total[:] = ZERO
-        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
+        for slot in range(intersection_offsets[i], intersection_offsets[i + 1]):
             for column in range(ROW_VALUES):
-                total[column] += pairs[slot, column]
+                total[column] += intersections[slot, column]
         grad_px[i] = math.sqrt(total[0] * total[0] + total[1] * total[1])
         grad_abs_px[i] = math.sqrt(total[ABS_U] * total[ABS_U] + total[ABS_V] * total[ABS_V])
         total[ABS_U] = ZERO

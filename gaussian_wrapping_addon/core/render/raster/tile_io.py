@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rows of a tile between its planes, ordered by blocks, and the images, ordered by pixels.
+"""Copy rows of a tile between its planes, ordered by blocks, and the images, ordered by pixels.
 
-A row of a tile is 16 pixels: in a plane four runs of four values, one a block; in an image of three
-channels 48 values, interleaved. Both are moved as vectors and reordered in registers. Rows that the
-image's edge cuts take the same path with masked loads and stores, so that their values are the
-same; masks are kept from whole rows because some processors are slow at them.
+A row of a tile is 16 pixels: in a plane four runs of four values, one per block; in an image of
+three channels 48 interleaved values. Both are moved as vectors and reordered in registers. Rows
+that the image's edge cuts take the same path with masked loads and stores, so that their values are
+the same; whole rows use no masks because these are slow on some processors.
 """
 
 from __future__ import annotations
@@ -35,32 +35,32 @@ _WORD = ir.IntType(32)
 
 
 class _Rows:
-    """Moves rows of one tile; ``live`` is the number of columns in the image, None for all."""
+    """Copies rows of one tile; ``live`` is the number of columns in the image, None for all."""
 
     def __init__(
-        self, lanes: int, context: Any, builder: Any, place: Any, at: Any, live: Any | None
+        self, lanes: int, context: Any, builder: Any, offset: Any, at: Any, live: Any | None
     ) -> None:
         self.lanes, self.builder = lanes, builder
         self.block, self.quad = Block(TILE, context, builder), Block(BLOCK_WIDTH, context, builder)
-        self.place, self.at = place, at
+        self.offset, self.at = offset, at
         self._live = None if live is None else builder.trunc(live, _WORD)
 
     def plane(self, m: Any, which: int) -> Vector:
         """Return the row of one plane."""
-        a, b, c, d = (self.quad.load(m, place).value for place in self._places(which))
+        a, b, c, d = (self.quad.load(m, offset).value for offset in self._offsets(which))
         left, right = self._shuffle(a, b, range(8)), self._shuffle(c, d, range(8))
         return Vector(self.block, self._shuffle(left, right, range(TILE)))
 
     def set_plane(self, value: Vector, m: Any, which: int) -> None:
         """Write the row of one plane."""
-        for column, place in enumerate(self._places(which)):
+        for column, offset in enumerate(self._offsets(which)):
             order = range(column * BLOCK_WIDTH, (column + 1) * BLOCK_WIDTH)
             part = self._shuffle(value.value, value.value, order)
-            self.quad.store(Vector(self.quad, part), m, place)
+            self.quad.store(Vector(self.quad, part), m, offset)
 
-    def _places(self, which: int) -> list[Any]:
+    def _offsets(self, which: int) -> list[Any]:
         return [
-            self.block.offset(self.place, which * STRIDE + column * self.lanes)
+            self.block.offset(self.offset, which * STRIDE + column * self.lanes)
             for column in range(BLOCK_COLUMNS)
         ]
 
@@ -69,7 +69,7 @@ class _Rows:
         self._store(value, image, self.at, 0, 1)
 
     def load_one(self, image: Any) -> Vector:
-        """Return the row of an image of one channel, 0 outside of it."""
+        """Return the row of an image of one channel, 0 outside it."""
         return self._load(image, self.at, 0, 1)
 
     def store_three(self, channels: Sequence[Vector], image: Any) -> None:
@@ -84,20 +84,20 @@ class _Rows:
             self._store(Vector(self.block, value), image, first, part, _CHANNELS)
 
     def load_three(self, image: Any) -> list[Vector]:
-        """Return the channels of the row of an image, 0 outside of it."""
+        """Return the channels of the row of an image, 0 outside it."""
         first = self._first_value()
         a, b, c = (self._load(image, first, part, _CHANNELS).value for part in range(_CHANNELS))
         channels = []
         for channel in range(_CHANNELS):
-            places = [divmod(k * _CHANNELS + channel, TILE) for k in range(TILE)]
-            two = [at + TILE * (part == 1) for part, at in places]
-            three = [places[k][1] + TILE if places[k][0] == 2 else k for k in range(TILE)]
+            indices = [divmod(k * _CHANNELS + channel, TILE) for k in range(TILE)]
+            two = [at + TILE * (part == 1) for part, at in indices]
+            three = [indices[k][1] + TILE if indices[k][0] == 2 else k for k in range(TILE)]
             value = self._shuffle(self._shuffle(a, b, two), c, three)
             channels.append(Vector(self.block, value))
         return channels
 
     def inside(self, value: Vector) -> Vector:
-        """Return ``value`` in the image, 0 outside."""
+        """Return ``value`` inside the image, 0 outside."""
         if self._live is None:
             return value
         zeros = self.block.vector(0.0).value
@@ -107,9 +107,9 @@ class _Rows:
         return self.builder.mul(self.at, self.block.index(_CHANNELS), flags=("nuw", "nsw"))
 
     def _shuffle(self, a: Any, b: Any, order: Sequence[int]) -> Any:
-        places = [ir.Constant(_WORD, k) for k in order]
+        indices = [ir.Constant(_WORD, k) for k in order]
         return self.builder.shuffle_vector(
-            a, b, ir.Constant(ir.VectorType(_WORD, len(places)), places)
+            a, b, ir.Constant(ir.VectorType(_WORD, len(indices)), indices)
         )
 
     def _mask(self, part: int, channels: int) -> Any:
@@ -130,8 +130,8 @@ class _Rows:
         return self.builder.call(function, values)
 
     def _pointer(self, image: Any, first: Any, part: int) -> Any:
-        place = self.builder.gep(image, [self.block.offset(first, part * TILE)])
-        return self.builder.bitcast(place, self.block.kind.as_pointer())
+        pointer = self.builder.gep(image, [self.block.offset(first, part * TILE)])
+        return self.builder.bitcast(pointer, self.block.kind.as_pointer())
 
     def _store(self, value: Vector, image: Any, first: Any, part: int, channels: int) -> None:
         pointer = self._pointer(image, first, part)
@@ -155,7 +155,7 @@ class _Rows:
 def _require_contiguous(*arrays: Any) -> None:
     for array in arrays:
         if not isinstance(array, types.Array) or array.layout != "C":
-            raise errors.TypingError(f"Rows of tiles are moved in C-contiguous arrays, not {array}")
+            raise errors.TypingError(f"Rows of tiles need C-contiguous arrays, not {array}")
 
 
 def _images(block: Block, kinds: Any, values: Any) -> list[Any]:
@@ -171,7 +171,7 @@ def _multiply_add(a: Vector, b: Vector, c: Vector) -> Vector:
 
 def _write_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
     @intrinsic
-    def write(typingctx, m, place, live, background, images, at):  # type: ignore[no-untyped-def]
+    def write(typingctx, m, offset, live, background, images, at):  # type: ignore[no-untyped-def]
         _require_contiguous(m, background, *images)
 
         def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -179,18 +179,18 @@ def _write_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
             block = rows.block
             state, behind = block.data(sig.args[0], args[0]), block.data(sig.args[3], args[3])
             *three, alpha, depth_image, slope = _images(block, sig.args[4], args[4])
-            through = rows.plane(state, TRANSMITTANCE)
+            transmittance = rows.plane(state, TRANSMITTANCE)
             for number, image in enumerate(three):
                 first = F0 + number * _CHANNELS
                 planes = [rows.plane(state, first + channel) for channel in range(_CHANNELS)]
                 if number == 0:
                     colors = [block.scalar(behind, block.index(k)) for k in range(_CHANNELS)]
                     planes = [
-                        plane + through * block.splat(color)
+                        plane + transmittance * block.splat(color)
                         for plane, color in zip(planes, colors, strict=True)
                     ]
                 rows.store_three(planes, image)
-            rows.store_one(1.0 - through, alpha)
+            rows.store_one(1.0 - transmittance, alpha)
             if depth:
                 rows.store_one(rows.plane(state, DEPTH), depth_image)
                 rows.store_one(rows.plane(state, SLOPE), slope)
@@ -204,7 +204,7 @@ def _write_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
 
 def _read_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
     @intrinsic
-    def read(typingctx, m, place, live, images, grads, at):  # type: ignore[no-untyped-def]
+    def read(typingctx, m, offset, live, images, grads, at):  # type: ignore[no-untyped-def]
         _require_contiguous(m, *images, *grads)
 
         def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -213,7 +213,7 @@ def _read_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
             state = block.data(sig.args[0], args[0])
             *three, alpha, depth_image, slope_image = _images(block, sig.args[3], args[3])
             *g_three, g_alpha, g_depth = _images(block, sig.args[4], args[4])
-            # The colour holds the background, so its part of the final T is included.
+            # The colour includes the background, and with it the final transmittance.
             grad = rows.load_one(g_alpha)
             remaining = _multiply_add(grad, rows.load_one(alpha), -grad)
             values = [rows.load_three(image) for image in three]
@@ -228,13 +228,17 @@ def _read_intrinsic(lanes: int, depth: bool, whole: bool) -> Any:
             rows.set_plane(rows.inside(block.vector(1.0)), state, gradient.TRANSMITTANCE)
             if depth:
                 found, grad = rows.load_one(depth_image), rows.load_one(g_depth)
-                pulls = (found > 0.0) & ((grad < 0.0) | (grad > 0.0))
+                has_gradient = (found > 0.0) & ((grad < 0.0) | (grad > 0.0))
                 slope = rows.load_one(slope_image)
-                # Divided exactly: fast arithmetic would allow vectors an approximation, and numba
+                # Exact division: fast math would allow an approximation for vectors, and numba
                 # makes every operation without a flag of its own fast.
-                pull = Vector(block, builder.fdiv(grad.value, slope.value, flags=("nsz",)))
-                rows.set_plane(pulls.choose(found, 0.0), state, gradient.DEPTH)
-                rows.set_plane(pulls.choose(pull, 0.0), state, gradient.PULL)
+                log_t_gradient = Vector(
+                    block, builder.fdiv(grad.value, slope.value, flags=("nsz",))
+                )
+                rows.set_plane(has_gradient.select(found, 0.0), state, gradient.DEPTH)
+                rows.set_plane(
+                    has_gradient.select(log_t_gradient, 0.0), state, gradient.LOG_T_GRADIENT
+                )
             return context.get_dummy_value()
 
         index = types.intp
@@ -249,13 +253,17 @@ _depth_whole_16, _depth_cut_16 = (_write_intrinsic(16, True, whole) for whole in
 _depth_whole_8, _depth_cut_8 = (_write_intrinsic(8, True, whole) for whole in (True, False))
 _read_whole_16, _read_cut_16 = (_read_intrinsic(16, False, whole) for whole in (True, False))
 _read_whole_8, _read_cut_8 = (_read_intrinsic(8, False, whole) for whole in (True, False))
-_pull_whole_16, _pull_cut_16 = (_read_intrinsic(16, True, whole) for whole in (True, False))
-_pull_whole_8, _pull_cut_8 = (_read_intrinsic(8, True, whole) for whole in (True, False))
+_depth_read_whole_16, _depth_read_cut_16 = (
+    _read_intrinsic(16, True, whole) for whole in (True, False)
+)
+_depth_read_whole_8, _depth_read_cut_8 = (
+    _read_intrinsic(8, True, whole) for whole in (True, False)
+)
 
 
 @inline
 def write_row(
-    lanes: Any, depth: Any, m: Any, place: Any, live: Any, background: Any, images: Any, at: Any
+    lanes: Any, depth: Any, m: Any, offset: Any, live: Any, background: Any, images: Any, at: Any
 ) -> None:
     """Write one row of a tile's forward planes to the images.
 
@@ -264,11 +272,11 @@ def write_row(
     lanes : int
         8 or 16.
     depth : bool
-        Also depth and slope.
+        Include depth and slope.
     m : (n,) float32
         The tile's scratch.
-    place : int
-        Where the row begins in each plane.
+    offset : int
+        Start of the row in each plane.
     live : int
         Columns of the tile in the image.
     background : (3,) float32
@@ -280,55 +288,55 @@ def write_row(
     if lanes == 16:
         if depth:
             if live == TILE:
-                _depth_whole_16(m, place, live, background, images, at)
+                _depth_whole_16(m, offset, live, background, images, at)
             else:
-                _depth_cut_16(m, place, live, background, images, at)
+                _depth_cut_16(m, offset, live, background, images, at)
         else:
             if live == TILE:
-                _write_whole_16(m, place, live, background, images, at)
+                _write_whole_16(m, offset, live, background, images, at)
             else:
-                _write_cut_16(m, place, live, background, images, at)
+                _write_cut_16(m, offset, live, background, images, at)
     else:
         if depth:
             if live == TILE:
-                _depth_whole_8(m, place, live, background, images, at)
+                _depth_whole_8(m, offset, live, background, images, at)
             else:
-                _depth_cut_8(m, place, live, background, images, at)
+                _depth_cut_8(m, offset, live, background, images, at)
         else:
             if live == TILE:
-                _write_whole_8(m, place, live, background, images, at)
+                _write_whole_8(m, offset, live, background, images, at)
             else:
-                _write_cut_8(m, place, live, background, images, at)
+                _write_cut_8(m, offset, live, background, images, at)
 
 
 @inline
 def read_row(
-    lanes: Any, depth: Any, m: Any, place: Any, live: Any, images: Any, grads: Any, at: Any
+    lanes: Any, depth: Any, m: Any, offset: Any, live: Any, images: Any, grads: Any, at: Any
 ) -> None:
     """Read one row of images and loss gradients into a tile's planes of the backward pass.
 
-    Pixels outside the image become opaque ones without gradient; ``live`` may be 0. Other
-    parameters as in :func:`write_row`; ``grads`` are those on the images but the slope.
+    Pixels outside the image become opaque and have no gradient; ``live`` may be 0. Other parameters
+    as in :func:`write_row`; ``grads`` are those on all images but the slope.
     """
     if lanes == 16:
         if depth:
             if live == TILE:
-                _pull_whole_16(m, place, live, images, grads, at)
+                _depth_read_whole_16(m, offset, live, images, grads, at)
             else:
-                _pull_cut_16(m, place, live, images, grads, at)
+                _depth_read_cut_16(m, offset, live, images, grads, at)
         else:
             if live == TILE:
-                _read_whole_16(m, place, live, images, grads, at)
+                _read_whole_16(m, offset, live, images, grads, at)
             else:
-                _read_cut_16(m, place, live, images, grads, at)
+                _read_cut_16(m, offset, live, images, grads, at)
     else:
         if depth:
             if live == TILE:
-                _pull_whole_8(m, place, live, images, grads, at)
+                _depth_read_whole_8(m, offset, live, images, grads, at)
             else:
-                _pull_cut_8(m, place, live, images, grads, at)
+                _depth_read_cut_8(m, offset, live, images, grads, at)
         else:
             if live == TILE:
-                _read_whole_8(m, place, live, images, grads, at)
+                _read_whole_8(m, offset, live, images, grads, at)
             else:
-                _read_cut_8(m, place, live, images, grads, at)
+                _read_cut_8(m, offset, live, images, grads, at)

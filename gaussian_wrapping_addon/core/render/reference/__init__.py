@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The definition of the renderer in plain torch: what every kernel must equal."""
+"""Reference renderer in plain torch: the definition that every kernel is tested against."""

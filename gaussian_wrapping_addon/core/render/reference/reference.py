@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The renderer's definition in plain torch: every pixel against every Gaussian.
+"""Reference renderer in plain torch: every pixel against every Gaussian.
 
 Any float type, gradients by autograd. Only for small scenes: the cost is pixels x Gaussians.
 """
@@ -24,8 +24,8 @@ _ELEMENTS_PER_CHUNK = 1_000_000
 
 
 @dataclass(frozen=True)
-class _Hits:
-    """What p pixels see of n Gaussians in blending order; rows are pixels."""
+class _RayEvaluation:
+    """n Gaussians, in blending order, evaluated on the rays of p pixels; rows are pixels."""
 
     log_alpha: Tensor  # (p, n) log of the opacity on the ray, before the cap
     weight: Tensor  # (p, n) alpha T, 0 where the Gaussian does not contribute
@@ -55,15 +55,15 @@ def render_reference(
     camera : Camera
         In the scene frame.
     options : RenderOptions
-        ``threads`` is not used.
+        ``threads`` is ignored.
 
     Raises
     ------
     UsageError
-        If statistics are asked for; only the fast renderer gathers them.
+        If statistics are requested; only the fast renderer collects them.
     """
     if options.statistics:
-        raise UsageError("The reference renderer gathers no statistics.", "Use render() for them.")
+        raise UsageError("The reference renderer collects no statistics.", "Use render() for them.")
     screen = reference_projection(gaussians, camera, options)
     chosen = torch.nonzero(screen.usable)[:, 0]
     order = chosen[torch.argsort(screen.depths[chosen].float(), stable=True)]
@@ -101,8 +101,8 @@ def reference_depth_at(
     (m,) tensor
         z-depth in scene units; 0 where there is none and off ``[0, width] x [0, height]``.
     """
-    hits, seen = _cast_at(gaussians, camera, positions, options)
-    return positions.new_zeros(len(positions)).index_put((seen,), _depth(hits, options))
+    rays, seen = _evaluate_rays_at(gaussians, camera, positions, options)
+    return positions.new_zeros(len(positions)).index_put((seen,), _depth(rays, options))
 
 
 def reference_transmittance_at(
@@ -112,7 +112,7 @@ def reference_transmittance_at(
     depths: Tensor,
     options: RenderOptions,
 ) -> Tensor:
-    """Return what the contributors of :func:`render_reference` let through up to z-depths.
+    """Return the transmittance of the contributors of :func:`render_reference` up to z-depths.
 
     Parameters
     ----------
@@ -126,25 +126,25 @@ def reference_transmittance_at(
     (m,) tensor
         In [0, 1]; 0 off the image.
     """
-    hits, seen = _cast_at(gaussians, camera, positions, options)
-    before = (hits.peak - depths[seen][:, None]).clamp_min(0.0)  # (k, n)
-    density = torch.exp(hits.log_alpha - 0.5 * hits.sharpness * before * before)
-    density = torch.where(hits.contributes, density.clamp_max(tolerances.ALPHA_MAX), 0.0)
-    through = torch.prod(1.0 - density, dim=1)
-    return positions.new_zeros(len(positions)).index_put((seen,), through)
+    rays, seen = _evaluate_rays_at(gaussians, camera, positions, options)
+    before = (rays.peak - depths[seen][:, None]).clamp_min(0.0)  # (k, n)
+    density = torch.exp(rays.log_alpha - 0.5 * rays.sharpness * before * before)
+    density = torch.where(rays.contributes, density.clamp_max(tolerances.ALPHA_MAX), 0.0)
+    transmittance = torch.prod(1.0 - density, dim=1)
+    return positions.new_zeros(len(positions)).index_put((seen,), transmittance)
 
 
-def _cast_at(
+def _evaluate_rays_at(
     gaussians: OrientedGaussians, camera: Camera, positions: Tensor, options: RenderOptions
-) -> tuple[_Hits, Tensor]:
-    """Return the hits of the positions on the image, and the indices of these positions."""
+) -> tuple[_RayEvaluation, Tensor]:
+    """Evaluate the rays of the positions on the image; return also these positions' indices."""
     screen = reference_projection(gaussians, camera, options)
     chosen = torch.nonzero(screen.usable)[:, 0]
     order = chosen[torch.argsort(screen.depths[chosen].float(), stable=True)]
     size = positions.new_tensor([camera.width, camera.height])
     seen = torch.nonzero(((positions >= 0.0) & (positions <= size)).all(1))[:, 0]
     x, y = positions[seen].unbind(1)
-    return _cast(screen.params[order], x, y), seen
+    return _evaluate_rays(screen.params[order], x, y), seen
 
 
 def _render_rows(
@@ -159,15 +159,15 @@ def _render_rows(
     rows = torch.arange(first_row, min(end_row, camera.height)).to(params) + 0.5
     columns = torch.arange(camera.width).to(params) + 0.5
     y, x = (grid.reshape(-1) for grid in torch.meshgrid(rows, columns, indexing="ij"))  # (p,)
-    hits = _cast(params, x, y)
+    rays = _evaluate_rays(params, x, y)
     features = params[:, 13:22]  # (n, 9)
-    blended = hits.weight @ features  # (p, 9)
-    color = blended[:, :3] + hits.final[:, None] * background
-    depth = _depth(hits, options) if options.depth else torch.zeros_like(hits.final)
-    return torch.cat([color, blended[:, 3:], 1.0 - hits.final[:, None], depth[:, None]], dim=1)
+    blended = rays.weight @ features  # (p, 9)
+    color = blended[:, :3] + rays.final[:, None] * background
+    depth = _depth(rays, options) if options.depth else torch.zeros_like(rays.final)
+    return torch.cat([color, blended[:, 3:], 1.0 - rays.final[:, None], depth[:, None]], dim=1)
 
 
-def _cast(params: Tensor, x: Tensor, y: Tensor) -> _Hits:
+def _evaluate_rays(params: Tensor, x: Tensor, y: Tensor) -> _RayEvaluation:
     """Evaluate all Gaussians on the rays of the pixel positions (x, y), in blending order."""
     u, v, qa, qb, qc, px, py, r, s, t, z, opacity, a0 = params[:, :13].unbind(1)
     dx, dy = x[:, None] - u, y[:, None] - v  # (p, n)
@@ -181,7 +181,7 @@ def _cast(params: Tensor, x: Tensor, y: Tensor) -> _Hits:
     contributes = (alpha > 0.0) & (before >= tolerances.TRANSMITTANCE_MIN)
     alpha = torch.where(contributes, alpha, 0.0)
     before = _transmittance_before(alpha)
-    return _Hits(
+    return _RayEvaluation(
         log_alpha,
         alpha * before,
         contributes,
@@ -193,28 +193,28 @@ def _cast(params: Tensor, x: Tensor, y: Tensor) -> _Hits:
 
 def _transmittance_before(alpha: Tensor) -> Tensor:
     """(p, n) product of ``1 - alpha`` over the Gaussians in front of each."""
-    through = torch.cumprod(1.0 - alpha, dim=1)
-    return torch.cat([torch.ones_like(alpha[:, :1]), through[:, :-1]], dim=1)
+    transmittance = torch.cumprod(1.0 - alpha, dim=1)
+    return torch.cat([torch.ones_like(alpha[:, :1]), transmittance[:, :-1]], dim=1)
 
 
-def _depth(hits: _Hits, options: RenderOptions) -> Tensor:
+def _depth(rays: _RayEvaluation, options: RenderOptions) -> Tensor:
     """(p,) z-depth of the 0.5-isosurface; 0 where there is none.
 
     See docs/method.md, sections 2.4 and 2.5.
     """
-    depth = torch.zeros_like(hits.final)
+    depth = torch.zeros_like(rays.final)
     limit = options.depth_valid_transmittance
-    deep = torch.nonzero((hits.final <= limit) & (hits.final < tolerances.ISO_LEVEL))[:, 0]
+    deep = torch.nonzero((rays.final <= limit) & (rays.final < tolerances.ISO_LEVEL))[:, 0]
     if len(deep) == 0:
         return depth
     # Only each pixel's contributors matter: move them to the front and drop the rest.
-    contributes = hits.contributes[deep]  # (q, n)
+    contributes = rays.contributes[deep]  # (q, n)
     count = int(contributes.sum(1).max())
     pick = torch.argsort((~contributes).to(torch.uint8), dim=1, stable=True)[:, :count]
     part = contributes.gather(1, pick)  # (q, c)
-    log_alpha = hits.log_alpha[deep].gather(1, pick)
-    peak = hits.peak[deep].gather(1, pick)
-    sharpness = hits.sharpness[deep].gather(1, pick)
+    log_alpha = rays.log_alpha[deep].gather(1, pick)
+    peak = rays.peak[deep].gather(1, pick)
+    sharpness = rays.sharpness[deep].gather(1, pick)
 
     def log_g(at: Tensor) -> Tensor:
         before = (peak - at[:, None]).clamp_min(0.0)  # (q, c)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The projection in plain torch, any float type, differentiable: what the kernels must equal."""
+"""Reference projection in plain torch: differentiable, any float type, ground truth for kernels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ReferenceScreen:
 
     params: Tensor  # (n, 24); column 23 is 0
     depths: Tensor  # (n,) distance from the camera to the mean
-    usable: Tensor  # (n,) bool: beyond the near plane, opacity above 1/255, held by float32
+    usable: Tensor  # (n,) bool: beyond the near plane, opacity above 1/255, fits float32
 
 
 def reference_projection(
@@ -32,7 +32,7 @@ def reference_projection(
     Rows that are not usable hold zeros and carry no gradient.
     """
     means = gaussians.means
-    # First without gradients: what overflows in a row that is not usable must not reach them.
+    # First without gradients: an overflow in an unusable row must not affect them.
     with torch.no_grad():
         axis, shift = camera.cam_from_world[2, :3], camera.cam_from_world[2, 3]
         index = torch.nonzero(means @ means.new_tensor(axis) + shift > options.near_z)[:, 0]  # (m,)
@@ -101,7 +101,7 @@ def _project(
 
 
 def _held_by_float32(rows: Tensor, distance: Tensor, camera: Camera) -> Tensor:
-    """(m,) which rows no product of rendering in float32 overflows (``docs/architecture.md``)."""
+    """(m,) rows for which no product of rendering overflows float32 (``docs/architecture.md``)."""
     u, v, qa, qb, qc, px, py, r, s, t, z, _, a0 = rows[:, :13].unbind(1)
     sigma_z = rows[:, 22]
     reach_x = torch.maximum(u.abs(), (camera.width - u).abs()) + tolerances.TILE_PX

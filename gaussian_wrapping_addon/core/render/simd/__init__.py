@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Explicit vectors of 8 or 16 float32 inside numba kernels.
 
-Used by every raster kernel; holds the constants and exponentials that these share.
+Used by every raster kernel; also their common constants and exponentials.
 """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the raster kernels share: constants, exponentials and vector width.
+"""Constants, exponentials and vector width of the raster kernels.
 
 The kernels keep the state of a tile in *planes* of 256 values inside one float32 scratch array.
 A plane is ordered by *blocks* of 8 or 16 pixels, 4 wide and 2 or 4 high, each of which is one
-vector; blocks are numbered row by row, and so are the pixels of one.
+vector; blocks, and the pixels of a block, are numbered row by row.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from ...kernels.compiled import inline
 TILE = tolerances.TILE_PX
 PLANE = TILE * TILE
 STRIDE = PLANE + TILE
-"""From plane to plane. Not a divisor of 4096 bytes: loads would seem to hit earlier stores."""
+"""Offset between planes. Not a divisor of 4096 bytes: loads would alias earlier stores."""
 BLOCK_WIDTH = 4
 BLOCK_COLUMNS = TILE // BLOCK_WIDTH
 FEATURES = 9
 ROW_VALUES = 24
-"""Columns of params and of pair gradients."""
+"""Columns of params and of intersection gradients."""
 # Planes of the forward scratch array.
 TRANSMITTANCE, F0 = 0, 1
 DEPTH, SLOPE = F0 + FEATURES, F0 + FEATURES + 1
 BEST, BEST_AT = SLOPE + 1, SLOPE + 2
 FORWARD_PLANES = BEST_AT + 1
 PREFETCH_AHEAD = 8
-"""Pairs between asking for a row and reading it."""
+"""Prefetch distance of rows, in intersections."""
 
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 ALPHA_MIN = np.float32(tolerances.ALPHA_MIN)
 ALPHA_MAX = np.float32(tolerances.ALPHA_MAX)
 TRANSMITTANCE_MIN = np.float32(tolerances.TRANSMITTANCE_MIN)
 ISO_LEVEL = np.float32(tolerances.ISO_LEVEL)
-# No ray's den is smaller but by rounding; keeps 1 / den finite.
+# No ray's den is smaller except by rounding; keeps 1 / den finite.
 DENOMINATOR_MIN = np.float32(tolerances.DENOMINATOR_MIN)
 FAR = np.float32(3e38)
 FLOAT32_MAX = float(np.finfo(np.float32).max)
-# Beyond this many sigma_z before a Gaussian's centre its density is below 3e-7.
+# Farther than this many sigma_z in front of its centre, a Gaussian's density is below 3e-7.
 FRONT_SIGMAS = np.float32(5.5)
 LIVENESS_EVERY = 32
-"""Pairs between two looks at which blocks of a tile still let light through."""
+"""Intersections between two updates of which blocks of a tile are not yet opaque."""
 
 _LINE_VALUES = 16
 # Pixels of a block relative to its first one.
@@ -94,7 +94,7 @@ def exp_short(x: Any) -> Any:
 def exp_wide(x: Any) -> Any:
     """Return exp(-x) for 0 <= x <= 22.4, and 0 above (relative error 7e-6).
 
-    A small value in place of 0 would be magnified by the 1 / sigma^2 of thin Gaussians far behind.
+    A small value instead of 0 would be amplified by the 1 / sigma^2 of thin Gaussians far behind.
     """
     p = _exp_fit(min(x * _THIRTY_SECOND, FIT_END))
     p = p * p
@@ -107,7 +107,7 @@ def exp_wide(x: Any) -> Any:
 
 @functools.lru_cache(maxsize=1)
 def vector_lanes() -> int:
-    """Return the pixels of a block that suit the CPU numba compiles for: 16 or 8."""
+    """Return the number of pixels per block for the CPU that numba compiles for: 16 or 8."""
     # 16 where AVX-512 is compiled for.
     chosen = getattr(numba.config, "CPU_NAME", None)
     if chosen and chosen != llvmlite.binding.get_host_cpu_name():
@@ -117,7 +117,7 @@ def vector_lanes() -> int:
 
 
 def aligned_zeros(count: int) -> np.ndarray:
-    """Return ``count`` float32 that begin at a cache line, so that no vector spans two lines."""
+    """Return ``count`` float32 aligned to a cache line, so that no vector spans two lines."""
     values = np.zeros(count + _LINE_VALUES, np.float32)
     offset = -(values.ctypes.data // values.itemsize) % _LINE_VALUES
     return values[offset : offset + count]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Explicit vectors of 8 or 16 float32 inside numba kernels, written as arithmetic.
+"""Explicit SIMD vectors of 8 or 16 float32 in numba kernels, with arithmetic operators.
 
-numba kernels call *intrinsics*; what those emit is written here with operators on :class:`Vector`.
-Unlike a loop that LLVM may or may not turn into vector code, depending on what it can prove about
-overlapping memory, this is always packed, keeps its state in registers over loops of its own, and
-compiles to the same instructions wherever it is used. No bounds are checked.
+The bodies of numba *intrinsics* are written with operators on :class:`Vector`, which emit LLVM IR.
+Unlike a loop, which LLVM may fail to vectorise if it cannot rule out overlapping memory, this code
+is always packed, keeps its state in registers across its own loops, and compiles to the same
+instructions wherever it is used. Bounds are not checked.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _FLOAT = ir.FloatType()
 _WORD = ir.IntType(32)
 _INDEX = ir.IntType(64)
 _SQRT_HALF_BITS = 0x3F3504F3
-"""The float32 sqrt(0.5): mantissas of logarithms run from it to twice it."""
+"""float32 sqrt(0.5): logarithms use mantissas between this and twice this."""
 
 
 class Vector:
@@ -87,11 +87,11 @@ class Vector:
 
     def max(self, other: Vector | float) -> Vector:
         """Return the larger value of each lane."""
-        return (self > other).choose(self, other)
+        return (self > other).select(self, other)
 
     def min(self, other: Vector | float) -> Vector:
         """Return the smaller value of each lane."""
-        return (self < other).choose(self, other)
+        return (self < other).select(self, other)
 
     def times(self, other: Vector) -> Vector:
         """Return the product, rounded before anything is added to it."""
@@ -138,7 +138,7 @@ class Vector:
 
 
 class Mask:
-    """One truth value a lane."""
+    """One boolean per lane."""
 
     __slots__ = ("block", "value")
 
@@ -154,14 +154,14 @@ class Mask:
     def __invert__(self) -> Mask:
         return Mask(self.block, self.block.builder.not_(self.value))
 
-    def choose(self, yes: Vector | float, no: Vector | float) -> Vector:
+    def select(self, yes: Vector | float, no: Vector | float) -> Vector:
         """Return ``yes`` where true, ``no`` elsewhere."""
         block = self.block
         a, b = block.vector(yes).value, block.vector(no).value
         return Vector(block, block.builder.select(self.value, a, b))
 
     def any(self) -> Any:
-        """Return whether any lane is true, as an SSA truth value."""
+        """Return whether any lane is true, as an SSA boolean."""
         return self.block.builder.icmp_unsigned("!=", self.bits(), self.block.index(0))
 
     def bits(self) -> Any:
@@ -172,7 +172,7 @@ class Mask:
 
 
 class State:
-    """Vectors that live in registers across the turns of a loop."""
+    """A vector that stays in registers across the iterations of a loop."""
 
     def __init__(self, block: Block, start: Vector | float) -> None:
         self.block = block
@@ -196,7 +196,7 @@ class Block:
     lanes : int
         8 or 16.
     context, builder
-        What numba hands to the code generator of an intrinsic.
+        Arguments of the code generator of a numba intrinsic.
     """
 
     def __init__(self, lanes: int, context: Any, builder: Any) -> None:
@@ -204,18 +204,18 @@ class Block:
         self.kind = ir.VectorType(_FLOAT, lanes)
 
     def vector(self, value: Vector | float) -> Vector:
-        """Return a vector; a number is repeated over the lanes."""
+        """Return a vector; a number is broadcast to all lanes."""
         if isinstance(value, Vector):
             return value
         return self.constants([value] * self.lanes)
 
     def constants(self, values: Sequence[float]) -> Vector:
-        """Return one given number a lane."""
+        """Return a constant vector, one number per lane."""
         numbers = [ir.Constant(_FLOAT, float(value)) for value in values]
         return Vector(self, ir.Constant(self.kind, numbers))
 
     def splat(self, scalar: Any) -> Vector:
-        """Repeat an SSA float32 over the lanes."""
+        """Broadcast an SSA float32 to all lanes."""
         zero = ir.Constant(_WORD, 0)
         one = self.builder.insert_element(ir.Constant(self.kind, ir.Undefined), scalar, zero)
         order = ir.Constant(ir.VectorType(_WORD, self.lanes), None)
@@ -237,8 +237,8 @@ class Block:
         return base
 
     def _run(self, data: Any, at: Any) -> Any:
-        place = self.builder.gep(data, [at], inbounds=True)
-        return self.builder.bitcast(place, self.kind.as_pointer())
+        pointer = self.builder.gep(data, [at], inbounds=True)
+        return self.builder.bitcast(pointer, self.kind.as_pointer())
 
     def load(self, data: Any, at: Any) -> Vector:
         """Return the vector at ``data[at]``."""
@@ -270,8 +270,8 @@ class Block:
     def totals(self, vectors: Sequence[Vector]) -> list[Vector]:
         """Return the sums over lanes of many vectors, ``lanes`` of them in each result.
 
-        Two vectors are folded into one by adding halves of their groups of lanes, again and again:
-        a third of the instructions of reducing one by one.
+        Two vectors are folded into one by repeatedly adding halves of their groups of lanes: a
+        third of the instructions of reducing one by one.
         """
         lanes = self.lanes
         missing = -len(vectors) % lanes
@@ -280,7 +280,7 @@ class Block:
         while group > 1:
             half = group // 2
             first = [g + k for g in range(0, 2 * lanes, group) for k in range(half)]
-            second = [place + half for place in first]
+            second = [k + half for k in first]
             level = [
                 self._shuffle(a, b, first) + self._shuffle(a, b, second)
                 for a, b in zip(level[::2], level[1::2], strict=True)
@@ -289,18 +289,18 @@ class Block:
         return level
 
     def _shuffle(self, a: Vector, b: Vector, order: Sequence[int]) -> Vector:
-        places = ir.Constant(
+        indices = ir.Constant(
             ir.VectorType(_WORD, self.lanes), [ir.Constant(_WORD, k) for k in order]
         )
-        return Vector(self, self.builder.shuffle_vector(a.value, b.value, places))
+        return Vector(self, self.builder.shuffle_vector(a.value, b.value, indices))
 
     def walk(
-        self, place: Any, count: Any, body: Callable[[Any], Any], test: Callable[[Any], Any]
+        self, cursor: Any, count: Any, body: Callable[[Any], Any], test: Callable[[Any], Any]
     ) -> None:
-        """Run ``body`` from the index kept in ``place`` up to ``count``, while it is true.
+        """Run ``body`` from the index stored in ``cursor`` up to ``count``, while it returns true.
 
-        ``place`` is moved past the last turn, so that another loop can go on from there. ``test``
-        is asked before each turn; both return an SSA truth value.
+        ``cursor`` is advanced past the last iteration, so that another loop can continue from
+        there. ``test`` is evaluated before each iteration; both return an SSA boolean.
         """
         builder = self.builder
         head, probe, turn, end = (
@@ -308,17 +308,17 @@ class Block:
         )
         builder.branch(head)
         builder.position_at_end(head)
-        index = builder.load(place)
+        index = builder.load(cursor)
         builder.cbranch(builder.icmp_signed("<", index, count), probe, end)
         builder.position_at_end(probe)
         builder.cbranch(test(index), turn, end)
         builder.position_at_end(turn)
-        builder.store(builder.add(index, self.index(1)), place)
+        builder.store(builder.add(index, self.index(1)), cursor)
         builder.cbranch(body(index), head, end)
         builder.position_at_end(end)
 
     def each_bit(self, bits: Any, body: Callable[[Any], None]) -> None:
-        """Run ``body(place)`` for each set bit of an SSA 64-bit integer, lowest first."""
+        """Run ``body(bit)`` for each set bit of an SSA 64-bit integer, lowest first."""
         builder = self.builder
         left = cgutils.alloca_once_value(builder, bits)
         head = builder.append_basic_block("bits")
@@ -335,13 +335,13 @@ class Block:
         builder.position_at_end(end)
 
     def repeat(self, count: Any, body: Callable[[Any], Mask | None]) -> None:
-        """Run ``body(index)`` for ``count`` turns, an SSA index.
+        """Run ``body(index)`` for ``count`` iterations, an SSA index.
 
-        The loop ends early where ``body`` returns a mask without a set lane.
+        The loop ends early if ``body`` returns a mask without a set lane.
         """
         with cgutils.for_range(self.builder, count) as loop:
-            goes_on = body(loop.index)
-            if goes_on is not None:
-                nobody = self.builder.icmp_unsigned("==", goes_on.bits(), self.index(0))
-                with self.builder.if_then(nobody, likely=False):
+            active = body(loop.index)
+            if active is not None:
+                none_active = self.builder.icmp_unsigned("==", active.bits(), self.index(0))
+                with self.builder.if_then(none_active, likely=False):
                     loop.do_break()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a block of pixels sees of one Gaussian, in explicit vectors: exponentials and the conic."""
+"""Evaluate a Gaussian on the rays of a block of pixels, in explicit vectors; exponentials."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def exp_short(x: Vector, scale: float = 1.0) -> Vector:
 def exp_wide(x: Vector, scale: float = 1.0) -> Vector:
     """Return exp(-scale x) for 0 <= scale x <= WIDE_END, and 0 above (relative error 7e-6).
 
-    A small value in place of 0 would be magnified by the 1 / sigma^2 of thin Gaussians far behind.
+    A small value instead of 0 would be amplified by the 1 / sigma^2 of thin Gaussians far behind.
     """
     value = _power(_fit(x * (scale / 32.0)), 5)
-    return (x < WIDE_END / scale).choose(value, 0.0)
+    return (x < WIDE_END / scale).select(value, 0.0)
 
 
 def _fit(y: Vector) -> Vector:
@@ -41,22 +41,22 @@ def _power(value: Vector, squarings: int) -> Vector:
 
 
 @dataclass(frozen=True)
-class Sight:
-    """The rays of a block against one Gaussian; names as in docs/architecture.md."""
+class RayEvaluation:
+    """One Gaussian evaluated on the rays of a block; names as in docs/architecture.md."""
 
     dx: Vector  # pixel - projected mean
     dy: Vector
     inverse: Vector  # 1 / den
     den: Vector
     distance: Vector
-    """Smallest squared Mahalanobis distance on the ray; at most what leaves alpha below 1/255."""
+    """Smallest squared Mahalanobis distance on the ray; clamped where alpha is below 1/255."""
     raw: Vector  # opacity on the ray before the cap
     alpha: Vector  # after the cap
     row: Row
 
 
 class Row:
-    """One row of params; each column is loaded and repeated over the lanes where it is used."""
+    """One row of params; each column is loaded and broadcast where it is used."""
 
     def __init__(self, block: Block, params: Any, gaussian: Any) -> None:
         self.block, self.params = block, params
@@ -71,7 +71,7 @@ class Row:
 
 
 def first_pixel(block: Block, number: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """Return the centre of the first pixel of a tile's block, the tile's own being ``(x, y)``."""
+    """Return the centre of a block's first pixel; that of the tile is ``(x, y)``."""
     builder, flags = block.builder, ("contract",)
     columns = constants.BLOCK_COLUMNS
     column = builder.and_(number, block.index(columns - 1))
@@ -82,7 +82,7 @@ def first_pixel(block: Block, number: Any, x: Any, y: Any) -> tuple[Any, Any]:
     return left, builder.fadd(y, builder.sitofp(down, y.type), flags=flags)
 
 
-def see(block: Block, params: Any, gaussian: Any, left: Any, top: Any) -> Sight:
+def evaluate_rays(block: Block, params: Any, gaussian: Any, left: Any, top: Any) -> RayEvaluation:
     """Evaluate a Gaussian on the rays of the block whose first pixel centre is ``(left, top)``."""
     row = Row(block, params, gaussian)
     builder, flags = block.builder, ("contract",)
@@ -100,13 +100,15 @@ def see(block: Block, params: Any, gaussian: Any, left: Any, top: Any) -> Sight:
     inverse = den.reciprocal()
     distance = (num * inverse).min(2.0 * SHORT_END)
     raw = exp_short(distance, 0.5) * row[11]
-    return Sight(dx, dy, inverse, den, distance, raw, raw.min(float(constants.ALPHA_MAX)), row)
+    return RayEvaluation(
+        dx, dy, inverse, den, distance, raw, raw.min(float(constants.ALPHA_MAX)), row
+    )
 
 
-def peak_depth(sight: Sight) -> Vector:
+def peak_depth(rays: RayEvaluation) -> Vector:
     """Return the z-depth of the Gaussian's maximum along each ray.
 
-    Rounded alike wherever it is used: thin Gaussians tell a depth's last bits apart.
+    Rounded identically wherever it is used: thin Gaussians resolve a depth's last bits.
     """
-    row = sight.row
-    return ((sight.dx * row[5] + (sight.dy * row[6] + 1.0)) * sight.inverse).times(row[10])
+    row = rays.row
+    return ((rays.dx * row[5] + (rays.dy * row[6] + 1.0)) * rays.inverse).times(row[10])

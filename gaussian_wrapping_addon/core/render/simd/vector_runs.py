@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Explicit vector instructions for numba kernels: runs of 8 or 16 float32, bits, prefetching.
 
-No bounds are checked: indices must be valid and not negative.
+Bounds are not checked: indices must be valid and not negative.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def _run_pointer(lanes: int, context: Any, builder: Any, kind: Any, array: Any, 
 def _copy_intrinsic(lanes: int) -> Any:
     """Make a function that copies ``lanes`` float32 as one vector.
 
-    A loop would not do: between two arrays, or two variable places of one array, LLVM cannot
-    prove that the copies do not overlap and falls back to single values.
+    Instead of a loop: between two arrays, or two variable offsets of one array, LLVM cannot prove
+    that the runs do not overlap, and falls back to scalar code.
     """
 
     @intrinsic
@@ -69,7 +69,7 @@ def _lowest_bit(typingctx, bits):  # type: ignore[no-untyped-def]
 
 
 def _prefetch_intrinsic(locality: int) -> Any:
-    """Make a function that asks for a row: 3 for the nearest cache, 2 for the one behind it."""
+    """Make a function that prefetches a row: locality 3 for the L1 cache, 2 for L2."""
 
     @intrinsic
     def prefetch(typingctx, rows, row):  # type: ignore[no-untyped-def]
@@ -80,9 +80,9 @@ def _prefetch_intrinsic(locality: int) -> Any:
             fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
             first = builder.mul(args[1], ir.Constant(args[1].type, ROW_VALUES))
             for offset in (0, ROW_VALUES - 1):  # 96 bytes lie on two cache lines
-                place = builder.gep(data, [builder.add(first, ir.Constant(first.type, offset))])
+                pointer = builder.gep(data, [builder.add(first, ir.Constant(first.type, offset))])
                 hints = [ir.Constant(word, value) for value in (0, locality, 1)]  # read, data
-                builder.call(fetch, [builder.bitcast(place, byte), *hints])
+                builder.call(fetch, [builder.bitcast(pointer, byte), *hints])
             return context.get_dummy_value()
 
         return types.void(rows, types.intp), generate
@@ -106,23 +106,23 @@ def copy_run(lanes: Any, target: Any, target_at: Any, source: Any, source_at: An
 
 @inline
 def lowest_bit(bits: Any) -> Any:
-    """Return the place of the lowest bit of a uint64 that is not 0."""
+    """Return the index of the lowest set bit of a uint64 other than 0."""
     return _lowest_bit(bits)  # type: ignore[call-arg]
 
 
 @inline
 def prefetch_row(rows: Any, row: Any) -> None:
-    """Ask for one row of a C-contiguous (n, 24) float32 array to be brought to the cache.
+    """Prefetch one row of a C-contiguous (n, 24) float32 array.
 
-    Tiles visit rows in no order that the processor could guess; waiting for them took a third of
-    the time.
+    Tiles access rows in an order that the processor cannot predict; waiting for them took a third
+    of the time.
     """
     _prefetch_near(rows, row)
 
 
 @inline
 def prefetch_row_early(rows: Any, row: Any) -> None:
-    """Ask for a row that is read much later to be brought to the second cache."""
+    """Prefetch a row that is read much later into the second-level cache."""
     _prefetch_far(rows, row)
 
 

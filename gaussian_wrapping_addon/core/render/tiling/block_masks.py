@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled: which blocks of a tile the ellipse of each of its Gaussians reaches."""
+"""Compiled bit masks: the blocks of a tile that each of its Gaussians' ellipses reaches."""
 
 from __future__ import annotations
 
@@ -15,35 +15,36 @@ from ...kernels.compiled import inline, kernel
 from ..simd.raster_math import BLOCK_COLUMNS, BLOCK_WIDTH, HALF, TILE
 from ..simd.simd import Block, Vector
 
-# Rounding of float32 boxes and skews and of this file's float32 arithmetic, all outwards: pixels,
-# share of the ellipse's size and place, and of the squared half chord near the ellipse's ends.
+# Margins for the rounding of float32 boxes and skews and of the float32 arithmetic here, outwards:
+# in pixels, relative to the ellipse's size and position, and for the squared half chord near the
+# ellipse's ends.
 _MARGIN_PX = 0.02
 _MARGIN_SHARE = 4e-6
 _MARGIN_CHORD = 4e-6
 _BOUNDED = 1.1
-"""Largest skew of a bounded ellipse over its half width, with room for rounding."""
+"""Largest ratio of skew to half width of a bounded ellipse, with a margin for rounding."""
 _GROUP = TILE
-"""Pairs of one vector."""
+"""Intersections per vector."""
 _BOX = 4
 _WORD, _INDEX = ir.IntType(32), ir.IntType(64)
 _FULL_ROW = (1 << BLOCK_COLUMNS) - 1
 
 
 class _Words:
-    """A vector of unsigned 32-bit integers, one a pair."""
+    """A vector of unsigned 32-bit integers, one per intersection."""
 
     def __init__(self, block: Block, value: Any) -> None:
         self.block, self.value = block, value
 
     @classmethod
     def of(cls, block: Block, number: int) -> _Words:
-        """Repeat a number."""
+        """Broadcast a number."""
         words = ir.VectorType(_WORD, block.lanes)
         return cls(block, ir.Constant(words, [ir.Constant(_WORD, number)] * block.lanes))
 
     @classmethod
     def truncated(cls, value: Vector) -> _Words:
-        """Round floating-point numbers >= 0 down."""
+        """Truncate floating-point numbers >= 0."""
         block = value.block
         kind = ir.VectorType(_WORD, block.lanes)
         return cls(block, block.builder.fptosi(value.value, kind))
@@ -62,20 +63,20 @@ class _Words:
 
 
 def _columns(block: Block, ids: Any, at: Any, boxes: Any, skews: Any) -> list[Vector]:
-    """Return the columns of boxes, then the skews, of 16 Gaussians."""
+    """Return the four box columns and the skews of 16 Gaussians."""
     builder, quad = block.builder, Block(_BOX, block.context, block.builder)
     rows, skew = [], ir.Constant(block.kind, ir.Undefined)
     for number in range(_GROUP):
-        place = builder.gep(ids, [block.offset(at, number)], inbounds=True)
-        gaussian = builder.sext(builder.load(place), _INDEX)
+        pointer = builder.gep(ids, [block.offset(at, number)], inbounds=True)
+        gaussian = builder.sext(builder.load(pointer), _INDEX)
         rows.append(quad.load(boxes, builder.mul(gaussian, block.index(_BOX))).value)
         number_ = ir.Constant(_WORD, number)
         skew = builder.insert_element(skew, block.scalar(skews, gaussian), number_)
 
     def shuffle(a: Any, b: Any, order: list[int]) -> Any:
-        places = [ir.Constant(_WORD, k) for k in order]
+        indices = [ir.Constant(_WORD, k) for k in order]
         kind = ir.VectorType(_WORD, len(order))
-        return builder.shuffle_vector(a, b, ir.Constant(kind, places))
+        return builder.shuffle_vector(a, b, ir.Constant(kind, indices))
 
     while len(rows) > _BOX:
         both = list(range(2 * rows[0].type.count))
@@ -89,8 +90,10 @@ def _columns(block: Block, ids: Any, at: Any, boxes: Any, skews: Any) -> list[Ve
     return [*columns, Vector(block, skew)]
 
 
-def _reached(block: Block, columns: list[Vector], left: Any, top: Any, height: int) -> _Words:
-    """Return the masks of 16 pairs for blocks ``height`` rows high."""
+def _reached_blocks(
+    block: Block, columns: list[Vector], left: Any, top: Any, height: int
+) -> _Words:
+    """Return the masks of 16 intersections for blocks ``height`` rows high."""
     x0, y0, x1, y1, skew = columns
     tile_x, tile_y = block.splat(left), block.splat(top)
     half_x, half_y = (x1 - x0) * 0.5, (y1 - y0) * 0.5
@@ -106,7 +109,7 @@ def _reached(block: Block, columns: list[Vector], left: Any, top: Any, height: i
     across = (half_x * half_x - skew * skew).max(0.0).sqrt() + half_x * _MARGIN_SHARE
     margin = (center_x.abs() + half_x) * _MARGIN_SHARE + _MARGIN_PX
     edge = (center_y.abs() + half_y) * _MARGIN_SHARE + _MARGIN_PX
-    # From here on in widths of a block.
+    # From here on in units of the block width.
     across, skew = across * (1.0 / BLOCK_WIDTH), skew * (1.0 / BLOCK_WIDTH)
     last = (center_x + margin) * (1.0 / BLOCK_WIDTH) + 1.0
     first = (margin - center_x) * (1.0 / BLOCK_WIDTH) + (
@@ -119,24 +122,24 @@ def _reached(block: Block, columns: list[Vector], left: Any, top: Any, height: i
         lower = inverse_y * float((strip + 1) * height - 1) + below
         meets = (upper <= 1.0) & (lower >= -1.0)
         upper, lower = upper.max(-1.0).min(1.0), lower.max(-1.0).min(1.0)
-        # How far the part of the ellipse in the strip reaches to the right, and to the left.
+        # Right and left extent of the part of the ellipse inside the strip.
         reach = []
         for turned in (extreme, -extreme):
             t = turned.max(upper).min(lower)
             reach.append((skew * t, across * ((1.0 - t * t).max(0.0) + _MARGIN_CHORD).sqrt()))
         right, left_ = reach[0][0] + reach[0][1], reach[1][1] - reach[1][0]
-        # Columns of blocks that begin before its right end, and that end behind its left end.
-        before = meets.choose((right + last).max(0.0).min(float(BLOCK_COLUMNS)), 0.0)
+        # Number of block columns that start left of its right end, and that end right of its left.
+        before = meets.select((right + last).max(0.0).min(float(BLOCK_COLUMNS)), 0.0)
         behind = (left_ + first).max(0.0).min(float(BLOCK_COLUMNS))
         full = _Words.of(block, _FULL_ROW)
         far = _Words.of(block, _FULL_ROW << (2 * BLOCK_COLUMNS))
-        # Both are bits of one row, shifted by the number of columns.
+        # Both as bit masks of one row, shifted by the number of columns.
         row = (full << _Words.truncated(before)) & (far >> _Words.truncated(behind))
         by = (strip - 1) * BLOCK_COLUMNS
-        places = _Words.of(block, abs(by))
-        masks = masks | (row << places if by >= 0 else row >> places)
-    every = _Words.of(block, (1 << BLOCK_COLUMNS * (TILE // height)) - 1)
-    chosen = block.builder.select(bounded.value, masks.value, every.value)
+        shift = _Words.of(block, abs(by))
+        masks = masks | (row << shift if by >= 0 else row >> shift)
+    all_blocks = _Words.of(block, (1 << BLOCK_COLUMNS * (TILE // height)) - 1)
+    chosen = block.builder.select(bounded.value, masks.value, all_blocks.value)
     return _Words(block, chosen)
 
 
@@ -151,9 +154,9 @@ def _mask_intrinsic(lanes: int) -> Any:
                 block.data(sig.args[k], args[k]) for k in (0, 2, 3, 6)
             )
             columns = _columns(block, ids_data, args[1], boxes_data, skews_data)
-            words = _reached(block, columns, args[4], args[5], lanes // BLOCK_WIDTH)
-            place = builder.gep(out, [args[7]], inbounds=True)
-            builder.store(words.value, builder.bitcast(place, words.value.type.as_pointer()), 4)
+            words = _reached_blocks(block, columns, args[4], args[5], lanes // BLOCK_WIDTH)
+            pointer = builder.gep(out, [args[7]], inbounds=True)
+            builder.store(words.value, builder.bitcast(pointer, words.value.type.as_pointer()), 4)
             return context.get_dummy_value()
 
         index, single = types.intp, types.float32
@@ -170,7 +173,7 @@ def _mask_group(
     lanes: Any, ids: Any, at: Any, boxes: Any, skews: Any, left: Any, top: Any, out: Any,
     out_at: Any,
 ) -> None:  # fmt: skip
-    """Write the masks of the 16 Gaussians ``ids[at ..]`` against one tile to ``out[out_at ..]``."""
+    """Write the masks of the 16 Gaussians ``ids[at ..]`` in one tile to ``out[out_at ..]``."""
     if lanes == 16:
         _mask_16(ids, at, boxes, skews, left, top, out, out_at)
     else:
@@ -192,10 +195,11 @@ def mask_kernel(lanes: int) -> Any:
         tiles_x: int,
         masks: np.ndarray,
     ) -> None:
-        """Write ``masks (pairs,) uint32``: bit ``4 row of blocks + column`` per block of the tile.
+        """Write ``masks (intersections,) uint32``: bit ``4 block row + block column`` of the tile.
 
         The part of the ellipse between the first and last pixel centres of a row of blocks is
-        convex, so its extent in x says which of them it meets. Sixteen pairs are one vector.
+        convex, so its extent in x determines the blocks it meets. Sixteen intersections are one
+        vector.
         """
         few = np.zeros(_GROUP, np.int32)
         found = np.zeros(_GROUP, np.uint32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A stable order by distance: radix sorts of ranges of keys, one range a thread."""
+"""Stable sort by distance: a radix sort of key ranges, one range per thread."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ...kernels.parallel import run_chunks
 
 _DIGIT_BITS = 10
 _BUCKETS = 1 << _DIGIT_BITS
-_MOST_DIGITS = 4
-# Below this a second thread costs more than it saves.
+_MAX_DIGITS = 4
+# Below this, a second thread costs more than it saves.
 _KEYS_PER_PART = 8192
 _COARSE_BITS = 10
 _INDEX_MASK = np.uint64(0xFFFFFFFF)
@@ -24,7 +24,7 @@ _INDEX_MASK = np.uint64(0xFFFFFFFF)
 def _coarse_histogram(
     keys: np.ndarray, bounds: np.ndarray, lowest: int, shift: int, histogram: np.ndarray
 ) -> None:
-    """Count the keys by their highest bits."""
+    """Histogram the keys by their highest bits."""
     histogram[:] = 0
     for run in range(len(bounds)):
         for k in range(bounds[run, 0], bounds[run, 1]):
@@ -35,23 +35,23 @@ def _coarse_histogram(
 def _sort_part(
     keys: np.ndarray,
     bounds: np.ndarray,
-    low: int,
-    high: int,
+    first_key: int,
+    end_key: int,
     packed: np.ndarray,
     other: np.ndarray,
     order: np.ndarray,
 ) -> None:
-    """Write the indices of the keys in ``low .. high`` to ``order``, which has their number.
+    """Write the indices of the keys in ``first_key .. end_key`` to ``order``, sorted.
 
-    ``packed`` and ``other`` have room for one more.
+    ``order`` has exactly their number of elements, ``packed`` and ``other`` one more.
     """
     begin, end = 0, np.uint64(0)
     largest = np.int64(0)
     for run in range(len(bounds)):
         for k in range(bounds[run, 0], bounds[run, 1]):
-            # Every key is written; those of other parts are overwritten by the next.
-            key = np.int64(keys[k]) - low
-            belongs = (key >= 0) & (key < high - low)
+            # Branch-free: every key is written, and overwritten by the next unless it belongs here.
+            key = np.int64(keys[k]) - first_key
+            belongs = (key >= 0) & (key < end_key - first_key)
             packed[end] = (np.uint64(key) << np.uint64(32)) | np.uint64(k)
             largest = max(largest, key if belongs else np.int64(0))
             end += np.uint64(belongs)
@@ -61,7 +61,7 @@ def _sort_part(
     digits = (bits + _DIGIT_BITS - 1) // _DIGIT_BITS
     width = np.uint64((bits + digits - 1) // digits) if digits else np.uint64(0)
     mask = (np.uint64(1) << width) - np.uint64(1)
-    heads = np.zeros((_MOST_DIGITS, _BUCKETS), np.int64)
+    heads = np.zeros((_MAX_DIGITS, _BUCKETS), np.int64)
     for k in range(begin, end):
         key = packed[k] >> np.uint64(32)
         for digit in range(digits):
@@ -75,9 +75,9 @@ def _sort_part(
         shift = np.uint64(32) + width * np.uint64(digit)
         for k in range(begin, end):
             bucket = np.int64((packed[k] >> shift) & mask)
-            place = heads[digit, bucket]
-            heads[digit, bucket] = place + 1
-            other[place] = packed[k]
+            index = heads[digit, bucket]
+            heads[digit, bucket] = index + 1
+            other[index] = packed[k]
         packed, other = other, packed
     for k in range(begin, end):
         order[k] = np.int32(packed[k] & _INDEX_MASK)
@@ -92,12 +92,12 @@ def order_by_keys(
     ----------
     keys : (r,) uint32
     bounds : (m, 2) int64
-        The runs of ``keys`` that count, increasing.
+        The runs of ``keys`` to sort, increasing.
     extent : (int, int)
-        The smallest and the largest key that count.
+        Smallest and largest key in these runs.
     threads : int
     store : ArrayStore
-        Holds the result until its next use here.
+        Owns the result, which is valid until the next call with this store.
 
     Returns
     -------

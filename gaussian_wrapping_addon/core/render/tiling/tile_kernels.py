@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled loops of the binning: pixel ranges, tiles an ellipse reaches, slots, scattering."""
+"""Compiled kernels of tile binning: pixel ranges, intersected tiles, slots, scattering."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from ... import tolerances
 from ...kernels.compiled import inline, kernel
 
 _TILE = tolerances.TILE_PX
-# Rounding of the float32 box and skew, in shares of the half width and in pixels.
+# Margin for the rounding of float32 boxes and skews: relative to the half width, and in pixels.
 _SHARE_MARGIN = 1e-6
 _PIXEL_MARGIN = 0.02
 
 ID = 0
-"""Columns of a record: Gaussian, first and end row of tiles, its first span, its first slot."""
+"""Columns of a record: Gaussian, first and end tile row, its first span, its first slot."""
 RECORD_VALUES = 5
-# Pairs listed before they are scattered, and written for each span however short it is.
-_FLUSH_PAIRS = 1024
+# Intersections buffered before they are scattered; entries written for each span, however short.
+_FLUSH_COUNT = 1024
 _AHEAD = 4
 
 
@@ -39,7 +39,7 @@ def range_pixels(
     Returns
     -------
     visible, spans : int
-        How many are visible, and rows of tiles that they reach together.
+        Number of visible Gaussians, and of tile rows that they reach in total.
     """
     count = 0
     spans = 0
@@ -75,30 +75,30 @@ def span_tiles(
 ) -> tuple[int, int, np.int64, np.int64]:
     """Find the tiles that the ellipses of the Gaussians ``begin .. end`` reach.
 
-    The ellipse cut by the strip of pixel centres of a row of tiles is convex, so the columns are
-    those of its extent in x. That extent ends at the ellipse's own extreme point where the strip
-    holds it, else on the strip's edge nearer to it.
+    The ellipse clipped to the strip of pixel centres of a tile row is convex, so the columns follow
+    from its extent in x. That extent ends at the ellipse's own extreme point if the strip contains
+    it, else on the nearer edge of the strip.
 
     Parameters
     ----------
     record, span : int
-        Where to write in ``records`` and ``spans``.
+        Where writing starts in ``records`` and ``spans``.
     spans : (s, 2) uint16
-        Receives first and end column of tiles for each row of tiles.
+        Receives first and end tile column for each tile row.
     records : (r, 5) int32
-        Receives one row for each Gaussian that reaches a tile; the number of its pairs in place of
-        the slot.
+        Receives one row for each Gaussian that reaches a tile, with its number of intersections
+        instead of the slot.
     keys : (r,) uint32
-        Receives the bits of the distance: positive floats are ordered like them.
+        Receives the bits of the distance, which order positive floats.
     changes : (tiles_y, tiles_x + 1) int32
-        Receives the change of the number of pairs from each tile to the next in its row.
+        Receives the change in the number of intersections from each tile to the next in its row.
 
     Returns
     -------
-    end_record, pairs, lowest_key, highest_key : int
+    end_record, intersections, lowest_key, highest_key : int
     """
     changes[:] = 0
-    all_pairs = 0
+    all_intersections = 0
     bits = depths.view(np.uint32)
     lowest, highest = np.int64(0xFFFFFFFF), np.int64(0)
     for i in range(begin, end):
@@ -106,7 +106,7 @@ def span_tiles(
             continue
         first_row, last_row = ranges[i, 0] // _TILE, ranges[i, 1] // _TILE
         first, last = ranges[i, 2] // _TILE, ranges[i, 3] // _TILE
-        pairs = 0
+        intersections = 0
         x0, x1 = np.float64(boxes[i, 0]), np.float64(boxes[i, 2])
         y0, y1 = np.float64(boxes[i, 1]), np.float64(boxes[i, 3])
         half_x, half_y = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
@@ -117,7 +117,7 @@ def span_tiles(
                 spans[at, 0], spans[at, 1] = first, last + 1
                 changes[row, first] += 1
                 changes[row, last + 1] -= 1
-            pairs = (last - first + 1) * (last_row - first_row + 1)
+            intersections = (last - first + 1) * (last_row - first_row + 1)
         else:
             center_x, center_y = 0.5 * (x1 + x0), 0.5 * (y1 + y0)
             inverse = 1.0 / half_y
@@ -140,7 +140,7 @@ def span_tiles(
                     right = skew * t + across * math.sqrt(max(1.0 - t * t, 0.0))
                     t = min(max(-extreme, top), bottom)
                     left = skew * t - across * math.sqrt(max(1.0 - t * t, 0.0))
-                    # Both ends lie within the box up to the margin: no conversion overflows.
+                    # Both ends lie within the box plus margin, so the conversions cannot overflow.
                     first_px = max(np.ceil(center_x + left - margin), low_px)
                     last_px = min(np.floor(center_x + right + margin - 1.0), high_px)
                     if first_px > last_px:
@@ -151,8 +151,8 @@ def span_tiles(
                 spans[at, 0], spans[at, 1] = first_tile, end_tile
                 changes[row, first_tile] += 1
                 changes[row, end_tile] -= 1
-                pairs += end_tile - first_tile
-        if pairs == 0:
+                intersections += end_tile - first_tile
+        if intersections == 0:
             continue
         key = bits[i]
         lowest, highest = min(lowest, np.int64(key)), max(highest, np.int64(key))
@@ -160,12 +160,12 @@ def span_tiles(
         records[record, 1] = first_row
         records[record, 2] = last_row + 1
         records[record, 3] = span
-        records[record, 4] = pairs
+        records[record, 4] = intersections
         keys[record] = key
         record += 1
         span += last_row - first_row + 1
-        all_pairs += pairs
-    return record, all_pairs, lowest, highest
+        all_intersections += intersections
+    return record, all_intersections, lowest, highest
 
 
 @kernel(fast=False)
@@ -178,47 +178,47 @@ def count_band(
     spans: np.ndarray,
     records: np.ndarray,
 ) -> int:
-    """Write the numbers of pairs within a band of tiles in place of the slots; return their sum."""
-    all_pairs = 0
+    """Replace the slots by the numbers of intersections within a band; return their sum."""
+    all_intersections = 0
     first_band_row, end_band_row = first_tile // tiles_x, (end_tile - 1) // tiles_x + 1
     for k in range(begin, end):
-        pairs = 0
+        intersections = 0
         begin_row = records[k, 1]
         offset = records[k, 3] - begin_row
         for row in range(max(begin_row, first_band_row), min(records[k, 2], end_band_row)):
             low: Any = max(row * tiles_x + np.int64(spans[offset + row, 0]), first_tile)
             high: Any = min(row * tiles_x + np.int64(spans[offset + row, 1]), end_tile)
-            pairs += max(high - low, 0)
-        records[k, 4] = pairs
-        all_pairs += pairs
-    return all_pairs
+            intersections += max(high - low, 0)
+        records[k, 4] = intersections
+        all_intersections += intersections
+    return all_intersections
 
 
 @kernel(fast=False)
-def place_slots(
+def assign_slots(
     begin: int,
     end: int,
     begin_gaussian: int,
     end_gaussian: int,
     slot: int,
     records: np.ndarray,
-    pair_offsets: np.ndarray,
+    intersection_offsets: np.ndarray,
 ) -> None:
-    """Turn the numbers of pairs into first slots, counting on from ``slot``.
+    """Turn the numbers of intersections into first slots, counting from ``slot``.
 
-    Writes ``pair_offsets`` of the Gaussians ``begin_gaussian .. end_gaussian``, whose records are
-    ``begin .. end``.
+    Writes ``intersection_offsets`` of the Gaussians ``begin_gaussian .. end_gaussian``, whose
+    records are ``begin .. end``.
     """
     i = begin_gaussian
     for k in range(begin, end):
         while i <= records[k, 0]:
-            pair_offsets[i] = slot
+            intersection_offsets[i] = slot
             i += 1
-        pairs = records[k, 4]
+        intersections = records[k, 4]
         records[k, 4] = slot
-        slot += pairs
+        slot += intersections
     while i < end_gaussian:
-        pair_offsets[i] = slot
+        intersection_offsets[i] = slot
         i += 1
 
 
@@ -226,7 +226,7 @@ def place_slots(
 def rank_records(
     begin: int, end: int, order: np.ndarray, records: np.ndarray, ranked: np.ndarray
 ) -> None:
-    """Copy the records ``order[begin .. end]`` to the same places of ``ranked``."""
+    """Copy the records ``order[begin .. end]`` to the same indices of ``ranked``."""
     for k in range(begin, end):
         record = np.uint64(order[k])
         for column in range(RECORD_VALUES):
@@ -235,15 +235,21 @@ def rank_records(
 
 @inline
 def _scatter(
-    filled: Any, tiles: Any, slots: Any, ids: Any, heads: Any, gaussian_ids: Any, pair_slots: Any
+    filled: Any,
+    tiles: Any,
+    slots: Any,
+    ids: Any,
+    heads: Any,
+    gaussian_ids: Any,
+    intersection_slots: Any,
 ) -> None:
-    """Move the listed pairs to the heads of their tiles."""
-    for pair in range(filled):
-        listed_tile = np.uint64(tiles[pair])
-        place = np.uint64(heads[listed_tile])
-        heads[listed_tile] = place + np.uint64(1)
-        gaussian_ids[place] = ids[pair]
-        pair_slots[place] = slots[pair]
+    """Scatter the buffered intersections to the heads of their tiles."""
+    for intersection in range(filled):
+        listed_tile = np.uint64(tiles[intersection])
+        index = np.uint64(heads[listed_tile])
+        heads[listed_tile] = index + np.uint64(1)
+        gaussian_ids[index] = ids[intersection]
+        intersection_slots[index] = slots[intersection]
 
 
 @kernel(fast=False)
@@ -257,15 +263,16 @@ def scatter_tiles(
     spans: np.ndarray,
     heads: np.ndarray,
     gaussian_ids: np.ndarray,
-    pair_slots: np.ndarray,
+    intersection_slots: np.ndarray,
 ) -> None:
-    """Write the pairs of the tiles ``first_tile .. end_tile``, part of a band, at their ``heads``.
+    """Write the intersections of some tiles of a band at their ``heads``.
 
-    ``ranked`` holds the records by increasing distance. The pairs are first listed in a buffer that
-    stays in the cache, some of them beyond the end of their span and overwritten by the next: few
-    spans are longer than that, so the processor does not mispredict where they end.
+    The tiles are ``first_tile .. end_tile``; ``ranked`` holds the records by increasing distance.
+    Intersections are first collected in a buffer that stays in cache. For each span at least
+    ``_AHEAD`` entries are written, those beyond its end to be overwritten by the next span: few
+    spans are longer, so that their ends are not mispredicted.
     """
-    room = _FLUSH_PAIRS + tiles_x + _AHEAD
+    room = _FLUSH_COUNT + tiles_x + _AHEAD
     tiles = np.empty(room, np.int32)
     slots = np.empty(room, np.int32)
     ids = np.empty(room, np.int32)
@@ -281,7 +288,7 @@ def scatter_tiles(
         offset = ranked[k, 3] - begin_row
         for row in range(max(begin_row, first_band_row), stop_row):
             span = np.uint64(offset + row)
-            # The part of the span within the band has slots; the part within the tiles is listed.
+            # The part of the span within the band has slots; that within the tiles is collected.
             low: Any = max(row * tiles_x + np.int64(spans[span, 0]), first_band_tile)
             high: Any = min(row * tiles_x + np.int64(spans[span, 1]), end_band_tile)
             width = max(high - low, 0)
@@ -289,18 +296,18 @@ def scatter_tiles(
             listed = max(min(high, end_tile) - tile, 0)
             at = slot + (tile - low)
             for ahead in range(_AHEAD):
-                place = filled + np.uint64(ahead)
-                tiles[place] = tile + ahead
-                slots[place] = at + ahead
-                ids[place] = i
+                index = filled + np.uint64(ahead)
+                tiles[index] = tile + ahead
+                slots[index] = at + ahead
+                ids[index] = i
             for ahead in range(_AHEAD, listed):
-                place = filled + np.uint64(ahead)
-                tiles[place] = tile + ahead
-                slots[place] = at + ahead
-                ids[place] = i
+                index = filled + np.uint64(ahead)
+                tiles[index] = tile + ahead
+                slots[index] = at + ahead
+                ids[index] = i
             filled += np.uint64(listed)
             slot += width
-            if filled >= np.uint64(_FLUSH_PAIRS):
-                _scatter(filled, tiles, slots, ids, heads, gaussian_ids, pair_slots)
+            if filled >= np.uint64(_FLUSH_COUNT):
+                _scatter(filled, tiles, slots, ids, heads, gaussian_ids, intersection_slots)
                 filled = np.uint64(0)
-    _scatter(filled, tiles, slots, ids, heads, gaussian_ids, pair_slots)
+    _scatter(filled, tiles, slots, ids, heads, gaussian_ids, intersection_slots)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lists of the Gaussians that touch each tile of 16 x 16 pixels, in blending order."""
+"""Tile lists: the Gaussians that reach each tile of 16 x 16 pixels, in blending order."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .depth_order import order_by_keys
 from .tile_kernels import (
     ID,
     RECORD_VALUES,
+    assign_slots,
     count_band,
-    place_slots,
     range_pixels,
     rank_records,
     scatter_tiles,
     span_tiles,
 )
 
-_MAX_PAIRS = 2**31 - 1
+_MAX_INTERSECTIONS = 2**31 - 1
 _MAX_TILES_ACROSS = 2**16 - 1
 _CHUNKS_PER_THREAD = 2
 
@@ -33,34 +33,34 @@ _CHUNKS_PER_THREAD = 2
 class TileLists:
     """For each tile, the Gaussians whose ellipse ``alpha >= 1/255`` reaches it, nearest first.
 
-    Tiles are numbered row by row. A *pair* is one (tile, Gaussian); *slots* number the pairs so
-    that those of one Gaussian are contiguous, which is where per-pair gradients are written. The
-    lists may be those of a band of tiles; all others are empty then.
+    Tiles are numbered row by row. An *intersection* is one (tile, Gaussian); *slots* number the
+    intersections so that those of one Gaussian are contiguous: their gradients are written there.
+    The lists may be those of a band of tiles; all other lists are empty then.
     """
 
     start: np.ndarray
-    """(tiles + 1,) int64: the pairs of tile t are ``start[t] .. start[t + 1]``."""
+    """(tiles + 1,) int64: tile t has the intersections ``start[t] .. start[t + 1]``."""
     gaussian_ids: np.ndarray
-    """(pairs,) int32, by increasing distance within a tile, ties by index."""
-    pair_slots: np.ndarray
-    """(pairs,) int32: slot of each pair."""
-    pair_offsets: np.ndarray
-    """(n + 1,) int64: the slots of Gaussian i are ``pair_offsets[i] .. pair_offsets[i + 1]``."""
+    """(intersections,) int32, by increasing distance within a tile, ties by index."""
+    intersection_slots: np.ndarray
+    """(intersections,) int32: slot of each intersection."""
+    intersection_offsets: np.ndarray
+    """(n + 1,) int64: the slots of Gaussian i are ``[offsets[i], offsets[i + 1])``."""
     pixel_ranges: np.ndarray
-    """(n, 4) int32: first and last row, first and last column of pixels whose centre lies in the
-    box, inside the image; empty (first > last) where not visible."""
+    """(n, 4) int32: first and last row, first and last column of the pixels of the image whose
+    centres lie in the box; empty (first > last) where not visible."""
     tiles_x: int
     tiles_y: int
 
 
 class TileBinning:
-    """Which tiles each Gaussian of a view reaches, from which the lists of any band are made.
+    """The tiles that each Gaussian of a view reaches; yields the lists of any band of tiles.
 
     Attributes
     ----------
     ids : (v,) int32
         The Gaussians that reach a tile, increasing.
-    tile_pairs : (tiles,) int64
+    tile_counts : (tiles,) int64
         Number of Gaussians that reach each tile.
     pixel_ranges, tiles_x, tiles_y
         As in :class:`TileLists`.
@@ -69,7 +69,7 @@ class TileBinning:
     def __init__(
         self, screen: ScreenGaussians, width: int, height: int, threads: int, store: ArrayStore
     ) -> None:
-        """Find tiles and order; the arrays live in ``store`` until its next binning.
+        """Find tiles and depth order; the arrays are valid until the next binning with ``store``.
 
         Raises
         ------
@@ -90,7 +90,7 @@ class TileBinning:
         self._gaussians = _bounds(count, threads)  # runs of Gaussians, one a chunk
         chunks = len(self._gaussians) - 1
         self.pixel_ranges = store.take("pixel ranges", (count, 4), np.int32)
-        found = np.zeros((chunks + 1, 2), np.int64)  # visible, rows of tiles they reach
+        found = np.zeros((chunks + 1, 2), np.int64)  # visible, tile rows they reach
 
         def ranges(first: int, end: int) -> None:
             for chunk in range(first, end):
@@ -101,7 +101,7 @@ class TileBinning:
 
         run_chunks(ranges, np.arange(chunks + 1), threads)
         starts = np.cumsum(found, axis=0)
-        if starts[-1, 1] > _MAX_PAIRS:
+        if starts[-1, 1] > _MAX_INTERSECTIONS:
             raise ResourceError(
                 f"The Gaussians reach {starts[-1, 1]} rows of tiles.", "Render a smaller image."
             )
@@ -109,7 +109,7 @@ class TileBinning:
         self._records = store.take("records", (int(starts[-1, 0]), RECORD_VALUES), np.int32)
         keys = store.take("keys", int(starts[-1, 0]), np.uint32)
         changes = store.take("changes", (chunks, self.tiles_y, self.tiles_x + 1), np.int32)
-        results = np.zeros((chunks, 4), np.int64)  # end record, pairs, lowest and highest key
+        results = np.zeros((chunks, 4), np.int64)  # end record, count, lowest and highest key
 
         def spans(first: int, end: int) -> None:
             for chunk in range(first, end):
@@ -130,10 +130,10 @@ class TileBinning:
                 )
 
         run_chunks(spans, np.arange(chunks + 1), threads)
-        # Gaussians that turned out to reach no tile leave gaps at the ends of the runs.
+        # Gaussians that turn out to reach no tile leave gaps at the ends of the runs.
         self._runs = np.stack([starts[:-1, 0], results[:, 0]], 1)  # (chunks, 2) runs of records
-        # The records hold numbers of pairs of the whole image until slots take their place.
-        self._whole_pairs: np.ndarray | None = results[:, 1]
+        # Until slots replace them, the records hold the intersection counts of the whole image.
+        self._image_intersections: np.ndarray | None = results[:, 1]
         seen = int((self._runs[:, 1] - self._runs[:, 0]).sum())
         self.ids = store.take("ids", seen, np.int32)
         at = 0
@@ -141,61 +141,65 @@ class TileBinning:
             self.ids[at : at + end - begin] = self._records[begin:end, ID]
             at += end - begin
         per_tile = changes.sum(0, dtype=np.int64).cumsum(1)  # (tiles_y, tiles_x + 1)
-        self.tile_pairs = np.ascontiguousarray(per_tile[:, :-1]).reshape(-1)
+        self.tile_counts = np.ascontiguousarray(per_tile[:, :-1]).reshape(-1)
         extent = (0, 0)
         if seen:
             extent = int(results[:, 2].min()), int(results[:, 3].max())
         self._order = order_by_keys(keys, self._runs, extent, threads, store)
 
-    def bands(self, most_pairs: int) -> list[tuple[int, int]]:
-        """Cut the tiles into runs of at most ``most_pairs`` pairs, or of a single tile.
+    def bands(self, max_intersections: int) -> list[tuple[int, int]]:
+        """Split the tiles into runs of at most ``max_intersections``, or of a single tile.
 
         Returns
         -------
         list of (first, end)
-            At least one band, even where nothing is visible.
+            At least one band, even if nothing is visible.
         """
-        below = np.concatenate([[0], np.cumsum(self.tile_pairs)])
-        tiles = len(self.tile_pairs)
+        below = np.concatenate([[0], np.cumsum(self.tile_counts)])
+        tiles = len(self.tile_counts)
         bands, first = [], 0
         while first < tiles:
-            fitting = int(np.searchsorted(below, below[first] + most_pairs, side="right")) - 1
+            fitting = (
+                int(np.searchsorted(below, below[first] + max_intersections, side="right")) - 1
+            )
             end = min(max(fitting, first + 1), tiles)
             bands.append((first, end))
             first = end
         return bands
 
-    def lists(self, first: int, end: int, most_pairs: int | None = None) -> TileLists:
-        """Return the lists of the tiles ``first .. end``; those made before are overwritten.
+    def lists(self, first: int, end: int, max_intersections: int | None = None) -> TileLists:
+        """Return the lists of the tiles ``first .. end``, overwriting those of the last call.
 
         Parameters
         ----------
         first, end : int
             Any run of tiles.
-        most_pairs : int, optional
-            No memory is reserved for more pairs than these, beyond what the band needs.
+        max_intersections : int, optional
+            Largest number of intersections to reserve memory for ahead of need.
 
         Raises
         ------
         ResourceError
-            If they would hold more than 2^31 - 1 pairs.
+            If the lists would hold more than 2^31 - 1 intersections.
         """
         store, threads = self._store, self.threads
-        tiles = len(self.tile_pairs)
+        tiles = len(self.tile_counts)
         start = store.take("start", tiles + 1, np.int64)
         start[: first + 1] = 0
-        np.cumsum(self.tile_pairs[first:end], out=start[first + 1 : end + 1])
-        start[end:] = pairs = int(start[end])
-        if pairs > _MAX_PAIRS:
+        np.cumsum(self.tile_counts[first:end], out=start[first + 1 : end + 1])
+        start[end:] = intersections = int(start[end])
+        if intersections > _MAX_INTERSECTIONS:
             raise ResourceError(
-                f"{pairs} pairs of Gaussian and tile do not fit.",
+                f"{intersections} tile intersections do not fit.",
                 "Render a smaller image or with a smaller budget.",
             )
-        pair_offsets = self._offsets(first, end)
+        intersection_offsets = self._offsets(first, end)
         heads = store.take("heads", tiles, np.int64)
         heads[:] = start[:-1]
-        gaussian_ids = store.take("gaussian ids", pairs, np.int32, most_pairs)
-        pair_slots = store.take("pair slots", pairs, np.int32, most_pairs)
+        gaussian_ids = store.take("gaussian ids", intersections, np.int32, max_intersections)
+        intersection_slots = store.take(
+            "intersection slots", intersections, np.int32, max_intersections
+        )
         ranked = store.take("ranked", (len(self._order), RECORD_VALUES), np.int32)
 
         def rank(begin: int, stop: int) -> None:
@@ -214,17 +218,17 @@ class TileBinning:
                 self._spans,
                 heads,
                 gaussian_ids,
-                pair_slots,
+                intersection_slots,
             )
 
-        # Each thread walks the whole order and keeps what falls into its tiles.
-        bounds = first + balanced_bounds(self.tile_pairs[first:end], threads)
+        # Each thread passes over the whole order and keeps what falls into its tiles.
+        bounds = first + balanced_bounds(self.tile_counts[first:end], threads)
         run_chunks(scatter, bounds, threads)
         return TileLists(
             start,
             gaussian_ids,
-            pair_slots,
-            pair_offsets,
+            intersection_slots,
+            intersection_offsets,
             self.pixel_ranges,
             self.tiles_x,
             self.tiles_y,
@@ -233,7 +237,7 @@ class TileBinning:
     def _offsets(self, first: int, end: int) -> np.ndarray:
         """Number the slots of a band; return (n + 1,) offsets."""
         chunks, threads = len(self._runs), self.threads
-        offsets = self._store.take("pair offsets", self._count + 1, np.int64)
+        offsets = self._store.take("intersection offsets", self._count + 1, np.int64)
         totals = np.zeros(chunks + 1, np.int64)
 
         def count(first_chunk: int, end_chunk: int) -> None:
@@ -243,22 +247,22 @@ class TileBinning:
                     begin, stop, first, end, self.tiles_x, self._spans, self._records
                 )
 
-        if self._whole_pairs is not None and (first, end) == (0, len(self.tile_pairs)):
-            totals[1:] = self._whole_pairs
+        if self._image_intersections is not None and (first, end) == (0, len(self.tile_counts)):
+            totals[1:] = self._image_intersections
         else:
             run_chunks(count, np.arange(chunks + 1), threads)
-        self._whole_pairs = None
+        self._image_intersections = None
         slots = np.cumsum(totals)
 
-        def place(first_chunk: int, end_chunk: int) -> None:
+        def assign(first_chunk: int, end_chunk: int) -> None:
             for chunk in range(first_chunk, end_chunk):
                 begin, stop = self._runs[chunk]
                 begin_gaussian, end_gaussian = self._gaussians[chunk : chunk + 2]
-                place_slots(
+                assign_slots(
                     begin, stop, begin_gaussian, end_gaussian, slots[chunk], self._records, offsets
                 )
 
-        run_chunks(place, np.arange(chunks + 1), threads)
+        run_chunks(assign, np.arange(chunks + 1), threads)
         offsets[self._count] = slots[-1]
         return offsets
 
@@ -272,9 +276,9 @@ def bin_gaussians(
 ) -> TileLists:
     """Sort the visible Gaussians by distance and scatter them into tile lists.
 
-    One radix sort of the distances and one counting sort into tiles; the order within each tile
-    is that of a stable sort, whatever the number of threads. In tiles at the corners of a box that
-    the ellipse itself does not reach, the Gaussian is left out.
+    One radix sort of the distances and one counting sort into tiles; within each tile the order is
+    that of a stable sort, for any number of threads. Tiles at the corners of a box that the ellipse
+    itself does not reach leave the Gaussian out.
 
     Parameters
     ----------
@@ -283,12 +287,12 @@ def bin_gaussians(
     threads : int
         0 uses every core.
     store : ArrayStore, optional
-        Where the lists live, until they are made again there; by default they are new.
+        Owns the lists, which are valid until its next binning; by default a new one.
 
     Raises
     ------
     ResourceError
-        If the lists would hold more than 2^31 - 1 pairs.
+        If the lists would hold more than 2^31 - 1 intersections.
     """
     store = ArrayStore() if store is None else store
     binning = TileBinning(screen, width, height, threads or default_threads(), store)
@@ -296,5 +300,5 @@ def bin_gaussians(
 
 
 def _bounds(count: int, threads: int) -> np.ndarray:
-    """Split the Gaussians: one run for one thread, else a few a thread."""
+    """Split the Gaussians: one run for a single thread, else a few per thread."""
     return even_bounds(count, threads, _CHUNKS_PER_THREAD if threads > 1 else 1)

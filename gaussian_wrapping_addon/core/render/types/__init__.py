@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a renderer takes and gives: options, images, gradients."""
+"""Data classes of the renderer: options, images, gradients."""

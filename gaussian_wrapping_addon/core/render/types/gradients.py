@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gradients with respect to the images of a view and to the Gaussians that it shows."""
+"""Gradients with respect to the images of a view and to its visible Gaussians."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ImageGradients:
-    """Gradient of a scalar with respect to the images of a view; ``None`` stands for zeros."""
+    """Gradient of a scalar with respect to the images of a view; ``None`` means zeros."""
 
     color: np.ndarray | None = None  # (h, w, 3)
     normal: np.ndarray | None = None  # (h, w, 3)
@@ -21,10 +21,10 @@ class ImageGradients:
 
 @dataclass(frozen=True)
 class VisibleGradients:
-    """Gradients of a scalar with respect to the raw parameters of the Gaussians that were seen.
+    """Gradients of a scalar with respect to the raw parameters of the visible Gaussians.
 
     Arrays are C-contiguous float32; row k belongs to Gaussian ``ids[k]``. They may be views of
-    scratch that the next rendering overwrites.
+    scratch memory that the next rendering overwrites.
     """
 
     ids: np.ndarray  # (v,) int32, increasing

@@ -11,14 +11,14 @@ from torch import Tensor
 
 @dataclass
 class RenderStatistics:
-    """Per-Gaussian figures of one view, all (n,) unless said otherwise.
+    """Per-Gaussian statistics of one view, (n,) unless noted otherwise.
 
-    Gradient figures are filled when ``backward`` runs through the render. The weights are (0,)
-    where only the screen gradients were asked for.
+    Gradient statistics are filled by the backward pass. The weights are (0,) if only screen
+    gradients were requested.
     """
 
     visible: np.ndarray
-    """bool: reached at least one tile of the image."""
+    """bool: reaches at least one tile of the image."""
     radii_px: np.ndarray
     """float32: half of the longer side of the screen box."""
     weight_sum: np.ndarray

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options of one rendering."""
+"""Rendering options."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ class RenderOptions:
     """Options of one rendering."""
 
     depth: bool = True
-    """Solve the 0.5-isosurface depth (and its gradient); off where no depth loss is active."""
+    """Solve the 0.5-isosurface depth (and its gradient); disable where no depth loss is active."""
     sh_degree: int | None = None
     """Use only this degree of the stored harmonics; ``None`` uses all."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     near_z: float = tolerances.NEAR_Z
     depth_valid_transmittance: float = tolerances.DEPTH_VALID_TRANSMITTANCE
     threads: int = 0
-    """0 uses every core this process may use."""
+    """0 uses every core available to this process."""
     statistics: bool = False
-    """Gather all of :class:`~.images.RenderStatistics` (wrapping, pruning)."""
+    """Collect all of :class:`~.images.RenderStatistics` (wrapping, pruning)."""
     screen_gradients: bool = False
-    """Gather only ``visible``, ``radii_px``, ``grad_px`` and ``grad_abs_px`` (density control):
-    spares the sums of blending weights."""
+    """Collect only ``visible``, ``radii_px``, ``grad_px`` and ``grad_abs_px`` (density control),
+    without the sums of blending weights."""
     budget_bytes: int = limits.RENDER_BUDGET_BYTES
-    """What everything that grows with the (tile, Gaussian) pairs may take. An image whose pairs do
-    not fit is rendered in bands of tiles; a band is never smaller than one tile."""
+    """Memory for everything that grows with the number of tile intersections. An image whose
+    intersections do not fit is rendered in bands of tiles; a band is at least one tile."""
 
     @property
     def gathers_statistics(self) -> bool:
-        """Whether a rendering has statistics at all."""
+        """Whether a rendering collects any statistics."""
         return self.statistics or self.screen_gradients

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which face owns each texel of an atlas, and where texels lie on the mesh."""
+"""Rasterisation of an atlas: the face of each texel and its position on the mesh."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which face owns each texel of the atlas, and where in the face its centre lies."""
+"""Rasterise an atlas: the face of each texel, and the barycentric coordinates of its centre."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from ...kernels.compiled import inline, kernel
 from ...kernels.parallel import even_bounds, run_chunks
 
 TOUCH_TEXELS = 0.75
-"""A texel whose centre is this near to a triangle may touch it (half diagonal 0.71)."""
+"""A texel whose centre is this close to a triangle may touch it (half diagonal 0.71)."""
 BAND_ROWS = 256
-"""Rows whose scratch arrays are held at once, for each thread."""
+"""Rows whose scratch arrays are held at once, per thread."""
 STRICT_TEXELS = 0.05
-"""Inside by more than this counts as inside when looking for overlaps."""
+"""Minimum distance to the edges at which a centre counts as inside in the overlap test."""
 
 
 @dataclass(frozen=True)
 class AtlasRaster:
-    """Texel ownership of a square atlas; row 0 is the top (v = 1)."""
+    """Face of each texel of a square atlas; row 0 is the top (v = 1)."""
 
     face: np.ndarray
-    """(size, size) int32, -1 where no face is."""
+    """(size, size) int32, -1 without a face."""
     bary: np.ndarray
     """(size, size, 2) float32 weights of the first two corners."""
     inside: np.ndarray
-    """(size, size) bool: the centre lies in the face; else the face only touches the texel."""
+    """(size, size) bool: the centre lies in the face; otherwise the face only touches the texel."""
     overlaps: int
-    """Texels whose centre is strictly inside two or more faces."""
+    """Number of texels whose centre is strictly inside two or more faces."""
 
 
 def texel_corners(corner_uvs: np.ndarray, size_px: int) -> np.ndarray:
@@ -46,7 +46,7 @@ def raster_atlas(
     threads: int,
     faces: np.ndarray | None = None,
 ) -> AtlasRaster:
-    """Rasterise UV triangles: exact at centres, then one ring of texels that are only touched.
+    """Rasterise UV triangles: exact at centres, plus one ring of texels that are only touched.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def raster_atlas(
     threads : int
         Threads to use; the result does not depend on it.
     faces : (f,) bool, optional
-        Those that lie in this atlas; all of them by default.
+        Faces in this atlas; all by default.
     """
     corners = texel_corners(corner_uvs, size_px)
     if faces is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where the texels of an atlas lie on its mesh."""
+"""Surface points of texels."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from .atlas_raster import AtlasRaster
 
 @dataclass(frozen=True)
 class TexelPoints:
-    """Points of a mesh under texels."""
+    """Surface points of texels."""
 
     face: np.ndarray
     """(n,) int32."""
     weights: np.ndarray
-    """(n, 3) float64 of the face's corners."""
+    """(n, 3) float64 barycentric weights of the face's corners."""
     points: np.ndarray
     """(n, 3) float64 positions."""
     raw_normals: np.ndarray
-    """(n, 3) float64 vertex normals interpolated, not of unit length."""
+    """(n, 3) float64 interpolated vertex normals, not of unit length."""
     normals: np.ndarray
-    """(n, 3) float64 the same, of unit length."""
+    """(n, 3) float64 the same, normalised."""
 
 
 def texel_points(
     mesh: SurfaceMesh, raster: AtlasRaster, texels: np.ndarray, normals: np.ndarray
 ) -> TexelPoints:
-    """Return the points under some texels.
+    """Return the surface points of some texels.
 
     Parameters
     ----------
     mesh : SurfaceMesh
     raster : AtlasRaster
-        Of its UVs.
+        Raster of its UVs.
     texels : (n,) int64
-        Flat indices of texels that faces own.
+        Flat indices of texels with a face.
     normals : (v, 3) float64
         Vertex normals.
     """

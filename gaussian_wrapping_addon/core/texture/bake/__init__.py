@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Colours of texels: here photos become texels, and what no photo shows is filled.
+"""Texture baking: blend photos into texels, fill unseen texels.
 
-In: points of the surface and photos. Out: images and what they cover.
+In: surface points and photos. Out: texture images and their coverage.
 """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The image of one atlas: what photos show, then what lies around it, then the space between.
+"""Image of one atlas: baked colours, fill of unseen texels, gutters and background.
 
-An atlas is filled in two steps, because what no photo saw is continued from the seen texels of all
-atlases: :class:`AtlasColors` puts the baked colours in and keeps little else; its ``finish`` does
-the rest.
+An atlas is completed in two steps, because unseen texels are filled from the seen texels of all
+atlases: :class:`AtlasColors` holds the baked colours and little else; its ``finish`` does the
+rest.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from collections.abc import Iterator
 import numpy as np
 
 from .atlas_points import AtlasPoints, blocks_of
-from .bake import Baked
-from .fill import RING_TEXELS, Continuation, fill_background, grow, surface_positions
+from .bake import BakedColors
+from .fill import BLEND_TEXELS, HarmonicFill, dilate, fill_background, surface_positions
 from .photo_samples import SurfaceArrays
 
-CONTINUED_POINTS = 1_000_000
-"""As many seen texels are enough for the cells from which colours are continued."""
-OUTLINE_TEXELS = 8
-"""Texels seen only at silhouettes take their neighbours' colour within this distance."""
-UNSURE_LEVELS = 15.0
-"""What only grazing or half hidden views show is taken while it is this near to what lies around,
-and not at all at twice this: on trained meshes such views are often of something before it."""
+MAX_FILL_SOURCES = 1_000_000
+"""Maximum number of seen texels used as sources of the harmonic fill."""
+SILHOUETTE_TEXELS = 8
+"""Texels seen only at silhouettes take their neighbours' colours within this distance."""
+UNRELIABLE_LEVELS = 15.0
+"""Colours of grazing or partly occluded views are used if they are this close to their
+surroundings, and not at all at twice this: on trained meshes, such views often show an occluder."""
 
 
 class AtlasColors:
-    """Colours of one atlas, until all are known from which unseen surface is continued.
+    """Colours of one atlas, before the fill of unseen texels is known.
 
     Parameters
     ----------
@@ -35,24 +35,24 @@ class AtlasColors:
     baked : Baked
         Colours of its points.
     known_points : int
-        As many seen texels are kept at most, for the continuation.
+        Maximum number of seen texels kept as sources of the fill.
     surface : SurfaceArrays
     """
 
     def __init__(
-        self, atlas: AtlasPoints, baked: Baked, known_points: int, surface: SurfaceArrays
+        self, atlas: AtlasPoints, baked: BakedColors, known_points: int, surface: SurfaceArrays
     ) -> None:
-        texels, seen = atlas.texels, baked.sure
+        texels, seen = atlas.texels, baked.reliable
         size_px = len(atlas.chart)
         self.image = np.zeros((size_px, size_px, 3), np.uint8)
         pixels = self.image.reshape(-1, 3)
         ring = np.full((size_px, size_px), -1, np.int16)
         flat_ring = ring.reshape(-1)
-        # Seen at silhouettes only: the neighbours' colour is cleaner, where there are neighbours.
+        # Seen only at silhouettes: use the cleaner colours of neighbours, if there are any.
         for rows in blocks_of(len(texels)):
             pixels[texels[rows]] = baked.colors[rows]
             flat_ring[texels[rows][seen[rows] & baked.clear[rows]]] = 0
-        grow(self.image, ring, atlas.chart, OUTLINE_TEXELS, inside=True)
+        dilate(self.image, ring, atlas.chart, SILHOUETTE_TEXELS, inside=True)
         trusted = seen.copy()
         for rows in blocks_of(len(texels)):
             trusted[rows] &= flat_ring[texels[rows]] >= 0
@@ -60,67 +60,67 @@ class AtlasColors:
         known = np.flatnonzero(trusted if trusted.any() else seen)
         known = known[:: max(1, len(known) // known_points)]
         if not seen.all():
-            grow(self.image, ring, atlas.chart, RING_TEXELS, inside=True)
+            dilate(self.image, ring, atlas.chart, BLEND_TEXELS, inside=True)
         self.known = surface_positions(atlas.points.part(known), surface)
-        """(n, 3) float64 where seen texels lie,"""
+        """(n, 3) float64 positions of seen texels."""
         self.known_colors = pixels[texels[known]]
-        """(n, 3) uint8 and their colours."""
+        """(n, 3) uint8 colours of these texels."""
         unseen = np.flatnonzero(~seen)
         self._unseen = texels[unseen]
         self._unseen_points = atlas.points.part(unseen)
         self._unseen_ring = flat_ring[self._unseen]
-        unsure = np.flatnonzero((baked.views > 0) & ~seen)
-        self._unsure, self._unsure_colors = texels[unsure], baked.colors[unsure]
-        self._unsure_ring = flat_ring[self._unsure]
+        unreliable = np.flatnonzero((baked.views > 0) & ~seen)
+        self._unreliable, self._unreliable_colors = texels[unreliable], baked.colors[unreliable]
+        self._unreliable_ring = flat_ring[self._unreliable]
         self._owned = atlas.chart >= 0
 
     def unseen(self, surface: SurfaceArrays) -> Iterator[np.ndarray]:
-        """Yield (m, 3) float64 positions of what no photo saw."""
+        """Yield (m, 3) float64 positions of unseen texels, in blocks."""
         for rows in blocks_of(len(self._unseen)):
             yield surface_positions(self._unseen_points.part(rows), surface)
 
-    def finish(
-        self, continuation: Continuation, surface: SurfaceArrays, gutter_px: int
-    ) -> np.ndarray:
-        """Fill what no photo saw, gutters and the rest; return the (h, w, 3) uint8 image."""
+    def finish(self, fill: HarmonicFill, surface: SurfaceArrays, gutter_px: int) -> np.ndarray:
+        """Fill unseen texels, gutters and background; return the (h, w, 3) uint8 image."""
         pixels = self.image.reshape(-1, 3)
         for rows, positions in zip(blocks_of(len(self._unseen)), self.unseen(surface), strict=True):
-            far = continuation.at(positions)
+            far = fill.at(positions)
             near = pixels[self._unseen[rows]]
-            share = _away(self._unseen_ring[rows])
+            share = _fill_weight(self._unseen_ring[rows])
             pixels[self._unseen[rows]] = np.rint(near + share * (far - near)).astype(np.uint8)
-        for rows in blocks_of(len(self._unsure)):
-            around = pixels[self._unsure[rows]].astype(np.float32)
-            shown = self._unsure_colors[rows]
+        for rows in blocks_of(len(self._unreliable)):
+            around = pixels[self._unreliable[rows]].astype(np.float32)
+            shown = self._unreliable_colors[rows]
             off = np.abs(shown - around).max(axis=1, initial=0.0)
-            near_enough = (2.0 - off / UNSURE_LEVELS).clip(0.0, 1.0)[:, None]
-            share = _away(self._unsure_ring[rows]) * near_enough  # no step at the sure ones
+            near_enough = (2.0 - off / UNRELIABLE_LEVELS).clip(0.0, 1.0)[:, None]
+            share = (
+                _fill_weight(self._unreliable_ring[rows]) * near_enough
+            )  # no step at the sure ones
             mixed = np.rint(around + share * (shown - around))
-            pixels[self._unsure[rows]] = mixed.astype(np.uint8)
+            pixels[self._unreliable[rows]] = mixed.astype(np.uint8)
         ring = np.where(self._owned, np.int16(0), np.int16(-1))
         chart = np.where(self._owned, np.int32(0), np.int32(-1))
-        grow(self.image, ring, chart, gutter_px, inside=False)
+        dilate(self.image, ring, chart, gutter_px, inside=False)
         del chart
         fill_background(self.image, ring >= 0)
         return self.image
 
 
-def _away(ring: np.ndarray) -> np.ndarray:
-    """(n, 1) float32 from 0 at seen texels to 1 where the rings around them end."""
+def _fill_weight(ring: np.ndarray) -> np.ndarray:
+    """Return (n, 1) float32 weights of the fill, from 0 at seen texels to 1 beyond their rings."""
     number = ring.astype(np.float32)
-    share = np.where(number < 0, np.float32(1.0), number / np.float32(RING_TEXELS + 1.0))
+    share = np.where(number < 0, np.float32(1.0), number / np.float32(BLEND_TEXELS + 1.0))
     return share[:, None]
 
 
-def continue_colors(atlases: list[AtlasColors], surface: SurfaceArrays) -> Continuation:
-    """Continue what photos show over the surface of all atlases."""
+def fill_harmonically(atlases: list[AtlasColors], surface: SurfaceArrays) -> HarmonicFill:
+    """Return the harmonic fill from the seen texels of all atlases."""
 
-    def wanted() -> Iterator[np.ndarray]:
+    def queries() -> Iterator[np.ndarray]:
         for atlas in atlases:
             yield from atlas.unseen(surface)
 
-    return Continuation(
+    return HarmonicFill(
         np.concatenate([a.known for a in atlases]),
         np.concatenate([a.known_colors for a in atlases]),
-        wanted,
+        queries,
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The texels of one atlas that faces own, as points of the surface."""
+"""Texels of one atlas that belong to a face, as surface points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..atlas.atlas_raster import AtlasRaster
 from .photo_samples import SurfacePoints
 
 BLOCK_TEXELS = 4_000_000
-"""Indices of 32 bits are made longer by numpy whenever they are used: never all at once."""
+"""Texels processed at once: numpy widens 32-bit indices to 64 bits whenever they are used."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class AtlasPoints:
 
 
 def atlas_points(raster: AtlasRaster, charts: np.ndarray) -> AtlasPoints:
-    """Take the points out of a raster, which is used up: its faces are turned into charts.
+    """Extract the points of a raster; its face indices are replaced by charts in place.
 
     Parameters
     ----------
@@ -52,5 +52,5 @@ def atlas_points(raster: AtlasRaster, charts: np.ndarray) -> AtlasPoints:
 
 
 def blocks_of(count: int) -> list[slice]:
-    """Split texels into blocks."""
+    """Return slices of at most :data:`BLOCK_TEXELS`."""
     return [slice(b, min(b + BLOCK_TEXELS, count)) for b in range(0, count, BLOCK_TEXELS)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Colours of surface points from the photos: best views, occlusion-tested, robustly blended."""
+"""Colours of surface points from photos: occlusion test, best views, robust blending."""
 
 from __future__ import annotations
 
@@ -16,150 +16,150 @@ from ...kernels.compiled import kernel, part
 from ...kernels.parallel import even_bounds, run_chunks
 from ...progress import Progress
 from .fill import surface_positions
-from .low_frequency_correction import solve_fields
+from .low_frequency_correction import solve_low_frequency_correction
 from .photo_gains import solve_gains
 from .photo_samples import LAST_RESORT_BELOW, PhotoView, SurfaceArrays, SurfacePoints, sample_photo
 from .visibility import photo_visibility
 
 KEPT_VIEWS = 15
-"""An odd number, so that the median of the views is one of them. Of five, the median changed where
-one view took another's place: flakes along the rim of a pot whose photos differ in exposure."""
+"""Odd, so that the median of the views is one of them. With five, the median changed wherever one
+view replaced another: flakes along the rim of a pot whose photos differ in exposure."""
 SHARPNESS = 6.0
-"""Weights are raised to this power: the best view leads. On held-out photos of the banana set, 6
+"""Exponent of the weights, so that the best view dominates. On held-out photos of the banana set, 6
 costs 0.1 dB against 1 and keeps a tenth more of the gradients."""
 OUTLIER_FLOOR = 20.0
 """Views within this many of 255 levels of the median are never outliers."""
 OUTLIER_FACTOR = 2.5
 CLEAR_PX = 2
-"""Nearer to a silhouette, a pixel's colour is partly that of something else."""
+"""Closer to a silhouette, a pixel's colour is mixed with that of another surface."""
 MEDIAN_POWER = 0.25
-"""Weights of the median: so even that one leading view cannot outvote the others."""
+"""Exponent of the weights in the median: even enough that one view cannot outvote the others."""
 POINTS_PER_BLOCK = 6_000_000
-"""Points held with their views at once (105 bytes each)."""
-EXPOSURE_POINTS = 24_000
-"""Some fifty in each cell of a photo's brightness field where a fifth of them is in the photo."""
-EXPOSURE_CELLS = 8_000_000
-"""Bound on points x photos of the exposure step."""
+"""Points processed at once with their views (105 bytes each)."""
+CORRECTION_POINTS = 24_000
+"""About fifty per grid cell of a photo's low-frequency correction, with a fifth of them in view."""
+MAX_CORRECTION_SAMPLES = 8_000_000
+"""Bound on points x photos of the colour correction."""
 COARSE_LONG_SIDE_PX = 480
 
 
 @dataclass(frozen=True)
-class Baked:
-    """Colours of the points."""
+class BakedColors:
+    """Blended colours of surface points."""
 
     colors: np.ndarray
-    """(n, 3) uint8; 0 where no photo sees the point."""
+    """(n, 3) uint8; 0 if no photo sees the point."""
     views: np.ndarray
-    """(n,) uint8 number of views blended, 0 where unseen."""
+    """(n,) uint8 number of views blended, 0 if unseen."""
     clear: np.ndarray
     """(n,) bool: some view sees the point away from silhouettes, where two surfaces mix."""
-    sure: np.ndarray
-    """(n,) bool: some view sees the point neither grazing nor half hidden."""
+    reliable: np.ndarray
+    """(n,) bool: some view sees the point neither at a grazing angle nor partly occluded."""
     photos_used: int
-    """Photos that gave at least a depth sample of the mesh."""
+    """Number of photos with at least one depth sample of the mesh."""
     gain_spread: float
     """Standard deviation of the log gains between photos."""
     gains_applied: bool
-    field_spread: float
-    """Standard deviation of the log brightness fields within photos."""
-    fields_applied: bool
+    low_frequency_spread: float
+    """Standard deviation of the log low-frequency corrections within photos."""
+    low_frequency_applied: bool
     rejected: int
-    """Kept views that were outliers."""
+    """Number of kept views rejected as outliers."""
 
 
 @dataclass(frozen=True)
-class Survey:
-    """What is known of the photos before colours are taken."""
+class PhotoPreparation:
+    """Photos that show the mesh, and their colour correction."""
 
-    plans: list[_Plan]
-    """Of the photos that show the mesh."""
-    exposure: _Exposure
+    used_photos: list[_UsedPhoto]
+    """Photos that show the mesh, and the level at which each is read."""
+    correction: _ColorCorrection
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _UsedPhoto:
     index: int
     divisor: int
 
 
 @dataclass(frozen=True)
-class _Exposure:
+class _ColorCorrection:
     factors: np.ndarray
-    """(photos, gh, gw, 3) float64 factors of each photo's brightness, on a grid over the photo."""
+    """(photos, gh, gw, 3) float64 colour factors of each photo, on a grid over the photo."""
     gain_spread: float
     gains_applied: bool
-    field_spread: float
-    fields_applied: bool
+    low_frequency_spread: float
+    low_frequency_applied: bool
 
 
 def bake(
     points: SurfacePoints,
     surface: SurfaceArrays,
     photos: PhotoSource,
-    survey: Survey,
+    preparation: PhotoPreparation,
     progress: Progress,
     *,
     threads: int,
-) -> Baked:
-    """Give each point the robust mean of its best views.
+) -> BakedColors:
+    """Blend the best views of each point by a robust mean.
 
     Parameters
     ----------
     points : SurfacePoints
         Points in texture order.
     photos : PhotoSource
-        Read one at a time, at the level that the texel size needs.
-    survey : Survey
-        Of these photos, by :func:`look_at_photos`.
+        Read one at a time, at the level that matches the texel size.
+    preparation : PhotoPreparation
+        Result of :func:`prepare_photos` for these photos.
 
     Notes
     -----
-    A view's weight is (cosine x useful pixels per texel)^2, faded near silhouettes and the
-    image border. The best ``KEPT_VIEWS`` are kept; with three or more, those far from their
-    median are dropped (docs/method.md, section 8.2).
+    The weight of a view is (cosine x useful pixels per texel)^2, reduced near silhouettes and the
+    image border. The best ``KEPT_VIEWS`` are kept; with three or more, those far from their median
+    are rejected (docs/method.md, section 8.2).
     """
-    plans, exposure = survey.plans, survey.exposure
+    used_photos, correction = preparation.used_photos, preparation.correction
     colors = np.zeros((len(points), 3), np.uint8)
     views = np.zeros(len(points), np.uint8)
     rejected = np.zeros(len(points), np.uint8)
     clearance = np.zeros(len(points), np.uint8)
-    sure = np.zeros(len(points), np.bool_)
+    reliable = np.zeros(len(points), np.bool_)
     blocks = max(1, math.ceil(len(points) / POINTS_PER_BLOCK))
     bounds = np.linspace(0, len(points), blocks + 1).astype(int).tolist()
-    steps = max(1, blocks * len(plans))
+    steps = max(1, blocks * len(used_photos))
     for block, (begin, end) in enumerate(pairwise(bounds)):
         part = points.part(slice(begin, end))
         weights = np.zeros((end - begin, KEPT_VIEWS), np.float32)
         kept = np.zeros((end - begin, KEPT_VIEWS, 3), np.uint8)
-        for step, plan in enumerate(plans):
-            fraction = 0.95 * (block * len(plans) + step) / steps
-            progress.update(fraction, f"texture: photo {step + 1} of {len(plans)}")
-            view = _view(photos, plan.index, plan.divisor, surface, threads)
+        for step, used_photo in enumerate(used_photos):
+            fraction = 0.95 * (block * len(used_photos) + step) / steps
+            progress.update(fraction, f"texture: photo {step + 1} of {len(used_photos)}")
+            view = _view(photos, used_photo.index, used_photo.divisor, surface, threads)
             sample_photo(
                 part,
                 surface,
                 view,
-                exposure.factors[plan.index],
+                correction.factors[used_photo.index],
                 weights,
                 kept,
                 clearance[begin:end],
                 threads,
             )
         progress.update(0.95 * (block + 1) / blocks, "blending views")
-        sure[begin:end] = weights.max(axis=1) > LAST_RESORT_BELOW
+        reliable[begin:end] = weights.max(axis=1) > LAST_RESORT_BELOW
         _blend_block(
             weights, kept, colors[begin:end], views[begin:end], rejected[begin:end], threads
         )
-    return Baked(
+    return BakedColors(
         colors,
         views,
         clearance >= CLEAR_PX,
-        sure,
-        len(plans),
-        exposure.gain_spread,
-        exposure.gains_applied,
-        exposure.field_spread,
-        exposure.fields_applied,
+        reliable,
+        len(used_photos),
+        correction.gain_spread,
+        correction.gains_applied,
+        correction.low_frequency_spread,
+        correction.low_frequency_applied,
         int(rejected.sum(dtype=np.int64)),
     )
 
@@ -178,12 +178,12 @@ def _view(
     )
 
 
-def survey_points(count: int) -> int:
-    """Return how many points :func:`look_at_photos` can do with for a number of photos."""
-    return max(1, min(EXPOSURE_POINTS, EXPOSURE_CELLS // max(count, 1)))
+def correction_sample_count(count: int) -> int:
+    """Return the number of points that :func:`prepare_photos` needs for a number of photos."""
+    return max(1, min(CORRECTION_POINTS, MAX_CORRECTION_SAMPLES // max(count, 1)))
 
 
-def look_at_photos(
+def prepare_photos(
     part: SurfacePoints,
     surface: SurfaceArrays,
     photos: PhotoSource,
@@ -191,24 +191,24 @@ def look_at_photos(
     progress: Progress,
     *,
     threads: int,
-) -> Survey:
-    """Look at every photo coarsely: which see the mesh, at what level, with what exposure.
+) -> PhotoPreparation:
+    """Find the photos that show the mesh, their level, and their colour correction.
 
     Parameters
     ----------
     part : SurfacePoints
-        Evenly over the surface, :func:`survey_points` of them.
+        Evenly spread over the surface, :func:`correction_sample_count` of them.
     count : int
         Number of photos.
     """
     wanted = len(part)
     colors = np.zeros((wanted, count, 3), np.uint8)
     valid = np.zeros((wanted, count), np.bool_)
-    places = np.zeros((wanted, count, 2), np.float32)
+    image_positions = np.zeros((wanted, count, 2), np.float32)
     positions = surface_positions(part, surface)
-    plans = []
+    used_photos = []
     for index in range(count):
-        progress.update(index / count, f"texture: looking at photo {index + 1} of {count}")
+        progress.update(index / count, f"texture: analysing photo {index + 1} of {count}")
         full = photos.camera(index, 1)
         coarse = max(1, math.ceil(max(full.width, full.height) / COARSE_LONG_SIDE_PX))
         coarse = min(coarse, full.width, full.height)
@@ -216,27 +216,29 @@ def look_at_photos(
         hit = view.visibility.depth[np.isfinite(view.visibility.depth)]
         if len(hit) == 0:
             continue
-        # At this level a texel near the camera still has one pixel.
+        # At this level, a texel near the camera still has one pixel.
         near = float(np.percentile(hit, 2.0))
         divisor = max(1, int(full.fx * surface.texel_size / near))
-        plans.append(_Plan(index, min(divisor, full.width, full.height)))
+        used_photos.append(_UsedPhoto(index, min(divisor, full.width, full.height)))
         weights = np.zeros((wanted, 1), np.float32)
         one = np.zeros((wanted, 1, 3), np.uint8)
         unused = np.zeros(wanted, np.uint8)
         sample_photo(part, surface, view, np.ones((1, 1, 3)), weights, one, unused, threads)
         valid[:, index] = weights[:, 0] > LAST_RESORT_BELOW
         colors[:, index] = one[:, 0]
-        places[:, index] = full.project(positions)[0] / [full.width, full.height]
+        image_positions[:, index] = full.project(positions)[0] / [full.width, full.height]
     gains, gain_spread = solve_gains(colors, valid)
-    fields, field_spread = solve_fields(colors, valid, places, gains)
-    exposure = _Exposure(
-        gains[:, None, None] * fields,
+    low_frequency, low_frequency_spread = solve_low_frequency_correction(
+        colors, valid, image_positions, gains
+    )
+    correction = _ColorCorrection(
+        gains[:, None, None] * low_frequency,
         gain_spread,
         bool((gains != 1.0).any()),
-        field_spread,
-        bool((fields != 1.0).any()),
+        low_frequency_spread,
+        bool((low_frequency != 1.0).any()),
     )
-    return Survey(plans, exposure)
+    return PhotoPreparation(used_photos, correction)
 
 
 def _blend_block(
@@ -270,7 +272,7 @@ def _blend(
         best = 0.0
         for k in range(slots):
             best = max(best, float(weights[i, k]))
-        # Last resorts count only where there is nothing else.
+        # Views of last resort count only if there are no others.
         least = LAST_RESORT_BELOW if best > LAST_RESORT_BELOW else 0.0
         for k in range(slots):
             if weights[i, k] > least:
@@ -292,11 +294,11 @@ def _blend(
                 for channel in range(3):
                     far = max(far, abs(kept[i, order[j], channel] - median[channel]))
                 distance[j] = far
-                place = j
-                while place > 0 and sorted_distance[place - 1] > far:
-                    sorted_distance[place] = sorted_distance[place - 1]
-                    place -= 1
-                sorted_distance[place] = far
+                rank = j
+                while rank > 0 and sorted_distance[rank - 1] > far:
+                    sorted_distance[rank] = sorted_distance[rank - 1]
+                    rank -= 1
+                sorted_distance[rank] = far
             limit = max(OUTLIER_FLOOR, OUTLIER_FACTOR * sorted_distance[(count - 1) // 2])
         red, green, blue, total = 0.0, 0.0, 0.0, 0.0
         used = 0
@@ -318,18 +320,18 @@ def _blend(
 
 @part(fast=False)
 def _weighted_median(values: Any, share: Any, count: int, ranked: Any, mass: Any) -> float:
-    """Insertion sort into the scratch arrays, then the value at half of the weight."""
+    """Return the weighted median, by insertion sort into the scratch arrays."""
     total = 0.0
     for j in range(count):
         value, weight = values[j], share[j]
         total += weight
-        place = j
-        while place > 0 and ranked[place - 1] > value:
-            ranked[place] = ranked[place - 1]
-            mass[place] = mass[place - 1]
-            place -= 1
-        ranked[place] = value
-        mass[place] = weight
+        rank = j
+        while rank > 0 and ranked[rank - 1] > value:
+            ranked[rank] = ranked[rank - 1]
+            mass[rank] = mass[rank - 1]
+            rank -= 1
+        ranked[rank] = value
+        mass[rank] = weight
     running = 0.0
     for j in range(count):
         running += mass[j]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fill what no photo has seen, and the space between charts.
+"""Fill unseen texels and the space between charts.
 
-Unseen surface takes a smooth (harmonic) continuation of the seen colours over the surface itself,
-in small cells in space, so that it does not depend on how charts were cut; near seen texels of
-the same chart it blends into their own colours. Space between charts repeats the chart's border,
-then fades to averages, so that mip maps stay clean.
+Unseen texels get a harmonic interpolation of the seen colours over the surface, on small cells in
+space, so that it does not depend on the charts; near seen texels of the same chart it blends into
+their colours. The space between charts repeats the chart's border, then fades to averages, so that
+mip maps stay clean.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from ...kernels.compiled import kernel
 from .photo_samples import SurfaceArrays, SurfacePoints
 
 CELLS_PER_SIDE = 96
-RING_TEXELS = 16
-NEAREST_PULL = 1e-4
-"""Weight of the nearest seen cell against one neighbour: decides for pieces that touch none."""
+BLEND_TEXELS = 16
+NEAREST_WEIGHT = 1e-4
+"""Weight of the nearest seen cell against one neighbour: determines pieces without seen cells."""
 UNKNOWN_GREY = 128
 CELL_BITS = 10
 BACKGROUND_ROWS = 256
-"""Rows of the image that are held as floats at once; even, so that pairs stay together."""
+"""Image rows held as floats at once; even, so that row pairs stay together."""
 
 
 def surface_positions(points: SurfacePoints, surface: SurfaceArrays) -> np.ndarray:
@@ -38,43 +38,43 @@ def surface_positions(points: SurfacePoints, surface: SurfaceArrays) -> np.ndarr
     return np.einsum("nc,ncx->nx", weights, corners)
 
 
-class Continuation:
-    """The harmonic continuation of some points' colours over the surface.
+class HarmonicFill:
+    """Harmonic interpolation of point colours over the surface.
 
     Parameters
     ----------
     known : (n, 3) float64
-        Positions with colours; may be empty, then all is mid grey.
+        Positions with colours; if empty, the result is mid grey.
     colors : (n, 3) uint8
-    wanted : callable
-        Each call yields anew the positions that want a colour, (m, 3) float64 at a time: there
-        may be tens of millions of them.
+    queries : callable
+        Each call yields again all positions to colour, in blocks of (m, 3) float64: there may be
+        tens of millions of them.
     """
 
     def __init__(
         self,
         known: np.ndarray,
         colors: np.ndarray,
-        wanted: Callable[[], Iterable[np.ndarray]],
+        queries: Callable[[], Iterable[np.ndarray]],
     ) -> None:
         self._keys = np.empty(0, np.int64)
         if len(known) == 0:
             return
         low, high = known.min(axis=0), known.max(axis=0)
-        for block in wanted():
+        for block in queries():
             low, high = np.minimum(low, block.min(axis=0)), np.maximum(high, block.max(axis=0))
         self._low = low
         self._cell = max(float((high - low).max()), 1e-12) / CELLS_PER_SIDE
         key_known = self._cells(known)
         keys = np.unique(key_known)
-        for block in wanted():
+        for block in queries():
             keys = np.union1d(keys, self._cells(block))
-        place = np.searchsorted(keys, key_known)
-        count = np.bincount(place, minlength=len(keys))
+        index = np.searchsorted(keys, key_known)
+        count = np.bincount(index, minlength=len(keys))
         has = count > 0
         values = np.empty((len(keys), 3))
         for channel in range(3):
-            total = np.bincount(place, colors[:, channel], len(keys))
+            total = np.bincount(index, colors[:, channel], len(keys))
             values[:, channel] = total / np.maximum(count, 1)
         centres = np.stack([keys >> (2 * CELL_BITS), (keys >> CELL_BITS), keys], axis=1)
         centres = centres & ((1 << CELL_BITS) - 1)  # (cells, 3)
@@ -82,7 +82,7 @@ class Continuation:
         self._keys, self._values = keys, values
 
     def at(self, positions: np.ndarray) -> np.ndarray:
-        """Return (m, 3) float32 colours of positions that were wanted."""
+        """Return (m, 3) float32 colours of positions that ``queries`` yielded."""
         if len(self._keys) == 0:
             return np.full((len(positions), 3), UNKNOWN_GREY, np.float32)
         return _interpolate(self._keys, self._values, (positions - self._low) / self._cell)
@@ -96,10 +96,10 @@ def _key(coordinates: np.ndarray) -> np.ndarray:
     return (x << (2 * CELL_BITS)) | (y << CELL_BITS) | z
 
 
-def _find(keys: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return the place of each wanted key, or -1."""
-    place = np.searchsorted(keys, wanted).clip(0, len(keys) - 1)
-    return np.where(keys[place] == wanted, place, -1)
+def _find(keys: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """Return the index of each key, or -1."""
+    index = np.searchsorted(keys, queries).clip(0, len(keys) - 1)
+    return np.where(keys[index] == queries, index, -1)
 
 
 def _harmonic(
@@ -113,8 +113,8 @@ def _harmonic(
     number_known = np.full(len(keys), -1)
     number_known[known] = np.arange(int(known.sum()))
     nearest = cKDTree(centres[known]).query(centres[unknown])[1]
-    right = NEAREST_PULL * values[nearest]
-    degree = np.full(len(unknown), NEAREST_PULL)
+    right = NEAREST_WEIGHT * values[nearest]
+    degree = np.full(len(unknown), NEAREST_WEIGHT)
     rows, columns = [], []
     limit = (1 << CELL_BITS) - 1
     for offset in np.ndindex(3, 3, 3):
@@ -134,17 +134,17 @@ def _harmonic(
         columns.append(number[there[row[~fixed]]])
     row, column = np.concatenate(rows), np.concatenate(columns)
     size = (len(unknown), len(unknown))
-    links = coo_matrix((np.ones(len(row)), (row, column)), shape=size)
-    matrix = identity(len(unknown)).multiply(degree[:, None]) - links
+    adjacency = coo_matrix((np.ones(len(row)), (row, column)), shape=size)
+    matrix = identity(len(unknown)).multiply(degree[:, None]) - adjacency
     return splu(matrix.tocsc()).solve(right)
 
 
-def _interpolate(keys: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Trilinear look-up among the cells that exist; a point's own cell always does."""
-    base = np.floor(places - 0.5).astype(np.int64)
-    share = places - 0.5 - base
-    total = np.zeros((len(places), 3))
-    weight_sum = np.full(len(places), 1e-12)
+def _interpolate(keys: np.ndarray, values: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Interpolate trilinearly among existing cells; the cell of a point always exists."""
+    base = np.floor(positions - 0.5).astype(np.int64)
+    share = positions - 0.5 - base
+    total = np.zeros((len(positions), 3))
+    weight_sum = np.full(len(positions), 1e-12)
     for offset in np.ndindex(2, 2, 2):
         target = base + offset
         weight = np.prod(np.where(np.array(offset) == 1, share, 1.0 - share), axis=1)
@@ -155,33 +155,35 @@ def _interpolate(keys: np.ndarray, values: np.ndarray, places: np.ndarray) -> np
     return (total / weight_sum[:, None]).astype(np.float32)
 
 
-def grow(image: np.ndarray, ring: np.ndarray, chart: np.ndarray, rings: int, inside: bool) -> None:
-    """Grow filled texels ring by ring, each the mean of its neighbours of the ring before.
+def dilate(
+    image: np.ndarray, ring: np.ndarray, chart: np.ndarray, rings: int, inside: bool
+) -> None:
+    """Dilate filled texels ring by ring; each texel is the mean of its neighbours in earlier rings.
 
     Parameters
     ----------
     image : (h, w, 3) uint8
-        Changed in place.
+        Modified in place.
     ring : (h, w) int16
-        0 where filled, -1 where not; changed in place to the ring that filled the texel.
+        0 if filled, -1 if not; modified in place to the ring that filled the texel.
     chart : (h, w) int32
         Chart of each texel, -1 between charts.
     rings : int
-        How far to grow, texels.
+        Number of rings, texels.
     inside : bool
-        Grow within each chart only; otherwise only between charts.
+        Dilate only within each chart; otherwise only between charts.
     """
-    frontier = np.empty(_with_open_neighbour(ring, chart, inside, np.empty(0, np.int64)), np.int64)
-    _with_open_neighbour(ring, chart, inside, frontier)
+    frontier = np.empty(_border_texels(ring, chart, inside, np.empty(0, np.int64)), np.int64)
+    _border_texels(ring, chart, inside, frontier)
     for number in range(1, rings + 1):
         if len(frontier) == 0:
             return
-        frontier = _grow_ring(frontier, number, image, ring, chart, inside)
+        frontier = _dilate_ring(frontier, number, image, ring, chart, inside)
 
 
 @kernel(fast=False)
-def _with_open_neighbour(ring: Any, chart: Any, inside: bool, out: Any) -> int:
-    """Count the filled texels beside some that are not; write as many as fit."""
+def _border_texels(ring: Any, chart: Any, inside: bool, out: Any) -> int:
+    """Count the filled texels next to unfilled ones; write as many as fit into ``out``."""
     height, width = ring.shape
     count = 0
     for y in range(height):
@@ -191,8 +193,8 @@ def _with_open_neighbour(ring: Any, chart: Any, inside: bool, out: Any) -> int:
             is_open = False
             for v in range(max(y - 1, 0), min(y + 2, height)):
                 for u in range(max(x - 1, 0), min(x + 2, width)):
-                    wanted = chart[v, u] == chart[y, x] if inside else chart[v, u] < 0
-                    is_open = is_open or (ring[v, u] < 0 and wanted)
+                    queries = chart[v, u] == chart[y, x] if inside else chart[v, u] < 0
+                    is_open = is_open or (ring[v, u] < 0 and queries)
             if is_open:
                 if count < len(out):
                     out[count] = y * width + x
@@ -201,7 +203,7 @@ def _with_open_neighbour(ring: Any, chart: Any, inside: bool, out: Any) -> int:
 
 
 @kernel(fast=False)
-def _grow_ring(
+def _dilate_ring(
     frontier: Any, number: int, image: Any, ring: Any, chart: Any, inside: bool
 ) -> np.ndarray:
     height, width = ring.shape
@@ -211,8 +213,8 @@ def _grow_ring(
         y, x = texel // width, texel % width
         for v in range(max(y - 1, 0), min(y + 2, height)):
             for u in range(max(x - 1, 0), min(x + 2, width)):
-                wanted = chart[v, u] == chart[y, x] if inside else chart[v, u] < 0
-                if ring[v, u] < 0 and wanted:
+                queries = chart[v, u] == chart[y, x] if inside else chart[v, u] < 0
+                if ring[v, u] < 0 and queries:
                     ring[v, u] = number
                     found[count] = v * width + u
                     count += 1
@@ -236,7 +238,7 @@ def _grow_ring(
 
 
 def fill_background(image: np.ndarray, filled: np.ndarray) -> None:
-    """Colour the rest of the image by averages of ever larger blocks, in place."""
+    """Fill the rest of the image by averages of increasingly large blocks (pull-push), in place."""
     if filled.all():
         return
     if not filled.any():
@@ -245,7 +247,7 @@ def fill_background(image: np.ndarray, filled: np.ndarray) -> None:
     height, width = filled.shape
     if max(height, width) == 1:
         return
-    # The finest level is the image itself: as floats it would be the largest array of all.
+    # The finest level is the image itself: as floats it would be the largest array.
     colors = [np.empty((-(-height // 2), -(-width // 2), 3), np.float32)]
     weights = [np.empty(colors[0].shape[:2], np.float32)]
     bands = [(row, min(row + BACKGROUND_ROWS, height)) for row in range(0, height, BACKGROUND_ROWS)]
@@ -271,7 +273,7 @@ def fill_background(image: np.ndarray, filled: np.ndarray) -> None:
 
 
 def _coarser(color: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Average blocks of 2 x 2 by weights of 0 and 1; the result has such weights too."""
+    """Average blocks of 2 x 2 with weights of 0 and 1; return such weights too."""
     total = _halved(weight[..., None])
     known = (total > 0).astype(np.float32)
     return _halved(color) / np.maximum(total, 1e-6) * known, known[..., 0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Renderings of the Gaussians in the place of photos: what baking needs, made on demand."""
+"""Renderings of the Gaussians as a replacement for photos in baking, rendered on demand."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from ...render.render import render
 from ...render.types.options import RenderOptions
 
 MIN_ALPHA = 0.5
-"""Where the Gaussians let more light through, there is no surface to take a colour from."""
+"""Below this opacity there is no surface to take a colour from."""
 
 
 class GaussianPhotos:
-    """The diffuse colour of Gaussians from the cameras of photos (docs/method.md, section 8.4).
+    """Diffuse colour of Gaussians from the cameras of photos (docs/method.md, section 8.4).
 
-    Harmonics of degree 0 alone: highlights and what else changes with the direction is left out,
-    and so is what stood in single photos only. Detail is that of the Gaussians. Only the last
-    rendering is kept.
+    Only harmonics of degree 0: highlights and other view-dependent effects are left out, and so are
+    objects in single photos. The detail is that of the Gaussians. Only the last rendering is
+    cached.
 
     Parameters
     ----------
     gaussians : OrientedGaussians
         In the scene frame.
     photos : PhotoStore
-        Gives cameras and masks.
+        Source of cameras and masks.
     threads : int
         The result does not depend on it.
     """
@@ -44,11 +44,11 @@ class GaussianPhotos:
         return self._photos.camera(index, divisor)
 
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return the (h, w, 3) uint8 rendering at a level, opaque where it is not masked."""
+        """Return the (h, w, 3) uint8 rendering at a level, opaque where not masked."""
         return self._rendered(index, divisor)[0]
 
     def mask(self, index: int, divisor: int = 1) -> np.ndarray:
-        """Return (h, w) bool: the photo counts here, and the Gaussians hide what is behind."""
+        """Return (h, w) bool: inside the photo's mask and covered by the Gaussians."""
         covered = self._rendered(index, divisor)[1]
         mask = self._photos.mask(index, divisor)
         return covered if mask is None else covered & mask

@@ -1,29 +1,29 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gain of each photo and channel, from surface points that several photos see."""
+"""Gain of each photo and channel, from surface points seen by several photos."""
 
 from __future__ import annotations
 
 import numpy as np
 
 MIN_GAIN_SPREAD = 0.02
-"""Gains whose logarithms spread less than this are noise and highlights: none are applied."""
+"""Gains with a smaller spread of logarithms are due to noise and highlights and not applied."""
 MAX_LOG_GAIN = 0.7
-"""A factor of two either way; more is a wrong match, not an exposure."""
+"""A factor of two either way; more is a mismatch and not an exposure."""
 PRIOR_POINTS = 20.0
-"""As much weight as this many points holds a gain at one."""
+"""Weight of the prior gain 1, in points."""
 DARKEST, BRIGHTEST = 10, 245
-"""Values beyond are clipped or noise and say nothing of the gain."""
+"""Values outside are clipped or noise and not used."""
 ROUNDS = 20
 ROBUST_LOG = 0.05
 
 
 def solve_gains(colors: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, float]:
-    """Find factors that bring the photos' colours of the same points together.
+    """Fit gains that equalise the photos' colours of the same points.
 
     Robust least squares of ``log c[i, p] = a[i] - log gain[p]`` by alternation, with weights
-    ``1 / max(|residual|, 0.05)``; the median of the log gains is 0: the texture has the exposure
-    of most photos. At the mean of two kinds of exposure, what is white in the darker photos would
-    be brighter than 255.
+    ``1 / max(|residual|, 0.05)``. The median of the log gains is 0, so the texture has the exposure
+    of most photos; with a mean of 0 and two groups of exposures, white in the darker photos would
+    exceed 255.
 
     Parameters
     ----------
@@ -35,9 +35,9 @@ def solve_gains(colors: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, floa
     Returns
     -------
     gains : (photos, 3) float64
-        Factors to multiply with; all 1 where exposures do not differ.
+        Factors to multiply with; all 1 if exposures do not differ.
     spread : float
-        Standard deviation of the log gains that were found.
+        Standard deviation of the fitted log gains.
     """
     photos = valid.shape[1]
     gains = np.ones((photos, 3))

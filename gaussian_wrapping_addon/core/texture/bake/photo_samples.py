@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sample one photo at many surface points: facing, in the image, not masked, not hidden."""
+"""Sample one photo at many surface points, with tests of facing, frame, mask and occlusion."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ from ...mesh.face_graph import vertex_normals
 from .visibility import PhotoVisibility, hidden_pixels
 
 MIN_COSINE = 0.2
-"""Views more grazing than 78 degrees are a last resort."""
+"""Views at more than 78 degrees from the normal are a last resort."""
 LAST_COSINE = 0.003
-"""More grazing still (89.8 degrees), not even the side is certain."""
+"""Beyond 89.8 degrees, even the side that faces the camera is uncertain."""
 LAST_RESORT = 1e-20
-"""Factor of the weights of a last resort: far below any other, so both fit in one number."""
+"""Weight factor of last-resort views: far below all others, so one number encodes both."""
 LAST_RESORT_BELOW = 1e-15
-"""Weights below are of a last resort; the faintest other is (0.2 x 0.01 px)^2 x floors = 3e-11."""
+"""Last-resort views have less; the smallest other weight is (0.2 x 0.01 px)^2 x floors = 3e-11."""
 CLEAR_PX = 4.0
-"""Views count in full from this distance to a silhouette, where pose errors mix two surfaces."""
+"""Full weight from this distance to a silhouette, where pose errors mix two surfaces."""
 CLEAR_FLOOR = 0.02
-"""Things thinner than that still take the best there is."""
+"""Minimum factor, so that thinner parts still use the best views available."""
 BORDER_SHARE = 0.04
-"""Weights fade over this share of the image side towards its border."""
+"""Weights decrease over this share of the image side towards its border."""
 BORDER_FLOOR = 0.02
 CLIPPED_FROM, CLIPPED_RANGE = 254.0, 40.0
-"""Views fade over this range below white: a clipped pixel is a lower bound, which after another
-photo's exposure is a flat grey beside it, and cameras bend the curve long before. Over 14 levels
-the white paper of the flowerpot set had grey patches. Highlights go where another view has none."""
+"""Weights decrease over this range below white: a clipped pixel is a lower bound, which becomes a
+flat grey after correction to another exposure, and camera response curves bend long before. With
+14 levels, the white paper of the flowerpot set had grey patches. Highlights vanish if another view
+has none."""
 CLIPPED_FLOOR = 0.02
 MAX_USEFUL_PX = 1.5
-"""A photo with more pixels a texel than this is no better."""
+"""More pixels per texel than this do not improve a view."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,13 @@ class SurfacePoints:
         return len(self.face)
 
     def part(self, rows: Any) -> SurfacePoints:
-        """Return some of the points."""
+        """Return a subset of the points."""
         return SurfacePoints(self.face[rows], self.bary[rows])
 
 
 @dataclass(frozen=True)
 class SurfaceArrays:
-    """What kernels need of a mesh."""
+    """Arrays of a mesh for the kernels."""
 
     vertices: np.ndarray
     """(v, 3) float64."""
@@ -75,20 +76,20 @@ class SurfaceArrays:
     def of(
         cls, vertices: np.ndarray, faces: np.ndarray, face_normals: np.ndarray, texel_size: float
     ) -> SurfaceArrays:
-        """Fill in the vertex normals."""
+        """Construct with vertex normals computed."""
         return cls(vertices, faces, face_normals, vertex_normals(vertices, faces), texel_size)
 
 
 @dataclass(frozen=True)
 class PhotoView:
-    """One photo at one level, ready to be sampled."""
+    """One photo at one level, prepared for sampling."""
 
     camera: Camera
     focal_px: float
-    """Focal length at full resolution, which decides how good the photo can be."""
+    """Focal length at full resolution, which limits the detail of the photo."""
     image: Pyramid
     mask: np.ndarray
-    """(h, w) bool; (1, 1) true where there is none."""
+    """(h, w) bool; (1, 1) true without a mask."""
     visibility: PhotoVisibility
 
 
@@ -102,18 +103,18 @@ def sample_photo(
     best_clearance: np.ndarray,
     threads: int,
 ) -> None:
-    """Offer the photo's colours to every point; each keeps the k best.
+    """Sample the photo at every point; each point keeps its k best views.
 
     Parameters
     ----------
     factors : (gh, gw, 3) float64
-        What the photo's channels are multiplied by, on a grid whose outer nodes are the corners.
+        Factors of the photo's channels, on a grid whose outer nodes are the image corners.
     weights : (n, k) float32
-        Changed in place; 0 marks a free place.
+        Modified in place; 0 marks a free slot.
     colors : (n, k, 3) uint8
-        Changed in place.
+        Modified in place.
     best_clearance : (n,) uint8
-        Changed in place to the largest distance to a silhouette of any view kept, pixels.
+        Modified in place to the largest distance to a silhouette of any view kept, pixels.
     """
     camera = view.camera
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
@@ -197,7 +198,7 @@ def _sample(
         v = intrinsics[1] * y / z + intrinsics[3]
         if not (u >= 0.0 and v >= 0.0 and u < width and v < height):
             continue
-        # Facing: the face itself gates, the smooth normal keeps noise out of the weight.
+        # Facing: the face normal decides, the smooth normal reduces noise in the weight.
         fx, fy, fz = face_normals[face, 0], face_normals[face, 1], face_normals[face, 2]
         nx = pose[0, 0] * fx + pose[0, 1] * fy + pose[0, 2] * fz
         ny = pose[1, 0] * fx + pose[1, 1] * fy + pose[1, 2] * fz
@@ -221,11 +222,11 @@ def _sample(
         weight *= _fade(np.float64(clearance[iy, ix]), CLEAR_PX, CLEAR_FLOOR)
         border = min(min(u, width - u) / width, min(v, height - v) / height)
         weight *= _fade(border, BORDER_SHARE, BORDER_FLOOR)
-        # Half a pixel from the border a pixel may mix in what is beyond, where no depth is known.
+        # Within half a pixel of the border, interpolation may mix in colours without a known depth.
         outermost = min(min(u, width - u), min(v, height - v)) < 0.5
         if cosine < MIN_COSINE or outermost:
             weight *= LAST_RESORT
-        # The worst of the kept views goes; a tie keeps the earlier photo.
+        # Replace the worst of the kept views; ties keep the earlier photo.
         slot = 0
         for k in range(1, kept):
             if weights[i, k] < weights[i, slot]:

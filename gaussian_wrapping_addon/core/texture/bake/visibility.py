@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Is a surface point seen by a photo, and how far is it from what hides it there?
+"""Visibility of surface points in a photo, and their distance to silhouettes.
 
-A depth buffer per photo answers for millions of texels at once. The test compares the buffer
-with the plane of the texel's face at every pixel that a bilinear look-up would touch, so that
-slopes need no tolerance and an occluder's colour never bleeds onto what lies behind it.
+One depth buffer per photo serves millions of texels. The test compares the buffer with the plane
+of the texel's face at every pixel of the bilinear look-up, so that slopes need no tolerance and an
+occluder's colour never bleeds onto the surface behind it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from ...kernels.compiled import inline, kernel
 from ...mesh.depth_buffer import depth_buffer
 
 BIAS_PX = 1.5
-"""Depth tolerance in pixel footprints: creases bend away from the plane by about one."""
+"""Depth tolerance in pixel footprints: creases deviate from the plane by about one."""
 BIAS_RELATIVE = 1e-5
-"""Rounding of float32 depths, with room."""
+"""Relative rounding of float32 depths, with margin."""
 JUMP_PX = 12.0
 """Neighbouring depths that differ by more footprints are a silhouette (slope above 85 degrees)."""
 MAX_CLEARANCE_PX = 16
@@ -28,25 +28,25 @@ MAX_CLEARANCE_PX = 16
 
 @dataclass(frozen=True)
 class PhotoVisibility:
-    """What a photo sees of the mesh."""
+    """Depth of the mesh in a photo and distances to silhouettes."""
 
     depth: np.ndarray
-    """(h, w) float32 z-depth of the first hit, infinite where nothing is hit."""
+    """(h, w) float32 z-depth of the first hit, infinite without a hit."""
     clearance: np.ndarray
-    """(h, w) uint8 distance to the nearest silhouette, pixels, capped."""
+    """(h, w) uint8 distance to the nearest silhouette, pixels, up to :data:`MAX_CLEARANCE_PX`."""
 
 
 def photo_visibility(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera, threads: int
 ) -> PhotoVisibility:
-    """Rasterise the mesh and measure the distance of each pixel to silhouettes."""
+    """Rasterise the mesh and compute the distance of each pixel to silhouettes."""
     depth = depth_buffer(vertices, faces, camera, threads=threads).depth
     return PhotoVisibility(depth, _clearance(depth, JUMP_PX / min(camera.fx, camera.fy)))
 
 
 @kernel(fast=False)
 def _clearance(depth: Any, jump: float) -> np.ndarray:
-    """Two sweeps of chamfer distances (3-4 weights, thirds of a pixel)."""
+    """Return chamfer distances to silhouettes by two sweeps (3-4 weights, thirds of a pixel)."""
     height, width = depth.shape
     far = 3 * MAX_CLEARANCE_PX
     distance = np.full((height, width), far, np.int32)
@@ -104,17 +104,17 @@ def hidden_pixels(
     plane: float,
     z: float,
 ) -> int:
-    """Count the pixels around a position (0 to 4) where something lies before ``n . p = plane``.
+    """Count the pixels around a position (0 to 4) at which the plane ``n . p = plane`` is occluded.
 
     Parameters
     ----------
     depth : (h, w) float32
     x, y : float
-        Where the point projects, pixels.
+        Projection of the point, pixels.
     intrinsics : (4,) float64
         fx, fy, cx, cy.
     nx, ny, nz, plane : float
-        The face's plane in camera coordinates; the normal looks towards the camera.
+        The face's plane in camera coordinates; the normal points towards the camera.
     z : float
         Depth of the point.
     """
@@ -130,7 +130,7 @@ def hidden_pixels(
         ray_y = (v + 0.5 - intrinsics[3]) / intrinsics[1]
         slope = nx * ray_x + ny * ray_y + nz
         expected = plane / slope if slope < 0.0 else z
-        # Behind the horizon of a grazing plane the point itself is the better guess.
+        # Beyond the horizon of a grazing plane, the depth of the point is a better estimate.
         expected = expected if 0.0 < expected < 2.0 * z else z
         if depth[v, u] < expected - tolerance:
             hidden += 1

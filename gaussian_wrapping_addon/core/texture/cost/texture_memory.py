@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What baking textures takes of memory, told before it begins."""
+"""Estimate the memory needed to bake textures."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from ...report_warning import ReportWarning
 from ..bake.bake import POINTS_PER_BLOCK
 
 BASE_BYTES = 500 * 10**6
-"""Photos, depth buffers and whatever else does not grow with the texture."""
+"""Photos, depth buffers and everything else that does not grow with the texture."""
 FACE_BYTES = 900
-"""A face with its share of vertices, graphs and helper files."""
+"""Per face, with its share of vertices, graphs and helper files."""
 TEXEL_BYTES = 30
-"""A texel of the atlas that is being baked, by the arrays that are held at once: image, rings,
-charts, points and their colours, and indices of some of them. Counted, not measured."""
+"""Per texel of the atlas being baked, from the arrays held at once: image, rings, charts, points
+and their colours, and indices of some of them. Counted, not measured."""
 WAITING_TEXEL_BYTES = 14
-"""The same of a finished atlas, which waits for the others."""
+"""The same for a baked atlas that waits for the others."""
 BLOCK_POINT_BYTES = 105
-"""A point of the block that is held with its views."""
+"""Per point of the block that is held with its views."""
 MIN_SIZE_PX = 256
 
 
 def texture_memory_bytes(size_px: int, atlases: int, faces: int) -> int:
-    """Return about how much more memory a process needs while it textures a mesh."""
+    """Return the approximate additional memory of a process that textures a mesh."""
     texels = size_px * size_px
     waiting = WAITING_TEXEL_BYTES * texels * (atlases - 1)
     block = BLOCK_POINT_BYTES * min(texels, POINTS_PER_BLOCK)
@@ -32,23 +32,23 @@ def texture_memory_bytes(size_px: int, atlases: int, faces: int) -> int:
 def fit_into_memory(
     size_px: int, atlases: int, faces: int, free_bytes: int, *, may_lower: bool
 ) -> tuple[int, int, ReportWarning | None]:
-    """Return side and number of textures that fit, and a warning where they are less than asked.
+    """Return side and number of textures that fit, and a warning if that is less than requested.
 
     Parameters
     ----------
     size_px, atlases : int
-        What is wanted.
+        Requested side and number.
     faces : int
-        Of the mesh.
+        Number of faces of the mesh.
     free_bytes : int
-        What may be taken; 0 where it is not known: then nothing is judged.
+        Available memory; 0 if unknown, then nothing is checked.
     may_lower : bool
-        Whether the size was chosen here, not asked for.
+        Whether the size may be lowered because it was chosen automatically.
 
     Raises
     ------
     ResourceError
-        Not even the smallest fits, or less than what was asked for.
+        Not even the smallest size fits, or not the requested one.
     """
     needed = texture_memory_bytes(size_px, atlases, faces)
     if free_bytes == 0 or needed <= free_bytes:
@@ -62,11 +62,11 @@ def fit_into_memory(
     what = "texture" if atlases == 1 else f"{atlases} textures"
     text = (
         f"A {what} of {size_px} pixels" if atlases == 1 else f"{what} of {size_px} pixels"
-    ) + f" may take {needed / 2**30:.1f} GB, {free_bytes / 2**30:.1f} GB are free"
+    ) + f" may need {needed / 2**30:.1f} GB of memory; {free_bytes / 2**30:.1f} GB are free"
     if not (fits and may_lower):
         hint = "Close other programs or use a machine with more memory."
         if fits:
-            hint = f"Ask for {number} of {side} pixels, or close other programs."
+            hint = f"Choose {number} of {side} pixels, or close other programs."
         raise ResourceError(f"{text}.", hint)
-    made = f"{text}: {number} of {side} pixels was made."
+    made = f"{text}. Made instead: {number} of {side} pixels."
     return side, number, ReportWarning("texture-made-smaller", made)

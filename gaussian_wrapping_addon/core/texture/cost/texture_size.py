@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Side and number of textures from what the photos resolve on the surface."""
+"""Side and number of textures from the resolution of the photos on the surface."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from ..bake.photo_samples import MIN_COSINE
 
 SAMPLED_FACES = 2_000
 TEXELS_PER_FACE = 12
-"""Many small charts need room for their faces, however little the photos show of each: with less,
-most faces of a wheel with 28 spokes had no texel at all."""
+"""Minimum for many small charts, even if the photos show little of each face: with less, most faces
+of a wheel with 28 spokes had no texel."""
 TEXELS_PER_DETAIL_POINT = 2
-"""A normal map of one texel for each vertex of the dense mesh would lose half of its bends."""
+"""With one texel per vertex of the dense mesh, a normal map would lose half of its bends."""
 FULL_GUTTER_SIDE_PX = 4096
 MIN_GUTTER_PX = 2
 MIN_SIZE_PX = 256
 MAX_AUTOMATIC_SIZE_PX = 4096
 EXPECTED_UTILISATION = 0.5
-"""Share of texels that charts cover; 0.4 to 0.65 were measured on ordinary meshes."""
+"""Share of texels covered by charts; 0.4 to 0.65 were measured on ordinary meshes."""
 ENOUGH = 0.8
-"""A texture of this share of the photos' resolution is enough: the next size costs four times."""
+"""This share of the photos' resolution suffices: the next size costs four times as much."""
 
 
-def wanted_side(
+def required_side(
     graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0, seed: int = 0
 ) -> float:
-    """Return the side in pixels of one texture that shows about what the photos do; no limits.
+    """Return the side in pixels of one texture at about the photos' resolution, without limits.
 
-    The footprint of a photo's pixel on the surface is ``z / focal``; each sampled face takes its
-    best photo, and the surface their median (by area). Occlusion is not tested: a size needs no
-    more than the order. There is also room for :data:`TEXELS_PER_FACE`,
-    and for :data:`TEXELS_PER_DETAIL_POINT` of the ``detail_points`` that a normal map shows.
+    The footprint of a photo's pixel on the surface is ``z / focal``; each sampled face uses its
+    best photo, and the surface the median of the faces (by area). Occlusion is not tested: only the
+    order of magnitude matters. The size also allows for :data:`TEXELS_PER_FACE`, and for
+    :data:`TEXELS_PER_DETAIL_POINT` of the ``detail_points`` of a normal map.
     """
     area = float(graph.areas.sum())
     generator = np.random.default_rng(seed)
@@ -63,8 +63,8 @@ def wanted_side(
 def automatic_size(
     graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0, seed: int = 0
 ) -> int:
-    """Return the side in pixels, a power of two from 256 to 4096, that :func:`wanted_side` asks."""
-    return _power_of_two(wanted_side(graph, photos, count, detail_points, seed))
+    """Return the side in pixels, a power of two from 256 to 4096, of :func:`required_side`."""
+    return _power_of_two(required_side(graph, photos, count, detail_points, seed))
 
 
 def _power_of_two(wanted: float) -> int:
@@ -79,13 +79,13 @@ def plan_textures(wanted: float, size_px: int, max_atlases: int) -> tuple[int, i
     Parameters
     ----------
     wanted : float
-        Side of the one texture that would do (:func:`wanted_side`).
+        Required side of a single texture (:func:`required_side`).
     size_px : int
-        What was asked for; 0 chooses a power of two from 256 to 4096.
+        Requested side; 0 chooses a power of two from 256 to 4096.
     max_atlases : int
-        As many textures as hold what one of side ``wanted`` would, up to this. 0 means one, but
-        where one of 8192 would not do and no smaller size was asked for:
-        :data:`~.limits.MAX_AUTOMATIC_ATLASES`.
+        Maximum number of textures, of which as many are used as hold the texels of one of side
+        ``wanted``. 0 means one, but :data:`~.limits.MAX_AUTOMATIC_ATLASES` if one of 8192 is not
+        enough and no smaller size was requested.
     """
     side = size_px or _power_of_two(wanted)
     most = max_atlases
@@ -93,15 +93,15 @@ def plan_textures(wanted: float, size_px: int, max_atlases: int) -> tuple[int, i
         is_free = size_px in (0, limits.MAX_TEXTURE_SIDE_PX)
         beyond = wanted > limits.MAX_TEXTURE_SIDE_PX
         most = limits.MAX_AUTOMATIC_ATLASES if is_free and beyond else 1
-    # A rounding error more than full does not need another texture.
+    # Rounding errors must not add another texture.
     return side, min(max(math.ceil((wanted / side) ** 2 - 1e-6), 1), most)
 
 
 def gutter_for(size_px: int, gutter_px: int) -> int:
     """Return the gutter of a texture: ``gutter_px`` at 4096 texels, in proportion below.
 
-    Smaller textures have fewer mip levels to keep apart, and charts hardly larger than a full
-    gutter would leave no room for texels.
+    Smaller textures have fewer mip levels to separate, and with full gutters around small charts
+    there would be no room for texels.
     """
     share = min(1.0, size_px / FULL_GUTTER_SIDE_PX)
     return max(min(MIN_GUTTER_PX, gutter_px), round(gutter_px * share))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""An image pyramid that never averages two charts: coarser colours without what lies beside."""
+"""Image pyramid of a texture whose averages never mix two charts."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from ...mesh.face_graph import face_graph, uv_charts
 from ...mesh.textured_mesh import TexturedMesh
 from ..atlas.atlas_raster import raster_atlas
 
-ENOUGH = 0.25
-"""A look-up takes a level where this share of its four texels, by weight, is of the chart."""
+MIN_WEIGHT = 0.25
+"""A look-up uses a level if this share of its four texels, by weight, belongs to the chart."""
 
 
 @dataclass(frozen=True)
 class ChartPyramid:
-    """Levels of a texture, each of half the side; a texel holds one chart's colour alone."""
+    """Levels of a texture, each of half the side; every texel has the colour of a single chart."""
 
     face_charts: np.ndarray
     """(f,) int32 chart of each face."""
     colors: list[np.ndarray]
-    """(h, w, 3) of each level; uint8 the finest, float32 the others."""
+    """(h, w, 3) of each level; the finest uint8, the others float32."""
     charts: list[np.ndarray]
-    """(h, w) int32 of each level: the chart whose texels were averaged, -1 for none."""
+    """(h, w) int32 of each level: the chart of the averaged texels, -1 for none."""
 
-    def looked_up(self, uv: np.ndarray, face: np.ndarray, level: int) -> np.ndarray:
-        """Return (n, 3) uint8 colours.
+    def sample_level(self, uv: np.ndarray, face: np.ndarray, level: int) -> np.ndarray:
+        """Return (n, 3) uint8 colours at UVs.
 
-        Bilinear among texels of the face's own chart; where a level has hardly any there, as in
-        charts narrower than its texels, the next finer one. The finest takes all four: beyond a
-        chart's border its gutter has its colours.
+        Bilinear among texels of the face's chart; if a level has too few of them, as in charts
+        narrower than its texels, the next finer one is used. The finest uses all four texels: the
+        gutter beyond a chart's border has its colours.
 
         Parameters
         ----------
@@ -46,7 +46,7 @@ class ChartPyramid:
         left = np.arange(len(uv))
         for number in range(min(level, len(self.colors) - 1), -1, -1):
             color, weight = self._bilinear(uv[left], charts[left], number)
-            good = weight >= ENOUGH if number else np.ones(len(left), np.bool_)
+            good = weight >= MIN_WEIGHT if number else np.ones(len(left), np.bool_)
             result[left[good]] = np.rint(color[good])
             left = left[~good]
             if len(left) == 0:
@@ -58,7 +58,7 @@ class ChartPyramid:
     ) -> tuple[np.ndarray, np.ndarray]:
         image, owner = self.colors[level], self.charts[level]
         height, width = owner.shape
-        # The finest level's size sets the scale: odd sides are rounded up by each halving.
+        # Scale from the finest level: odd sides are rounded up by each halving.
         fine_height, fine_width = self.charts[0].shape
         x = (uv[:, 0] * fine_width / 2**level - 0.5).clip(0.0, width - 1.0)
         y = ((1.0 - uv[:, 1]) * fine_height / 2**level - 0.5).clip(0.0, height - 1.0)
@@ -84,7 +84,7 @@ def chart_pyramid(
     ----------
     textured : TexturedMesh
     levels : int
-        How many besides the finest, at most.
+        Maximum number of levels in addition to the finest.
     """
     mesh = textured.mesh
     corner_uvs = np.asarray(textured.corner_uvs)
@@ -107,20 +107,20 @@ def chart_pyramid(
 def _halved(
     image: np.ndarray, owner: np.ndarray, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Average 2 x 2 texels of the chart that has most of them, by texels of the finest level."""
+    """Average those of 2 x 2 texels in the chart that has most texels of the finest level there."""
     odd = ((0, owner.shape[0] % 2), (0, owner.shape[1] % 2))
     owner = np.pad(owner, odd, constant_values=-1)
     weight = np.pad(weight, odd)
     image = np.pad(image, (*odd, (0, 0)))
-    places = [np.s_[dy::2, dx::2] for dy in (0, 1) for dx in (0, 1)]
-    best = np.full(owner[places[0]].shape, -1, np.int32)
+    offsets = [np.s_[dy::2, dx::2] for dy in (0, 1) for dx in (0, 1)]
+    best = np.full(owner[offsets[0]].shape, -1, np.int32)
     most = np.zeros(best.shape, np.float32)
-    for place in places:
-        support = sum(weight[p] * (owner[p] == owner[place]) for p in places)
+    for offset in offsets:
+        support = sum(weight[p] * (owner[p] == owner[offset]) for p in offsets)
         better = support > most
-        best[better], most[better] = owner[place][better], support[better]
+        best[better], most[better] = owner[offset][better], support[better]
     color = np.zeros((*best.shape, 3), np.float32)
-    for place in places:
-        color += (weight[place] * (owner[place] == best))[..., None] * image[place]
+    for offset in offsets:
+        color += (weight[offset] * (owner[offset] == best))[..., None] * image[offset]
     color /= np.maximum(most, 1.0)[..., None]
     return color, best, most

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a light mesh is given of its dense one: normal map, ambient occlusion, as settings ask."""
+"""Detail maps of a mesh from its dense version: normal map, ambient occlusion."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from .occlusion import MAX_SIDE_PX, bake_occlusion
 
 
 @dataclass(frozen=True)
-class Detail:
-    """Maps beside the colours; ``None`` where not asked for."""
+class DetailMaps:
+    """Maps in addition to the colours; ``None`` if not requested."""
 
     normal_map: np.ndarray | None = None
     """(h, w, 3) uint8."""
@@ -32,7 +32,7 @@ class Detail:
 
 
 def wants_normal_map(settings: TextureSettings, *, is_decimated: bool) -> bool:
-    """Tell whether a mesh gets a normal map."""
+    """Return whether a mesh gets a normal map."""
     return settings.normal_map == "on" or (settings.normal_map == "auto" and is_decimated)
 
 
@@ -46,28 +46,28 @@ def bake_detail(
     *,
     threads: int,
     atlas: int = 0,
-) -> Detail:
-    """Bake the maps that the settings ask for.
+) -> DetailMaps:
+    """Bake the maps requested by the settings.
 
     Parameters
     ----------
     mesh : SurfaceMesh
-        The mesh that will carry them.
+        The mesh that uses the maps.
     unwrapped : Unwrap
     raster : AtlasRaster
-        Of the atlas of these UVs that is baked; the normal map has its size.
+        Raster of the baked atlas; the normal map has its size.
     dense : SurfaceMesh or None
-        What the mesh was decimated from; where it was not, it is its own dense mesh.
+        The mesh before decimation; without one, the mesh itself is the dense mesh.
     settings : TextureSettings
     progress : Progress
         Span of this step.
     atlas : int
-        Which one.
+        Number of the atlas.
     """
     with_normals = wants_normal_map(settings, is_decimated=dense is not None)
     with_occlusion = settings.ambient_occlusion == "on"
     if not (with_normals or with_occlusion):
-        return Detail()
+        return DetailMaps()
     surface = DenseSurface(mesh if dense is None else dense)
     size_px = raster.face.shape[0]
     normal_map = occlusion = None
@@ -84,11 +84,11 @@ def bake_detail(
         span = progress.span(0.5 if with_normals else 0.0, 1.0)
         open_sky = bake_occlusion(mesh, coarse, surface, gutter_px, span)
         occlusion, statistics["ambient_occlusion"] = open_sky.image, open_sky.statistics
-    return Detail(normal_map, occlusion, statistics)
+    return DetailMaps(normal_map, occlusion, statistics)
 
 
-def merged_statistics(details: Sequence[Detail]) -> dict[str, Any]:
-    """Return the statistics of the atlases of one mesh as one: shares are their means."""
+def merged_statistics(details: Sequence[DetailMaps]) -> dict[str, Any]:
+    """Merge the statistics of the atlases of one mesh; shares are averaged."""
     merged: dict[str, Any] = {}
     for name, first in details[0].statistics.items():
         each = [detail.statistics[name] for detail in details]

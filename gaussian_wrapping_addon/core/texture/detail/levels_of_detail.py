@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Levels of detail: ever fewer faces, each level with an atlas and maps of its own.
+"""Levels of detail: successively decimated meshes, each with its own atlas and maps.
 
-Collapses across charts move the seams, so that one atlas for all levels would either forbid them
-or smear colours. Each level is therefore unwrapped anew, at half the side, and looks its colours
-up on the textured mesh by the same rays that find its normals on the dense one.
+Edge collapses across charts move the seams, so one atlas for all levels would either prevent them
+or smear colours. Each level is therefore unwrapped again, at half the side, and its colours are
+sampled from the textured mesh by the same rays that sample normals from the dense one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ...report_warning import ReportWarning
 from ...settings import TextureSettings
 from ..atlas.atlas_raster import AtlasRaster
 from ..atlas.texel_points import texel_points
-from ..bake.fill import fill_background, grow
+from ..bake.fill import dilate, fill_background
 from ..cost.texture_size import gutter_for
 from ..unwrap.unwrap import unwrap
 from .chart_pyramid import ChartPyramid, chart_pyramid
@@ -36,20 +36,20 @@ from .detail import bake_detail, merged_statistics
 _logger = logging.getLogger(__name__)
 
 FACES_DIVISOR = 4
-"""A level's faces are twice as long, so half the texture side shows as much a face."""
+"""Edges of a level are twice as long, so half the texture side gives as many texels a face."""
 FLOOR_FACES = 100
-"""No level below has fewer: a shape would not be known again."""
+"""Minimum number of faces of a level; with fewer, the shape would not be recognisable."""
 MIN_SIDE_PX = 128
 
 
-class Colors(NamedTuple):
-    """Where a level looks up its colours."""
+class ColorSource(NamedTuple):
+    """Source of the colours of a level."""
 
     textured: TexturedMesh
     surface: DenseSurface
-    """Of the textured mesh."""
+    """Surface of the textured mesh."""
     pyramids: list[ChartPyramid]
-    """Of its texture, one for each atlas."""
+    """Pyramids of its texture, one for each atlas."""
 
 
 def levels_of_detail(
@@ -69,15 +69,15 @@ def levels_of_detail(
     textured : TexturedMesh
         Level 0.
     dense : SurfaceMesh or None
-        What level 0 was decimated from; otherwise level 0 is the dense mesh of the others.
+        Level 0 before decimation; without one, level 0 is the dense mesh of the others.
     settings : TextureSettings
-        ``lods`` levels are made, fewer where the next would have less than
-        :data:`FLOOR_FACES` faces, or where no more faces can go without tearing the mesh: why
-        becomes an entry of ``warnings`` in the statistics of ``textured``.
+        ``lods`` levels are made, fewer if the next would have less than :data:`FLOOR_FACES` faces,
+        or if no more faces can be removed without tearing the mesh. The reason is added to
+        ``warnings`` in the statistics of ``textured``.
     work_folder : Path
         For temporary sub-folders.
     region : Region, optional
-        The region that the mesh was made in: its flat boundary stays flat.
+        Region of the mesh: its flat boundary stays flat.
 
     Returns
     -------
@@ -92,23 +92,23 @@ def levels_of_detail(
         chart_pyramid(textured, settings.lods, threads, number)
         for number in range(len(textured.atlases))
     ]
-    colors = Colors(textured, DenseSurface(textured.mesh), pyramids)
+    colors = ColorSource(textured, DenseSurface(textured.mesh), pyramids)
     current, size_px = textured.mesh, textured.albedo.shape[0]
     for number in range(1, settings.lods + 1):
         span = progress.span((number - 1) / settings.lods, number / settings.lods)
         target = len(current.faces) // FACES_DIVISOR
         if target < FLOOR_FACES:
-            _ended(textured, settings, number, f"it would have {target} faces")
+            _warn_fewer_levels(textured, settings, number, f"the next would have {target} faces")
             break
         try:
             fewer = decimate(
                 current.vertices, current.faces, target, span.span(0.0, 0.2), region=region
             )
         except MeshingError as error:
-            _ended(textured, settings, number, error.message.rstrip("."))
+            _warn_fewer_levels(textured, settings, number, error.message.rstrip("."))
             break
         if 2 * len(fewer.faces) > len(current.faces):
-            _ended(textured, settings, number, "fewer faces would tear the mesh")
+            _warn_fewer_levels(textured, settings, number, "fewer faces would tear the mesh")
             break
         current = SurfaceMesh(fewer.vertices, fewer.faces.astype(np.int32))
         size_px = max(size_px // 2, min(size_px, MIN_SIDE_PX))
@@ -119,18 +119,20 @@ def levels_of_detail(
     return levels
 
 
-def _ended(textured: TexturedMesh, settings: TextureSettings, number: int, reason: str) -> None:
-    """Say, in the log and for the report, why there is no further level."""
-    text = f"{number - 1} of {settings.lods} levels of detail were made, no further one: {reason}."
+def _warn_fewer_levels(
+    textured: TexturedMesh, settings: TextureSettings, number: int, reason: str
+) -> None:
+    """Log and report why there is no further level."""
+    text = f"{number - 1} of {settings.lods} levels of detail were made: {reason}."
     _logger.warning("%s", text)
-    hint = "Ask for fewer with --lods, or for a mesh with more faces."
+    hint = "Choose fewer with --lods, or a mesh with more faces."
     warning = ReportWarning("fewer-levels", text, hint)
     textured.statistics.setdefault("warnings", []).append(warning.to_json())
 
 
 def _level(
     mesh: SurfaceMesh,
-    colors: Colors,
+    colors: ColorSource,
     source: SurfaceMesh,
     size_px: int,
     settings: TextureSettings,
@@ -149,7 +151,7 @@ def _level(
         span = progress.span(low, high)
         raster = unwrapped.raster(size_px, threads, number)
         overlaps += raster.overlaps
-        albedo = transferred(mesh, raster, colors, gutter_px, span.span(0.0, 0.4))
+        albedo = transfer_colors(mesh, raster, colors, gutter_px, span.span(0.0, 0.4))
         detail = bake_detail(
             mesh, unwrapped, raster, source, settings, span.span(0.4, 1.0),
             threads=threads, atlas=number,
@@ -167,17 +169,17 @@ def _level(
     return TexturedMesh.of(mesh, unwrapped.corner_uvs, unwrapped.face_atlas, maps, statistics)
 
 
-def transferred(
-    mesh: SurfaceMesh, raster: AtlasRaster, colors: Colors, gutter_px: int, progress: Progress
+def transfer_colors(
+    mesh: SurfaceMesh, raster: AtlasRaster, colors: ColorSource, gutter_px: int, progress: Progress
 ) -> np.ndarray:
-    """Return the (h, w, 3) uint8 texture of a mesh, looked up on another textured one.
+    """Return the (h, w, 3) uint8 texture of a mesh, sampled from another textured mesh.
 
     Parameters
     ----------
     mesh : SurfaceMesh
     raster : AtlasRaster
-        Of its UVs, at the size wanted: the source is averaged to the same fineness, within its
-        charts.
+        Raster of its UVs at the wanted size; the source is averaged to the same resolution,
+        within its charts.
     gutter_px : int
     """
     size = raster.face.shape[0]
@@ -191,21 +193,21 @@ def transferred(
         progress.update(start / len(texels), "level of detail: colours")
         part = texels[start : start + BLOCK]
         at = texel_points(mesh, raster, part, normals)
-        places = colors.surface.corresponding(at.points, at.normals, cage)
-        lost = np.flatnonzero(places.how == NO_HIT)
+        matches = colors.surface.correspondences(at.points, at.normals, cage)
+        lost = np.flatnonzero(matches.method == NO_HIT)
         if len(lost):
             near, _ = colors.surface.nearest(at.points[lost])
-            places.face[lost], places.weights[lost] = near.face, near.weights
-        uvs = np.asarray(colors.textured.corner_uvs, np.float64)[places.face]  # (n, 3, 2)
-        uv = np.einsum("nc,ncx->nx", places.weights, uvs)
-        owner = atlas_of_faces[places.face]
+            matches.face[lost], matches.weights[lost] = near.face, near.weights
+        uvs = np.asarray(colors.textured.corner_uvs, np.float64)[matches.face]  # (n, 3, 2)
+        uv = np.einsum("nc,ncx->nx", matches.weights, uvs)
+        owner = atlas_of_faces[matches.face]
         for number, pyramid in enumerate(colors.pyramids):
             mine = owner == number
-            found = pyramid.looked_up(uv[mine], places.face[mine], level)
+            found = pyramid.sample_level(uv[mine], matches.face[mine], level)
             image.reshape(-1, 3)[part[mine]] = found
     owned = raster.face >= 0
     ring, chart = np.where(owned, 0, -1).astype(np.int16), np.where(owned, 0, -1).astype(np.int32)
-    grow(image, ring, chart, gutter_px, inside=False)
+    dilate(image, ring, chart, gutter_px, inside=False)
     fill_background(image, ring >= 0)
     progress.update(1.0, "level of detail: colours")
     return image

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A tangent-space normal map: the detail of a dense mesh on a lighter one."""
+"""Tangent-space normal map: the detail of a dense mesh on a lighter one."""
 
 from __future__ import annotations
 
@@ -13,21 +13,29 @@ from ...mesh.tangent_frame import TangentFrames, tangent_frames
 from ...progress import Progress
 from ..atlas.atlas_raster import AtlasRaster
 from ..atlas.texel_points import texel_points
-from ..bake.fill import grow
-from .dense_surface import BLOCK, BY_NEAREST, BY_RAY, NO_HIT, DenseSurface, Places, cage_distance
+from ..bake.fill import dilate
+from .dense_surface import (
+    BLOCK,
+    BY_NEAREST,
+    BY_RAY,
+    NO_HIT,
+    DenseSurface,
+    SurfaceCorrespondences,
+    cage_distance,
+)
 
 FLAT = (128, 128, 255)
-"""The colour of the light mesh's own normal: what is between charts."""
+"""Colour of the unperturbed normal, also used between charts."""
 
 
 @dataclass(frozen=True)
 class NormalMap:
-    """The image and where its normals came from."""
+    """Normal map and its statistics."""
 
     image: np.ndarray
-    """(h, w, 3) uint8, +Y (OpenGL, Blender, glTF), not a colour: no sRGB."""
+    """(h, w, 3) uint8, +Y (OpenGL, Blender, glTF), linear data, not sRGB."""
     statistics: dict[str, Any]
-    """Distance between the meshes, shares of texels found by rays, nearest points, not at all."""
+    """Distance of the meshes; shares of texels found by rays, by nearest points, or not at all."""
 
 
 def bake_normal_map(
@@ -38,27 +46,27 @@ def bake_normal_map(
     gutter_px: int,
     progress: Progress,
 ) -> NormalMap:
-    """Tell the dense mesh's normals in the frames of the light mesh, texel by texel.
+    """Bake the dense mesh's normals in the tangent frames of the light mesh.
 
     Parameters
     ----------
     light : SurfaceMesh
-        The mesh that will carry the map, smooth shaded.
+        The mesh that uses the map, smooth shaded.
     corner_uvs : (f, 3, 2) float32
     raster : AtlasRaster
-        Of these UVs; its size is the map's.
+        Raster of these UVs; the map has its size.
     dense : DenseSurface
-        The mesh with the detail, same units.
+        The mesh with the detail, in the same units.
     gutter_px : int
-        How far charts are continued outwards.
+        Width by which charts are dilated.
     progress : Progress
         Span of this step.
 
     Notes
     -----
     The three numbers of a texel solve ``x T + y B + z N = n`` with the interpolated tangent,
-    bitangent and normal of the light mesh, so that a reader finds ``n`` whatever their lengths and
-    angles. Normals that point below the light surface are laid into it: z is never negative.
+    bitangent and normal of the light mesh, so that a renderer recovers ``n`` for any lengths and
+    angles of these. Normals that point below the light surface are clamped to it: z >= 0.
     """
     size = raster.face.shape[0]
     frames = tangent_frames(light.vertices, light.faces, corner_uvs)
@@ -73,16 +81,20 @@ def bake_normal_map(
         progress.update(begin / len(texels), "normal map: rays between the meshes")
         part = texels[begin : begin + BLOCK]
         at = texel_points(light, raster, part, frames.normals)
-        places = dense.corresponding(at.points, at.normals, cage)
-        counts += np.bincount(places.how, minlength=3)
-        found = places.how != NO_HIT
+        matches = dense.correspondences(at.points, at.normals, cage)
+        counts += np.bincount(matches.method, minlength=3)
+        found = matches.method != NO_HIT
         wanted = at.normals.copy()
-        rows = Places(places.face[found], places.weights[found], places.how[found])
+        rows = SurfaceCorrespondences(
+            matches.face[found], matches.weights[found], matches.method[found]
+        )
         wanted[found] = dense.normals(rows)
-        pixels[part] = encode(in_frame(wanted, at.raw_normals, at.weights, at.face, frames))
+        pixels[part] = encode_normals(
+            to_tangent_space(wanted, at.raw_normals, at.weights, at.face, frames)
+        )
     ring = np.where(raster.face >= 0, 0, -1).astype(np.int16)
     chart = np.where(raster.face >= 0, 0, -1).astype(np.int32)
-    grow(image, ring, chart, gutter_px, inside=False)
+    dilate(image, ring, chart, gutter_px, inside=False)
     progress.update(1.0, "normal map: finished")
     total = max(len(texels), 1)
     statistics = {
@@ -96,14 +108,14 @@ def bake_normal_map(
     return NormalMap(image, statistics)
 
 
-def in_frame(
+def to_tangent_space(
     wanted: np.ndarray,
     normal: np.ndarray,
     weights: np.ndarray,
     face: np.ndarray,
     frames: TangentFrames,
 ) -> np.ndarray:
-    """Tell unit vectors in the frames of points on the light mesh.
+    """Transform unit vectors to the tangent frames of points on the light mesh.
 
     Parameters
     ----------
@@ -111,24 +123,26 @@ def in_frame(
     normal : (n, 3) float64
         Interpolated, not of unit length.
     weights : (n, 3) float64
-        Of the corners of ``face`` (n,).
+        Barycentric weights of the corners of ``face`` (n,).
 
     Returns
     -------
     (n, 3) float64
-        Unit length, z not negative.
+        Unit length, z >= 0.
     """
     tangent = np.einsum("nc,ncx->nx", weights, frames.tangents[face])
     bitangent = frames.signs[face][:, None] * np.cross(normal, tangent)
     axes = (np.cross(bitangent, normal), np.cross(normal, tangent), np.cross(tangent, bitangent))
     volume = (tangent * axes[0]).sum(axis=1)
-    told = np.stack([(wanted * axis).sum(axis=1) for axis in axes], axis=1)  # times the volume
-    told *= np.sign(volume)[:, None]
-    told[:, 2] = np.maximum(told[:, 2], 0.0)
-    length = np.linalg.norm(told, axis=1, keepdims=True)
-    return np.where(length > 0.0, told / np.where(length > 0.0, length, 1.0), (0.0, 0.0, 1.0))
+    components = np.stack(
+        [(wanted * axis).sum(axis=1) for axis in axes], axis=1
+    )  # times the volume
+    components *= np.sign(volume)[:, None]
+    components[:, 2] = np.maximum(components[:, 2], 0.0)
+    length = np.linalg.norm(components, axis=1, keepdims=True)
+    return np.where(length > 0.0, components / np.where(length > 0.0, length, 1.0), (0.0, 0.0, 1.0))
 
 
-def encode(vectors: np.ndarray) -> np.ndarray:
-    """Turn (n, 3) unit vectors into (n, 3) uint8, -1 to 1 over 0 to 255."""
+def encode_normals(vectors: np.ndarray) -> np.ndarray:
+    """Encode (n, 3) unit vectors as (n, 3) uint8: [-1, 1] to [0, 255]."""
     return np.rint((0.5 * vectors + 0.5) * 255.0).clip(0, 255).astype(np.uint8)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ambient occlusion of the dense mesh: how much of the sky above it each texel sees."""
+"""Ambient occlusion map of the dense mesh."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from ...mesh.tangent_frame import shading_normals
 from ...progress import Progress
 from ..atlas.atlas_raster import AtlasRaster
 from ..atlas.texel_points import texel_points
-from ..bake.fill import grow
-from .dense_surface import BLOCK, NO_HIT, DenseSurface, Places, cage_distance
+from ..bake.fill import dilate
+from .dense_surface import BLOCK, NO_HIT, DenseSurface, SurfaceCorrespondences, cage_distance
 
 MAX_SIDE_PX = 1024
 """Occlusion varies slowly, and each texel costs :data:`RAYS` rays."""
 RAYS = 64
-"""Steps of 1.6 %; the noise of a half-open texel is about 2 %."""
+"""Resolution 1.6 %; the noise of a half-open texel is about 2 %."""
 REACH_SHARE = 0.1
-"""Of the mesh's diagonal: what is further away than this hides nothing."""
+"""Share of the mesh's diagonal: surfaces farther away do not occlude."""
 LIFT_SHARE = 1e-6
-"""Of the mesh's diagonal: rays begin this far above the surface."""
+"""Share of the mesh's diagonal: height of the ray origins above the surface."""
 GOLDEN = np.array([0.7548776662466927, 0.5698402909980532])
-"""Steps of the plane's most even sequence: powers of the root of x^3 = x + 1."""
+"""Steps of the R2 low-discrepancy sequence: powers of 1 / x with x^3 = x + 1."""
 
 
 @dataclass(frozen=True)
 class OcclusionMap:
-    """The image and how it was made."""
+    """Occlusion map and its statistics."""
 
     image: np.ndarray
-    """(k, k) uint8, 255 where open."""
+    """(k, k) uint8, 255 if unoccluded."""
     statistics: dict[str, Any]
-    """Size, rays a texel, reach in scene units, mean."""
+    """Size, rays per texel, maximum distance in scene units, mean."""
 
 
 def bake_occlusion(
@@ -45,18 +45,18 @@ def bake_occlusion(
     gutter_px: int,
     progress: Progress,
 ) -> OcclusionMap:
-    """Look around at what of the dense mesh each texel of the light one stands for.
+    """Bake the occlusion of the dense mesh at points that correspond to texels of the light one.
 
     Parameters
     ----------
     light : SurfaceMesh
-        The mesh that will carry the map.
+        The mesh that uses the map.
     raster : AtlasRaster
-        Of its UVs, at the map's size (:data:`MAX_SIDE_PX` at most is sensible).
+        Raster of its UVs at the size of the map (sensibly at most :data:`MAX_SIDE_PX`).
     dense : DenseSurface
-        Same units; the light mesh's own surface where there is no other.
+        In the same units; the light mesh itself without another one.
     gutter_px : int
-        How far charts are continued outwards.
+        Width by which charts are dilated.
     """
     size = raster.face.shape[0]
     cage = cage_distance(light, DenseSurface(light), dense)
@@ -66,47 +66,49 @@ def bake_occlusion(
     texels = np.flatnonzero(raster.face.ravel() >= 0)
     block = max(1, BLOCK // RAYS)
     for begin in range(0, len(texels), block):
-        progress.update(begin / len(texels), "ambient occlusion: looking around")
+        progress.update(begin / len(texels), "ambient occlusion: casting rays")
         part = texels[begin : begin + block]
         at = texel_points(light, raster, part, normals)
-        places = dense.corresponding(at.points, at.normals, cage)
-        found = places.how != NO_HIT
-        rows = Places(places.face[found], places.weights[found], places.how[found])
-        seen = openness(dense, rows, reach, part[found])
+        matches = dense.correspondences(at.points, at.normals, cage)
+        found = matches.method != NO_HIT
+        rows = SurfaceCorrespondences(
+            matches.face[found], matches.weights[found], matches.method[found]
+        )
+        seen = sky_visibility(dense, rows, reach, part[found])
         values.ravel()[part[found]] = np.rint(255.0 * seen).astype(np.uint8)
     image = np.repeat(values[..., None], 3, axis=2)
     owned = raster.face >= 0
     ring, chart = np.where(owned, 0, -1).astype(np.int16), np.where(owned, 0, -1).astype(np.int32)
-    grow(image, ring, chart, gutter_px, inside=False)
+    dilate(image, ring, chart, gutter_px, inside=False)
     progress.update(1.0, "ambient occlusion: finished")
     mean = float(values.ravel()[texels].mean() / 255.0) if len(texels) else 1.0
     statistics = {"size_px": size, "rays": RAYS, "reach_scene": reach, "open_share": mean}
     return OcclusionMap(np.ascontiguousarray(image[..., 0]), statistics)
 
 
-def openness(
-    surface: DenseSurface, places: Places, reach: float, numbers: np.ndarray
+def sky_visibility(
+    surface: DenseSurface, matches: SurfaceCorrespondences, reach: float, numbers: np.ndarray
 ) -> np.ndarray:
-    """Return which share of the light of an even sky reaches points of a mesh.
+    """Return the share of light from a uniform sky that reaches points of a mesh.
 
     Parameters
     ----------
-    places : Places
+    matches : SurfaceCorrespondences
         Points, each on a face.
     reach : float
-        Only what is nearer than this hides the sky.
+        Only surfaces nearer than this occlude the sky.
     numbers : (n,) int64
-        Turn each point's fixed pattern of rays, so that neighbours do not err alike.
+        Offset the fixed ray pattern of each point, so that errors of neighbours are uncorrelated.
 
     Returns
     -------
     (n,) float64
-        1 where nothing is in the way, weighted by the cosine to the face's normal.
+        1 if unoccluded, weighted by the cosine to the face normal.
     """
-    normals = surface.face_normals[places.face]
+    normals = surface.face_normals[matches.face]
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     sign = np.where(normals[:, 2] < 0.0, -1.0, 1.0)
-    # Two axes beside each normal, without a special case (Duff and others, 2017).
+    # Two axes orthogonal to each normal, without a special case (Duff and others, 2017).
     scale = -1.0 / (sign + normals[:, 2])
     mixed = normals[:, 0] * normals[:, 1] * scale
     one = np.stack(
@@ -116,15 +118,15 @@ def openness(
     turn = (np.asarray(numbers, np.int64)[:, None] % 65_521) * GOLDEN  # (n, 2)
     number = (np.arange(RAYS)[:, None] + 0.5) * np.array([1.0 / RAYS, GOLDEN[0]])
     share = (number[None] + turn[:, None]) % 1.0  # (n, rays, 2)
-    # Even on the disc below is cosine-weighted on the half sphere above.
+    # Uniform on the disc is cosine-weighted on the hemisphere.
     radius, angle = np.sqrt(share[..., 0]), 2.0 * np.pi * share[..., 1]
     height = np.sqrt(1.0 - share[..., 0])
-    ways = (
+    directions = (
         (radius * np.cos(angle))[..., None] * one[:, None]
         + (radius * np.sin(angle))[..., None] * other[:, None]
         + height[..., None] * normals[:, None]
     )  # (n, rays, 3)
-    origins = surface.points(places) + LIFT_SHARE * surface.size * normals
+    origins = surface.points(matches) + LIFT_SHARE * surface.size * normals
     origins = np.repeat(origins, RAYS, axis=0)
-    hit = surface.is_hit(origins, ways.reshape(-1, 3), reach)
+    hit = surface.is_hit(origins, directions.reshape(-1, 3), reach)
     return 1.0 - hit.reshape(-1, RAYS).mean(axis=1)

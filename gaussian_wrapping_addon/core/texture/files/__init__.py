@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Textured meshes as files: GLB, OBJ, PLY, and what no file may hold.
+"""Write textured meshes as files (GLB, OBJ, PLY), and validate them before export.
 
-In: a textured mesh. Out: files in the frame that was asked for.
+In: a textured mesh. Out: files in the requested frame.
 """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What no mesh file may hold, asked before any writer sees it, Blender's included.
+"""Validate a mesh before export, also before Blender's exporters.
 
-Those write a NaN without a word, and what reads the file then shows nothing or crashes.
+Exporters write NaN silently, and readers of the file then show nothing or crash.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import MeshingError, cannot_be_written
+from ...errors import MeshingError, unwritable_error
 from ...limits import MAX_ATLASES
 
 SINGLE_MAX = float(np.finfo(np.float32).max)
-"""Coordinates beyond become infinite in single precision, which most formats have."""
+"""Larger coordinates become infinite in single precision, which most formats use."""
 
 
 def atlas_file(name: str, atlas: int) -> str:
-    """Return the name of a map's file: ``albedo.png``, then ``albedo-2.png`` and on.
+    """Return the file name of a map: ``albedo.png``, then ``albedo-2.png`` and on.
 
     Parameters
     ----------
@@ -32,29 +32,29 @@ def atlas_file(name: str, atlas: int) -> str:
     return f"{name}-{atlas + 1}.png" if atlas else f"{name}.png"
 
 
-def check_face_atlas(face_atlas: np.ndarray, faces: int) -> np.ndarray:
-    """Return (f,) uint8 atlases of faces as a file holds them.
+def validate_face_atlas(face_atlas: np.ndarray, faces: int) -> np.ndarray:
+    """Validate the atlas indices of faces read from a file; return them as (f,) uint8.
 
     Raises
     ------
     ValueError
-        Not one for each face, no integers, or more than :data:`~.limits.MAX_ATLASES`.
+        Not one for each face, not integers, or not below :data:`~.limits.MAX_ATLASES`.
     """
     if face_atlas.shape != (faces,) or face_atlas.dtype.kind not in "iu":
         raise ValueError("face_atlas is not one integer for each face")
     if faces and not 0 <= int(face_atlas.min()) <= int(face_atlas.max()) < MAX_ATLASES:
-        raise ValueError("a face lies in an atlas that cannot be")
+        raise ValueError("an atlas index of a face is out of range")
     return face_atlas.astype(np.uint8)
 
 
-def check_mesh(
+def validate_for_export(
     vertices: np.ndarray,
     faces: np.ndarray,
     corner_uvs: np.ndarray | None = None,
     *,
     name: str = "the mesh to write",
 ) -> None:
-    """Refuse a mesh that is empty, not finite (also in float32), or names missing vertices.
+    """Raise if a mesh is empty, not finite (also in float32), or has indices out of range.
 
     Parameters
     ----------
@@ -62,12 +62,12 @@ def check_mesh(
     faces : (f, 3) int
     corner_uvs : (f, 3, 2) float, optional
     name : str
-        What the mesh is called in the error.
+        Name of the mesh in the error message.
 
     Raises
     ------
     MeshingError
-        Names the first place that is wrong.
+        States the first invalid element.
     """
     subject = name[:1].upper() + name[1:]
     if len(faces) == 0 or len(vertices) == 0:
@@ -79,7 +79,7 @@ def check_mesh(
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshingError(
-            f"A face of {name} names a vertex that does not exist.", "Mesh the region again."
+            f"A face of {name} refers to a vertex that does not exist.", "Mesh the region again."
         )
     if corner_uvs is None:
         return
@@ -92,9 +92,9 @@ def check_mesh(
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn what the system says of a path into our error."""
+def write_errors(path: Path) -> Iterator[None]:
+    """Translate ``OSError`` of a path into the package's error."""
     try:
         yield
     except OSError as error:
-        raise cannot_be_written(path, error) from error
+        raise unwritable_error(path, error) from error

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One textured mesh as binary glTF 2.0: Y up, images embedded."""
+"""Encode one textured mesh as binary glTF 2.0: Y up, images embedded."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def glb_bytes(
     shading: str = "auto",
     face_atlas: np.ndarray | None = None,
 ) -> bytes:
-    """Build the file.
+    """Return the content of the file.
 
-    Photos hold their own light, so the material is ``KHR_materials_unlit``, with an ordinary
-    rough material for readers that do not know it. With a normal map or occlusion it is lit:
-    readers ignore both where a material is unlit. Normals are those that the map was baked for;
-    tangents stand beside them where there is a normal map. Faces that name a vertex twice are
-    left out. Each atlas has a material, a primitive with vertices of its own, and its images.
+    Photos contain their lighting, so the material is ``KHR_materials_unlit``, with an ordinary
+    rough material for readers without that extension. With a normal map or occlusion it is lit:
+    readers ignore both in unlit materials. Normals are those for which the map was baked; with a
+    normal map, tangents are written too. Faces with a repeated vertex are left out. Each atlas has
+    a material, a primitive with its own vertices, and its images.
 
     Parameters
     ----------
@@ -52,13 +52,13 @@ def glb_bytes(
     png : bytes or sequence of bytes
         The texture, or one for each atlas.
     offset : (3,) float64
-        What was taken off the world coordinates; kept in the node's extras.
+        Offset subtracted from the world coordinates; stored in the node's extras.
     normal_png, occlusion_png : the same, optional
         Tangent-space normal map (+Y) and ambient occlusion (red channel), for the same UVs.
     shading : str
-        ``"lit"``, ``"unlit"`` (then without both maps), or ``"auto"``: as said above.
+        ``"lit"``, ``"unlit"`` (then without both maps), or ``"auto"``: as described above.
     face_atlas : (f,) int, optional
-        Where there are several atlases.
+        Atlas of each face, if there are several.
     """
     if shading == "unlit":
         normal_png = occlusion_png = None
@@ -119,7 +119,7 @@ def glb_bytes(
 
 
 class _Parts:
-    """The binary chunk, its views and accessors, as they grow."""
+    """Builder of the binary chunk with its buffer views and accessors."""
 
     def __init__(self) -> None:
         self.binary = bytearray()
@@ -127,14 +127,14 @@ class _Parts:
         self.accessors: list[dict[str, Any]] = []
 
     def add(self, data: bytes, target: int | None = None) -> int:
-        """Append bytes; return their view."""
+        """Append bytes; return the index of their buffer view."""
         view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
         self.views.append(view if target is None else {**view, "target": target})
         self.binary += data + b"\0" * (-len(data) % 4)
         return len(self.views) - 1
 
     def add_array(self, array: np.ndarray, component: int, kind: str, target: int) -> int:
-        """Append an array; return its accessor."""
+        """Append an array; return the index of its accessor."""
         view = self.add(array.tobytes(), target)
         self.accessors.append(
             {"bufferView": view, "componentType": component, "count": len(array), "type": kind}
@@ -143,7 +143,7 @@ class _Parts:
 
 
 class _Tables(NamedTuple):
-    """Of a whole mesh, glTF's axes."""
+    """Vertex data of a whole mesh in glTF's axes."""
 
     faces: np.ndarray  # (f, 3)
     uvs: np.ndarray  # (3 f, 2) float32, v upwards
@@ -167,7 +167,7 @@ def _vertex_tables(
 
 
 def _add_primitive(parts: _Parts, tables: _Tables, chosen: np.ndarray) -> dict[str, Any]:
-    """Add the chosen faces; one glTF vertex for each set of vertex, UV and tangent."""
+    """Add the chosen faces; one glTF vertex for each combination of vertex, UV and tangent."""
     rows = np.repeat(chosen, 3)
     corner_vertex, uvs = tables.faces[chosen].ravel(), tables.uvs[rows]
     key = np.zeros(len(uvs), np.dtype([("vertex", "<i8"), ("uv", "<u8"), ("tangent", "<u8", (2,))]))
@@ -203,7 +203,7 @@ def _listed(png: bytes | Sequence[bytes] | None) -> list[bytes]:
 
 
 def _material(images: list[str], is_unlit: bool, atlas: int, first: int) -> dict[str, Any]:
-    """Return the material of an atlas, whose textures stand from ``first`` on, in this order."""
+    """Return the material of an atlas, whose textures start at index ``first``, in this order."""
     material: dict[str, Any] = {
         "name": Path(atlas_file("albedo", atlas)).stem,
         "pbrMetallicRoughness": {

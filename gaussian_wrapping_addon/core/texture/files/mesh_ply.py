@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mesh as PLY: exact coordinates, and the texture as vertex colours. Needs numpy alone."""
+"""Write a mesh as PLY: exact coordinates, texture as vertex colours. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...files import write_bytes
-from .file_checks import check_mesh, writing
+from .file_checks import validate_for_export, write_errors
 
 
 def write_mesh_ply(
@@ -22,7 +22,7 @@ def write_mesh_ply(
     path : Path
         Its folder must exist.
     vertices : (v, 3) float64
-        World coordinates; stored without loss.
+        World coordinates; stored losslessly.
     faces : (f, 3) int32
     colors : (v, 3) uint8 or None
 
@@ -34,7 +34,7 @@ def write_mesh_ply(
         The file cannot be written.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
-    check_mesh(vertices, faces)
+    validate_for_export(vertices, faces)
     fields = [(axis, "<f8") for axis in "xyz"]
     names = ["property double x", "property double y", "property double z"]
     if colors is not None:
@@ -60,7 +60,7 @@ def write_mesh_ply(
         "",
     ]
     data = "\n".join(header).encode() + rows.tobytes() + triangles.tobytes()
-    with writing(path):
+    with write_errors(path):
         write_bytes(path, data)
 
 
@@ -71,19 +71,19 @@ def vertex_colors(
     albedos: Sequence[np.ndarray],
     face_atlas: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return (v, 3) uint8 means of the texture at the corners of each vertex.
+    """Return (v, 3) uint8 vertex colours: mean of the texture over the corners of each vertex.
 
     Parameters
     ----------
     count : int
-        Of the vertices.
+        Number of vertices.
     faces : (f, 3) int
     corner_uvs : (f, 3, 2) float
         v upwards.
     albedos : sequence of (h, w, 3) uint8
-        One for each atlas. The first row is the top.
+        One per atlas; the first row is the top.
     face_atlas : (f,) int, optional
-        Where there are several.
+        Atlas of each face, if there are several.
     """
     uvs = np.asarray(corner_uvs, np.float64).reshape(-1, 2)
     atlas = np.zeros(len(uvs), np.int64) if face_atlas is None else np.repeat(face_atlas, 3)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How the lit material of a result shines: the same in Blender and in every file."""
+"""Roughness and specular level of lit materials, the same in Blender and in every file format."""
 
 ROUGHNESS = 0.9
-"""Photos carry their own light: a glossy guess on top of it would look wrong from most sides."""
+"""Photos contain their lighting: added gloss would look wrong from most directions."""
 
 SPECULAR_LEVEL = 0.1
-"""As Blender counts: 0.5 is a reflectance of 4 %, which glTF's factor 1 stands for."""
+"""Blender's scale: 0.5 is a reflectance of 4 %, which corresponds to glTF's factor 1."""
 
 OBJ_SHININESS = 1000.0 * (1.0 - ROUGHNESS) ** 2
-"""``Ns`` of OBJ as Blender writes and reads roughness; others take it for Phong's exponent."""
+"""``Ns`` of OBJ as Blender maps it to roughness; other programs use it as Phong exponent."""

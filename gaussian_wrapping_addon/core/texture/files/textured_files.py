@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Write textured meshes: arrays for Blender, PLY, OBJ, GLB, and where their coordinates lie.
+"""Write textured meshes: arrays for Blender, PLY, OBJ, GLB, and their coordinate frames.
 
 | file | coordinates |
 |---|---|
 | ``mesh.npz`` | scene frame, float64 |
 | ``mesh.ply`` | world, double |
 | ``mesh.obj`` | world minus ``offset``, world axes |
-| ``mesh.glb`` | world minus ``offset``, turned from Z up to Y up (x, z, -y), float32 |
+| ``mesh.glb`` | world minus ``offset``, rotated from Z up to Y up (x, z, -y), float32 |
 
-``offset`` is 0 unless the mesh lies so far from the origin that float32 would show; it is written
-to ``transform.json`` and into the GLB's node.
+``offset`` is 0 unless the mesh is so far from the origin that float32 precision would be visible;
+it is written to ``transform.json`` and into the GLB's node.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ...export_formats import RESULT_FORMATS
 from ...files import write_bytes, write_json
 from ...mesh.tangent_frame import shading_normals
 from ...mesh.textured_mesh import TexturedMesh
-from .file_checks import atlas_file, check_mesh, writing
+from .file_checks import atlas_file, validate_for_export, write_errors
 from .glb import glb_bytes
 from .mesh_ply import vertex_colors, write_mesh_ply
 from .shading import OBJ_SHININESS, SPECULAR_LEVEL
@@ -42,27 +42,27 @@ def write_obj(
     normal_name: str | Sequence[str] | None = None,
     face_atlas: np.ndarray | None = None,
 ) -> None:
-    """Write ``path`` and its ``.mtl`` beside it, which names an image in the same folder.
+    """Write an OBJ and its ``.mtl``, which refers to an image in the same folder.
 
     Parameters
     ----------
     vertices : (v, 3) float64
     faces : (f, 3) int32
     corner_uvs : (f, 3, 2) float32
-        v upwards, as OBJ wants it.
+        v upwards, as in OBJ.
     image_name : str or sequence of str
-        One for each atlas; without spaces, which OBJ readers do not agree on.
+        One per atlas; without spaces, which OBJ readers handle differently.
     normal_name : the same, optional
-        A normal map, under the name of ``map_Bump``, by which Blender writes and reads them.
+        A normal map, written as ``map_Bump``, as Blender writes and reads it.
     face_atlas : (f,) int, optional
-        Where there are several atlases; each has a material of its own.
+        Atlas of each face, if there are several; each has its own material.
     """
-    check_mesh(vertices, faces, corner_uvs)
+    validate_for_export(vertices, faces, corner_uvs)
     names = [image_name] if isinstance(image_name, str) else list(image_name)
     bumps = [normal_name] if isinstance(normal_name, str) else list(normal_name or ())
     for name in names:
         if any(c.isspace() for c in name + path.name):
-            raise UsageError(f"OBJ files cannot name {name!r}.", "Use a name without spaces.")
+            raise UsageError(f"OBJ files cannot refer to {name!r}.", "Use a name without spaces.")
     uvs, corner = np.unique(corner_uvs.reshape(-1, 2), axis=0, return_inverse=True)
     corner = corner.reshape(-1, 3) + 1
     owner = np.asarray(faces) + 1
@@ -71,7 +71,7 @@ def write_obj(
     text.write(f"mtllib {path.stem}.mtl\no {path.stem}\n")
     np.savetxt(text, vertices, fmt="v %.9g %.9g %.9g")
     np.savetxt(text, uvs, fmt="vt %.7f %.7f")
-    # Without normals, readers show every face flat, and a normal map on faces that it is not for.
+    # Without normals, readers shade faces flat, which does not match the normal map.
     np.savetxt(text, shading_normals(vertices, faces), fmt="vn %.6f %.6f %.6f")
     atlas = np.zeros(len(table), np.uint8) if face_atlas is None else face_atlas
     shine = " ".join([str(SPECULAR_LEVEL)] * 3)
@@ -84,7 +84,7 @@ def write_obj(
         material += f"Ni 1.5\nd 1\nillum 2\nmap_Kd {name}\n"
         if bumps:
             material += f"map_Bump -bm 1 {bumps[number]}\n"
-    with writing(path):
+    with write_errors(path):
         write_bytes(path.with_suffix(".mtl"), material.encode())
         write_bytes(path, text.getvalue().encode())
 
@@ -103,8 +103,8 @@ def write_glb(
     face_atlas: np.ndarray | None = None,
 ) -> None:
     """Write a binary glTF with the images inside; see :func:`.glb.glb_bytes`."""
-    check_mesh(vertices, faces, corner_uvs)
-    with writing(path):
+    validate_for_export(vertices, faces, corner_uvs)
+    with write_errors(path):
         data = glb_bytes(
             vertices, faces, corner_uvs, png, offset,
             normal_png=normal_png, occlusion_png=occlusion_png, shading=shading,
@@ -120,23 +120,23 @@ def write_textured(
     world_from_scene: Similarity,
     offset: np.ndarray | None = None,
 ) -> None:
-    """Write ``mesh.npz``, ``albedo.png``, ``mesh.ply``, ``transform.json`` and the formats asked.
+    """Write ``mesh.npz``, ``albedo.png``, ``mesh.ply``, ``transform.json`` and further formats.
 
-    ``normal.png`` and ``occlusion.png`` stand beside them where the mesh has such maps; further
-    atlases are ``albedo-2.png`` and on.
+    ``normal.png`` and ``occlusion.png`` are written if the mesh has these maps; further atlases
+    are ``albedo-2.png`` and on.
 
     Parameters
     ----------
     textured : TexturedMesh
         Scene frame.
     folder : Path
-        Made when missing.
+        Created if missing.
     formats : tuple of str
-        Among :data:`RESULT_FORMATS`; ``"ply"`` is always written.
+        Elements of :data:`RESULT_FORMATS`; ``"ply"`` is always written.
     world_from_scene : Similarity
-        Leads to the world frame of the input.
+        Transform to the world frame of the input.
     offset : (3,) float64, optional
-        What the files leave out, where several are to lie over each other; else
+        Offset subtracted in the files, to align several of them; by default
         :func:`file_offset`.
 
     Raises
@@ -144,17 +144,17 @@ def write_textured(
     MeshingError
         The mesh is empty or not finite.
     UsageError
-        A format that is not written here.
+        Unknown format.
     ResourceError
         The folder cannot be written.
     """
     unknown = sorted(set(formats) - set(RESULT_FORMATS))
     if unknown:
         raise UsageError(
-            f"There is no export {unknown[0]!r} here.", f"Use {', '.join(RESULT_FORMATS)}."
+            f"Unknown export format {unknown[0]!r}.", f"Use {', '.join(RESULT_FORMATS)}."
         )
     mesh = textured.mesh
-    check_mesh(mesh.vertices, mesh.faces, textured.corner_uvs)
+    validate_for_export(mesh.vertices, mesh.faces, textured.corner_uvs)
     world = world_from_scene.points(mesh.vertices)
     offset = file_offset(world) if offset is None else offset
     atlases, face_atlas = textured.atlases, textured.face_atlas
@@ -165,7 +165,7 @@ def write_textured(
     }
     pngs = {name: [png_bytes(image) for image in several] for name, several in images.items()}
     arrays = {} if face_atlas is None else {"face_atlas": np.asarray(face_atlas, np.uint8)}
-    with writing(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         stream = io.BytesIO()
         np.savez(

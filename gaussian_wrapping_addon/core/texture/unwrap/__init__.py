@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""UV coordinates: charts and packing by xatlas in helper processes, checked.
+"""UV unwrapping: charts and packing by xatlas in helper processes, with validation.
 
-In: a mesh. Out: UVs per face corner, no texel used twice.
+In: a mesh. Out: UVs per face corner without overlaps.
 """

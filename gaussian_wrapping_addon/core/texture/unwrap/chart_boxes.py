@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How large charts can be in a texture, judged by their boxes."""
+"""Packing scale of charts, estimated from their bounding boxes."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import math
 import numpy as np
 
 MAX_PACKING_PX = 1024
-"""Packing costs by the texel: it is done on a smaller square, with gutters in proportion."""
+"""The cost of packing grows with the texels: a smaller square is used, with scaled gutters."""
 ROUNDING_TEXELS = 2
-"""A chart takes this more than its box: texels are whole, and touched ones are kept for it."""
+"""Texels added to a box: sizes are rounded up, and touched texels belong to the chart."""
 FILL_SHARE = 0.8
-"""Share of the square that the boxes of charts and their gutters take when they just fit."""
+"""Share of the square covered by the boxes of charts with gutters when they just fit."""
 SCALE_STEPS = 30
 WIDE_SHARE = 0.45
-"""Of a square's side: wider charts of a mesh with several squares are cut, to fill each of them."""
+"""Share of a square's side: with several squares, wider charts are split to fill each square."""
 USED_SHARE = 0.6
-"""Share of a square that is used after packing, about."""
+"""Approximate share of a square used after packing."""
 MAX_CUTS = 12
 """Rounds of halving."""
 MIN_SCALE_SHARE = 0.01
-"""Of the scale at which the largest chart fills the square: given when not even gutters fit."""
+"""Share of the scale at which the largest chart fills the square: minimum if gutters do not fit."""
 
 
 def packing_square(size_px: int, gutter_px: float) -> tuple[int, int]:
-    """Return the side and the padding, in whole texels, with which charts are packed."""
+    """Return the side and the padding for packing, in whole texels."""
     side_px = min(size_px, MAX_PACKING_PX)
     return side_px, math.ceil(gutter_px * side_px / size_px)
 
@@ -51,8 +51,8 @@ def chart_extents(points: np.ndarray, corners: np.ndarray, charts: np.ndarray) -
     return high - low
 
 
-def scale_that_fits(extents: np.ndarray, side_px: int, padding_px: int, squares: int = 1) -> float:
-    """Return the texels for a unit at which boxes with their padding fill most of the squares."""
+def packing_scale(extents: np.ndarray, side_px: int, padding_px: int, squares: int = 1) -> float:
+    """Return the texels per unit at which boxes with padding fill most of the squares."""
     low, high = 0.0, side_px / max(float(extents.max()), 1e-30)
     largest = high
     for _ in range(SCALE_STEPS):
@@ -62,16 +62,16 @@ def scale_that_fits(extents: np.ndarray, side_px: int, padding_px: int, squares:
     return max(low, MIN_SCALE_SHARE * largest)
 
 
-def cut_wide_charts(corner_uvs: np.ndarray, charts: np.ndarray, squares: int) -> np.ndarray:
-    """Halve charts that are too wide to be spread over several squares.
+def split_wide_charts(corner_uvs: np.ndarray, charts: np.ndarray, squares: int) -> np.ndarray:
+    """Split charts that are too wide for several squares.
 
-    One chart cannot be larger than a square: where it holds most of the surface, several squares
-    would show no more of it than one.
+    A chart cannot be larger than a square: if one chart holds most of the surface, several squares
+    would give no more resolution than one.
 
     Parameters
     ----------
     corner_uvs : (f, 3, 2) float64
-        At one scale.
+        All charts at the same scale.
     charts : (f,) int
         Labels from 0.
     squares : int

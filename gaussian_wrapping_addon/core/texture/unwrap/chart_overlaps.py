@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Faces of one chart that cover each other, found exactly, and charts split until none does."""
+"""Find overlapping faces within a chart exactly, and split charts until there are none."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from ...kernels.compiled import inline, kernel
 from ...mesh.face_graph import FaceGraph, components
 
 OVERLAP_DEPTH_SHARE = 1e-4
-"""Two faces overlap when they cannot be moved apart by this share of the median edge of all. In
-textures in use that is a hundredth of a texel; rounding of UVs stays below."""
+"""Minimum penetration depth of an overlap, as a share of the median edge of all faces. In typical
+textures this is a hundredth of a texel, above the rounding of UVs."""
 LEAST_CLASS_SHARE = 1.0 / 64.0
-"""Of the median width or height: all smaller faces share one class."""
+"""Share of the median width or height: all smaller faces are in one class."""
 
 
 def signed_areas(flat: np.ndarray) -> np.ndarray:
@@ -23,7 +23,7 @@ def signed_areas(flat: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
 
 
-def conflicts(corner_uvs: np.ndarray, charts: np.ndarray) -> np.ndarray:
+def find_overlaps(corner_uvs: np.ndarray, charts: np.ndarray) -> np.ndarray:
     """Find the pairs of faces of the same chart that overlap.
 
     Returns
@@ -42,21 +42,21 @@ def conflicts(corner_uvs: np.ndarray, charts: np.ndarray) -> np.ndarray:
 
 
 def overlapping_pairs(uvs: np.ndarray, charts: np.ndarray, depth: float) -> tuple[np.ndarray, int]:
-    """Find pairs of one chart that lie deeper in each other than ``depth``.
+    """Find pairs of faces of one chart that penetrate each other by more than ``depth``.
 
     Returns
     -------
     pairs : (p, 2) int64
         Each once.
     candidates : int
-        Pairs that were looked at.
+        Number of pairs tested.
 
     Notes
     -----
-    Boxes are sorted into classes by width and height, each within a factor of two, and those of a
-    class into rows as high as it. A box meets three rows, at most, of each class that is as high
-    as itself or higher, and in a row only boxes within twice its width: what is looked at grows
-    with the boxes that meet, however long and thin they are and whichever way they lie.
+    Bounding boxes are sorted into classes by width and height, each within a factor of two, and
+    within a class into rows of its height. A box intersects at most three rows of each class of at
+    least its height, and in a row only boxes within twice the width are tested: the cost grows with
+    the intersecting boxes, for any aspect ratio and orientation.
     """
     rows = _rows(uvs, charts)
     found = np.empty((0, 2), np.int64)
@@ -70,15 +70,15 @@ def overlapping_pairs(uvs: np.ndarray, charts: np.ndarray, depth: float) -> tupl
 
 class _Rows(NamedTuple):
     order: np.ndarray
-    """(f,) faces by chart, class, row and left border; all below is in this order."""
+    """(f,) faces sorted by chart, class, row and left border; ``arrays`` is in this order."""
     arrays: tuple[np.ndarray, ...]
-    """As :func:`_overlapping` takes them."""
+    """Arguments of :func:`_overlapping`."""
 
 
 def _rows(uvs: np.ndarray, charts: np.ndarray) -> _Rows:
     low, high = uvs.min(axis=1), uvs.max(axis=1)  # (f, 2)
     size = high - low
-    # One class for all that is narrower than most by far: there is no end of classes below.
+    # One class for all very small boxes, as the number of classes below is unbounded.
     least = np.maximum(LEAST_CLASS_SHARE * np.median(size, axis=0), np.finfo(np.float64).tiny)
     exponent = np.frexp(np.maximum(size, least))[1]  # (f, 2) int32; size <= 2^exponent
     row = np.floor(np.ldexp(low[:, 1], -exponent[:, 1]))
@@ -93,7 +93,7 @@ def _rows(uvs: np.ndarray, charts: np.ndarray) -> _Rows:
     class_chart = chart[class_begin]
     classes_end = np.searchsorted(class_chart, chart, side="right")  # (f,)
     own_height = np.maximum.accumulate(np.where(new_class, np.arange(len(order)), 0))
-    # Classes of a chart are sorted by height: those as high or higher follow one another.
+    # Classes of a chart are sorted by height: those of at least a height are contiguous.
     height_key = np.stack([class_chart, exponent[class_begin, 1]], axis=1)
     begins = np.flatnonzero(_changes(height_key[:, 0], height_key[:, 1]))
     group = begins[np.searchsorted(begins, np.arange(len(class_begin)), side="right") - 1]
@@ -110,22 +110,22 @@ def _rows(uvs: np.ndarray, charts: np.ndarray) -> _Rows:
 
 
 def _changes(*columns: np.ndarray) -> np.ndarray:
-    """Tell which rows begin something new: the first, and those unlike the one before."""
+    """Return which rows differ from the previous one, (n,) bool; the first does."""
     new = np.ones(len(columns[0]), np.bool_)
     new[1:] = np.any([column[1:] != column[:-1] for column in columns], axis=0)
     return new
 
 
 def split_overlaps(corner_uvs: np.ndarray, charts: np.ndarray, graph: FaceGraph) -> np.ndarray:
-    """Split charts until no two faces of one overlap; UVs stay.
+    """Split charts until no two faces of one overlap; UVs are unchanged.
 
-    A new chart grows from the face in the middle of the old one over shared edges, and leaves out
-    what it would cover or what is turned over; what is left is split in the same way.
+    A new chart grows from the central face of the old one over shared edges, without faces that it
+    would overlap or that are flipped; the remaining faces are split in the same way.
 
     Parameters
     ----------
     corner_uvs : (f, 3, 2) float
-        Finite; charts may lie upon each other.
+        Finite; different charts may overlap.
     charts : (f,) int
         Each connected.
 
@@ -134,7 +134,7 @@ def split_overlaps(corner_uvs: np.ndarray, charts: np.ndarray, graph: FaceGraph)
     (f,) int32
         New labels from 0.
     """
-    pairs = conflicts(corner_uvs, charts)
+    pairs = find_overlaps(corner_uvs, charts)
     areas = signed_areas(np.asarray(corner_uvs, np.float64))
     count = int(charts.max()) + 1
     up = np.bincount(charts, areas > 0, count)
@@ -164,8 +164,8 @@ def split_overlaps(corner_uvs: np.ndarray, charts: np.ndarray, graph: FaceGraph)
 
 
 @inline
-def _apart(a: Any, b: Any, ccw: float) -> float:
-    """Return the widest gap between two triangles over the directions of the first one's edges."""
+def _separation(a: Any, b: Any, ccw: float) -> float:
+    """Return the largest separation of two triangles along the first one's edge normals."""
     widest = -np.inf
     for k in range(3):
         ax, ay = a[k, 0], a[k, 1]
@@ -182,7 +182,7 @@ def _apart(a: Any, b: Any, ccw: float) -> float:
 
 
 @inline
-def _turn(a: Any) -> float:
+def _orientation(a: Any) -> float:
     double = (a[1, 0] - a[0, 0]) * (a[2, 1] - a[0, 1]) - (a[2, 0] - a[0, 0]) * (a[1, 1] - a[0, 1])
     return 1.0 if double > 0.0 else (-1.0 if double < 0.0 else 0.0)
 
@@ -209,8 +209,8 @@ def _overlapping(
     left = low[:, 0]
     for i in range(len(uvs)):
         one = uvs[i]
-        turn = _turn(one)
-        if turn == 0.0:
+        orientation = _orientation(one)
+        if orientation == 0.0:
             continue
         for c in range(classes_begin[i], classes_end[i]):
             same_height = class_height[c] == height[i]
@@ -227,10 +227,10 @@ def _overlapping(
                     apart = high[j, 0] < low[i, 0] + depth or high[j, 1] < low[i, 1] + depth
                     if not apart and low[j, 1] <= high[i, 1] - depth:
                         other = uvs[j]
-                        turn_other = _turn(other)
-                        if turn_other != 0.0 and (
-                            _apart(one, other, turn) <= -depth
-                            and _apart(other, one, turn_other) <= -depth
+                        orientation_other = _orientation(other)
+                        if orientation_other != 0.0 and (
+                            _separation(one, other, orientation) <= -depth
+                            and _separation(other, one, orientation_other) <= -depth
                         ):
                             if count < len(found):
                                 found[count, 0] = i
@@ -243,9 +243,9 @@ def _overlapping(
 
 @kernel(fast=False)
 def _grow_pieces(
-    charts: Any, faces: Any, neighbours: Any, turn: Any, starts: Any, others: Any, label: int
+    charts: Any, faces: Any, neighbours: Any, orientation: Any, starts: Any, others: Any, label: int
 ) -> np.ndarray:
-    """Give the faces listed (by chart, from the middle outwards) labels of pieces."""
+    """Label the pieces of the given faces (sorted by chart, from the centre outwards)."""
     piece = charts.copy()
     waiting = np.zeros(len(charts), np.bool_)
     for face in faces:
@@ -265,7 +265,7 @@ def _grow_pieces(
                 other = neighbours[face, k]
                 if other < 0 or not waiting[other] or charts[other] != charts[seed]:
                     continue
-                if turn[other] * turn[seed] < 0.0:
+                if orientation[other] * orientation[seed] < 0.0:
                     continue
                 free = True
                 for at in range(starts[other], starts[other + 1]):

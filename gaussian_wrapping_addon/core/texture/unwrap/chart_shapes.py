@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shapes of charts: a smooth copy of a mesh to find them on, and their fit to the true mesh."""
+"""Geometry of charts: smoothing of the mesh before charting, ARAP relaxation of charts."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
 from ...mesh.topology import area_vectors, half_edges
-from .chart_overlaps import conflicts, signed_areas
+from .chart_overlaps import find_overlaps, signed_areas
 
 SMOOTHING_STEPS = 2
-"""More bring more charts again (the copy shrinks into folds), one leaves noise of 0.3 edges."""
+"""More give more charts again (the copy shrinks into folds); one leaves 0.3 edges of noise."""
 MAX_MOVE_SHARE = 0.5
-"""Of the mean length of a vertex's edges."""
+"""Share of the mean length of a vertex's edges."""
 MIN_AREA_SHARE = 0.03
-"""A face left with less of its area was crushed; xatlas hung on a wire of three faces around."""
+"""With a smaller share of its area, a face is crushed; xatlas hung on a wire three faces around."""
 RELAXATIONS = 6
-"""After six rounds the stretch of charts moves by less than 0.1 %."""
+"""After six rounds, the stretch of charts changes by less than 0.1 %."""
 MAX_ROUNDS_BACK = 30
-"""A point put back may spoil its neighbours, so all are looked at again."""
+"""Maximum number of rounds: restoring a point may fold its neighbours, so all are tested again."""
 MIN_HEIGHT_SHARE = 0.02
-"""Needles are given this height by their longest edge, so that their weights stay bounded."""
-HOLD = 1e-6
-"""Weight that keeps a chart in its place, by the mean weight of a vertex."""
+"""Minimum height of needles relative to their longest edge, so that their weights stay bounded."""
+ANCHOR_WEIGHT = 1e-6
+"""Weight that fixes the position of a chart, relative to the mean weight of a vertex."""
 
 
-def smoothed_copy(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Move vertices toward the mean of their neighbours, by half an edge at most.
+def smooth_vertices(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Move vertices towards the mean of their neighbours, by at most half an edge.
 
-    xatlas splits charts wherever faces are noisy or badly shaped; on the copy both are milder.
+    xatlas splits charts at noisy or badly shaped faces; smoothing reduces both.
 
     Returns
     -------
@@ -44,19 +44,19 @@ def smoothed_copy(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     degree = np.maximum(np.bincount(rows, minlength=count), 1)
     length = np.linalg.norm(start[rows] - start[columns], axis=1)
     limit = MAX_MOVE_SHARE * np.bincount(rows, length, count) / degree
-    links = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    lonely = np.bincount(rows, minlength=count) == 0
+    adjacency = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    isolated = np.bincount(rows, minlength=count) == 0
     points = start.copy()
     for _ in range(SMOOTHING_STEPS):
-        move = (links @ points) / degree[:, None] - start
-        move[lonely] = 0.0
+        move = (adjacency @ points) / degree[:, None] - start
+        move[isolated] = 0.0
         far = np.linalg.norm(move, axis=1)
         points = start + move * np.minimum(1.0, limit / np.maximum(far, 1e-300))[:, None]
-    return np.asarray(_without_crushed_faces(points, start, faces) + centre)
+    return np.asarray(_restore_crushed_faces(points, start, faces) + centre)
 
 
-def _without_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Put points back to their start where a face lost most of its area: wires keep their tubes."""
+def _restore_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Restore the vertices of faces that lost most of their area, so that thin tubes stay open."""
     before = np.linalg.norm(area_vectors(start, faces), axis=1)
     points = points.copy()
     while True:
@@ -69,7 +69,7 @@ def _without_crushed_faces(points: np.ndarray, start: np.ndarray, faces: np.ndar
 
 
 def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number the different points of each chart.
+    """Index the distinct points of each chart.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray
     Returns
     -------
     corners : (f, 3) int64
-        Index of a point for each corner; charts share none.
+        Index of a point for each corner; charts share no points.
     first : (n,) int64
         A corner ``3 * face + k`` at each point.
     """
     bits = np.ascontiguousarray(corner_uvs, np.float32).reshape(-1, 2) + np.float32(0.0)
-    bits = bits.view(np.uint32).astype(np.int64)  # (3 f, 2); + 0.0 makes one zero of two
+    bits = bits.view(np.uint32).astype(np.int64)  # (3 f, 2); + 0.0 maps -0.0 to 0.0
     order = np.lexsort((bits[:, 1], bits[:, 0], np.repeat(charts, 3)))
     keys = np.column_stack([np.repeat(charts, 3), bits])[order]
     fresh = np.concatenate([[True], (keys[1:] != keys[:-1]).any(axis=1)])
@@ -93,13 +93,13 @@ def chart_points(corner_uvs: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray
     return corners.reshape(-1, 3), order[fresh]
 
 
-def even_density(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-    """Scale each chart so that its area is that of its faces, and put its corner at the origin.
+def equalise_density(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+    """Scale each chart to the area of its faces, and move its lower corner to the origin.
 
     Parameters
     ----------
     shapes : (f, 3, 2) float64
-        True shape of each face, see :func:`flat_faces`.
+        True shape of each face, see :func:`flatten_faces`.
     """
     count = int(charts.max()) + 1
     uvs = np.asarray(corner_uvs, np.float64)
@@ -117,8 +117,8 @@ def even_density(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray)
     return np.asarray((uvs - low[charts][:, None, :]) * scale[charts][:, None, None])
 
 
-def flat_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Lay each face into the plane: (f, 3, 2) float64, counter-clockwise, first corner at 0."""
+def flatten_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Flatten each face to the plane: (f, 3, 2) float64, counter-clockwise, first corner at 0."""
     corners = np.asarray(vertices, np.float64)[faces]
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     length = np.maximum(np.linalg.norm(one, axis=1), 1e-300)
@@ -131,16 +131,16 @@ def flat_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-    """Bring the faces of charts nearer to their true shapes (as rigid as possible).
+    """Relax charts towards the true shapes of their faces (as rigid as possible).
 
     Rounds of two steps (Liu and others 2008, "A Local/Global Approach to Mesh Parameterization"):
-    the best turn of each face, then the points that fit all turned faces in the least squares
-    sense. Where that turns faces over or lays them upon each other, points stay as they were.
+    the best rotation of each face, then the least-squares points for all rotated faces. Points of
+    faces that flip or overlap as a result are restored.
 
     Parameters
     ----------
     corner_uvs : (f, 3, 2) float
-        Charts of even density, counter-clockwise.
+        Charts of uniform density, counter-clockwise.
     charts : (f,) int
     shapes : (f, 3, 2) float64
 
@@ -151,16 +151,16 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
     start = np.asarray(corner_uvs, np.float64)
     corners, first = chart_points(corner_uvs.astype(np.float32), charts)
     points = start.reshape(-1, 2)[first]
-    shapes = _without_needles(shapes)
-    weights = _cotangents(shapes)  # (f, 3) of the edge from corner k to k + 1
+    shapes = _widen_needles(shapes)
+    weights = _cotangents(shapes)  # (f, 3) for the edge from corner k to k + 1
     size = len(points)
     begin, end = half_edges(corners)
     weight = weights.ravel()
     off = coo_matrix((-weight, (begin, end)), shape=(size, size)).tocsr()
     off = off + off.T
     total = -np.asarray(off.sum(axis=1)).ravel()
-    hold = HOLD * float(np.mean(np.abs(total)))
-    solve = splu((off + diags(total + hold)).tocsc(), permc_spec="MMD_AT_PLUS_A").solve
+    anchor = ANCHOR_WEIGHT * float(np.mean(np.abs(total)))
+    solve = splu((off + diags(total + anchor)).tocsc(), permc_spec="MMD_AT_PLUS_A").solve
     edges = shapes - np.roll(shapes, -1, axis=1)  # (f, 3, 2)
     for _ in range(RELAXATIONS):
         now = points[corners]
@@ -177,21 +177,21 @@ def relax(corner_uvs: np.ndarray, charts: np.ndarray, shapes: np.ndarray) -> np.
             ],
             axis=2,
         )
-        pull = (weights[..., None] * turned).reshape(-1, 2)
-        target = hold * points
+        edge_targets = (weights[..., None] * turned).reshape(-1, 2)
+        right_side = anchor * points
         for axis in range(2):
-            target[:, axis] += np.bincount(begin, pull[:, axis], size)
-            target[:, axis] -= np.bincount(end, pull[:, axis], size)
-        points = np.asarray(solve(target))
+            right_side[:, axis] += np.bincount(begin, edge_targets[:, axis], size)
+            right_side[:, axis] -= np.bincount(end, edge_targets[:, axis], size)
+        points = np.asarray(solve(right_side))
     if not np.isfinite(points).all():
         return start
-    return _without_new_folds(points, start.reshape(-1, 2)[first], corners, charts)
+    return _restore_folded_faces(points, start.reshape(-1, 2)[first], corners, charts)
 
 
-def _without_new_folds(
+def _restore_folded_faces(
     points: np.ndarray, start: np.ndarray, corners: np.ndarray, charts: np.ndarray
 ) -> np.ndarray:
-    """Put points back to their start where faces turned over or came to lie upon each other.
+    """Restore the points of faces that flipped or overlap since the start.
 
     Returns
     -------
@@ -200,12 +200,14 @@ def _without_new_folds(
     count = int(charts.max()) + 1
     before = start[corners]
     was_up = signed_areas(before) > 0.0
-    folded = np.bincount(charts[conflicts(before, charts)[:, 0]], minlength=count)
+    folded = np.bincount(charts[find_overlaps(before, charts)[:, 0]], minlength=count)
     points = points.copy()
     for _ in range(MAX_ROUNDS_BACK):
         now = points[corners]
-        pairs = conflicts(now, charts)
-        pairs = pairs[folded[charts[pairs[:, 0]]] == 0]  # those that folded before are split later
+        pairs = find_overlaps(now, charts)
+        pairs = pairs[
+            folded[charts[pairs[:, 0]]] == 0
+        ]  # charts that overlapped before are split later
         bad = was_up & (signed_areas(now) <= 0.0)
         bad[pairs] = True
         back = np.unique(corners[bad])
@@ -213,11 +215,11 @@ def _without_new_folds(
         if len(back) == 0:
             return now
         points[back] = start[back]
-    spoilt = np.bincount(charts, bad, count) > 0
-    return np.where(spoilt[charts][:, None, None], before, points[corners])
+    still_folded = np.bincount(charts, bad, count) > 0
+    return np.where(still_folded[charts][:, None, None], before, points[corners])
 
 
-def _without_needles(shapes: np.ndarray) -> np.ndarray:
+def _widen_needles(shapes: np.ndarray) -> np.ndarray:
     longest = np.linalg.norm(shapes - np.roll(shapes, -1, axis=1), axis=2).max(axis=1)
     longest = np.maximum(longest, 1e-300)
     double = 2.0 * np.abs(signed_areas(shapes))
@@ -230,7 +232,7 @@ def _without_needles(shapes: np.ndarray) -> np.ndarray:
 
 
 def _cotangents(shapes: np.ndarray) -> np.ndarray:
-    """(f, 3) half cotangent of the angle opposite to the edge from corner k to k + 1."""
+    """Return (f, 3) half cotangents of the angle opposite to the edge from corner k to k + 1."""
     result = np.empty((len(shapes), 3))
     for k in range(3):
         apex = shapes[:, (k + 2) % 3]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Charts of a mesh by xatlas in a helper process, of even density and without folds, packed."""
+"""Find charts of a mesh with xatlas in a helper process, without folds, and pack them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from ...errors import DatasetError, ResourceError, WorkerError
 from ...mesh.face_graph import face_graph, uv_charts
 from ...processes.helper_process import run_helper
 from ...progress import Progress
-from .chart_boxes import chart_extents, cut_wide_charts, packing_square, scale_that_fits
+from .chart_boxes import chart_extents, packing_scale, packing_square, split_wide_charts
 from .chart_overlaps import signed_areas, split_overlaps
-from .chart_shapes import chart_points, even_density, flat_faces, relax, smoothed_copy
+from .chart_shapes import chart_points, equalise_density, flatten_faces, relax, smooth_vertices
 from .chunks import split_into_chunks
 from .stretch import Stretch, texture_stretch
 
@@ -27,22 +27,22 @@ PACK_HELPER = "texture.unwrap.pack_helper"
 HELPER_MEMORY_BYTES = 8 * 2**30
 DEADLINE_BASE_S = 30.0
 DEADLINE_PER_FACE_S = 1e-3
-"""Noisy meshes take about 1e-4 s a face and packing; ten times that is a hang."""
+"""Noisy meshes take about 1e-4 s per face, with packing; ten times that is a hang."""
 MAX_MEAN_STRETCH = 1.1
-"""Charts found on the smoothed copy that stay worse than this are found on the mesh itself too."""
-WORTH_SHATTERING = 1.2
-"""Texels for an edge by which the charts of the mesh itself must be better: there are many more,
-with a seam around each, and boxes flatter small charts."""
+"""With more mean stretch of the charts of the smoothed copy, the mesh itself is charted too."""
+MIN_DENSITY_GAIN = 1.2
+"""Factor in texels per edge by which the charts of the mesh itself must be better: there are many
+more of them, each with seams, and bounding boxes favour small charts."""
 MAX_LOST_SHARE = 1e-3
-"""The same when more of the surface has no area in them."""
+"""The mesh itself is charted too if a larger share of the surface has no area in the charts."""
 
 
 @dataclass(frozen=True)
 class Charts:
-    """Charts in the plane, each at the scale of the surface, laid upon each other."""
+    """Charts in the plane, each at the scale of the surface, not yet packed."""
 
     faces: np.ndarray
-    """(k,) int64 those of the faces given that have a chart."""
+    """(k,) int64 indices of the given faces that have a chart."""
     corner_uvs: np.ndarray
     """(k, 3, 2) float64."""
     labels: np.ndarray
@@ -50,11 +50,11 @@ class Charts:
     stretch: Stretch
 
     def density(self, size_px: int, gutter_px: int, atlases: int = 1) -> float:
-        """Return how many texels an edge gets, about, on all but 5 % of the surface."""
+        """Return the approximate texels per edge on all but 5 % of the surface."""
         corners = np.arange(self.corner_uvs.size // 2).reshape(-1, 3)
         extents = chart_extents(self.corner_uvs.reshape(-1, 2), corners, self.labels)
         side_px, padding_px = packing_square(size_px, gutter_px)
-        scale = scale_that_fits(extents, side_px, padding_px, atlases) * size_px / side_px
+        scale = packing_scale(extents, side_px, padding_px, atlases) * size_px / side_px
         return scale / max(self.stretch.p95, 1.0)
 
 
@@ -67,18 +67,18 @@ def find_charts(
     progress: Progress,
     atlases: int = 1,
 ) -> Charts:
-    """Let xatlas cut the mesh into charts without folds.
+    """Cut the mesh into charts without folds with xatlas.
 
-    It works on a smoothed copy: on a mesh as rough as real ones it makes up to twelve times as
-    many charts. The charts are then relaxed to the shape of the mesh itself. Where that leaves too
-    much stretch, the mesh itself is given to xatlas, and what shows more in a texture is kept.
+    Charts are found on a smoothed copy: on meshes as rough as real ones, xatlas makes up to twelve
+    times as many. The charts are then relaxed to the shape of the mesh itself. If too much stretch
+    remains, the mesh itself is charted too, and the result with the higher texel density is kept.
 
     Parameters
     ----------
     vertices : (v, 3) float64
         Median edge about 1, near the origin.
     faces : (f, 3) int32
-        Faces with an area.
+        Faces with non-zero area.
     size_px, gutter_px : int
         Side of the texture and texels to keep free between charts.
     folder : Path
@@ -86,55 +86,57 @@ def find_charts(
     progress : Progress
         Span of this step.
     atlases : int
-        Textures that the charts are spread over.
+        Number of textures for the charts.
 
     Raises
     ------
     WorkerError, DatasetError, ResourceError
-        xatlas crashed, answered nonsense or took too long.
+        xatlas crashed, returned invalid results or took too long.
     """
-    copy = smoothed_copy(vertices, faces)
+    copy = smooth_vertices(vertices, faces)
     try:
         first = _charts(vertices, copy, faces, folder, progress.span(0.0, 0.6))
     except (WorkerError, ResourceError, DatasetError) as error:
         _logger.info("xatlas failed on the smoothed copy: %s", error.message)
         return _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0))
-    poor = first.stretch.mean > MAX_MEAN_STRETCH or first.stretch.collapsed_share > MAX_LOST_SHARE
-    if not poor and len(first.faces) == len(faces):
+    too_stretched = (
+        first.stretch.mean > MAX_MEAN_STRETCH or first.stretch.collapsed_share > MAX_LOST_SHARE
+    )
+    if not too_stretched and len(first.faces) == len(faces):
         return first
     second = _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0))
     density = [one.density(size_px, gutter_px, atlases) for one in (first, second)]
     _logger.debug("texels for an edge: %.2f, without smoothing %.2f", *density)
     lost = first.stretch.collapsed_share - second.stretch.collapsed_share
     lost += (len(second.faces) - len(first.faces)) / len(faces)
-    return second if lost > MAX_LOST_SHARE or density[1] > WORTH_SHATTERING * density[0] else first
+    return second if lost > MAX_LOST_SHARE or density[1] > MIN_DENSITY_GAIN * density[0] else first
 
 
 def _charts(
     vertices: np.ndarray, positions: np.ndarray, faces: np.ndarray, folder: Path, progress: Progress
 ) -> Charts:
-    """Cut the mesh at other positions into charts, and relax them to its own."""
+    """Cut the mesh into charts at given positions, and relax these to ``vertices``."""
     corner_uvs = _run_xatlas(positions, faces, folder, progress.span(0.0, 0.7))
     kept = np.flatnonzero(np.isfinite(corner_uvs).all(axis=(1, 2)))
     if len(kept) == 0:
-        raise WorkerError("xatlas gave no face a place.")
+        raise WorkerError("xatlas assigned no face to a chart.")
     faces, corner_uvs = faces[kept], corner_uvs[kept]
     graph = face_graph(vertices, faces)
     progress.update(0.75, "fitting charts to the surface")
     labels = uv_charts(graph, faces, corner_uvs)
-    shapes = flat_faces(vertices, faces)
-    flat = even_density(_counter_clockwise(corner_uvs, labels), labels, shapes)
+    shapes = flatten_faces(vertices, faces)
+    flat = equalise_density(_counter_clockwise(corner_uvs, labels), labels, shapes)
     flat = relax(flat, labels, shapes)
     progress.update(0.9, "splitting charts that fold")
     labels = split_overlaps(flat, labels, graph)
-    flat = even_density(flat, labels, shapes)
+    flat = equalise_density(flat, labels, shapes)
     side = max(float(np.abs(flat).max()), 1e-300)
     stretch = texture_stretch(vertices, faces, flat / side)
     return Charts(kept, flat, labels, stretch)
 
 
 def _counter_clockwise(corner_uvs: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Mirror the charts of which more lies face down than up."""
+    """Mirror the charts with negative total signed area."""
     uvs = np.asarray(corner_uvs, np.float64).copy()
     uvs[np.bincount(labels, signed_areas(uvs))[labels] < 0.0, :, 0] *= -1.0
     return uvs
@@ -161,11 +163,11 @@ def _run_xatlas(
         vertex_bounds=np.array(vertex_bounds),
         face_bounds=face_bounds,
     )
-    answer = _run(CHARTS_HELPER, folder, len(faces), progress.span(0.1, 1.0))["corner_uvs"]
-    if answer.shape != (len(faces), 3, 2):
-        raise WorkerError("xatlas left UVs of another mesh.")
+    result = _run(CHARTS_HELPER, folder, len(faces), progress.span(0.1, 1.0))["corner_uvs"]
+    if result.shape != (len(faces), 3, 2):
+        raise WorkerError("xatlas returned UVs of another mesh.")
     corner_uvs = np.empty((len(faces), 3, 2), np.float32)
-    corner_uvs[order] = answer
+    corner_uvs[order] = result
     return corner_uvs
 
 
@@ -191,27 +193,27 @@ def pack_charts(
     progress: Progress,
     atlases: int = 1,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Place charts in unit squares, ``atlases`` at most, all at one scale.
+    """Pack charts into at most ``atlases`` unit squares, all at the same scale.
 
     Returns
     -------
     corner_uvs : (k, 3, 2) float32
-        v upwards, no chart mirrored; NaN for faces that found no place.
+        v upwards, no chart mirrored; NaN for faces that were not packed.
     face_atlas : (k,) uint8
-        The square of each face.
+        Square of each face.
     gutter_px : float
-        Texels kept between charts; less than asked for when there is no room.
+        Texels kept between charts; fewer than requested if there is no room.
 
     Raises
     ------
     WorkerError, DatasetError, ResourceError
-        xatlas crashed, answered nonsense or took too long.
+        xatlas crashed, returned invalid results or took too long.
     """
-    # Rows of a texture go down, v goes up: turned over here, charts are as given in the end.
+    # Rows of a texture go down, v goes up: flipped here, so that charts keep their orientation.
     flat = (charts.corner_uvs * [1.0, -1.0]).astype(np.float32)
     labels = charts.labels
     if atlases > 1:
-        labels = cut_wide_charts(charts.corner_uvs, labels, atlases)
+        labels = split_wide_charts(charts.corner_uvs, labels, atlases)
     corners, first = chart_points(flat, labels)
     np.savez(
         folder / "input.npz",
@@ -225,8 +227,8 @@ def pack_charts(
     output = _run(PACK_HELPER, folder, len(flat), progress)
     points, numbers = output["points"], output["atlas"]
     if points.shape != (len(first), 2) or numbers.shape != (len(first),):
-        raise WorkerError("xatlas left UVs of other charts.")
+        raise WorkerError("xatlas returned UVs of other charts.")
     corner_uvs = points[corners].astype(np.float32)
     corner_uvs[..., 1] = 1.0 - corner_uvs[..., 1]
-    # Corners of a face are of one chart, and so in one atlas.
+    # All corners of a face are in one chart, and so in one atlas.
     return corner_uvs, numbers[corners[:, 0]].astype(np.uint8), float(output["gutter_px"])

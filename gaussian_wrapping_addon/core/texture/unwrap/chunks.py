@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Split a mesh into chunks of connected faces, small enough for xatlas to survive."""
+"""Split a mesh into chunks of connected faces, small enough for xatlas."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ MAX_CHUNK_FACES = 1500
 SMALL_CHUNK_SHARE = 0.125
 MERGED_CHUNK_SHARE = 1.3
 NORMAL_COST = 1.5
-"""Cost of an opposed normal against the cost of one chunk radius of distance."""
+"""Cost of deviating normals relative to the cost of one chunk radius of distance."""
 
 
 def split_into_chunks(graph: FaceGraph, max_faces: int = MAX_CHUNK_FACES) -> np.ndarray:
     """Label faces by chunk.
 
-    Chunks grow from a seed over shared edges, nearest and most alike in normal first; leftovers
-    join the neighbour they share most edges with; separate small pieces are bundled.
+    Chunks grow from a seed over shared edges, by distance and deviation of normals; small chunks
+    are merged with the neighbour with which they share most edges; isolated small pieces are
+    bundled.
 
     Returns
     -------
@@ -42,7 +43,7 @@ def _grow(
 ) -> np.ndarray:
     count = len(neighbours)
     labels = np.full(count, -1, np.int32)
-    # Seeds taken from the border of finished chunks keep the next chunk adjacent to them.
+    # Seeds from the border of finished chunks keep the next chunk adjacent to them.
     border = np.empty(count, np.int32)
     border_begin, border_end = 0, 0
     queued = np.zeros(count, np.bool_)
@@ -131,7 +132,7 @@ def _root(target: np.ndarray, chunk: int) -> int:
 
 
 def _bundle(labels: np.ndarray, max_faces: int) -> np.ndarray:
-    """Put what is still small (separate pieces) together until a chunk is full."""
+    """Bundle chunks that are still small (isolated pieces) until a chunk is full."""
     kept, inverse, sizes = np.unique(labels, return_inverse=True, return_counts=True)
     bundle = np.empty(len(kept), np.int32)
     current, filled, used = -1, max_faces, 0

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...errors import DatasetError
 from ...processes.helper_process import emit
-from .chart_boxes import chart_extents, packing_square, scale_that_fits
+from .chart_boxes import chart_extents, packing_scale, packing_square
 
 GROWTH = 1.1
 MAX_GROWTHS = 8
@@ -27,14 +27,14 @@ def main(folder: Path) -> None:
     """Pack ``input.npz`` into ``output.npz``.
 
     Input: ``points (n, 2) float32``, ``corners (f, 3) uint32``, ``charts (f,) uint32``,
-    ``size_px``, ``gutter_px``, ``atlases``: how many squares there may be. Output: ``points (n, 2)
+    ``size_px``, ``gutter_px``, ``atlases`` (maximum number of squares). Output: ``points (n, 2)
     float32`` in 0 to 1 (y downwards), NaN for those of faces that xatlas ignored; ``atlas (n,)
-    int32`` the square of each, from 0; ``gutter_px`` that is kept.
+    int32`` the square of each, from 0; the ``gutter_px`` kept.
 
     Raises
     ------
     DatasetError
-        xatlas found no place for the charts.
+        xatlas could not pack the charts.
     """
     with np.load(folder / "input.npz", allow_pickle=False) as arrays:
         task = {name: arrays[name] for name in arrays.files}
@@ -45,7 +45,7 @@ def main(folder: Path) -> None:
         if packed is not None:
             break
         if padding_px == 0:
-            raise DatasetError("xatlas found no place for the charts.")
+            raise DatasetError("xatlas could not pack the charts.")
         padding_px //= 2
     points, atlas = packed
     np.savez(
@@ -55,9 +55,9 @@ def main(folder: Path) -> None:
 
 
 def _largest(task: dict[str, np.ndarray], side_px: int, padding_px: int) -> _Packed | None:
-    """Pack at the largest scale that fits into the squares; ``None`` when none was found."""
+    """Pack at the largest scale that fits into the squares; ``None`` if none was found."""
     extents = chart_extents(task["points"], task["corners"], task["charts"])
-    scale = scale_that_fits(extents, side_px, padding_px, int(task["atlases"]))
+    scale = packing_scale(extents, side_px, padding_px, int(task["atlases"]))
     packed = _pack(task, scale, side_px, padding_px)
     too_large = 0.0
     for factor in SHRINKING if packed is None else ():
@@ -98,8 +98,8 @@ def _pack(
     packing.texels_per_unit = scale
     packing.padding = padding_px
     packing.bilinear = True
-    # xatlas turns a chart by exchanging x and y, which mirrors it: text would be read backwards.
-    # Over seven test meshes, turning saved no room on average (single ones: -4 to +6 %).
+    # xatlas rotates charts by exchanging x and y, which mirrors them: text would be reversed.
+    # Over seven test meshes, rotating saved no space on average (individually -4 to +6 %).
     packing.rotate_charts = False
     atlas.generate(xatlas.ChartOptions(), packing)
     if not 1 <= atlas.atlas_count <= int(task["atlases"]):
@@ -118,7 +118,7 @@ def _points(task: dict[str, np.ndarray], atlas: Any, scale: float, side_px: int)
     number[source] = squares[assigned]
     points = np.full((len(task["points"]), 2), np.nan, np.float32)
     points[source] = np.asarray(uvs, np.float32)[assigned]
-    # xatlas makes charts smaller that are larger than the square: all must keep one density.
+    # xatlas shrinks charts larger than the square, but all must keep the same density.
     texels = points[task["corners"]].astype(np.float64) * side_px
     before = task["points"][task["corners"]].astype(np.float64)
     return (points, number) if _smallest_scale(before, texels) > 0.98 * scale else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How unevenly an unwrap spreads its texels over the surface."""
+"""Texture stretch of an unwrap."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 from ...errors import MeshingError
 
 COLLAPSED_UV_AREA = 1e-14
-"""Faces of less area in UVs (a hundredth of a texel is 1e-10 at 8192) have no direction to
-measure; the unwrap gives flat ones a point."""
+"""Faces with less area in UVs (a hundredth of a texel is 1e-10 at 8192) have no measurable
+direction; the unwrap collapses flat ones to a point."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """L2 texture stretch, 1 where a texel covers as much surface as on average, in all directions.
+    """L2 texture stretch: 1 if a texel covers as much surface as on average, in all directions.
 
-    The root mean square over directions of how far a step in the texture moves on the surface.
+    Root mean square over directions of the distance on the surface per unit step in the texture.
     """
 
     mean: float
     """Mean over the surface."""
     p95: float
-    """95 % of the surface have less."""
+    """95th percentile over the surface."""
     collapsed_share: float
     """Share of the surface that has no area in the texture."""
 

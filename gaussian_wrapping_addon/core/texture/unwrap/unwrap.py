@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""UV unwrap: charts and packing by xatlas, checked; a box projection to fall back on."""
+"""UV unwrap: charts and packing by xatlas, validated, with a box projection as fallback."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import NO_ROOM, DatasetError, ResourceError, WorkerError, cannot_be_written
+from ...errors import DISK_FULL_ERRNOS, DatasetError, ResourceError, WorkerError, unwritable_error
 from ...mesh.face_graph import FaceGraph, face_graph, uv_charts
 from ...mesh.surface_mesh import SurfaceMesh
 from ...mesh.topology import edge_lengths
@@ -23,16 +23,16 @@ from .charts import find_charts, pack_charts
 _logger = logging.getLogger(__name__)
 
 FLAT_FACE_AREA = 1e-6
-"""Faces of less than this share of the squared median edge are not given to xatlas."""
+"""Faces with less area than this share of the squared median edge are not passed to xatlas."""
 MAX_IGNORED_AREA_SHARE = 1e-3
 CHECK_SIZE_PX = 2048
 MAX_REASON = 200
-"""Characters of a helper's last words that go into the report."""
+"""Maximum number of characters of a helper's error message in the report."""
 
 
 @dataclass(frozen=True)
 class Unwrap:
-    """UVs of a mesh and how they were made."""
+    """UVs of a mesh and the method of the unwrap."""
 
     corner_uvs: np.ndarray
     """(f, 3, 2) float32 in [0, 1], v upwards; faces without area are collapsed to a point."""
@@ -41,11 +41,11 @@ class Unwrap:
     method: str
     """``"xatlas"`` or ``"box"``."""
     gutter_px: float
-    """Texels kept free between charts at the size asked for."""
+    """Texels kept free between charts at the requested size."""
     reason: str = ""
     """Why the fallback was used."""
     face_atlas: np.ndarray | None = None
-    """(f,) uint8 the atlas of each face, from 0; None where there is one."""
+    """(f,) uint8 atlas of each face, from 0; None with a single atlas."""
 
     @property
     def atlases(self) -> int:
@@ -68,25 +68,25 @@ def unwrap(
     threads: int = 1,
     atlases: int = 1,
 ) -> Unwrap:
-    """Give every face corner a UV, without overlaps.
+    """Compute UVs for all face corners, without overlaps.
 
     Parameters
     ----------
     mesh : SurfaceMesh
-        Checked mesh: finite, at least one face with area.
+        Valid mesh: finite, at least one face with area.
     size_px, gutter_px : int
         Side of the texture and texels to keep free between charts.
     work_folder : Path
-        A folder for a temporary sub-folder, removed before returning.
+        Folder for a temporary sub-folder, which is removed before returning.
     progress : Progress
         Span of this step.
     atlases : int
-        Textures that the charts are spread over, at one density; fewer may be used.
+        Maximum number of textures for the charts, all at the same density.
 
     Notes
     -----
-    xatlas crashes, hangs or answers NaN on some meshes. Whatever it does, a
-    box projection takes its place, with a warning and ``method = "box"``.
+    xatlas crashes, hangs or returns NaN on some meshes. In all of these cases a box projection
+    replaces it, with a warning and ``method = "box"``.
     """
     graph = face_graph(mesh.vertices, mesh.faces)
     try:
@@ -98,33 +98,33 @@ def unwrap(
         if isinstance(error.__cause__, OSError):
             raise  # a full disk: nothing else could be written either
         reason = error.message[:MAX_REASON]
-        _logger.warning("xatlas could not unwrap the mesh (%s): box projection instead", reason)
+        _logger.warning("xatlas could not unwrap the mesh (%s): using box projection", reason)
         corner_uvs, face_atlas, gutter_left_px = box_unwrap(
             mesh, graph, size_px, gutter_px, progress.span(0.0, 0.9), atlases
         )
         method = "box"
-        problem = _problem(corner_uvs, face_atlas, size_px, threads)
-        if problem:
-            _logger.warning("the box projection is not perfect: %s", problem)
+        defect = _find_defect(corner_uvs, face_atlas, size_px, threads)
+        if defect:
+            _logger.warning("the box projection has defects: %s", defect)
     if gutter_left_px < gutter_px:
         _logger.warning(
-            "the texture is too small for %d texels between charts: %.1f are kept",
+            "the texture is too small for gutters of %d texels between charts: using %.1f",
             gutter_px,
             gutter_left_px,
         )
     progress.update(0.95, "finding charts")
-    # Atlases lie upon each other: apart, no two charts touch by chance.
+    # Atlases share the unit square: shifted apart, charts of different atlases cannot touch.
     apart = corner_uvs + 2.0 * face_atlas.astype(np.float64)[:, None, None]
     charts = uv_charts(graph, mesh.faces, apart)
     progress.update(1.0, f"unwrapped with {method}")
     return Unwrap(
         corner_uvs, charts, method, float(gutter_left_px), reason,
-        _numbered(face_atlas) if face_atlas.any() else None,
+        _renumber(face_atlas) if face_atlas.any() else None,
     )  # fmt: skip
 
 
-def _numbered(face_atlas: np.ndarray) -> np.ndarray:
-    """Number the atlases that are used from 0, without gaps."""
+def _renumber(face_atlas: np.ndarray) -> np.ndarray:
+    """Renumber the used atlases from 0, without gaps."""
     return np.unique(face_atlas, return_inverse=True)[1].ravel().astype(np.uint8)
 
 
@@ -146,7 +146,7 @@ def _xatlas(
     solid = np.flatnonzero(graph.areas > FLAT_FACE_AREA * unit**2)
     if len(solid) == 0:
         raise DatasetError("No face of the mesh has an area.")
-    # xatlas has absolute tolerances: median edge 1, centre 0 suits them.
+    # xatlas has absolute tolerances, which suit a median edge of 1 and centre 0.
     scaled = (mesh.vertices - mesh.vertices.mean(axis=0)) / unit
     faces = mesh.faces[solid]
     work_folder.mkdir(parents=True, exist_ok=True)
@@ -159,9 +159,9 @@ def _xatlas(
             charts, size_px, gutter_px, folder, progress.span(0.7, 0.9), atlases
         )
     except (OSError, ValueError, KeyError) as error:
-        if isinstance(error, OSError) and error.errno in NO_ROOM:
-            raise cannot_be_written(error.filename or folder, error) from error
-        raise WorkerError(f"xatlas left no usable result ({error}).") from None
+        if isinstance(error, OSError) and error.errno in DISK_FULL_ERRNOS:
+            raise unwritable_error(error.filename or folder, error) from error
+        raise WorkerError(f"xatlas returned no usable result ({error}).") from None
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     progress.update(0.9, "checking the unwrap")
@@ -170,16 +170,16 @@ def _xatlas(
     face_atlas = np.zeros(len(mesh.faces), np.uint8)
     face_atlas[solid[charts.faces]] = chart_atlas
     _collapse_ignored(corner_uvs, face_atlas, mesh.faces, graph)
-    problem = _problem(corner_uvs, face_atlas, size_px, threads)
-    if problem:
-        raise DatasetError(f"The UVs that xatlas made cannot be used: {problem}.")
+    defect = _find_defect(corner_uvs, face_atlas, size_px, threads)
+    if defect:
+        raise DatasetError(f"The UVs returned by xatlas are invalid: {defect}.")
     return corner_uvs, face_atlas, gutter_left_px
 
 
 def _collapse_ignored(
     corner_uvs: np.ndarray, face_atlas: np.ndarray, faces: np.ndarray, graph: FaceGraph
 ) -> None:
-    """Give faces without UVs one point of the atlas: that of a face at the same vertex."""
+    """Collapse faces without UVs to a point of the atlas: that of a face at the same vertex."""
     missing = ~np.isfinite(corner_uvs).all(axis=(1, 2))
     if not missing.any():
         return
@@ -198,12 +198,12 @@ def _collapse_ignored(
     face_atlas[missing] = face_atlas[chosen // 3]
 
 
-def _problem(corner_uvs: np.ndarray, face_atlas: np.ndarray, size_px: int, threads: int) -> str:
-    """Say what is wrong with the UVs; empty when nothing is."""
+def _find_defect(corner_uvs: np.ndarray, face_atlas: np.ndarray, size_px: int, threads: int) -> str:
+    """Return a description of the first defect of the UVs; empty without one."""
     if not np.isfinite(corner_uvs).all():
         return "some are not finite"
     if corner_uvs.min() < 0.0 or corner_uvs.max() > 1.0:
-        return "some lie outside of 0 to 1"
+        return "some lie outside 0 to 1"
     used = overlaps = 0
     for number in np.unique(face_atlas).tolist():
         faces = face_atlas == number

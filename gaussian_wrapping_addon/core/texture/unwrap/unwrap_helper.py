@@ -12,7 +12,7 @@ from ...errors import DatasetError
 from ...processes.helper_process import emit
 
 ROUGH_SIDE_PX = 512
-"""Charts are packed once more later: here they are only kept apart."""
+"""Charts are packed again later; here they only must not overlap."""
 UNASSIGNED = 2**32 - 1
 
 
@@ -60,7 +60,7 @@ def _write(folder: Path, task: dict[str, np.ndarray], atlas: Any) -> None:
     for index, (begin, end) in enumerate(_pairs(task["face_bounds"])):
         _, corners, uvs = atlas.get_mesh(index)
         assigned = np.asarray(atlas.get_mesh_vertex_assignment(index)[1]) != UNASSIGNED
-        # Back to texels: the two sides of the atlas may differ, its texels are square.
+        # Back to texels: the sides of the atlas may differ, but its texels are square.
         texels = np.asarray(uvs, np.float64) * [atlas.width, atlas.height]
         texels[~assigned] = np.nan
         corner_uvs[begin:end] = texels[np.asarray(corners).reshape(-1, 3)]

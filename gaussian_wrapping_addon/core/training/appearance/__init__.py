@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What differs between photos of one scene: exposure, background.
+"""Per-photo appearance: exposure and background.
 
 In: renderings and photos. Out: corrected images and gradients.
 """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Masks that say "nothing is here": render and photo over one colour, a new one every iteration.
+"""Train on masked photos as empty space: composite render and photo over a random background.
 
-With ``mask_mode="ignore"`` masked pixels count in no term and anything may stand there. With
-``"background"`` the space behind them must be empty: over a colour that changes from iteration to
-iteration no Gaussian can look like the background, so that only transparency lowers the loss.
+With ``mask_mode="ignore"`` masked pixels enter no loss and may show anything. With ``"background"``
+the space behind them must be empty: over a colour that changes every iteration, no Gaussian can
+imitate the background, so that only transparency lowers the loss.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ...errors import UsageError
 from ...kernels.array_store import ArrayStore
 
 MIN_SHARE = 0.75
-"""A point of the thing is inside of its mask in every photo; this leaves room for bad masks."""
+"""Points of the object lie inside its mask in every photo; this tolerates some bad masks."""
 
 
 def draw_background(random: np.random.Generator) -> np.ndarray:
@@ -35,7 +35,7 @@ def composited(
     *,
     store: ArrayStore | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return render and photo over a background colour, both to be compared without a mask.
+    """Composite render and photo over a background colour, to be compared without a mask.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def composited(
     alpha : (h, w), the same type
     photo : (h, w, 3) uint8, or floats in [0, 1]
     mask : (h, w) bool, optional
-        False where the photo must be empty. Without it, the photo stays as it is.
+        False where the photo must be empty. Without it, the photo is unchanged.
     background : (3,)
         In [0, 1].
     store : ArrayStore, optional
@@ -55,7 +55,7 @@ def composited(
     image : (h, w, 3), of the colour's type
         ``color + (1 - alpha) background``.
     target : (h, w, 3), the same type
-        The photo inside of the mask, the background elsewhere.
+        The photo inside the mask, the background elsewhere.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def composited(
 
 
 def background_gradient(by_image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Return the gradient on alpha (h, w) of :func:`composited`; that on colour is ``by_image``."""
+    """Return the gradient of :func:`composited` on alpha (h, w); on colour it is ``by_image``."""
     return -(by_image @ np.asarray(background, by_image.dtype))
 
 
@@ -95,10 +95,10 @@ def inside_masks(
     masks: Sequence[np.ndarray | None],
     min_share: float = MIN_SHARE,
 ) -> np.ndarray:
-    """Tell which points the masks allow: inside of them in enough of the photos that hold them.
+    """Tell which points lie inside the masks in a sufficient share of the photos.
 
-    Points that are not would start Gaussians where nothing may be, and would stretch an automatic
-    region over what was masked out.
+    Other points would initialise Gaussians in empty space, and would extend an automatic region
+    over what was masked out.
 
     Parameters
     ----------
@@ -106,20 +106,20 @@ def inside_masks(
         Scene frame.
     cameras : sequence of Camera
     masks : sequence of (h, w) bool or None
-        Of the cameras' sizes; ``None`` leaves nothing out.
+        Of the cameras' sizes; ``None`` masks nothing.
     min_share : float
-        Of the cameras in whose image a point lies, the share whose masks must hold it; with 0 one
-        of them is enough.
+        Share of the cameras with the point in their image whose masks must contain it; with 0 one
+        of them suffices.
 
     Returns
     -------
     (n,) bool
-        False also for points that no camera's image holds.
+        False also for points outside all images.
 
     Raises
     ------
     UsageError
-        Cameras and masks do not fit together.
+        Cameras and masks differ in number or size.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     if len(cameras) != len(masks):
@@ -132,7 +132,7 @@ def inside_masks(
         if mask is not None and mask.shape != size:
             raise UsageError(
                 f"The mask of {camera.name} is {mask.shape}, its camera {size}.",
-                "Use the mask of the camera's size.",
+                "Use a mask of the camera's size.",
             )
         rows, columns, _, seen = pixels_of(points, camera)
         held[seen] += 1

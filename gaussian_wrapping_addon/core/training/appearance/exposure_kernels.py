@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Kernels of the trained exposure: an affine map per colour channel, and its gradients."""
+"""Kernels of the trained exposure: an affine map per colour channel and its gradients."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ...kernels.compiled import kernel
 def apply_rows(
     begin: int, end: int, color: Any, alpha: Any, gains: Any, offsets: Any, out: Any
 ) -> None:
-    """Write ``gains color + offsets alpha`` of rows; ``alpha`` of no rows stands for 1."""
+    """Write ``gains color + offsets alpha`` of rows; an ``alpha`` without rows stands for 1."""
     with_alpha = alpha.shape[0] > 0
     red, green, blue = gains[0], gains[1], gains[2]
     for y in range(begin, end):
@@ -31,7 +31,7 @@ def backward_rows(
     """Write the gradients on colour and alpha, and each row's six sums for gains and offsets.
 
     ``sums[y]`` = sums over the row of ``by_out color`` (3) and ``by_out alpha`` (3), in float64:
-    a row is summed by one thread, so that the total does not depend on their number.
+    a row is summed by one thread, so that the total does not depend on the number of threads.
     """
     with_alpha = alpha.shape[0] > 0
     for y in range(begin, end):

@@ -3,17 +3,17 @@
 
 See docs/method.md, section 1.6.
 
-The method's ``exp(a) I + b`` has one gain and one offset per photo. Cameras on automatic change the
-white balance too, so here every channel has its own. The offset is not a luxury: with the sRGB
-curve ``s = 1.055 L^(1/2.4) - 0.055``, light ``L`` times ``g`` makes of ``s`` exactly
-``k s + 0.055 (k - 1)`` with ``k = g^(1/2.4)``, which a gain alone cannot follow in dark parts.
+The method's ``exp(a) I + b`` has one gain and one offset per photo. Cameras in automatic mode also
+change the white balance, so here every channel has its own. The offset is necessary: with the sRGB
+curve ``s = 1.055 L^(1/2.4) - 0.055``, light ``L`` times ``g`` maps ``s`` exactly to
+``k s + 0.055 (k - 1)`` with ``k = g^(1/2.4)``, which a gain alone cannot fit in dark parts.
 
-The corrected image enters the whole colour loss. In the method SSIM sees the raw render; but its
-luminance and contrast terms then ask of the same Gaussians a different brightness for every photo,
-which is the contradiction that the exposure is there to remove.
+The corrected image enters the whole colour loss. In the method, SSIM is computed on the raw render;
+its luminance and contrast terms then demand a different brightness of the same Gaussians for every
+photo, which is the contradiction that the exposure removes.
 
-The Gaussians keep the mean exposure of the training photos: the means over these of all log gains
-and of all offsets (at middle grey) are held at 0, without which colours and exposures could drift
+The Gaussians have the mean exposure of the training photos: the means over these of all log gains
+and of all offsets (at middle grey) are held at 0; otherwise colours and exposures could drift
 against each other.
 """
 
@@ -30,32 +30,32 @@ from ...kernels.parallel import default_threads, even_bounds, run_chunks
 from .exposure_kernels import apply_rows, backward_rows
 
 SRGB_PEDESTAL = 0.055
-"""Constant of the sRGB curve: display values plus this are a power of the light."""
+"""Offset of the sRGB curve: display values plus this are a power of the light."""
 
 PIVOT = 0.5
-"""Display value about which gains act: an offset then moves the mean of a usual image and a gain
-its contrast, and Adam, which scales every value alone, need not creep along the valley between
-them. Middle grey is also what the pinned means leave in place."""
+"""Display value about which gains act: an offset then shifts the mean of a typical image and a gain
+its contrast. This decorrelates them, which helps Adam, as it scales every value separately. Middle
+grey is also the value that zero means leave unchanged."""
 
 REFERENCE_RATE = 1e-3
 """Learning rate of docs/method.md, section 1.4."""
 
 TRAVEL = 1.5
-"""A short run's first rate would let a value move by this much in all of its photo's turns; as the
-rate falls, it is 0.6. Light altered by a factor of 1.35 either way is a log gain of 0.13."""
+"""Total change that a short run's first rate allows over all steps of a photo; as the rate decays,
+it is 0.6. Light altered by a factor of 1.35 either way is a log gain of 0.13."""
 
 LARGEST_RATE = 0.02
 LAST_SHARE = 0.1
-"""The last rate is this share of the first: Adam's steps are about as large as its rate, and what
-they leave at the end is an error of colour."""
+"""Ratio of the last rate to the first: Adam's steps are about as large as its rate, and the last
+ones remain as an error of colour."""
 
 MAX_LOG_GAIN = 1.5
-"""Log gains are kept within this; more is no exposure but a photo that shows nothing."""
+"""Bound of the log gains; larger ones stem from photos without content, not from exposure."""
 MAX_OFFSET = 1.0
 
 BETAS = (0.9, 0.99)
-"""Of Adam. A photo has its turn only some dozens of times in a short run; its gradient, a mean over
-all its pixels, is hardly noisy, so that a short memory of its size serves better than 0.999."""
+"""Decay rates of Adam. A photo has only some dozens of steps in a short run, and its gradient, a
+mean over all its pixels, has little noise, so that a shorter memory than 0.999 works better."""
 
 EPSILON = 1e-15
 
@@ -63,7 +63,7 @@ _NO_ALPHA = {np.dtype(t): np.zeros((0, 0), t) for t in (np.float32, np.float64)}
 
 
 def exposure_rate(iteration: int, iterations: int, photos: int) -> float:
-    """Return the learning rate of an iteration: :data:`TRAVEL` over a photo's turns, falling.
+    """Return the learning rate of an iteration: :data:`TRAVEL` over a photo's steps, decaying.
 
     Never below :data:`REFERENCE_RATE` nor above :data:`LARGEST_RATE` at the start; then log-linear
     to :data:`LAST_SHARE` of that.
@@ -74,23 +74,23 @@ def exposure_rate(iteration: int, iterations: int, photos: int) -> float:
 
 
 class Exposure:
-    """Gains and offsets of all photos, with what their optimiser remembers.
+    """Gains and offsets of all photos, with their optimiser state.
 
     Parameters
     ----------
     count : int
         Number of the scene's views.
     trained : sequence of int
-        Views that are trained on; the others stay neutral and take no part in the mean.
+        Training views; the others stay neutral and are excluded from the mean.
     log_gains : (count, 3), optional
-        Log gains of display values plus :data:`SRGB_PEDESTAL` to start from, as
-        :mod:`..selection.exposure_selection` estimates them; then a short run has only to refine
-        them. Not finite values count as 0.
+        Initial log gains of display values plus :data:`SRGB_PEDESTAL`, as estimated by
+        :mod:`..selection.exposure_selection`; a short run then only refines them. Non-finite
+        values count as 0.
 
     Raises
     ------
     UsageError
-        A trained view is none of the scene's, or the gains do not fit.
+        A trained view does not exist, or the gains have the wrong shape.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Exposure:
         self.second = np.zeros((count, 6), np.float32)
         self.steps = np.zeros(count, np.int64)
         self.gradient = np.zeros(6)
-        """Of the last backward pass, for the step that follows; no part of the state."""
+        """Gradient of the last backward pass, for the next step; not part of the state."""
         self._store = ArrayStore()
         if log_gains is not None:
             start = np.asarray(log_gains, np.float64)
@@ -124,15 +124,15 @@ class Exposure:
     def corrected(
         self, view: int, color: np.ndarray, alpha: np.ndarray | None = None, *, threads: int = 0
     ) -> np.ndarray:
-        """Return what the photo's exposure makes of a render: ``exp(a) color + b``.
+        """Apply the photo's exposure to a render: ``exp(a) color + b``.
 
         Parameters
         ----------
         view : int
         color : (h, w, 3) float32 or float64
         alpha : (h, w), the same type, optional
-            The offset is then ``b alpha``: what a colour blended over emptiness becomes. For
-            images that are composited afterwards (:mod:`.background`).
+            The offset is then ``b alpha``, as for a colour blended over emptiness. For images that
+            are composited afterwards (:mod:`.background`).
 
         Returns
         -------
@@ -159,12 +159,12 @@ class Exposure:
         *,
         threads: int = 0,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return the gradients on colour and alpha; keep that of the exposure for :meth:`step`.
+        """Return the gradients on colour and alpha; store that of the exposure for :meth:`step`.
 
         Parameters
         ----------
         view, color, alpha
-            As handed to :meth:`corrected`.
+            As passed to :meth:`corrected`.
         by_corrected : (h, w, 3), of the colour's type
             Gradient of the loss on the corrected image.
 
@@ -173,14 +173,14 @@ class Exposure:
         by_color : (h, w, 3)
             Valid until the next call.
         by_alpha : (h, w) or None
-            ``None`` without alpha. Both bitwise the same for any number of threads.
+            ``None`` without alpha. Both are bitwise the same for any number of threads.
         """
         color, cover = self._arrays(color, alpha)
         by_out = np.ascontiguousarray(by_corrected, color.dtype)
         if by_out.shape != color.shape:
             raise UsageError(
                 f"Image {color.shape} and gradient {by_out.shape} differ in size.",
-                "Hand in the gradient of the corrected image.",
+                "Pass the gradient of the corrected image.",
             )
         by_color = self._store.take(f"by color {color.dtype}", color.shape, color.dtype)
         by_alpha = self._store.take(f"by alpha {color.dtype}", cover.shape, color.dtype)
@@ -200,9 +200,9 @@ class Exposure:
         return by_color, None if alpha is None else by_alpha
 
     def step(self, view: int, rate: float) -> None:
-        """Move a photo's exposure by Adam along the last backward pass, then pin the mean.
+        """Apply an Adam step of a photo's exposure with the last gradient, then pin the mean.
 
-        A gradient that is not finite moves nothing.
+        A non-finite gradient is skipped.
         """
         if not np.isfinite(self.gradient).all():
             return
@@ -217,7 +217,7 @@ class Exposure:
         self.pin()
 
     def pin(self) -> None:
-        """Bring the means over the trained photos to 0 (to rounding), and values into bounds."""
+        """Subtract the means over the trained photos (0 to rounding) and clip values to bounds."""
         if len(self.trained) == 0:
             return
         kept = self.values[self.trained].astype(np.float64)
@@ -236,7 +236,7 @@ class Exposure:
         return float(np.sqrt(np.mean(self.values[self.trained, :3].astype(np.float64) ** 2)))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return copies of all that the next iteration depends on, by name."""
+        """Return copies of the arrays that the next iteration depends on, by name."""
         names = ("values", "first", "second", "steps", "trained")
         return {name: getattr(self, name).copy() for name in names}
 
@@ -247,14 +247,14 @@ class Exposure:
         Raises
         ------
         KeyError, ValueError
-            Something is missing or does not fit together.
+            An array is missing, or arrays are inconsistent.
         """
         count = len(arrays["values"])
         trained = arrays["trained"]
         if trained.ndim != 1 or (
             len(trained) and not (0 <= trained.min() <= trained.max() < count)
         ):
-            raise ValueError("the trained views of the exposures are none of the scene's")
+            raise ValueError("the trained views of the exposures are not among the scene's")
         made = cls(count, trained.tolist())
         for name in ("values", "first", "second", "steps"):
             like, array = getattr(made, name), arrays[name]
@@ -276,38 +276,37 @@ class Exposure:
         if cover.shape != color.shape[:2]:
             raise UsageError(
                 f"Image {color.shape} and alpha {cover.shape} differ in size.",
-                "Hand in the alpha of the same render.",
+                "Pass the alpha of the same render.",
             )
         return color, cover
 
 
 FIT_ROUNDS = 8
 FIT_PRIOR_SQ = 0.02**2
-"""Weight, as a variance of display values, of the wish that a fitted gain be 1: a photo of one
-colour says nothing of gain against offset."""
+"""Weight of the prior on a fitted gain of 1, as a variance of display values: a photo of uniform
+colour does not separate gain and offset."""
 FIT_SCALE = 0.05
-"""Errors beyond this many display values count with falling weight."""
+"""Errors beyond this display value have decreasing weight."""
 FIT_DARKEST, FIT_BRIGHTEST = 2.5 / 255, 252.5 / 255
-"""Values of the photo beyond are clipped and say nothing of its exposure."""
+"""Values of the photo outside this range may be clipped and are ignored."""
 MIN_FIT_PIXELS = 64
 
 
 def fit_exposure(
     render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return gain and offset per channel that bring a render closest to a photo.
+    """Fit gain and offset per channel of a render to a photo.
 
-    Least squares in closed form, repeated with weights ``1 / max(|error|, 0.05)`` (Huber); the gain
-    is drawn to 1 as weakly as :data:`FIT_PRIOR_SQ` says. For photos whose exposure was not trained.
-    A figure measured on the very pixels that the fit saw flatters; report that of
-    :func:`corrected_for_measuring`.
+    Least squares in closed form, reweighted with ``1 / max(|error|, 0.05)`` (Huber), with a weak
+    prior :data:`FIT_PRIOR_SQ` on a gain of 1. For photos whose exposure was not trained. Metrics on
+    the fitted pixels are too optimistic; report those of :func:`corrected_for_measuring`.
 
     Parameters
     ----------
     render : (h, w, 3) floats
     photo : (h, w, 3) uint8, or floats in [0, 1]
     mask : (h, w) bool, optional
-        Pixels to look at.
+        Pixels to use.
 
     Returns
     -------
@@ -356,17 +355,17 @@ def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 def corrected_for_measuring(
     render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the render in the photo's exposure, no pixel corrected by a fit that saw it.
+    """Return the render in the photo's exposure, each half corrected by a fit to the other half.
 
-    The exposure of a held-out photo was never trained. Each half of the image (left, right) is
-    corrected by the fit on the other, so that figures of the whole image measure how well the scene
-    is known and not how well six numbers fit. They must be named as such: "PSNR after an exposure
-    fitted crosswise on the image's halves".
+    The exposure of a held-out photo was never trained. As each half of the image (left, right) is
+    corrected by the fit to the other, metrics of the whole image measure how well the scene is
+    reconstructed and not how well six numbers fit. They must be named as such: "PSNR after an
+    exposure fitted crosswise on the image's halves".
 
     Parameters
     ----------
     render, photo, mask
-        As for :func:`fit_exposure`. A half whose other half has too few pixels stays as rendered.
+        As for :func:`fit_exposure`. A half whose other half has too few pixels is not corrected.
 
     Returns
     -------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How fast this machine renders, against the one that the estimate's constants come from."""
+"""Rendering speed of this machine, relative to the reference machine of the estimate."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ SIDE_PX = 160
 
 REFERENCE_S = 0.0060
 """Time of one pass on the machine of the estimate's measurements (2 threads of an AMD EPYC with
-AVX-512). One thread of it took 8.7 ms, the fastest of many passes, while others worked too; from
-that, two threads on a quiet machine are taken to need 6 ms."""
+AVX-512). One thread took 8.7 ms, the fastest of many passes under load; from that, two threads of
+an idle machine are assumed to need 6 ms."""
 
 PASSES = 12
 TIME_LIMIT_S = 0.7
-"""No pass begins later than this, so that a slow machine is timed in about a second too."""
+"""No pass starts later than this, so that a slow machine is also timed in about a second."""
 
 
 def renderer_is_compiled() -> bool:
-    """Tell whether the kernels of a training lie ready, from an earlier run on this machine."""
+    """Tell whether the training kernels are cached from an earlier run on this machine."""
     renderer = forward_kernel(vector_lanes(), True, False)
     return is_ready(adam_rows) and is_ready(renderer)
 
@@ -40,8 +40,8 @@ def machine_speed(threads: int) -> float:
     """Return how many times faster than the reference machine one fixed view is rendered.
 
     Forward with depth, and backward, of 4000 Gaussians on 160 x 160 pixels; the median of a few
-    passes counts, since the training shares a busy machine too; the first, which loads the kernels,
-    does not.
+    passes, since the training would share a busy machine too, excluding the first, which loads the
+    kernels.
     """
     gaussians, camera = _scene()
     renderer = ViewRenderer()

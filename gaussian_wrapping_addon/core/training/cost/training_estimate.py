@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a training will take: time, memory and disk, from photos, settings and the machine.
+"""Estimate time, memory and disk space of a training from photos, settings and the machine.
 
-The time of an iteration is a constant, plus a part per rendered pixel, plus a part per Gaussian;
-the pyramid's levels and the growth of the number of Gaussians are summed over the whole plan. The
+The time of an iteration is a constant plus terms per rendered pixel and per Gaussian, summed over
+the schedule with its pyramid levels and growth of the number of Gaussians. The
 constants were fitted (least squares of the relative error) to 35 finished trainings on 2 threads of
 one machine (AMD EPYC): 8 scenes of 14 to 50 photos, 96 to 480 px, caps from 5000 to 120 000
-Gaussians, 22 to 424 s. The estimate lay between 0.52 and 1.24 times what they took; scenes with
-much background take longest per pixel. The range that is told covers all of them. On a machine
-with 14 waiting processes (3 trainings of 200 to 300 iterations, speed told by its fastest pass) the
-estimate lay between 0.45 and 0.69 times what they took, one of them above the range.
+Gaussians, 22 to 424 s. The estimate was between 0.52 and 1.24 times the measured time; scenes with
+much background take longest per pixel. The reported range covers all of them. On a machine with 14
+waiting processes (3 trainings of 200 to 300 iterations, speed from its fastest pass) the estimate
+was between 0.45 and 0.69 times the measured time, one of them above the range.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...errors import ResourceError
-from ...gaussians.initialisation import FEW_POINTS
+from ...gaussians.initialisation import MIN_START_POINTS
 from ...machine import available_memory_bytes
 from ...report_warning import ReportWarning
 from ...settings import TrainingSettings
@@ -33,62 +33,62 @@ if TYPE_CHECKING:
     from ...dataset.scene import Scene
 
 ITERATION_S = 2.06e-3
-"""Of each iteration, whatever its size."""
+"""Per iteration, whatever its size."""
 
 PIXEL_S = 0.75e-6
-"""Of each pixel of an iteration with isosurface depth: rendering, losses and their gradients. With
-it, and the figures below, 3000 iterations on 40 photos of 640 x 480 px come to 284 s; they took
-335 s on two cores with a little other work (benchmarks/scenes wheel, preset standard)."""
+"""Per pixel of an iteration with isosurface depth: rendering, losses and their gradients. With this
+and the figures below, 3000 iterations on 40 photos of 640 x 480 px are estimated at 284 s; they
+took 335 s on two cores with a little other load (benchmarks/scenes wheel, preset standard)."""
 
 WITHOUT_DEPTH = 0.45
-"""Share of :data:`PIXEL_S` before the depth is asked for (docs/benchmarks/kernels.md: depth adds
-105 to 141 % to rendering forward, and the normal losses go with it)."""
+"""Share of :data:`PIXEL_S` before depth is rendered (docs/benchmarks/kernels.md: depth adds 105 to
+141 % to rendering forward, and the normal losses come with it)."""
 
 GAUSSIAN_S = 0.254e-6
-"""Of each Gaussian in each iteration: projection, and the step of those that were seen."""
+"""Per Gaussian and iteration: projection, and the step of visible ones."""
 
 MULTI_VIEW_SHARE = 0.4
-"""What a multi-view iteration adds, as a share of a plain one (57 ms against 144 ms of one thread,
-40 000 Gaussians, 4000 places)."""
+"""Additional time of a multi-view iteration, as a share of a plain one (57 ms against 144 ms of one
+thread, 40 000 Gaussians, 4000 pixels)."""
 
 LOW, HIGH = 0.75, 1.95
-"""The range told is the model's figure times these: it holds every measured training."""
+"""The reported range is the model's time times these: it covers every measured training."""
 
 MESH_AND_TEXTURE_SHARE = (0.2, 0.9)
-"""What meshing and texture took, as a share of the training before them: from 17 to 94 % in the
-jobs of docs/figures.md and of benchmarks/scenes, with one region of about 50 thousand faces. Long
+"""Time of meshing and texture, as a share of the training before them: from 17 to 94 % in the jobs
+of docs/figures.md and of benchmarks/scenes, with one region of about 50 thousand faces. Long
 trainings have the small shares."""
 
 ROUND_GROWTH = 1.8
-"""Growth of the number of Gaussians in one round of densification, until the budget (measured: 1.55
-to 1.87 in the first round)."""
+"""Growth of the number of Gaussians per densification, up to the budget (measured: 1.55 to 1.87 in
+the first one)."""
 
 LITTLE_GROWTH = 0.4
-"""Share of the room to grow that is used, at the least, where the photos decide on growth."""
+"""Least share of the room for growth that is used if the photos decide on growth."""
 
 BASE_BYTES = 520 * 2**20
-"""Python with torch, scipy and the compiled kernels. With it, a training of 8000 Gaussians at 96 px
-was estimated at 533 MiB and took 531 MiB. Whole jobs of 40 small photos took 0.7 to 1.4 GB: mesh
-and texture need more than a small training does."""
+"""Python with torch, scipy and the compiled kernels. With this, a training of 8000 Gaussians at 96
+px was estimated at 533 MiB and took 531 MiB. Whole jobs of 40 small photos took 0.7 to 1.4 GB: mesh
+and texture need more than a small training."""
 
 GAUSSIAN_COPIES = 8
-"""Parameters, two moments, two states to fall back to, a checkpoint on its way to disk."""
+"""Parameters, two moments, two snapshots, a checkpoint being written."""
 
 PIXEL_BYTES = 250
 """Images, their gradients, contributor lists, losses."""
 
 RENDER_GAUSSIAN_BYTES = 600
-"""Screen rows, pairs and their gradients."""
+"""Screen parameters, tile intersections and their gradients."""
 
 PHOTO_CACHE_BYTES = 1 << 30
 MEMORY_SHARE_LEFT = 0.9
-"""More than this share of the free memory makes the system swap or kill."""
+"""Beyond this share of the free memory the system may swap or kill the process."""
 
 CHECKPOINTS = 3
-"""Two stay, and the third is written before the oldest goes."""
+"""Two are kept, and the third is written before the oldest is removed."""
 
 RESULT_BYTES_PER_GAUSSIAN = 500
-"""Trained Gaussians and the PLY of the result."""
+"""Trained Gaussians and the result's PLY."""
 
 OTHER_DISK_BYTES = 60 * 2**20
 """Pictures, report, mesh and texture of one region."""
@@ -98,33 +98,33 @@ DISK_RESERVE_BYTES = 100 * 2**20
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What the estimate must know of an input."""
+    """Input properties for the estimate."""
 
     photos: int
     pixels: float
-    """Mean number of pixels of a photo as it lies on disk."""
+    """Mean number of pixels of the photos on disk."""
     long_side_px: int
-    """Of the largest photo."""
+    """Long side of the largest photo."""
     points: int
-    """Sparse points; 0 where they are not known yet."""
+    """Number of sparse points; 0 if not known yet."""
     masked: bool = False
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What the estimate must know of a machine; 0 bytes where the system does not tell."""
+    """Machine properties for the estimate; 0 bytes if unknown."""
 
     threads: int
     speed: float = 1.0
-    """Times the reference machine (:func:`~.machine_speed.machine_speed`)."""
+    """Relative to the reference machine (:func:`~.machine_speed.machine_speed`)."""
     memory_bytes: int = 0
-    """That could be taken now."""
+    """Memory available now."""
     disk_free_bytes: int = 0
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a training will take."""
+    """Estimated cost of a training."""
 
     seconds_low: float
     seconds_high: float
@@ -132,10 +132,10 @@ class Estimate:
     """Largest resident size of the worker."""
     disk_bytes: int
     gaussians: int
-    """Most Gaussians that it will hold."""
+    """Largest number of Gaussians."""
 
     def span(self) -> str:
-        """Return the time as people say it."""
+        """Return the range of the time in suitable units."""
         low, high = self.seconds_low, self.seconds_high
         if high < 90:
             return f"{max(1, round(low))} to {max(1, round(high))} s"
@@ -144,7 +144,7 @@ class Estimate:
         return f"{low / 3600:.1f} to {high / 3600:.1f} h"
 
     def sentence(self) -> str:
-        """Return all of it in one line."""
+        """Return the estimate in one line."""
         return (
             f"{self.span()}, {self.memory_bytes / 2**30:.1f} GB of memory, "
             f"{self.disk_bytes / 2**30:.2f} GB of disk, up to {self.gaussians} Gaussians"
@@ -152,7 +152,7 @@ class Estimate:
 
 
 def scene_facts(scene: Scene) -> SceneFacts:
-    """Return the facts of a loaded scene."""
+    """Return the properties of a loaded scene."""
     sizes = [(v.camera.width, v.camera.height) for v in scene.views]
     return SceneFacts(
         len(sizes),
@@ -164,7 +164,7 @@ def scene_facts(scene: Scene) -> SceneFacts:
 
 
 def this_machine(folder: Path, threads: int, speed: float = 1.0) -> Machine:
-    """Return what is free now, on the disk that holds ``folder`` (or will hold it)."""
+    """Return the resources free now; disk space is that of ``folder``, which need not exist yet."""
     existing = folder
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
@@ -176,16 +176,16 @@ def this_machine(folder: Path, threads: int, speed: float = 1.0) -> Machine:
 
 
 def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float) -> np.ndarray:
-    """Return (iterations + extra,) expected numbers of Gaussians.
+    """Return the (iterations + extra,) expected numbers of Gaussians.
 
     Parameters
     ----------
     growth : float
-        Share of the room between start and limit that is filled.
+        Share of the room between initial number and limit that is filled.
     """
     schedule = _schedule(facts, settings)
     limit = schedule.growth_limit()
-    start = min(limit, max(facts.points, FEW_POINTS))
+    start = min(limit, max(facts.points, MIN_START_POINTS))
     top = limit if settings.growth == "on" else start + growth * (limit - start)
     if settings.growth == "off":
         top = start
@@ -217,7 +217,7 @@ def _trained_pixels(facts: SceneFacts, settings: TrainingSettings) -> float:
 def _seconds(
     facts: SceneFacts, settings: TrainingSettings, counts: np.ndarray, first: int = 0
 ) -> float:
-    """Return the model's time on the reference machine, from iteration ``first`` on."""
+    """Return the modelled time on the reference machine, from iteration ``first`` on."""
     schedule, pixels = _schedule(facts, settings), _trained_pixels(facts, settings)
     last = settings.iterations - 1
     total_s = 0.0
@@ -236,7 +236,7 @@ def _seconds(
 
 
 def _window(pixels: float, most: int) -> float:
-    """Return about how many pixels of an image an iteration looks at (:mod:`..windows`)."""
+    """Return the approximate number of pixels of a window (:mod:`..windows`)."""
     across = math.ceil(math.sqrt(pixels / most))
     return pixels / across**2 if across > 1 else pixels
 
@@ -244,9 +244,9 @@ def _window(pixels: float, most: int) -> float:
 def estimate(
     scene_facts: SceneFacts, settings: TrainingSettings, machine: Machine, *, first: int = 0
 ) -> Estimate:
-    """Return what a training will take.
+    """Estimate the cost of a training.
 
-    Where the photos decide (``"auto"``), the range reaches from "not needed" to "needed".
+    For settings left to the photos (``"auto"``), the range extends from "off" to "on".
 
     Parameters
     ----------
@@ -254,12 +254,12 @@ def estimate(
     settings : TrainingSettings
     machine : Machine
     first : int
-        Iterations that a checkpoint has done already.
+        Iterations already done by a checkpoint.
 
     Returns
     -------
     Estimate
-        Seconds of the training alone: solving cameras from photos, meshing and texture come on top
+        Times are those of the training alone, without camera poses, meshing and texture
         (:data:`MESH_AND_TEXTURE_SHARE`).
     """
     decided = settings.multi_view == "auto"
@@ -285,26 +285,26 @@ def estimate(
     return Estimate(low_s, high_s, round(memory), round(disk) + OTHER_DISK_BYTES, count)
 
 
-def judge(expected: Estimate, machine: Machine) -> list[ReportWarning]:
-    """Refuse where the disk is clearly too full; return warnings about memory.
+def check_resources(expected: Estimate, machine: Machine) -> list[ReportWarning]:
+    """Check disk space and memory; return warnings about memory.
 
     Raises
     ------
     ResourceError
-        The disk has less free than the training will write.
+        The disk has less free space than the training will write.
     """
     if machine.disk_free_bytes and expected.disk_bytes > machine.disk_free_bytes:
         missing = expected.disk_bytes + DISK_RESERVE_BYTES - machine.disk_free_bytes
         raise ResourceError(
             f"The training will write {expected.disk_bytes / 2**30:.2f} GB, and only "
             f"{machine.disk_free_bytes / 2**30:.2f} GB are free where the job lies.",
-            f"Free {missing / 2**30:.2f} GB there, choose another --out, or fewer "
+            f"Free {missing / 2**30:.2f} GB there, choose another --out, or set fewer "
             "--max-gaussians; then resume.",
         )
     if machine.memory_bytes and expected.memory_bytes > MEMORY_SHARE_LEFT * machine.memory_bytes:
         text = (
-            f"The training may need {expected.memory_bytes / 2**30:.1f} GB of memory, and "
-            f"{machine.memory_bytes / 2**30:.1f} GB are free: close other programs, or give fewer "
+            f"The training may need {expected.memory_bytes / 2**30:.1f} GB of memory, and only "
+            f"{machine.memory_bytes / 2**30:.1f} GB are free: close other programs, or set fewer "
             "--max-gaussians or a smaller --max-image-px."
         )
         return [ReportWarning("memory-short", text)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which Gaussians there are: adding, pruning, orientation and clones.
+"""Density control: densification, pruning, orientations and wrapping clones.
 
-In: statistics of views. Out: a changed set of Gaussians and of their moments.
+In: statistics of views. Out: an updated set of Gaussians with their moments.
 """

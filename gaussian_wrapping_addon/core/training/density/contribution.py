@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What each Gaussian contributes to the photos, and removing those that together show nothing."""
+"""Measure the contribution of each Gaussian to the views and prune the smallest ones."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Contributions:
     """Blending weights over views, all (n,) float64."""
 
     share: np.ndarray
-    """Mean over the views of the part of the image that the Gaussian fills: sum of its blending
-    weights by the number of pixels."""
+    """Mean over the views of the share of the image that the Gaussian fills: sum of its blending
+    weights divided by the number of pixels."""
     largest: np.ndarray
     """Largest blending weight at any pixel of any view."""
 
@@ -34,10 +34,10 @@ def contributions(
     *,
     threads: int = 0,
 ) -> Contributions:
-    """Measure what each Gaussian contributes to the images of the views.
+    """Measure the contribution of each Gaussian to the images of the views.
 
-    Pixels outside a mask count like all others: what stands there is in front of, or behind,
-    something that other views train.
+    Masked pixels count like all others: Gaussians there are in front of, or behind, something that
+    other views train.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def contributions(
         Scene frame.
     views : iterable of WrapView
     renderer : ViewRenderer
-        Its last view is overwritten.
+        Overwrites its last view.
     """
     raw = RawArrays.from_gaussians(gaussians)
     options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
@@ -63,18 +63,18 @@ def contributions(
 def least_contributors(
     found: Contributions, total_share: float, weights: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return (n,) bool: the Gaussians of least contribution that together make up a share of all.
+    """Return (n,) bool: the Gaussians of least contribution that add up to a share of the total.
 
-    Removing them changes no image by more than that share on average, however many they are; a
+    Removing them changes the images by no more than that share on average, however many they are; a
     fixed number or threshold would depend on the scene (compare the pruning by significance of
     LightGaussian and the blending weights of Mini-Splatting).
 
     Parameters
     ----------
     total_share : float
-        In [0, 1): of the sum of all contributions.
+        Share of the sum of all contributions, in [0, 1).
     weights : (n,), optional
-        What the contribution of each Gaussian is worth.
+        Factors on the contributions of the Gaussians.
     """
     share = found.share if weights is None else found.share * weights
     order = np.argsort(share, kind="stable")
@@ -85,7 +85,7 @@ def least_contributors(
 
 
 def prune_contributors(adam: Adam, least: np.ndarray) -> int:
-    """Remove the Gaussians of a mask, but never all of them; return how many."""
+    """Remove the Gaussians of a mask, unless that is all of them; return their number."""
     keep = np.flatnonzero(~least)
     if len(keep) == 0 or len(keep) == len(least):
         return 0

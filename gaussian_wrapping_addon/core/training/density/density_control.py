@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Adding Gaussians where the images ask for them, and removing those that show nothing."""
+"""Density control: clone and split Gaussians with high gradients, prune transparent ones."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from ...render.types.images import RenderStatistics
 from ..optimizer.adam import Adam
 
 GRADIENT_THRESHOLD = 2e-4
-"""Average loss gradient per half image from which a Gaussian is doubled.
+"""Average loss gradient, in half image units, from which a Gaussian is densified.
 
 See docs/method.md, section 4.1.
 """
 
 LOWEST_SCORE = 0.3
-"""Where the budget has room for more than qualify, those with at least this share of the threshold
-are taken, best first: the budget decides how many, the gradients decide which (Taming 3DGS)."""
+"""If the budget has room for more than those above the threshold, candidates down to this share of
+it are taken, best first: the budget decides how many, the gradients which (Taming 3DGS)."""
 
 CLONE_SIZE = 0.01 * tolerances.SCENE_RADIUS
-"""Gaussians whose largest raw standard deviation is at most this are cloned, others split."""
+"""Gaussians with a largest raw standard deviation of at most this are cloned, others are split."""
 
 SPLIT_FACTOR = 1.6
 MIN_OPACITY = 0.02
-"""Gaussians with a smaller raw opacity are removed. Between 0.05 and 0.005 of the two published
+"""Gaussians with a smaller raw opacity are pruned. Between the 0.05 and 0.005 of the two published
 codes (docs/method.md, section 4.1): short runs hardly recover what 0.05 removes."""
 
 RESET_OPACITY = 0.01
@@ -37,11 +37,11 @@ class DensityStatistics:
     """Running sums over the views since the last densification, all (n,)."""
 
     gradient: np.ndarray
-    """float32: sum of screen gradients, per half image."""
+    """float32: sum of screen-space gradients, in half image units."""
     gradient_abs: np.ndarray
-    """float32: the same of the absolute gradients (AbsGS)."""
+    """float32: the same for absolute gradients (AbsGS)."""
     views: np.ndarray
-    """int32: views that saw the Gaussian."""
+    """int32: number of views that saw the Gaussian."""
 
     @classmethod
     def zeros(cls, count: int) -> DensityStatistics:
@@ -51,18 +51,18 @@ class DensityStatistics:
         )
 
     def add(self, statistics: RenderStatistics, width: int, height: int, part: float = 1.0) -> None:
-        """Add one view after its backward pass.
+        """Accumulate one view after its backward pass.
 
         Parameters
         ----------
         width, height : int
-            Of its image, pixels.
+            Size of its image, pixels.
         part : float
-            Share of the image that was rendered: a loss that is a mean over fewer pixels has
-            larger gradients.
+            Share of the image that was rendered: a mean loss over fewer pixels has larger
+            gradients.
         """
         half_image = 0.5 * max(width, height) * part
-        # 0 for the unseen: all are added, which is faster than picking the seen.
+        # 0 for invisible ones: adding all is faster than indexing the visible.
         weight = np.multiply(statistics.visible, half_image, dtype=np.float32)
         self.gradient += weight * statistics.grad_px
         self.gradient_abs += weight * statistics.grad_abs_px
@@ -71,7 +71,7 @@ class DensityStatistics:
 
 @dataclass(frozen=True)
 class DensityChange:
-    """What one round of density control did."""
+    """Numbers of Gaussians changed by one round of density control."""
 
     cloned: int
     split: int
@@ -85,24 +85,24 @@ def densify_and_prune(
     random: np.random.Generator,
     weights: np.ndarray | None = None,
 ) -> DensityChange:
-    """Clone small and split large Gaussians with high gradients; remove transparent ones.
+    """Clone small and split large Gaussians with high gradients; prune transparent ones.
 
-    A Gaussian qualifies by its average gradient, or by its average absolute gradient above the
-    quantile that selects the same share (docs/method.md, section 4.1). Where more qualify than
-    ``limit`` has room for, those with the highest gradients are taken.
+    A Gaussian is a candidate by its average gradient, or by an average absolute gradient above the
+    quantile that selects the same share (docs/method.md, section 4.1). If there are more candidates
+    than room up to ``limit``, those with the highest gradients are taken.
 
     Parameters
     ----------
     adam : Adam
         Rebuilt; new Gaussians start with zero moments.
     statistics : DensityStatistics
-        Of the current Gaussians.
+        Statistics of the current Gaussians.
     limit : int
-        The number of Gaussians never grows beyond this.
+        Largest number of Gaussians.
     random : numpy.random.Generator
-        Positions of the new Gaussians are drawn from the old ones.
+        Draws the means of new Gaussians from the distributions of the old ones.
     weights : (n,), optional
-        What counts in the ranking where room is short: gradients are multiplied by it there.
+        Factors on the gradients in the ranking when room is short.
     """
     log_scales = adam.array("log_scales")
     opacity = 1.0 / (1.0 + np.exp(-adam.array("opacity_logits").astype(np.float64)))
@@ -130,7 +130,7 @@ def densify_and_prune(
 def _qualified(
     statistics: DensityStatistics, keep: np.ndarray, room: int, weights: np.ndarray | None
 ) -> np.ndarray:
-    """(n,) bool: Gaussians to double, at most ``room`` of them."""
+    """Return (n,) bool: Gaussians to densify, at most ``room`` of them."""
     views = np.maximum(statistics.views, 1)
     average = statistics.gradient / views
     average_abs = statistics.gradient_abs / views
@@ -151,7 +151,7 @@ def _qualified(
 
 
 def _offsets(adam: Adam, rows: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """(m, 3) draws from the Gaussians of ``rows``, relative to their means."""
+    """Return (m, 3) samples of the Gaussians of ``rows``, relative to their means."""
     gaussians = adam.gaussians().detached()
     rotations = gaussians.rotations().numpy()[rows]  # (m, 3, 3)
     local = np.exp(adam.array("log_scales")[rows]) * random.normal(size=(len(rows), 3))
@@ -159,7 +159,7 @@ def _offsets(adam: Adam, rows: np.ndarray, random: np.random.Generator) -> np.nd
 
 
 def reset_opacity(adam: Adam) -> None:
-    """Cap all effective opacities at 0.01 and forget their moments.
+    """Cap all effective opacities at 0.01 and reset their moments.
 
     See docs/method.md, section 4.1.
     """

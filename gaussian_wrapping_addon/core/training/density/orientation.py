@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Orientation without training: the shortest axis, its sign by the cameras' vote."""
+"""Orientation without training: the shortest axis, with its sign by a vote of the cameras."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from ...render.render import render
 from ...render.types.options import RenderOptions
 
 FIRST_SIGN = 0.5
-"""Size of the sign parameter after the cameras' vote (docs/method.md, section 1.3)."""
+"""Magnitude of the sign parameter after the vote (docs/method.md, section 1.3)."""
 
 
 def voted_orientation(
     gaussians: OrientedGaussians, cameras: Iterable[Camera], *, threads: int = 0
 ) -> np.ndarray:
-    """Return the orientation parameters of Gaussians that have learned none.
+    """Return orientation parameters for Gaussians whose orientation was not trained.
 
-    The direction is the shortest axis. Each camera votes with the Gaussian's blending weight for
-    the side that it sees; the sign parameter is +-0.5, or 0 where no camera sees the Gaussian
+    The direction is the shortest axis. Each camera votes for the side that it sees, weighted by the
+    Gaussian's blending weight; the sign parameter is +-0.5, or 0 if no camera sees the Gaussian
     (docs/method.md, section 1.3).
 
     Parameters
@@ -56,6 +56,6 @@ def voted_orientation(
 def orient(
     gaussians: OrientedGaussians, cameras: Iterable[Camera], *, threads: int = 0
 ) -> OrientedGaussians:
-    """Return the Gaussians with :func:`voted_orientation`: a splat that can be meshed."""
+    """Return the Gaussians with :func:`voted_orientation`, so that a splat can be meshed."""
     orientation = voted_orientation(gaussians, cameras, threads=threads)
     return gaussians.replaced(orientation=torch.from_numpy(orientation))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Orientation: its first guess, and clones of opposite orientation where normals disagree."""
+"""Wrapping: initial orientations, and clones of opposite orientation where normals disagree."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from ..optimizer.adam import Adam
 from .orientation import voted_orientation
 
 SHIFT = 0.1
-"""Original and clone move apart by this many standard deviations along the normal, each."""
+"""Original and clone are each moved by this many standard deviations along the normal."""
 
 MIN_VIEWS = 2
-"""The error of a Gaussian is averaged over at least this many views, so that one bad view of a
-rarely seen Gaussian does not win (docs/method.md, section 4.2)."""
+"""Least divisor of the mean error of a Gaussian, so that one bad view of a rarely seen Gaussian
+does not rank first (docs/method.md, section 4.2)."""
 
 _SATURATED = 20.0
 """tanh of this is 1 in float32: normals of unit length."""
@@ -32,7 +32,7 @@ _SATURATED = 20.0
 
 @dataclass(frozen=True)
 class WrapView:
-    """A training view as the rounds look at it."""
+    """Camera and mask of a training view."""
 
     camera: Camera
     mask: np.ndarray | None
@@ -40,11 +40,10 @@ class WrapView:
 
 
 def start_orientation(adam: Adam, views: Iterable[WrapView], *, threads: int = 0) -> None:
-    """Set the direction to the shortest axis and let the views vote for the sign.
+    """Initialise orientations: the shortest axis, with its sign by a vote of the views.
 
-    Each view votes with the Gaussian's blending weight for the side that it sees; the sign
-    parameter becomes +-0.5, or stays 0 where no view sees the Gaussian (docs/method.md,
-    section 1.3).
+    Each view votes for the side that it sees, weighted by the Gaussian's blending weight; the sign
+    parameter becomes +-0.5, or stays 0 if no view sees the Gaussian (docs/method.md, section 1.3).
     """
     cameras = (view.camera for view in views)
     adam.array("orientation")[:] = voted_orientation(adam.gaussians(), cameras, threads=threads)
@@ -56,8 +55,8 @@ def normal_errors(
 ) -> np.ndarray:
     """Return (n,) mean normal error of each Gaussian over the views (docs/method.md, section 4.2).
 
-    ``1 - N . n_depth`` with normals of unit length; each pixel counts for the Gaussian with the
-    largest blending weight there.
+    ``1 - N . n_depth`` with unit normals; each pixel is assigned to the Gaussian with the largest
+    blending weight.
     """
     count = len(gaussians)
     unit = gaussians.orientation.detach().clone()
@@ -85,28 +84,28 @@ def normal_errors(
 
 
 def wrap(adam: Adam, errors: np.ndarray, share: float, limit: int) -> int:
-    """Clone the Gaussians of largest error with the opposite orientation.
+    """Clone the Gaussians of largest normal error with the opposite orientation.
 
     See docs/method.md, section 4.2.
 
-    Both are shrunk along the normal to half the volume and moved apart by 0.1 standard deviations
-    along it, the clone to the back. Gaussians without orientation are left alone.
+    Original and clone are shrunk along the normal to half the volume and each moved by 0.1 standard
+    deviations along it, the clone backwards. Gaussians without orientation are skipped.
 
     Parameters
     ----------
     adam : Adam
-        Rebuilt; clones have zero moments.
+        Rebuilt; clones start with zero moments.
     errors : (n,) float64
-        Of :func:`normal_errors`.
+        From :func:`normal_errors`.
     share : float
-        At most this share of the Gaussians is cloned.
+        Largest share of the Gaussians to clone.
     limit : int
-        The number of Gaussians never grows beyond this.
+        Largest number of Gaussians.
 
     Returns
     -------
     int
-        How many were cloned.
+        Number of clones.
     """
     gaussians = adam.gaussians().detached()
     count = len(gaussians)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Starts of a training other than sparse points: an existing splat.
+"""Initialisation of a training from an existing splat instead of sparse points.
 
 In: a splat. Out: Gaussians in the scene frame.
 """

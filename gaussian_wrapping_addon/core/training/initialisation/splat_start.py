@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Start of a training from an existing splat: into the scene, capped, checked, oriented."""
+"""Initialise a training from an existing splat: transform, cap, check against photos, orient."""
 
 from __future__ import annotations
 
@@ -27,51 +27,51 @@ from ...render.types.options import RenderOptions
 from ...report_warning import ReportWarning
 from ...settings import TrainingSettings
 from ..density.orientation import orient
-from .splat_motion import move_gaussians, with_degree
+from .splat_transform import transform_gaussians, with_degree
 
 _logger = logging.getLogger(__name__)
 
 ITERATIONS_SHARE = 0.3
-"""Of the preset's iterations: colour and places are there, shapes and orientations are to learn."""
+"""Share of the preset's iterations: positions and colours exist, shapes and orientations do not."""
 
 FILTER_MULTIPLE = 2.0
-"""No axis is shorter than this many standard deviations of the 3D filter: of a thinner one the
-filter would take the opacity (a disc a tenth of the filter thick keeps a tenth of it)."""
+"""Shortest axis, in standard deviations of the 3D filter: a thinner one would lose its opacity to
+the filter (a disc a tenth of the filter thick keeps a tenth of it)."""
 
 HIGHEST_OPACITY = 0.995
 LOWEST_OPACITY = 1e-4
-"""Opacities are clamped to this range: beyond, the sigmoid's gradient is too small to train."""
+"""Opacities are clamped to this range: beyond it, the sigmoid's gradient is too small to train."""
 
 MATCH_VIEWS = 8
-"""Photos that the splat is compared with."""
+"""Number of photos that the splat is compared with."""
 
 MATCH_DB = 12.0
-"""Below this PSNR the splat shows something else than the photos."""
+"""Below this PSNR the splat does not match the photos."""
 
 CLEAR_DB = 20.0
-"""From here on a splat matches even where a photo of one colour would do as well."""
+"""From this PSNR a splat matches even if a uniform image would match as well."""
 
 WEIGHT_VIEWS = 24
-"""Views that are asked which Gaussians count, where there are too many."""
+"""Views from which Gaussians are ranked if there are too many."""
 
 _SMALL_DIVISOR = 4
 
 
 @dataclass(frozen=True)
 class SplatStart:
-    """What training starts from."""
+    """Initial state of a training from a splat."""
 
     gaussians: OrientedGaussians
-    """float32, scene frame; ``filter_3d`` is that of the training cameras at full size."""
+    """float32, scene frame; ``filter_3d`` of the training cameras at full size."""
     warnings: tuple[ReportWarning, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
 
 
 def wrapping_settings(settings: TrainingSettings) -> TrainingSettings:
-    """Return the plan of a short training from a splat.
+    """Return the settings of a short training from a splat.
 
-    Nothing is added or pruned by density control; depth and normals are learned from the start;
-    the wrapping rounds lie between 30 and 70 % of the iterations.
+    Density control neither adds nor prunes; depth and normals are trained from the start; the
+    wrapping rounds lie between 30 and 70 % of the iterations.
     """
     return dataclasses.replace(
         settings,
@@ -98,21 +98,21 @@ def start_from_splat(
     *,
     threads: int = 0,
 ) -> SplatStart:
-    """Read a splat in the world frame of the photos' cameras and make it a training's start.
+    """Read a splat in the world frame of the photos' cameras and prepare it for training.
 
     Parameters
     ----------
     path : Path
         3D Gaussian splatting PLY of any program.
     scene : Scene
-        Of the photos.
+        Scene of the photos.
     photos : PhotoStore
     view_indices : sequence of int
         Training views.
     settings : TrainingSettings
-        ``max_gaussians`` and ``sh_degree`` are kept to.
+        ``max_gaussians`` and ``sh_degree`` are respected.
     progress : Progress
-        Asked for cancelling at every view.
+        Checked for cancellation at every view.
 
     Returns
     -------
@@ -123,47 +123,49 @@ def start_from_splat(
     ParseError
         The file is not a splat.
     DatasetError
-        The splat does not show what the photos show.
+        The splat does not match the photos.
     """
     splat = read_foreign_splat(path)
     progress.check()
-    # Degrees do not mix in a rotation: those that are cut need not be rotated.
+    # Rotations do not mix degrees: truncate before rotating.
     wanted = with_degree(baked(splat.gaussians), settings.sh_degree)
-    moved = move_gaussians(wanted, scene.world_from_scene.inverse())
+    moved = transform_gaussians(wanted, scene.world_from_scene.inverse())
     cameras = [photos.camera(i, 1) for i in view_indices]
     gaussians = fit_filter(moved, cameras, threads=threads)
     warnings, facts = list(splat.warnings), dict(splat.facts)
     if len(gaussians) > settings.max_gaussians:
         text = (
-            f"The splat has {len(gaussians)} Gaussians; the {settings.max_gaussians} that the "
-            "photos show most of are kept."
+            f"The splat has {len(gaussians)} Gaussians; the {settings.max_gaussians} with the "
+            "largest contribution to the photos are kept."
         )
         warnings.append(ReportWarning("gaussians-over-cap", text))
-        chosen = _spread(view_indices, WEIGHT_VIEWS)
+        chosen = _evenly_spaced(view_indices, WEIGHT_VIEWS)
         small = [photos.camera(i, _divisor(photos, i)) for i in chosen]
-        weights = _shown(gaussians, small, progress, threads=threads)
-        # A stable order makes the choice among equals a function of the file alone.
+        weights = _mean_weights(gaussians, small, progress, threads=threads)
+        # A stable order makes ties depend on the file alone.
         kept = np.sort(np.argsort(-weights, kind="stable")[: settings.max_gaussians])
         gaussians = gaussians.select(torch.from_numpy(kept))
     facts["splat_kept"] = len(gaussians)
-    matched, unlike = _match(gaussians, photos, view_indices, progress, threads=threads)
+    matched, unlike = _compare_with_photos(
+        gaussians, photos, view_indices, progress, threads=threads
+    )
     facts["splat_psnr"] = round(matched, 2)
     if unlike:
         raise DatasetError(
-            f"The splat {path.name} does not show what the photos show (PSNR {matched:.1f} dB): "
-            "its frame probably differs from that of the photos' cameras.",
+            f"The splat {path.name} does not match the photos (PSNR {matched:.1f} dB): its "
+            "coordinate frame probably differs from that of the photos' cameras.",
             "Give the photos with the camera poses that the splat was trained with, or wrap the "
             "splat alone, without photos.",
         )
     if not splat.oriented:
-        chosen = _spread(view_indices, WEIGHT_VIEWS)
+        chosen = _evenly_spaced(view_indices, WEIGHT_VIEWS)
         small = [photos.camera(i, _divisor(photos, i)) for i in chosen]
         gaussians = orient(gaussians, small, threads=threads)
     return SplatStart(gaussians, tuple(warnings), facts)
 
 
 def baked(gaussians: OrientedGaussians) -> OrientedGaussians:
-    """Return the same Gaussians with a filter of 0: it is in scales and opacities (float64)."""
+    """Bake the 3D filter into scales and opacities; return float64 Gaussians with a filter of 0."""
     wide = OrientedGaussians(**{n: t.detach().double() for n, t in gaussians.tensors()})
     if not wide.filter_3d.any():
         return wide
@@ -177,10 +179,10 @@ def baked(gaussians: OrientedGaussians) -> OrientedGaussians:
 def fit_filter(
     gaussians: OrientedGaussians, cameras: Sequence[Camera], *, threads: int = 0
 ) -> OrientedGaussians:
-    """Return Gaussians that look with the cameras' 3D filter as the given ones do without.
+    """Return Gaussians that look with the cameras' 3D filter like the given ones without.
 
-    Where that cannot be (an axis shorter than :data:`FILTER_MULTIPLE` filters, a thin and opaque
-    Gaussian), the axis is made that long and the opacity as high as it can be.
+    Where that is impossible (an axis shorter than :data:`FILTER_MULTIPLE` filters, a thin and
+    opaque Gaussian), the axis gets that length and the opacity the highest possible value.
 
     Parameters
     ----------
@@ -199,11 +201,11 @@ def fit_filter(
     least = (FILTER_MULTIPLE * width)[:, None]
     wanted = torch.maximum(torch.exp(wide["log_scales"]), least)  # (n, 3) effective
     raw = torch.sqrt(wanted**2 - width[:, None] ** 2)
-    kept = (raw / wanted).prod(dim=1)  # (n,) what the filter leaves of the opacity
+    kept = (raw / wanted).prod(dim=1)  # (n,) share of the opacity left by the filter
     wide["log_scales"] = torch.log(raw)
     wide["opacity_logits"] = _logit(torch.sigmoid(wide["opacity_logits"]) / kept)
     wide["filter_3d"] = width
-    # Files hold quaternions of any length; the rotation's learning rate is for length 1.
+    # Files hold quaternions of any length; the learning rate of rotations assumes length 1.
     wide["quats"] = torch.nn.functional.normalize(wide["quats"], dim=1)
     return OrientedGaussians(**{name: t.float() for name, t in wide.items()})
 
@@ -213,7 +215,7 @@ def _logit(opacity: torch.Tensor) -> torch.Tensor:
     return torch.log(clamped) - torch.log1p(-clamped)
 
 
-def _spread(indices: Sequence[int], count: int) -> list[int]:
+def _evenly_spaced(indices: Sequence[int], count: int) -> list[int]:
     """Return at most ``count`` of the indices, evenly spread."""
     positions = np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int)
     return [indices[i] for i in positions.tolist()]
@@ -225,10 +227,10 @@ def _divisor(photos: PhotoSource, index: int) -> int:
     return _SMALL_DIVISOR if min(camera.width, camera.height) >= 32 * _SMALL_DIVISOR else 1
 
 
-def _shown(
+def _mean_weights(
     gaussians: OrientedGaussians, cameras: Sequence[Camera], progress: Progress, *, threads: int
 ) -> np.ndarray:
-    """(n,) share of all views' pixels that each Gaussian gives."""
+    """Return (n,) summed shares of the views' pixels that each Gaussian contributes."""
     options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
     total = np.zeros(len(gaussians))
     for camera in cameras:
@@ -240,7 +242,7 @@ def _shown(
     return total
 
 
-def _match(
+def _compare_with_photos(
     gaussians: OrientedGaussians,
     photos: PhotoSource,
     view_indices: Sequence[int],
@@ -248,14 +250,15 @@ def _match(
     *,
     threads: int,
 ) -> tuple[float, bool]:
-    """Return the median PSNR against some photos, dB, and whether the splat shows another thing.
+    """Return the median PSNR against some photos, dB, and whether the splat does not match them.
 
-    It does where it is below :data:`MATCH_DB`, or, short of :data:`CLEAR_DB`, no better than each
-    photo's mean colour: before a black background any small thing is close to any photo.
+    It does not if the PSNR is below :data:`MATCH_DB`, or, below :data:`CLEAR_DB`, if it is no
+    better than that of each photo's mean colour: before a black background any small object is
+    close to any photo.
     """
     options = RenderOptions(depth=False, threads=threads)
     errors, spreads = [], []
-    for index in _spread(view_indices, MATCH_VIEWS):
+    for index in _evenly_spaced(view_indices, MATCH_VIEWS):
         progress.check()
         divisor = _divisor(photos, index)
         with torch.no_grad():
@@ -269,7 +272,7 @@ def _match(
         errors.append(float(((np.clip(image[counted], 0.0, 1.0) - pixels) ** 2).mean()))
         spreads.append(float(pixels.var(axis=0).mean()))
     if not errors:
-        raise DatasetError("The masks leave nothing of any photo.", "Check the masks.")
+        raise DatasetError("The masks cover all photos completely.", "Check the masks.")
     psnr = -10.0 * math.log10(max(float(np.median(errors)), 1e-10))
     explains_nothing = float(np.median(np.array(errors) - np.array(spreads))) >= 0.0
     return psnr, psnr < MATCH_DB or (psnr < CLEAR_DB and explains_nothing)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A price on overlap: Gaussians shrink where the photos do not ask for their size."""
+"""Footprint regulariser: penalise the mean number of Gaussians that overlap a pixel."""
 
 from __future__ import annotations
 
@@ -8,32 +8,33 @@ import numpy as np
 from ...render.types.gradients import VisibleGradients
 
 
-def add_overlap_price(
+def add_footprint_regulariser(
     gradients: VisibleGradients,
     log_scales: np.ndarray,
     boxes: np.ndarray,
     size_px: tuple[int, int],
-    price: float,
+    weight: float,
 ) -> float:
-    """Add the gradient of ``price`` times the mean number of Gaussians over a pixel.
+    """Add the gradient of ``weight`` times the mean number of Gaussians over a pixel.
 
-    Blending costs time for every Gaussian whose footprint holds a pixel, seen or hidden. Photos
-    alone do not mind: half transparent layers that overlap a hundredfold show the same as a few
-    small opaque ones, but take longer and have no surface. The footprint is the box on the screen;
-    its area grows with the square of the scale, and each axis takes its share of the square sum.
+    Blending costs time for every Gaussian whose footprint contains a pixel, visible or occluded.
+    Photos alone do not penalise this: half-transparent layers that overlap a hundredfold look the
+    same as a few small opaque ones, but take longer and have no surface. The footprint is the box
+    on the screen; its area grows with the square of the scale, and the gradient is distributed over
+    the axes by their squares. The weight is the setting ``overlap_price``.
 
     Parameters
     ----------
     gradients : VisibleGradients
-        ``log_scales`` is added to.
+        The gradient is added to ``log_scales``.
     log_scales : (n, 3) float32
         Raw, of all Gaussians.
     boxes : (n, 4) float32
         Footprints on the screen: x0, y0, x1, y1 in pixels.
     size_px : (int, int)
-        Width and height of the image; what lies outside costs nothing.
-    price : float
-        Of one Gaussian over every pixel, in the unit of the loss.
+        Width and height of the image; area outside it does not count.
+    weight : float
+        Loss of one Gaussian over every pixel.
 
     Returns
     -------
@@ -46,6 +47,6 @@ def add_overlap_price(
     area = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])  # (v,)
     area /= np.float32(width * height)
     squares = np.exp(2.0 * log_scales[ids])  # (v, 3)
-    squares *= (2.0 * price * area / squares.sum(1))[:, None]
+    squares *= (2.0 * weight * area / squares.sum(1))[:, None]
     gradients.log_scales[...] += squares
     return float(area.sum())

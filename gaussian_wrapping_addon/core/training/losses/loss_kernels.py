@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled rows of the losses: normals of a depth map, and how others agree with them."""
+"""Compiled normal losses: normals of a depth map and their agreement with blended normals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MIN_NORMAL_SQ = 1e-30
 """Cross products whose squared length (scene units^4) is below this give no normal."""
 
 BLOCK_PX = 256
-"""Columns whose planes lie in the fastest cache together."""
+"""Columns per block, so that its planes fit into the L1 cache."""
 
 _PLANE = BLOCK_PX + 16
 # Planes of a block. Constant offsets in one array let LLVM see that they do not overlap.
@@ -27,7 +27,7 @@ _PLANES = 22
 
 @inline
 def _edges(x: Any, y: Any, fx: Any, fy: Any, up: Any, down: Any, left: Any, right: Any) -> Any:
-    """Differences of back-projected neighbours: down the column of pixels, along the row.
+    """Differences of back-projected neighbours, along the column and along the row.
 
     ``x``, ``y``: the pixel's ray; ``fx``, ``fy``: 1 / focal length in pixels.
     """
@@ -45,7 +45,7 @@ def _cross(a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: Any) -> Any:
 
 @kernel(fast=False)
 def normal_rows(begin, end, depth, camera, max_jump, normals, valid):  # type: ignore[no-untyped-def]
-    """Camera-frame normals of the surface z = depth, rows [begin, end).
+    """Compute camera-frame normals of the surface z = depth, rows [begin, end).
 
     See docs/method.md, section 2.8.
 
@@ -56,8 +56,8 @@ def normal_rows(begin, end, depth, camera, max_jump, normals, valid):  # type: i
     camera : (4,) float64
         fx, fy, cx, cy.
     max_jump : float
-        Where opposite neighbours differ by more than this share of the depth, there is no normal;
-        0 switches the test off.
+        No normal where opposite neighbours differ by more than this share of the depth; 0
+        disables the test.
     normals : (h, w, 3), valid : (h, w) bool
         Written.
     """
@@ -92,8 +92,8 @@ def normal_rows(begin, end, depth, camera, max_jump, normals, valid):  # type: i
 
 @part(fast=True)
 def _load_planes(row, first, count, depth, alpha, mask, geometric, learned, planes):  # type: ignore[no-untyped-def]
-    """Copy ``count`` pixels of a row and its neighbours to planes; masked and border pixels have
-    no keep."""
+    """Copy ``count`` pixels of a row and its neighbours to planes; masked and border pixels get a
+    keep flag of 0."""
     width = depth.shape[1]
     one, zero = planes.dtype.type(1.0), planes.dtype.type(0.0)
     here, up, down = depth[row], depth[row - 1, first:], depth[row + 1, first:]
@@ -131,8 +131,8 @@ def _load_planes(row, first, count, depth, alpha, mask, geometric, learned, plan
 def _agree(  # type: ignore[no-untyped-def]
     first, count, y, camera, rotation, max_jump, weight_geometric, weight_learned, planes
 ):
-    """Losses and gradients of ``count`` pixels; returns the sums of ``1 - cos`` and the number of
-    pixels with a normal."""
+    """Compute losses and gradients of ``count`` pixels; return the sums of ``1 - cos`` and the
+    number of pixels with a normal."""
     kind = planes.dtype.type
     zero, half, one = kind(0.0), kind(0.5), kind(1.0)
     fx, fy, cx = kind(1.0 / camera[0]), kind(1.0 / camera[1]), kind(camera[2])
@@ -217,8 +217,8 @@ def _store_planes(first, count, planes, by_geometric, by_learned, by_alpha):  # 
 
 @part(fast=True)
 def _spread_planes(first, count, planes, by_up, by_down, by_here):  # type: ignore[no-untyped-def]
-    """Write what ``count`` pixels say about the depth above and below; add what they say about the
-    depth beside them, a place further right because ``by_here`` begins a pixel early."""
+    """Write the gradients of ``count`` pixels on the depths above and below; add those on the
+    depths beside them, one index to the right because ``by_here`` begins a pixel early."""
     up, down, here = by_up[first:], by_down[first:], by_here[first:]
     for j in range(count):
         up[j] = planes[_BY_UP + j]
@@ -240,10 +240,10 @@ def agreement_rows(  # type: ignore[no-untyped-def]
     begin, end, depth, camera, rotation, mask, geometric, learned, alpha, max_jump,
     weight_geometric, weight_learned, sums, by_depth, by_geometric, by_learned, by_alpha,
 ):  # fmt: skip
-    """Disagreement of blended normals with the depth's normals, rows [begin, end), and gradients.
+    """Compare blended normals with the depth's normals, rows [begin, end), with gradients.
 
-    A strip also looks at the row above and the row below it, whose normals depend on its depth, so
-    that nothing depends on where strips begin.
+    A strip includes the rows above and below it, whose normals depend on its depth, so that results
+    do not depend on where strips begin.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def agreement_rows(  # type: ignore[no-untyped-def]
         Blended normals, scene frame; the geometric ones are divided by ``alpha`` here.
     alpha : (h, w)
     weight_geometric, weight_learned : float
-        What one pixel contributes to the loss per unit of ``1 - cos``.
+        Loss of one pixel per unit of ``1 - cos``.
     sums : (h, 3) float64
         Written: sums of ``1 - cos`` over the row, geometric and learned, and pixels with a normal.
     by_depth, by_alpha : (h, w), by_geometric, by_learned : (h, 3 w)
@@ -265,7 +265,7 @@ def agreement_rows(  # type: ignore[no-untyped-def]
     height, width = depth.shape
     kind = depth.dtype.type
     planes = np.zeros(_PLANES * _PLANE, kind)
-    # Of the last three rows: what they say about the depth above, below and in them.
+    # Gradients of the last three rows on the depths above, below and in them.
     by_up, by_down = np.zeros((3, width), kind), np.zeros((3, width), kind)
     by_here = np.zeros((3, width + 2), kind)
     for i in range(begin - 1, end + 1):

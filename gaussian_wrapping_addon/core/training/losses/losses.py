@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The losses of training, with their gradients on the images of a render.
+"""Colour and normal losses with their gradients on the rendered images.
 
 See docs/method.md, section 3.
 """
@@ -22,8 +22,8 @@ _NO_MASK = np.zeros((0, 0), np.bool_)
 
 
 @dataclass
-class ColorFigures:
-    """What the colour loss measured on the way, over unmasked values."""
+class ColorMetrics:
+    """Image metrics from the colour loss, over unmasked values."""
 
     l1: float
     mean_squared: float
@@ -31,8 +31,8 @@ class ColorFigures:
 
 
 @dataclass
-class NormalFigures:
-    """What the normal losses measured on the way: means of ``1 - cos`` over all pixels."""
+class NormalMetrics:
+    """Terms of the normal losses: means of ``1 - cos`` over all pixels."""
 
     depth_normal: float
     normal: float
@@ -48,8 +48,8 @@ def color_loss(
     lambda_dssim: float = 0.2,
     threads: int = 0,
     store: ArrayStore | None = None,
-) -> tuple[float, np.ndarray, ColorFigures]:
-    """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and figures.
+) -> tuple[float, np.ndarray, ColorMetrics]:
+    """Return ``(1 - lambda) L1 + lambda (1 - SSIM)``, its gradient and metrics.
 
     See docs/method.md, section 3.1.
 
@@ -61,16 +61,16 @@ def color_loss(
     mask : (h, w) bool, optional
         False pixels count in no term.
     lambda_dssim : float
-        Share of the SSIM term. It is 0 where no window of SSIM fits or is left.
+        Weight of the SSIM term; 0 is used if no window of SSIM fits or is unmasked.
     store : ArrayStore, optional
-        Memory for the gradient, which is then valid until the next call with it.
+        Memory for the gradient, which is then valid until the next call.
 
     Returns
     -------
     loss : float
-        0 where the mask leaves no pixel.
+        0 if the mask leaves no pixel.
     gradient : (h, w, 3), of the image's type
-    figures : ColorFigures
+    figures : ColorMetrics
 
     Raises
     ------
@@ -85,7 +85,7 @@ def color_loss(
     found = compare(image, photo, mask, weights=weights, threads=threads, out=out)
     assert found.gradient is not None
     value = (1.0 - lambda_dssim) * found.absolute + lambda_dssim * (1.0 - found.similarity)
-    return value, found.gradient, ColorFigures(found.absolute, found.squared, found.similarity)
+    return value, found.gradient, ColorMetrics(found.absolute, found.squared, found.similarity)
 
 
 def normals_from_depth(
@@ -93,14 +93,14 @@ def normals_from_depth(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return unit normals of a depth map, facing the camera (docs/method.md, section 2.8).
 
-    The cross product of central differences of the back-projected depth.
+    Cross products of central differences of the back-projected depth.
 
     Parameters
     ----------
     depth : (h, w)
         z-depth, scene units; <= 0 where there is none.
     camera : Camera
-        Of the same size.
+        Camera of the same size.
     max_jump : float
         No normal where opposite neighbours differ by more than this share of the depth; 0 = off.
 
@@ -138,19 +138,19 @@ def normal_losses(
     max_jump: float = 0.0,
     threads: int = 0,
     store: ArrayStore | None = None,
-) -> tuple[float, ImageGradients, NormalFigures]:
-    """Return ``lambda_DN L_DN + lambda_N L_N``, gradients and both means.
+) -> tuple[float, ImageGradients, NormalMetrics]:
+    """Return ``lambda_DN L_DN + lambda_N L_N``, its gradients and both means.
 
     See docs/method.md, sections 3.2 and 3.3.
 
     ``L_DN = mean(valid (1 - n_geo / alpha . n_depth))`` and ``L_N = mean(valid (1 - N . n_depth))``
-    over all pixels of the image (of the mask), with the normals of
-    :func:`normals_from_depth`. Nothing is detached.
+    over all pixels of the image (of the mask), with the normals of :func:`normals_from_depth`.
+    Gradients flow through all terms.
 
     Parameters
     ----------
     depth, alpha : (h, w) float32 or float64
-        Of the render.
+        Rendered images.
     geometric_normal, normal : (h, w, 3), the same type
         Blended normals of the render, scene frame.
     camera : Camera
@@ -158,14 +158,14 @@ def normal_losses(
     mask : (h, w) bool, optional
         False pixels count in no term.
     store : ArrayStore, optional
-        Memory for the gradients, which are then valid until the next call with it.
+        Memory for the gradients, which are then valid until the next call.
 
     Returns
     -------
     loss : float
     gradients : ImageGradients
-        Of all four images, none of the colour.
-    figures : NormalFigures
+        On all four images; none on the colour.
+    figures : NormalMetrics
 
     Raises
     ------
@@ -203,7 +203,7 @@ def normal_losses(
         alpha=by_alpha,
         depth=by_depth,
     )
-    return value, gradients, NormalFigures(depth_normal, oriented, share)
+    return value, gradients, NormalMetrics(depth_normal, oriented, share)
 
 
 def _take(store: ArrayStore | None, name: str, like: np.ndarray) -> np.ndarray:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Losses between two views, with gradients on both (docs/method.md, section 3.4).
+"""Multi-view losses between two views, with gradients on both (docs/method.md, section 3.4).
 
-Some pixels of the rendered view are lifted to its isosurface and followed into another view.
-*Geometric*: the depth of the other view there, brought back, should meet the pixel again.
-*Photometric*: the plane through the point shows both photos the same patch. Nothing is rendered
-for the other view: its depth is solved at the places that are asked for.
+Sampled pixels of the rendered view are lifted to its isosurface and projected into another view.
+*Geometric*: the depth of the other view there, reprojected, should meet the pixel again.
+*Photometric*: the plane through the point should show the same patch in both photos. The other view
+is not rendered: its depth is solved at the projected positions only.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ from .multi_view_kernels import (
 from .pixel_choice import NO_MASK, choose_pixels, grey_image
 
 __all__ = [
-    "MultiViewFigures",
     "MultiViewLoss",
+    "MultiViewMetrics",
     "MultiViewOptions",
     "add_image_gradients",
     "merge_gradients",
@@ -56,19 +56,19 @@ _GEOMETRY_COLUMNS = 13
 
 @dataclass(frozen=True)
 class MultiViewOptions:
-    """Weights and size of the multi-view terms."""
+    """Weights and sizes of the multi-view terms."""
 
     lambda_photometric: float = 0.6
     lambda_geometric: float = 0.02
     correlation: str = "signed"
     pixels: int = 4000
-    """Most pixels that are looked at."""
+    """Largest number of sampled pixels."""
     patch_sizes: int = PATCH_SIZES
-    """Sizes of patch that are tried where smaller ones are flat."""
+    """Number of patch sizes, the larger ones for regions where smaller patches are flat."""
     max_rise: float = MAX_RISE
-    """How far the surface may leave a patch's plane within it, in half sides of the patch."""
+    """Largest deviation of the surface from a patch's plane, in half sides of the patch."""
     weight: float = 1.0
-    """Of both terms: n where they are asked in every n-th iteration."""
+    """Factor on both terms: n if they are evaluated in every n-th iteration."""
 
     def __post_init__(self) -> None:
         if self.correlation not in CORRELATIONS:
@@ -79,7 +79,7 @@ class MultiViewOptions:
 
     @classmethod
     def of_settings(cls, settings: TrainingSettings) -> MultiViewOptions:
-        """Return the options that a training's settings ask for."""
+        """Return the options of a training's settings."""
         return cls(
             settings.lambda_photometric,
             settings.lambda_geometric,
@@ -90,21 +90,21 @@ class MultiViewOptions:
 
 
 @dataclass(frozen=True)
-class MultiViewFigures:
-    """What the terms measured on the way."""
+class MultiViewMetrics:
+    """Values of the terms and pixel counts."""
 
     photometric: float
     """Mean of ``w (1 - correlation)`` over the patches kept; 0 without any."""
     geometric: float
     """Mean of ``w noise`` over the valid pixels, pixels; 0 without any."""
     chosen: int
-    """Pixels looked at."""
+    """Number of sampled pixels."""
     valid: int
-    """Those that came back to within a pixel."""
+    """Pixels that reproject to within a pixel."""
     kept: int
-    """Those whose patches count."""
+    """Pixels whose patches are compared."""
     dropped: int
-    """Pixels and Gaussians left out because their numbers were not finite."""
+    """Pixels and Gaussians skipped because of non-finite values."""
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ class MultiViewLoss:
     gradients: ImageGradients
     """On ``depth`` and ``geometric_normal`` of the rendered view; none on the others."""
     other: VisibleGradients | None
-    """On the Gaussians, by way of the other view's depth; ``None`` where that has no part."""
-    figures: MultiViewFigures
+    """On the Gaussians, through the other view's depth; ``None`` without such a contribution."""
+    figures: MultiViewMetrics
 
 
 def multi_view_losses(
@@ -134,32 +134,32 @@ def multi_view_losses(
     threads: int = 0,
     store: ArrayStore | None = None,
 ) -> MultiViewLoss:
-    """Compare a rendered view with another photo and with the depth seen from there.
+    """Compare a rendered view with the photo and the depth of another view.
 
     ``weight (lambda_photometric mean(w (1 - ncc)) + lambda_geometric mean(w noise))`` with
-    ``w = exp(-noise)`` held constant (docs/method.md, section 3.4). A pixel is valid where both
-    depths exist, both masks keep it and the noise is below one pixel; its patch is kept where the
-    plane is not seen edge-on, all samples are inside both images and masks, neither patch is flat,
-    and ``1 - ncc < 0.9``.
+    ``w = exp(-noise)`` treated as constant (docs/method.md, section 3.4). A pixel is valid where
+    both depths exist, both masks include it and the noise is below one pixel; its patch is kept
+    where the plane is not seen edge-on, all samples are inside both images and masks, neither patch
+    is flat, and ``1 - ncc < 0.9``.
 
     Parameters
     ----------
     image : ViewPass
-        Rendered with depth; anything with its images does.
+        Rendered with depth; any object with the same images will do.
     gaussians : RawArrays
-        What was rendered, scene frame.
+        Rendered Gaussians, scene frame.
     camera, other_camera : Camera
         Scene frame; sizes may differ.
     photo, other_photo : (h, w, 3) uint8, or floats in [0, 1]
     mask, other_mask : (h, w) bool or ``None``
-        False pixels count nowhere.
+        False pixels are ignored.
     settings : MultiViewOptions
     random : numpy Generator
         ``settings.pixels`` numbers are drawn.
     threads : int
         The result does not depend on it.
     store : ArrayStore, optional
-        Memory for the gradients on images, which are then valid until the next call with it.
+        Memory for the gradients on images, which are then valid until the next call.
 
     Returns
     -------
@@ -168,7 +168,7 @@ def multi_view_losses(
     Raises
     ------
     UsageError
-        If a photo's or mask's size is not its camera's.
+        If the size of a photo or mask differs from its camera's.
     """
     threads = threads or default_threads()
     store = ArrayStore() if store is None else store
@@ -179,20 +179,20 @@ def multi_view_losses(
     pixels = choose_pixels(
         grey, image.depth, mask, settings.pixels, random, threads=threads, store=store
     )
-    pair = _Pair(image, camera, other_camera, pixels, options.near_z, threads)
+    pair = _ViewPair(image, camera, other_camera, pixels, options.near_z, threads)
     kept_there = NO_MASK if other_mask is None else np.ascontiguousarray(other_mask, np.bool_)
-    places, moves = pair.lift(kept_there)
+    positions, position_slopes = pair.lift(kept_there)
     by_depth = store.zeros("multi-view by depth", image.depth.shape, np.float32)
     by_normal = store.zeros("multi-view by normal", image.geometric_normal.shape, np.float32)
     on_images = ImageGradients(depth=by_depth, geometric_normal=by_normal)
     given = np.isfinite(image.depth.reshape(-1)[pixels])  # (m,)
     given &= np.isfinite(image.geometric_normal.reshape(-1, 3)[pixels]).all(1)
-    if not np.isfinite(places[:, 0]).any():
-        nothing = MultiViewFigures(0.0, 0.0, len(pixels), 0, 0, int((~given).sum()))
+    if not np.isfinite(positions[:, 0]).any():
+        nothing = MultiViewMetrics(0.0, 0.0, len(pixels), 0, 0, int((~given).sum()))
         return MultiViewLoss(0.0, on_images, None, nothing)
     view = query_view(gaussians, other_camera, options)
-    answer = solve_depths(view, places)
-    noise, by_found, by_places = pair.back(places, answer.values)
+    depths = solve_depths(view, positions)
+    noise, by_found, by_positions = pair.reproject(positions, depths.values)
     valid = noise < np.inf  # (m,)
     weights = np.where(valid, np.exp(-noise), 0.0)
     lambda_photometric = settings.weight * settings.lambda_photometric
@@ -216,14 +216,14 @@ def multi_view_losses(
     share = lambda_geometric * weights / max(1, int(valid.sum()))
     other, broken = None, 0
     if lambda_geometric != 0.0 and valid.any():
-        other, on_places, broken = _other_gradients(gaussians, view, answer, share * by_found)
-        on_places = share[:, None] * by_places + on_places
-        pixel_depth = pixel_depth + (on_places * moves).sum(1)
+        other, on_positions, broken = _other_gradients(gaussians, view, depths, share * by_found)
+        on_positions = share[:, None] * by_positions + on_positions
+        pixel_depth = pixel_depth + (on_positions * position_slopes).sum(1)
     sound = given & np.isfinite(pixel_depth) & np.isfinite(pixel_normal).all(1)
     rows = pixels[sound]
     by_depth.reshape(-1)[rows] = pixel_depth[sound]
     by_normal.reshape(-1, 3)[rows] = pixel_normal[sound]
-    figures = MultiViewFigures(
+    figures = MultiViewMetrics(
         photometric,
         geometric,
         len(pixels),
@@ -235,8 +235,8 @@ def multi_view_losses(
     return MultiViewLoss(value, on_images, other, figures)
 
 
-class _Pair:
-    """Two views and the pixels of the first, as the kernels take them."""
+class _ViewPair:
+    """Two views and the sampled pixels of the first, packed for the kernels."""
 
     def __init__(
         self,
@@ -256,35 +256,35 @@ class _Pair:
         self.bounds = even_bounds(len(pixels), threads)
 
     def lift(self, other_mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return places in the other view (m, 2) float32, and how they move with the depth."""
+        """Return positions in the other view (m, 2) float32, and their derivatives by depth."""
         count = len(self.pixels)
-        places, moves = np.empty((count, 2), np.float32), np.empty((count, 2))
+        positions, position_slopes = np.empty((count, 2), np.float32), np.empty((count, 2))
 
         def run(begin: int, end: int) -> None:
             lift_range(
                 begin, end, self.pixels, self.image.depth, self.camera, self.other, self.pose,
-                self.near_z, other_mask, places, moves,
+                self.near_z, other_mask, positions, position_slopes,
             )  # fmt: skip
 
         run_chunks(run, self.bounds, self.threads)
-        return places, moves
+        return positions, position_slopes
 
-    def back(
-        self, places: np.ndarray, found: np.ndarray
+    def reproject(
+        self, positions: np.ndarray, found: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return noise (m,), its derivatives by depth (m,) and place (m, 2) in the other view."""
+        """Return noise (m,), its derivatives by the other view's depth (m,) and position (m, 2)."""
         count = len(self.pixels)
-        noise, by_found, by_places = np.empty(count), np.empty(count), np.empty((count, 2))
+        noise, by_found, by_positions = np.empty(count), np.empty(count), np.empty((count, 2))
         width = self.image.depth.shape[1]
 
         def run(begin: int, end: int) -> None:
             return_range(
-                begin, end, self.pixels, width, places, found, self.camera, self.other, self.pose,
-                self.near_z, noise, by_found, by_places,
+                begin, end, self.pixels, width, positions, found, self.camera, self.other,
+                self.pose, self.near_z, noise, by_found, by_positions,
             )  # fmt: skip
 
         run_chunks(run, self.bounds, self.threads)
-        return noise, by_found, by_places
+        return noise, by_found, by_positions
 
     def compare(
         self,
@@ -314,12 +314,12 @@ class _Pair:
 
 
 def _other_gradients(
-    gaussians: RawArrays, view: QueryView, answer: QueryResult, by_found: np.ndarray
+    gaussians: RawArrays, view: QueryView, depths: QueryResult, by_found: np.ndarray
 ) -> tuple[VisibleGradients, np.ndarray, int]:
-    """Return gradients on the Gaussians (m', ...) and places (m, 2), and Gaussians dropped."""
+    """Return gradients on the Gaussians (m', ...) and positions (m, 2), and Gaussians dropped."""
     grad_params = np.zeros_like(view.screen.params)
-    by_places, _ = add_query_gradients(view, answer, by_found, grad_params)
-    # Everything is finite where the sum of the absolute values is.
+    by_positions, _ = add_query_gradients(view, depths, by_found, grad_params)
+    # All values are finite if the sum of their absolute values is.
     with np.errstate(all="ignore"):
         sizes = np.abs(grad_params[:, :_GEOMETRY_COLUMNS]).sum(1)  # (n,)
     wild = ~np.isfinite(sizes)
@@ -328,7 +328,7 @@ def _other_gradients(
     found = project_backward_visible(
         gaussians, view.camera, view.options, view.screen, grad_params, ids
     )
-    return found, by_places.astype(np.float64), int(wild.sum())
+    return found, by_positions.astype(np.float64), int(wild.sum())
 
 
 def _mean(values: np.ndarray, where: np.ndarray) -> float:

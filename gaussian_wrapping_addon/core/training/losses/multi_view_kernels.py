@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled loops of the multi-view terms: there and back between two views, patches compared.
+"""Compiled kernels of the multi-view terms: reprojection between two views, patch comparison.
 
-Everything is float64 but the images, the depths and the places that are looked up. Derivatives are
-written out by hand. With ``r_p`` the ray of the reference pixel, ``r_o`` that of a sample of its
-patch, depth z and any multiple n of the plane's normal, the homography of docs/method.md,
-section 3.4, takes ``r_o`` to ``R r_o + s t`` with ``s = (n . r_o) / (z n . r_p)``; only s depends
-on z and n.
+All values are float64, except images, depths and positions. Derivatives are written by hand. With
+``r_p`` the ray of the reference pixel, ``r_o`` that of a sample of its patch, depth z and any
+multiple n of the plane's normal, the homography of docs/method.md, section 3.4, takes ``r_o`` to
+``R r_o + s t`` with ``s = (n . r_o) / (z n . r_p)``; only s depends on z and n.
 """
 
 from __future__ import annotations
@@ -25,32 +24,32 @@ HALF_PATCH = 3
 PATCH_STEP_PX = 0.5
 """... half a pixel of the reference apart, where that is not flat."""
 PATCH_SIZES = 3
-"""Where it is flat, patches of twice and four times the size are tried: plain walls and glaze show
-their shading and stains only from farther apart."""
+"""Flat patches are retried at twice and four times the size: plain walls and glaze show shading and
+stains at a larger scale only."""
 SAMPLES = (2 * HALF_PATCH + 1) ** 2
 
 MAX_NOISE_PX = 1.0
-"""Points that come back farther from their pixel than this are hidden or wrong in one view."""
+"""Points with a larger reprojection error are occluded or wrong in one view."""
 MIN_NOISE_PX = 1e-9
-"""Below, the direction in which a point missed its pixel is rounding: no gradient."""
+"""Below this, the direction of the reprojection error is rounding: no gradient."""
 
 MIN_SPREAD = SAMPLES * 0.012**2
 """Smallest sum of squared deviations in a patch, of grey in [0, 1]: contrast of three grey levels.
 The usual 5e-6 (docs/method.md, section 3.4) is far below the noise of photos: such patches agree by
-chance, pull the surface about at random, and a surface that is pulled about recedes."""
+chance, displace the surface at random, and a surface displaced at random recedes."""
 SPREAD_PRODUCT = 1e-8
 """Added to the product of two such sums: patches of weak contrast correlate less."""
 MAX_ERROR = 0.9
-"""Patches that agree less than this show different things."""
+"""Patches with a larger error show different things."""
 MIN_NORMAL = 0.3
-"""Shortest mean normal that stands for a plane (docs/method.md, section 3.4)."""
+"""Shortest blended normal that defines a plane (docs/method.md, section 3.4)."""
 MIN_FACING = 0.1
-"""Least cosine between normal and ray (84 degrees): a plane seen more edge-on has no patch."""
+"""Smallest cosine between normal and ray (84 degrees): more grazing planes have no patch."""
 MAX_RISE = 4.0
-"""Where the surface leaves the plane by more than so many half sides of the patch within it, there
-is no plane, as for a spoke before a wall: thin parts would be pulled towards what lies behind. With
-1, thin parts gain a little more, but rooms lose most of what the terms give them: early surfaces
-are rough."""
+"""Largest deviation of the surface from the plane within a patch, in half sides of the patch:
+beyond it there is no plane, as for a spoke before a wall, and thin parts would be pulled towards
+what lies behind. With 1, thin parts gain slightly more, but rooms lose most of the terms' benefit,
+as early surfaces are rough."""
 
 # States of a compared pixel.
 SKIPPED, KEPT, BROKEN = 0, 1, 2
@@ -63,7 +62,7 @@ def _on_image(x: Any, y: Any, camera: Any) -> Any:
 
 @inline
 def _masked(mask: Any, x: Any, y: Any) -> Any:
-    """Whether the pixel that holds a place on the image is left out."""
+    """Whether the pixel at an image position is masked."""
     return (
         mask.shape[0] > 0
         and not mask[min(int(y), mask.shape[0] - 1), min(int(x), mask.shape[1] - 1)]
@@ -81,10 +80,10 @@ def lift_range(
     pose: np.ndarray,
     near_z: float,
     other_mask: np.ndarray,
-    places: np.ndarray,
-    moves: np.ndarray,
+    positions: np.ndarray,
+    position_slopes: np.ndarray,
 ) -> None:
-    """Where pixels land in the other view, and how that moves with their depth.
+    """Project pixels into the other view, with derivatives by their depth.
 
     Parameters
     ----------
@@ -94,9 +93,9 @@ def lift_range(
     camera, other : (6,) float64
     pose : (3, 4) float64
         Other camera from reference camera.
-    places : (m, 2) float32
-        Written: pixels of the other view; NaN behind ``near_z``, off the image, in its mask.
-    moves : (m, 2) float64
+    positions : (m, 2) float32
+        Written: pixels of the other view; NaN behind ``near_z``, outside the image or masked.
+    position_slopes : (m, 2) float64
         Written: derivative with respect to the depth.
     """
     width = depth.shape[1]
@@ -109,17 +108,17 @@ def lift_range(
         a1 = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]
         a2 = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
         h2 = a2 * z + pose[2, 3]
-        places[k, 0] = places[k, 1] = np.float32(math.nan)
-        moves[k, 0] = moves[k, 1] = 0.0
+        positions[k, 0] = positions[k, 1] = np.float32(math.nan)
+        position_slopes[k, 0] = position_slopes[k, 1] = 0.0
         if not h2 > near_z:
             continue
         u, v = (a0 * z + pose[0, 3]) / h2, (a1 * z + pose[1, 3]) / h2
         at_x, at_y = other[0] * u + other[2], other[1] * v + other[3]
         if not _on_image(at_x, at_y, other) or _masked(other_mask, at_x, at_y):
             continue
-        places[k, 0], places[k, 1] = np.float32(at_x), np.float32(at_y)
-        moves[k, 0] = other[0] * (a0 - u * a2) / h2
-        moves[k, 1] = other[1] * (a1 - v * a2) / h2
+        positions[k, 0], positions[k, 1] = np.float32(at_x), np.float32(at_y)
+        position_slopes[k, 0] = other[0] * (a0 - u * a2) / h2
+        position_slopes[k, 1] = other[1] * (a1 - v * a2) / h2
 
 
 @kernel(fast=False, fused=True)
@@ -128,7 +127,7 @@ def return_range(
     end: int,
     pixels: np.ndarray,
     width: int,
-    places: np.ndarray,
+    positions: np.ndarray,
     found: np.ndarray,
     camera: np.ndarray,
     other: np.ndarray,
@@ -136,29 +135,29 @@ def return_range(
     near_z: float,
     noise: np.ndarray,
     by_found: np.ndarray,
-    by_places: np.ndarray,
+    by_positions: np.ndarray,
 ) -> None:
-    """How far from their pixel points come back, with derivatives.
+    """Compute the reprojection error of pixels (the noise), with derivatives.
 
     Parameters
     ----------
-    places : (m, 2) float32
-        In the other view.
+    positions : (m, 2) float32
+        Positions in the other view.
     found : (m,) float32
-        Depth of the other view there; 0 where there is none.
+        Depth of the other view there; 0 where undefined.
     noise : (m,) float64
-        Written: pixels; inf where there is no way back or it is not below :data:`MAX_NOISE_PX`.
-    by_found : (m,), by_places : (m, 2) float64
+        Written: pixels; inf where undefined or not below :data:`MAX_NOISE_PX`.
+    by_found : (m,), by_positions : (m, 2) float64
         Written: derivative of the noise; 0 where it is inf or nearly 0.
     """
     for k in range(begin, end):
         noise[k] = math.inf
-        by_found[k] = by_places[k, 0] = by_places[k, 1] = 0.0
+        by_found[k] = by_positions[k, 0] = by_positions[k, 1] = 0.0
         z = float(found[k])
         if not z > near_z:
             continue
-        x = (float(places[k, 0]) - other[2]) / other[0]
-        y = (float(places[k, 1]) - other[3]) / other[1]
+        x = (float(positions[k, 0]) - other[2]) / other[0]
+        y = (float(positions[k, 1]) - other[3]) / other[1]
         c0, c1, c2 = x * z - pose[0, 3], y * z - pose[1, 3], z - pose[2, 3]
         b0 = pose[0, 0] * c0 + pose[1, 0] * c1 + pose[2, 0] * c2
         b1 = pose[0, 1] * c0 + pose[1, 1] * c1 + pose[2, 1] * c2
@@ -182,12 +181,12 @@ def return_range(
         e1 = pose[1, 0] * g0 + pose[1, 1] * g1 + pose[1, 2] * g2
         e2 = pose[2, 0] * g0 + pose[2, 1] * g1 + pose[2, 2] * g2
         by_found[k] = e0 * x + e1 * y + e2
-        by_places[k, 0], by_places[k, 1] = e0 * z / other[0], e1 * z / other[1]
+        by_positions[k, 0], by_positions[k, 1] = e0 * z / other[0], e1 * z / other[1]
 
 
 @inline
 def _corner(grey: Any, x: Any, y: Any) -> Any:
-    """Upper left pixel of the four around a place, and the shares of the right and lower ones."""
+    """Upper left of the four pixels around a position, and the right and lower weights."""
     at_x, at_y = x - 0.5, y - 0.5
     column = min(max(int(at_x), 0), grey.shape[1] - 2)
     row = min(max(int(at_y), 0), grey.shape[0] - 2)
@@ -196,13 +195,13 @@ def _corner(grey: Any, x: Any, y: Any) -> Any:
 
 @inline
 def _between(grey: Any, x: Any, y: Any) -> Any:
-    """Whether a place lies between pixel centres: NaN does not."""
+    """Whether a position lies between pixel centres; false for NaN."""
     return x >= 0.5 and y >= 0.5 and x <= grey.shape[1] - 0.5 and y <= grey.shape[0] - 0.5
 
 
 @inline
 def _all_count(mask: Any, row: Any, column: Any) -> Any:
-    """Whether the mask keeps a pixel and those to its right and below."""
+    """Whether a pixel and those to its right and below are unmasked."""
     return mask.shape[0] == 0 or (
         mask[row, column]
         and mask[row, column + 1]
@@ -217,27 +216,27 @@ def compare_range(  # type: ignore[no-untyped-def]
     grey, other_grey, mask, other_mask, squared, sizes, max_rise, states, errors, by_depth,
     by_normals,
 ):  # fmt: skip
-    """Compare the patches around pixels with what their planes show of the other photo.
+    """Compare patches around pixels with the other photo, warped by their planes.
 
     Parameters
     ----------
     pixels : (m,) int32, noise : (m,) float64
         Pixels whose noise is inf are skipped.
     depth, alpha : (h, w) float32, normals : (h, w, 3) float32
-        Of the reference view; blended normals, scene frame.
+        Images of the reference view; blended normals, scene frame.
     rotation : (3, 3) float64
         Reference camera from scene.
     grey, other_grey : (h, w) float32, mask, other_mask : bool or (0, 0) for none
     squared : bool
         Correlation -1 is as good as 1.
     sizes : int
-        Sizes of patch that are tried, each twice as large as the one before, until one is not flat.
+        Number of patch sizes, each twice the one before, tried until a patch is not flat.
     max_rise : float
         See :data:`MAX_RISE`.
     states : (m,) uint8
-        Written: :data:`KEPT` where the patch counts, :data:`BROKEN` where numbers were not finite.
+        Written: :data:`KEPT` for compared patches, :data:`BROKEN` for non-finite values.
     errors : (m,) float64
-        Written: ``1 - correlation``; 0 where not kept, as are the derivatives.
+        Written: ``1 - correlation``; 0 if not kept, as are the derivatives.
     by_depth : (m,), by_normals : (m, 3) float64
         Written: derivatives with respect to the depth and the normal (scene frame, any length).
     """
@@ -315,7 +314,7 @@ def compare_range(  # type: ignore[no-untyped-def]
                     high, below = g00 + right * (g01 - g00), g10 + right * (g11 - g10)
                     theirs[sample] = high + low * (below - high)
                     across = (g01 - g00) + low * ((g11 - g10) - (g01 - g00))
-                    # How the sample changes with the ratio.
+                    # Derivative of the sample by the ratio.
                     slopes[sample] = (
                         across * other[0] * (pose[0, 3] - u * pose[2, 3])
                         + (below - high) * other[1] * (pose[1, 3] - v * pose[2, 3])

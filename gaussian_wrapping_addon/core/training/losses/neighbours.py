@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which cameras are compared with which by the multi-view terms (docs/method.md, section 3.4)."""
+"""Select neighbouring cameras for the multi-view terms (docs/method.md, section 3.4)."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from ... import tolerances
 from ...dataset.camera import Camera
 
 _MOST_POINTS = 2000
-"""Points that the overlap of two images is estimated from, spread over those given."""
+"""Most points for estimating the overlap of two images, subsampled from those given."""
 _FEW_POINTS = 10
-"""A camera that sees fewer of them says nothing about overlap: the other rules decide alone."""
+"""The overlap criterion is skipped for cameras that see fewer of them."""
 
 
 @dataclass(frozen=True)
 class NeighbourLimits:
-    """What makes a camera a candidate; lengths in scene units.
+    """Criteria for candidate cameras; lengths in scene units.
 
-    40 photos around an object are 16 to 28 degrees and 0.25 to 0.4 radii of the scene apart: with
-    the method's 0.3 radii (:data:`FIXED_LIMITS`) 23 of 40 have no neighbour, with these none; on a
-    capture of 50 to 80 photos every camera finds eight, the nearest of which are the method's. In a
-    room, where axes differ by 28 to 101 degrees, 32 of 40 have none, with these none. Angles beyond
-    30 degrees would add pairs that see a patch too differently, and no camera needs them.
+    40 photos around an object are 16 to 28 degrees and 0.25 to 0.4 scene radii apart: with the
+    method's 0.3 radii (:data:`FIXED_LIMITS`) 23 of 40 have no neighbour, with these all have; on a
+    capture of 50 to 80 photos every camera has eight, the nearest of which are the method's. In a
+    room, where axes differ by 28 to 101 degrees, 32 of 40 have none, with these all have. Angles
+    beyond 30 degrees would add pairs with too different views of a patch, and no camera needs them.
     """
 
     max_angle_deg: float = 30.0
     """Between the optical axes."""
     min_distance: float = 0.002 * tolerances.SCENE_RADIUS
-    """Between the centres: without a baseline, depth says nothing."""
+    """Between the centres: without a baseline, depth is not constrained."""
     max_distance: float = 1.0 * tolerances.SCENE_RADIUS
     min_overlap: float = 0.3
-    """Share of the sparse points in a camera's image that the other's image must hold too."""
+    """Share of the sparse points in a camera's image that must also lie in the other's image."""
     most: int = 8
-    """Neighbours kept of each camera, the nearest."""
+    """Most neighbours of each camera; the nearest are kept."""
 
 
 FIXED_LIMITS = NeighbourLimits(max_distance=0.3 * tolerances.SCENE_RADIUS, min_overlap=0.0)
@@ -49,11 +49,11 @@ def find_neighbours(
     *,
     points: np.ndarray | None = None,
 ) -> list[np.ndarray]:
-    """Return the cameras that each camera is compared with (docs/method.md, section 3.4).
+    """Return the neighbours of each camera (docs/method.md, section 3.4).
 
-    Candidates look in about the same direction from about the same place, and see part of the same
-    sparse points. The nearest come first, ties by angle, then by index. One camera's choice does
-    not depend on the others' choices.
+    Candidates have a similar direction and position, and share part of the visible sparse points.
+    Sorted by distance, then by angle, then by index. The neighbours of one camera do not depend on
+    those of others.
 
     Parameters
     ----------
@@ -61,12 +61,12 @@ def find_neighbours(
         Scene frame.
     limits : NeighbourLimits, optional
     points : (n, 3) array, optional
-        Sparse points, scene frame; without them overlap is not asked for.
+        Sparse points, scene frame; without them the overlap criterion is skipped.
 
     Returns
     -------
     list of (k,) int64
-        Indices into ``cameras``, for each of them; empty where there is no candidate.
+        Indices into ``cameras``, for each camera; empty without candidates.
     """
     limits = limits or NeighbourLimits()
     if len(cameras) == 0:
@@ -93,7 +93,7 @@ def find_neighbours(
 
 
 def _seen_points(cameras: Sequence[Camera], points: np.ndarray | None) -> np.ndarray:
-    """Return (c, n) bool: the image of a camera holds a point, whatever may stand before it."""
+    """Return (c, n) bool: a point projects into the image of a camera, ignoring occlusion."""
     if points is None or len(points) == 0:
         return np.zeros((len(cameras), 0), np.bool_)
     step = -(-len(points) // _MOST_POINTS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Choice of the pixels that the multi-view terms look at: spread out, more where texture is."""
+"""Sample the pixels for the multi-view terms: stratified, with more of them on texture."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ...kernels.compiled import kernel
 from ...kernels.parallel import even_bounds, run_chunks
 
 BORDER_PX = 2
-"""Pixels nearer to the border than this have patches that leave the image."""
+"""Pixels closer to the border than this have patches that leave the image."""
 BLOCK_PX = 8
-"""Pixels are walked in blocks of this side, so that a stratum is a patch rather than a line."""
+"""Pixels are traversed in blocks of this side, so that a stratum is a patch and not a line."""
 NO_MASK = np.zeros((0, 0), np.bool_)
 # Luma of Rec. 601, the common grey of colour photos.
 RED, GREEN, BLUE = 0.299, 0.587, 0.114
@@ -26,7 +26,7 @@ def grey_image(
 ) -> np.ndarray:
     """Return (h, w) float32 grey in [0, 1] of an (h, w, 3) photo: uint8, or floats in [0, 1].
 
-    ``name`` is where ``store`` keeps it.
+    ``name`` is its key in ``store``.
     """
     shape = photo.shape[:2]
     grey = np.empty(shape, np.float32) if store is None else store.take(name, shape, np.float32)
@@ -49,19 +49,19 @@ def choose_pixels(
     threads: int,
     store: ArrayStore | None = None,
 ) -> np.ndarray:
-    """Choose up to ``count`` different pixels with depth, inside the mask.
+    """Sample up to ``count`` distinct pixels with depth, inside the mask.
 
-    Stratified along blocks of pixels. The chance of a pixel is its brightness gradient plus the
-    mean one: half of the pixels follow texture, half are spread evenly.
+    Stratified along blocks of pixels. The probability of a pixel is proportional to its brightness
+    gradient plus the mean one: half of the pixels follow texture, half are uniform.
 
     Parameters
     ----------
     grey, depth : (h, w) float32
-        Depth is > 0 where there is one.
+        Depth is > 0 where defined.
     mask : (h, w) bool, optional
         False pixels are never chosen.
     random : numpy Generator
-        ``count`` numbers are drawn, whatever the images hold.
+        ``count`` numbers are drawn, whatever the images contain.
 
     Returns
     -------
@@ -114,8 +114,8 @@ def _steepness_rows(
     steepness: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Write the length of the brightness gradient, -1 where a pixel cannot be chosen, and for each
-    row their sum and number."""
+    """Write the length of the brightness gradient, -1 for pixels that cannot be chosen, and for
+    each row their sum and number."""
     height, width = grey.shape
     for i in range(begin, end):
         total, usable = 0.0, 0
@@ -141,10 +141,10 @@ def _steepness_rows(
 def _pick(
     steepness: np.ndarray, even: float, total: float, jitter: np.ndarray, chosen: np.ndarray
 ) -> Any:
-    """Write the pixel that each stratum's number falls on, none twice; return how many."""
+    """Write the pixel selected by each stratum's draw, without duplicates; return their number."""
     height, width = steepness.shape
     stratum = total / len(jitter)
-    found, asked, running = 0, 0, 0.0
+    found, drawn, running = 0, 0, 0.0
     for top in range(0, height, BLOCK_PX):
         for left in range(0, width, BLOCK_PX):
             for i in range(top, min(top + BLOCK_PX, height)):
@@ -153,8 +153,8 @@ def _pick(
                         continue
                     running += steepness[i, j] + even
                     hit = False
-                    while asked < len(jitter) and (asked + jitter[asked]) * stratum < running:
-                        asked += 1
+                    while drawn < len(jitter) and (drawn + jitter[drawn]) * stratum < running:
+                        drawn += 1
                         hit = True
                     if hit:
                         chosen[found] = i * width + j

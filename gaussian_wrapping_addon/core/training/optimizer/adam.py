@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Adam over the Gaussians' tensors, in place, stepping only Gaussians that the view saw."""
+"""Sparse Adam over the Gaussians' tensors, in place: only Gaussians seen by a view are stepped."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ See docs/method.md, section 1.5.
 """
 
 _TABLE_STEPS = 20_000
-"""Both bias corrections are 1 within float32 from here on."""
+"""Steps from which both bias corrections are 1 in float32."""
 
 _STAYS = np.float32(-1.0)
 
@@ -37,10 +37,10 @@ def _corrections() -> np.ndarray:
 
 
 class Adam:
-    """Trained tensors with their moments; rows are Gaussians and can be rebuilt.
+    """Adam optimiser of the trained tensors; rows are Gaussians and can be rebuilt.
 
-    Each Gaussian counts its own steps, so that one created late, or rarely seen, starts with the
-    right bias correction instead of jumping.
+    Each Gaussian counts its own steps, so that one created late, or rarely seen, has the right bias
+    correction instead of an overshooting first step.
 
     Parameters
     ----------
@@ -60,15 +60,15 @@ class Adam:
         return len(self.steps)
 
     def gaussians(self) -> OrientedGaussians:
-        """Return the current Gaussians; the tensors are the trained ones themselves."""
+        """Return the current Gaussians; the tensors share memory with the trained ones."""
         return OrientedGaussians(**self.values)
 
     def array(self, name: str) -> np.ndarray:
-        """Return the memory of one tensor; writing changes the Gaussians."""
+        """Return a view of one tensor; writing changes the Gaussians."""
         return self.values[name].numpy()
 
     def moments(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the memory of the first and second moment of one tensor, of its shape."""
+        """Return views of the first and second moment of one tensor, in its shape."""
         shape = tuple(self.values[name].shape)
         begin = COLUMNS.get(name, SH_COLUMN)
         both = self._moments[:, :, begin : begin + math.prod(shape[1:])]
@@ -82,21 +82,21 @@ class Adam:
         sh_degree: int | None = None,
         threads: int = 0,
     ) -> None:
-        """Update the Gaussians that a view has seen, in place.
+        """Step the Gaussians that a view has seen, in place.
 
-        A Gaussian counts as seen when any of its gradients is not 0. Those that are listed but
-        hidden behind others keep their values, moments and steps, like those that are not listed.
+        A Gaussian counts as seen if any of its gradients is not 0. Listed Gaussians that are hidden
+        behind others keep their values, moments and steps, like those not listed.
 
         Parameters
         ----------
         gradients : VisibleGradients
             No Gaussian is listed twice.
         rates : mapping of name to (c,) float32
-            Learning rate of each column of the flattened tensor, >= 0; a tensor that is absent
-            stays.
+            Learning rate of each column of the flattened tensor, >= 0; absent tensors are not
+            changed.
         sh_degree : int, optional
-            Highest degree of the harmonics that has ever had a gradient: spares the columns
-            beyond, whose moments are 0, the step of 0.
+            Highest degree of the harmonics that has ever had a gradient: the columns beyond, with
+            moments of 0, are skipped.
         """
         threads = threads or default_threads()
         coefficients = self.values["sh"].shape[1]
@@ -123,16 +123,16 @@ class Adam:
     def rebuild(
         self, parents: np.ndarray, fresh: np.ndarray, changes: Mapping[str, np.ndarray]
     ) -> None:
-        """Replace all Gaussians by rows picked from the current ones.
+        """Replace all Gaussians by rows selected from the current ones.
 
         Parameters
         ----------
         parents : (m,) int64
-            Row of the current Gaussians that each new one starts from.
+            Row of the current Gaussians from which each new one is copied.
         fresh : (m,) bool
             New Gaussians whose moments and steps start at zero; the others keep their parent's.
         changes : mapping of name to array
-            Tensors to replace after picking, (m, ...).
+            Tensors to replace after the selection, (m, ...).
         """
         rows = torch.from_numpy(np.ascontiguousarray(parents, np.int64))
         for name in list(self.values):
@@ -147,10 +147,10 @@ class Adam:
         self.steps[fresh] = 0
 
     def reset_moments(self, name: str) -> None:
-        """Forget the moments of one tensor (after its values were set by hand)."""
+        """Zero the moments of one tensor (after its values were set directly)."""
         for moment in self.moments(name):
             moment[...] = 0.0
 
     def is_finite(self) -> bool:
-        """Tell whether every parameter is a finite number."""
+        """Tell whether every parameter is finite."""
         return all(math.isfinite(float(tensor.sum())) for tensor in self.values.values())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled Adam steps of single Gaussians, all of their tensors at once, on explicit vectors."""
+"""Compiled Adam steps, all tensors of a Gaussian at once, with explicit SIMD vectors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BETA1, BETA2 = 0.9, 0.999
 EPSILON = 1e-15
 
 LANES = 16
-"""Columns stepped at once. LLVM splits them into as many registers as the processor needs."""
+"""Columns per step. LLVM splits them into as many registers as the processor needs."""
 
 COLUMNS = {"quats": 0, "orientation": 4, "means": 8, "opacity_logits": 11, "log_scales": 12}
 """First column of each small tensor in moments and rates; column 15 stays empty."""
@@ -25,28 +25,28 @@ SH_COLUMN = LANES
 """First column of the harmonics."""
 
 AHEAD = 8
-"""Gaussians between asking for memory and using it: those that a view sees lie in no order that
-the processor could guess."""
+"""Prefetch distance in Gaussians: the order of those that a view sees is not predictable for the
+processor."""
 
 _WORD = ir.IntType(32)
 
 
 class _Emitter:
-    """Emits Adam on runs of 16 columns; every operation is rounded to float32, as numpy does."""
+    """Emit Adam on runs of 16 columns; every operation is rounded to float32, as in numpy."""
 
     def __init__(self, context: Any, builder: Any, sig: Any, args: Any) -> None:
         self.context, self.builder, self.sig, self.args = context, builder, sig, args
         self.vector = ir.VectorType(ir.FloatType(), LANES)
 
     def pointer(self, argument: int, at: Any, lanes: int) -> Any:
-        """Return the address of ``lanes`` values of an array, from place ``at`` on."""
+        """Return the address of ``lanes`` values of an array, from index ``at`` on."""
         make = self.context.make_array(self.sig.args[argument])
         data = make(self.context, self.builder, self.args[argument]).data
         kind = ir.VectorType(ir.FloatType(), lanes)
         return self.builder.bitcast(self.builder.gep(data, [at]), kind.as_pointer())
 
     def state(self, moments: int, rates: int, rate_at: Any) -> tuple[Any, Any, Any]:
-        """Return the addresses of both moments, whose places follow their array, and rates."""
+        """Return the addresses of both moments, whose indices follow their array, and of rates."""
         return (
             self.pointer(moments, self.args[moments + 1], LANES),
             self.pointer(moments, self.args[moments + 2], LANES),
@@ -71,13 +71,13 @@ class _Emitter:
         chosen = ir.Constant(ir.VectorType(_WORD, len(lanes)), lanes)
         return self.builder.shuffle_vector(a, b, chosen)
 
-    def advance(self, x: Any, g: Any, places: tuple[Any, Any, Any], up: Any, down: Any) -> Any:
-        """Update the moments and return the new values; columns of negative rate stay.
+    def advance(self, x: Any, g: Any, addresses: tuple[Any, Any, Any], up: Any, down: Any) -> Any:
+        """Update the moments and return the new values; columns of negative rate are unchanged.
 
-        ``places``: addresses of first moment, second moment and rate.
+        ``addresses``: addresses of first moment, second moment and rate.
         """
         b = self.builder
-        m, v, rate = (b.load(place, align=4) for place in places)
+        m, v, rate = (b.load(address, align=4) for address in addresses)
         one = np.float32(1.0)
         keep1, take1 = self.constant(BETA1), self.constant(float(one - np.float32(BETA1)))
         keep2, take2 = self.constant(BETA2), self.constant(float(one - np.float32(BETA2)))
@@ -87,8 +87,8 @@ class _Emitter:
         size = b.fadd(b.fmul(b.call(root, [new_v]), self.splat(down)), self.constant(EPSILON))
         step = b.fdiv(b.fmul(b.fmul(rate, self.splat(up)), new_m), size)
         moves = b.fcmp_ordered(">=", rate, ir.Constant(self.vector, None))
-        b.store(b.select(moves, new_m, m), places[0], align=4)
-        b.store(b.select(moves, new_v, v), places[1], align=4)
+        b.store(b.select(moves, new_m, m), addresses[0], align=4)
+        b.store(b.select(moves, new_v, v), addresses[1], align=4)
         return b.select(moves, b.fsub(x, step), x)
 
 
@@ -107,7 +107,7 @@ def _step_small(  # type: ignore[no-untyped-def]
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         emit = _Emitter(context, builder, sig, args)
 
-        def places(first: int, row: Any) -> list[Any]:
+        def addresses(first: int, row: Any) -> list[Any]:
             found = []
             for k, values in enumerate(_SMALL_VALUES):
                 at = builder.mul(row, ir.Constant(row.type, values))
@@ -122,9 +122,9 @@ def _step_small(  # type: ignore[no-untyped-def]
             rest = emit.shuffled(mean_opacity, scales, list(range(8)))
             return emit.shuffled(turns, rest, list(range(LANES)))
 
-        targets, first_rate = places(0, args[5]), ir.Constant(args[5].type, 0)
+        targets, first_rate = addresses(0, args[5]), ir.Constant(args[5].type, 0)
         moved = emit.advance(
-            joined(targets), joined(places(6, args[11])), emit.state(12, 15, first_rate),
+            joined(targets), joined(addresses(6, args[11])), emit.state(12, 15, first_rate),
             args[16], args[17],
         )  # fmt: skip
         at = 0
@@ -181,7 +181,7 @@ def _step_run(  # type: ignore[no-untyped-def]
 
 @intrinsic
 def _prefetch(typingctx, values, at):  # type: ignore[no-untyped-def]
-    """Ask for the cache line of ``values[at]`` of a flat array to be brought, to be written."""
+    """Prefetch the cache line of ``values[at]`` of a flat array for writing."""
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         emit = _Emitter(context, builder, sig, args)
@@ -209,12 +209,12 @@ def adam_rows(  # type: ignore[no-untyped-def]
     quats, orientation, means, opacity_logits, log_scales, sh,
     moments, steps, corrections, rates, sh_columns,
 ):  # fmt: skip
-    """One step of the Gaussians ``ids[begin .. end]``; those whose gradient is 0 stay.
+    """Step the Gaussians ``ids[begin .. end]``; those whose gradient is 0 are unchanged.
 
     Parameters
     ----------
     ids : (v,) int32
-        Gaussians of the gradients' rows, none of them twice.
+        Gaussians of the gradients' rows, without duplicates.
     grad_quats ... grad_log_scales
         (4 v,), (4 v,), (3 v,), (v,), (3 v,) float32; ``grad_sh`` (v, k).
     quats ... log_scales, sh
@@ -226,9 +226,9 @@ def adam_rows(  # type: ignore[no-untyped-def]
     corrections : (s, 2) float32
         ``1 / (1 - beta1^t)`` and ``1 / sqrt(1 - beta2^t)``.
     rates : (c,) float32
-        Learning rate of each column; negative for columns that stay.
+        Learning rate of each column; negative for columns to leave unchanged.
     sh_columns : int
-        So many columns of the harmonics are stepped.
+        Number of columns of the harmonics to step.
     """
     last = corrections.shape[0] - 1
     sh_values, sh_gradients, columns = sh.reshape(-1), grad_sh.reshape(-1), sh.shape[1]
@@ -243,7 +243,7 @@ def adam_rows(  # type: ignore[no-untyped-def]
         _prefetch(orientation, 4 * ahead)
         _prefetch(means, 3 * ahead)
         _prefetch(log_scales, 3 * ahead)
-        # The opacity's gradient alone tells for all but Gaussians capped at every pixel.
+        # The opacity's gradient alone decides, except for Gaussians capped at every pixel.
         if not (
             grad_opacity_logits[k] != 0.0
             or _has_value(grad_quats, 4 * k, 4)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sums of gradients that come from several views or losses."""
+"""Sum gradients of several views or losses."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def merge_gradients(
     Parameters
     ----------
     first, second : VisibleGradients
-        Of the same Gaussians, each with increasing ids. Neither is changed.
+        For the same Gaussians, each with increasing ids. Neither is changed.
     count : int
         Number of Gaussians that ids point into.
     threads : int
         The result does not depend on it.
     store : ArrayStore, optional
-        Memory for the sum, which is then valid until the next call with it.
+        Memory for the sum, which is then valid until the next call.
 
     Returns
     -------
     VisibleGradients
-        A row for each Gaussian of either, ids increasing.
+        One row for each Gaussian in either, with increasing ids.
     """
     threads = threads or default_threads()
     taken = ArrayStore() if store is None else store
@@ -47,13 +47,13 @@ def merge_gradients(
     listed[first.ids] = True
     listed[second.ids] = True
     ids = np.flatnonzero(listed).astype(np.int32)
-    place = taken.take("merged place", count, np.int32)
-    place[ids] = np.arange(len(ids), dtype=np.int32)
+    new_row = taken.take("merged place", count, np.int32)
+    new_row[ids] = np.arange(len(ids), dtype=np.int32)
     rows = []
     for name, part in (("merged first", first), ("merged second", second)):
         row_of = taken.take(name, len(ids), np.int32)
         row_of.fill(-1)
-        row_of[place[part.ids]] = np.arange(len(part.ids), dtype=np.int32)
+        row_of[new_row[part.ids]] = np.arange(len(part.ids), dtype=np.int32)
         rows.append(row_of)
     sums = {}
     for name in _TENSORS:
@@ -81,7 +81,7 @@ def _add_rows_everywhere(
 
 
 def add_image_gradients(first: ImageGradients, second: ImageGradients) -> ImageGradients:
-    """Return the sum of two image gradients; arrays of ``first`` are written to where both are."""
+    """Return the sum of two image gradients; common arrays are summed into those of ``first``."""
     sums = {}
     for field in dataclasses.fields(ImageGradients):
         one, two = getattr(first, field.name), getattr(second, field.name)
@@ -101,7 +101,7 @@ def _add_rows(
     second: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Sum the rows that either has (-1: none) into rows [begin, end) of ``out``."""
+    """Sum the rows of both (-1: none) into rows [begin, end) of ``out``."""
     for k in range(begin, end):
         one, two = first_rows[k], second_rows[k]
         for c in range(out.shape[1]):

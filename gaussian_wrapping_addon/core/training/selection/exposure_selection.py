@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Evidence, before any training, of whether photos differ in exposure.
+"""Detect, before training, whether the photos differ in exposure.
 
 See docs/method.md, section 4.4.
 
-Every sparse point's colour is read in every photo that may see it. Which photos do is not known, so
-that points behind others are left out by a coarse depth buffer, and what this misses (occlusion,
+The colour of every sparse point is sampled in every photo that may see it. Visibility is not known:
+points behind others are rejected by a coarse depth buffer, and the remaining outliers (occlusion,
 highlights, wrong matches) by weights that fall with the square of the disagreement.
 
-An exposure changes all parts of a scene alike; shading that depends on the view changes one. A thin
-thing that is lit from one side, seen from both, looks like an exposure when all points are taken
-together. So the points are split by place, gains are found for each part alone, and what counts is
-on what most parts agree.
+An exposure changes all parts of a scene alike; view-dependent shading changes one. A thin object
+lit from one side and seen from both looks like an exposure if all points are taken together. So the
+points are split spatially, gains are solved for each part alone, and the consensus of the parts
+decides.
 """
 
 from __future__ import annotations
@@ -27,76 +27,77 @@ from ..appearance.background import pixels_of
 from ..appearance.photo_exposure import FIT_BRIGHTEST, FIT_DARKEST, SRGB_PEDESTAL
 
 NEEDED_SPREAD = 0.025
-"""Robust spread of the log gains above which exposures are modelled. At a middle grey such photos
-disagree by 1.2 % of white, an error that alone limits the PSNR to 38 dB. Of the scenes it was
-chosen on, rendered at one exposure, a matte body shows 0.002 and a thin fence lit from one side
-0.011; photos altered by factors of light up to 1.35 either way show 0.060."""
+"""Robust spread of the log gains above which exposures are modelled. At middle grey such photos
+differ by 1.2 % of white, an error that alone limits the PSNR to 38 dB. Among the scenes it was
+chosen on, rendered at one exposure, a matte body has 0.002 and a thin fence lit from one side
+0.011; photos altered by factors of light up to 1.35 either way have 0.060."""
 
-ERRORS_AWAY = 4.0
-"""The spread must also be this many standard errors of a photo's gain."""
+MIN_STANDARD_ERRORS = 4.0
+"""The spread must also exceed this many standard errors of a photo's gain."""
 
 OUTLIER_SPREADS = 3.0
 OUTLIER_SHARE = 0.1
-"""Also where at least this share of the photos (two at the least) differ from the median by more
-than :data:`OUTLIER_SPREADS` times :data:`NEEDED_SPREAD`: a median deviation does not see them."""
+"""Exposures are also modelled if at least this share of the photos (at least two) differ from the
+median by more than :data:`OUTLIER_SPREADS` times :data:`NEEDED_SPREAD`, which a median deviation
+does not show."""
 
 MIN_POINTS = 24
-"""Points, by weight, for a photo's gain to be known."""
+"""Sum of point weights from which a photo's gain is known."""
 MIN_PHOTOS = 3
 MIN_KNOWN_SHARE = 0.5
-"""Of the photos whose gain must be known for a decision."""
+"""Share of the photos whose gain must be known for a decision."""
 
 PARTS = 8
-"""Parts that the points are split into, a power of two; fewer where points are few."""
+"""Number of parts into which the points are split, a power of two; fewer for few points."""
 MIN_PART_POINTS = 80
 MIN_POINTS_IN_PART = 12
-"""As :data:`MIN_POINTS`, for the gain that one part alone gives a photo."""
+"""Like :data:`MIN_POINTS`, for a photo's gain from one part alone."""
 MIN_PART_SHARE = 0.2
-"""Of the photos in which a part must be known for it to have a say."""
+"""Share of the photos for which a part must give known gains to count."""
 
-LOOK_SIDE_PX = 128
-"""Photos are looked at as small as their long side stays at least this: averaged pixels carry less
-noise, and forgive errors of the poses."""
+SAMPLE_SIDE_PX = 128
+"""Photos are downsampled as long as their long side stays at least this: averaged pixels are less
+noisy and tolerate pose errors."""
 
 MAX_POINTS = 4000
 MAX_SAMPLES = 2_000_000
-"""Of all points in all photos; bounds the memory (about 60 bytes each)."""
+"""Most samples of points in photos; bounds the memory (about 60 bytes each)."""
 
 BUFFER_CELLS = 24
 """Cells of the depth buffer along the long side of a photo."""
-BEHIND_SHARE = 0.06
-"""A point this share of the depth behind the nearest around it is taken for hidden."""
+OCCLUSION_SHARE = 0.06
+"""A point is occluded if it lies behind the nearest one around it by this share of the depth."""
 
 ROUNDS = 24
 FIRST_SCALE, LAST_SCALE = 0.3, 0.06
-"""Disagreement in log colour beyond which a sample loses its weight, first and last round: at first
-it must let gains in, at last only noise."""
+"""Scale of the robust weights in log colour, in the first and last round: it must admit gains at
+first and only noise at last."""
 PRIOR_POINTS = 5.0
-"""As much weight as this many points holds a gain at one."""
+"""Weight of the prior towards a gain of one, in points."""
 
 
 @dataclass(frozen=True)
-class ExposureNeed:
-    """Whether gains and offsets per photo are to be trained, and why."""
+class ExposureEvidence:
+    """Evidence on whether to train gains and offsets per photo."""
 
     needed: bool
     known: bool
-    """False where there is too little to see it by; then it is not modelled."""
+    """False if the data do not suffice; exposures are then not modelled."""
     spread: float
-    """Robust standard deviation, over the photos, of the log gain on which most parts of the scene
-    agree; largest of the three channels."""
+    """Robust standard deviation, over the photos, of the consensus log gain of the scene's parts;
+    largest of the three channels."""
     spread_together: float
-    """The same of the gains from all points together, which shading on one side raises too."""
+    """The same for gains from all points together, which one-sided shading raises too."""
     error: float
     """Median standard error of a log gain."""
     outliers: int
-    """Photos whose gain is far from the median."""
+    """Number of photos whose gain is far from the median."""
     photos: int
-    """Photos whose gain is known."""
+    """Number of photos whose gain is known."""
     points: int
-    """Points that two photos or more see."""
+    """Number of points seen by two or more photos."""
     log_gains: np.ndarray
-    """(views of the scene, 3) float64, median 0: what training may start from; 0 where unknown.
+    """(views of the scene, 3) float64, median 0: initial values for training; 0 where unknown.
     Of display values plus :data:`..appearance.photo_exposure.SRGB_PEDESTAL`."""
     evidence: str
     """One sentence for the report."""
@@ -111,32 +112,32 @@ class ExposureNeed:
 
 @dataclass(frozen=True)
 class LogGains:
-    """Gains of photos as :func:`solve_log_gains` finds them."""
+    """Gains of photos, from :func:`solve_log_gains`."""
 
     values: np.ndarray
     """(photos, 3), median 0 over the photos with enough points."""
     errors: np.ndarray
     """(photos, 3) standard errors; inf where there is no point."""
     points: np.ndarray
-    """(photos, 3) points by weight."""
+    """(photos, 3) sums of the point weights."""
 
 
-def exposure_need(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> ExposureNeed:
-    """Decide from the colours of the sparse points whether exposures are to be modelled.
+def select_exposure(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> ExposureEvidence:
+    """Decide from the colours of the sparse points whether to model exposures.
 
     Parameters
     ----------
     scene : Scene
     photos : PhotoStore
-        Looked at in a small size.
+        Sampled at a small size.
     views : sequence of int
         Views that are trained on.
 
     Returns
     -------
-    ExposureNeed
-        ``known=False`` and ``needed=False`` where the points are too few: the brightness of whole
-        photos says nothing, since they show different things.
+    ExposureEvidence
+        ``known=False`` and ``needed=False`` with too few points: the mean brightness of photos is
+        no evidence, since they show different things.
     """
     views = list(views)
     count = len(scene.views)
@@ -148,17 +149,17 @@ def exposure_need(scene: Scene, photos: PhotoSource, views: Sequence[int]) -> Ex
     points = np.asarray(scene.points, np.float64).reshape(-1, 3)[kept]
     if len(views) < MIN_PHOTOS or len(points) < MIN_POINTS:
         few = f"{len(views)} photos and {len(points)} sparse points"
-        return _unknown(count, f"Not known: {few} are too few to compare.")
+        return _unknown(count, f"Unknown: {few} are too few to compare.")
     colors, valid = sample_points(points, photos, views)
     reference = np.asarray(scene.point_colors).reshape(-1, 3)[kept] / 255.0
     found = solve_log_gains(colors, valid, reference)
-    parts = [solve_log_gains(colors[p], valid[p], reference[p]) for p in split_by_place(points)]
+    parts = [solve_log_gains(colors[p], valid[p], reference[p]) for p in split_spatially(points)]
     shared = int(np.count_nonzero(valid.any(axis=2).sum(axis=1) >= 2))
-    return judge(found, parts, views, count, shared)
+    return exposure_evidence(found, parts, views, count, shared)
 
 
-def split_by_place(points: np.ndarray) -> list[np.ndarray]:
-    """Return the indices of up to :data:`PARTS` parts: halves by number along the widest axis."""
+def split_spatially(points: np.ndarray) -> list[np.ndarray]:
+    """Return indices of up to :data:`PARTS` parts, by repeated median splits of the widest axis."""
     parts = [np.arange(len(points))]
     while len(parts) < PARTS and len(points) >= 2 * len(parts) * MIN_PART_POINTS:
         halves = []
@@ -181,30 +182,32 @@ def sample_points(
     colors : (n, views, 3) float32
         Display values in [0, 1].
     valid : (n, views, 3) bool
-        The photo holds the point, the mask too, no other point stands before it, and the value is
-        not clipped.
+        The point lies in the photo and its mask, no other point occludes it, and the value is not
+        clipped.
     """
     colors = np.zeros((len(points), len(views), 3), np.float32)
     valid = np.zeros(colors.shape, bool)
-    for place, view in enumerate(views):
+    for slot, view in enumerate(views):
         base = photos.camera(view, 1)
         side = max(base.width, base.height)
-        divisor = next((d for d in (4, 2) if side >= d * LOOK_SIDE_PX), 1)
+        divisor = next((d for d in (4, 2) if side >= d * SAMPLE_SIDE_PX), 1)
         camera, photo = photos.camera(view, divisor), photos.photo(view, divisor)
         mask = photos.mask(view, divisor)
         rows, columns, depth, seen = pixels_of(points, camera)
-        shown = _in_front(rows, columns, depth, max(camera.width, camera.height))
+        shown = _unoccluded(rows, columns, depth, max(camera.width, camera.height))
         if mask is not None:
             shown &= mask[rows, columns]
         rows, columns, seen = rows[shown], columns[shown], seen[shown]
         value = photo[rows, columns].astype(np.float32) / np.float32(255.0)  # (m, 3)
-        colors[seen, place] = value
-        valid[seen, place] = (value >= FIT_DARKEST) & (value <= FIT_BRIGHTEST)
+        colors[seen, slot] = value
+        valid[seen, slot] = (value >= FIT_DARKEST) & (value <= FIT_BRIGHTEST)
     return colors, valid
 
 
-def _in_front(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, side_px: int) -> np.ndarray:
-    """Tell which points no other one in the same or a neighbouring cell stands well before."""
+def _unoccluded(
+    rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, side_px: int
+) -> np.ndarray:
+    """Tell which points are not occluded by a point in the same or a neighbouring cell."""
     cell = max(1.0, side_px / BUFFER_CELLS)
     y, x = (rows / cell).astype(np.int64) + 1, (columns / cell).astype(np.int64) + 1
     nearest = np.full((BUFFER_CELLS + 3, BUFFER_CELLS + 3), np.inf)
@@ -214,17 +217,17 @@ def _in_front(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, side_px:
         for dx in (-1, 0, 1):
             inner = nearest[1 + dy : nearest.shape[0] - 1 + dy, 1 + dx : nearest.shape[1] - 1 + dx]
             around[1:-1, 1:-1] = np.minimum(around[1:-1, 1:-1], inner)
-    return depth <= (1.0 + BEHIND_SHARE) * around[y, x]
+    return depth <= (1.0 + OCCLUSION_SHARE) * around[y, x]
 
 
 def solve_log_gains(
     colors: np.ndarray, valid: np.ndarray, reference: np.ndarray | None = None
 ) -> LogGains:
-    """Find the photos' gains that bring the colours of the same points together.
+    """Solve for the gains of photos that align the colours of common points.
 
-    ``log(c[i, p] + 0.055) = level[i] + gain[p]`` by alternating weighted means. Weights are those
-    of Geman and McClure, one for the three channels of a sample (what covers a point changes them
-    all), with a scale that shrinks from :data:`FIRST_SCALE` to :data:`LAST_SCALE`.
+    ``log(c[i, p] + 0.055) = level[i] + gain[p]`` by alternating weighted means, with Geman-McClure
+    weights, one for the three channels of a sample (an occluder changes all of them), whose scale
+    shrinks from :data:`FIRST_SCALE` to :data:`LAST_SCALE`.
 
     Parameters
     ----------
@@ -232,7 +235,7 @@ def solve_log_gains(
         Display values in [0, 1].
     valid : (n, photos, 3) bool
     reference : (n, 3), optional
-        The points' own colours, of photos that do see them. By default the medians of ``colors``.
+        Colours of the points, from photos that see them. By default the medians of ``colors``.
     """
     logs = np.log(np.asarray(colors, np.float64) + SRGB_PEDESTAL).astype(np.float32)
     valid = valid & (valid.any(axis=2).sum(axis=1) >= 2)[:, None, None]
@@ -251,76 +254,76 @@ def solve_log_gains(
         weight = present * ((1.0 + square / np.float32(scale**2)) ** -2)[..., None]
         total = weight.sum(axis=0)  # (photos, 3)
         gain = (weight * (logs - level[:, None])).sum(axis=0) / (total + PRIOR_POINTS)
-        gain -= _middle(gain, total)
+        gain -= _median_gain(gain, total)
         per_point = weight.sum(axis=1)  # (n, 3)
         fresh = (weight * (logs - gain)).sum(axis=1) / np.maximum(per_point, 1e-9)
         level = np.where(per_point > 1e-3, fresh, level)
     residual = (logs - level[:, None] - gain) * present
     total = weight.sum(axis=0).astype(np.float64)
     noise = np.sqrt(((weight * residual) ** 2).sum(axis=0, dtype=np.float64))
-    # No better than a noise of one 8-bit step: synthetic points may agree to the last bit.
+    # At least the noise of one 8-bit step: synthetic points may agree to the last bit.
     floor = np.sqrt(np.maximum(total, 1.0)) / 255.0
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = np.where(total > 0, np.maximum(noise, floor) / total, np.inf)
     return LogGains(gain.astype(np.float64), errors, total)
 
 
-def judge(
+def exposure_evidence(
     found: LogGains, parts: Sequence[LogGains], views: Sequence[int], count: int, points: int
-) -> ExposureNeed:
-    """Decide from gains and their standard errors.
+) -> ExposureEvidence:
+    """Return the evidence from gains and their standard errors.
 
     Parameters
     ----------
     found : LogGains
-        Of the photos ``views``, from all points.
+        Gains of the photos ``views`` from all points.
     parts : sequence of LogGains
-        The same, each from the points of one part of the scene.
+        The same from the points of each part of the scene.
     views : sequence of int
     count : int
-        Views of the scene.
+        Number of views of the scene.
     points : int
-        For the report.
+        Number of common points, for the report.
     """
     known = (found.points >= MIN_POINTS).all(axis=1)
     number = int(np.count_nonzero(known))
     if number < max(MIN_PHOTOS, MIN_KNOWN_SHARE * len(views)):
         return _unknown(
             count,
-            f"Not known: only {number} of {len(views)} photos share enough sparse "
+            f"Unknown: only {number} of {len(views)} photos share enough sparse "
             "points to be compared.",
             photos=number,
             points=points,
         )
     values = found.values[known] - np.median(found.values[known], axis=0)  # (known, 3)
-    agreed = _agreed(parts, values, known)
+    consensus = _consensus(parts, values, known)
     errors = found.errors[known]
-    spread, error = _spread(agreed), float(np.median(errors))
-    limit = np.maximum(OUTLIER_SPREADS * NEEDED_SPREAD, ERRORS_AWAY * errors)
-    far = (np.abs(agreed) > limit) & (np.abs(values) > limit)
+    spread, error = _spread(consensus), float(np.median(errors))
+    limit = np.maximum(OUTLIER_SPREADS * NEEDED_SPREAD, MIN_STANDARD_ERRORS * errors)
+    far = (np.abs(consensus) > limit) & (np.abs(values) > limit)
     outliers = int(np.count_nonzero(far.any(axis=1)))
-    differs = spread > max(NEEDED_SPREAD, ERRORS_AWAY * error)
+    differs = spread > max(NEEDED_SPREAD, MIN_STANDARD_ERRORS * error)
     several = outliers >= max(2.0, OUTLIER_SHARE * number)
     needed = bool(differs or several)
     log_gains = np.zeros((count, 3))
     log_gains[np.asarray(views)[known]] = values
     evidence = (
-        f"Gains of {number} photos, from "
-        f"{points} sparse points, spread by {100 * spread:.1f} % where the scene's parts agree "
-        f"(limit {100 * NEEDED_SPREAD:.1f} %; one photo's error {100 * error:.1f} %; all points "
+        f"Gains of {number} photos, from {points} sparse points, have a robust standard deviation "
+        f"of {100 * spread:.1f} % by consensus of the scene's parts (limit "
+        f"{100 * NEEDED_SPREAD:.1f} %; standard error of a photo {100 * error:.1f} %; all points "
         f"together {100 * _spread(values):.1f} %), and {outliers} photos differ by more than "
         f"{100 * OUTLIER_SPREADS * NEEDED_SPREAD:.1f} %."
     )
-    return ExposureNeed(
+    return ExposureEvidence(
         needed, True, spread, _spread(values), error, outliers, number, points, log_gains, evidence
     )
 
 
-def _agreed(parts: Sequence[LogGains], values: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _consensus(parts: Sequence[LogGains], values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """(known, 3) medians over the parts of each photo's gain, median 0 over the photos.
 
-    A part sees only some of the photos, and its gains are those against their median: at the level
-    of all points' gains it would take over what it is asked to check.
+    A part is seen by some of the photos only, and its gains are relative to their median: aligning
+    it with the gains of all points would bias it towards what it has to check.
     """
     rows = []
     for part in parts:
@@ -333,23 +336,23 @@ def _agreed(parts: Sequence[LogGains], values: np.ndarray, known: np.ndarray) ->
     if not rows:
         return values
     stacked = np.stack(rows)  # (parts, known, 3)
-    said = np.isfinite(stacked[..., 0]).any(axis=0)
-    agreed = values.copy()
-    agreed[said] = np.nanmedian(stacked[:, said], axis=0)
-    return agreed - np.median(agreed, axis=0)
+    covered = np.isfinite(stacked[..., 0]).any(axis=0)
+    consensus = values.copy()
+    consensus[covered] = np.nanmedian(stacked[:, covered], axis=0)
+    return consensus - np.median(consensus, axis=0)
 
 
 def _spread(values: np.ndarray) -> float:
     return float((1.4826 * np.median(np.abs(values), axis=0)).max())
 
 
-def _unknown(count: int, evidence: str, *, photos: int = 0, points: int = 0) -> ExposureNeed:
+def _unknown(count: int, evidence: str, *, photos: int = 0, points: int = 0) -> ExposureEvidence:
     zeros = np.zeros((count, 3))
-    return ExposureNeed(False, False, 0.0, 0.0, 0.0, 0, photos, points, zeros, evidence)
+    return ExposureEvidence(False, False, 0.0, 0.0, 0.0, 0, photos, points, zeros, evidence)
 
 
 def _median_of(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return the median over the second axis of the valid values; 0 where there is none."""
+    """Return the median of the valid values over the second axis; 0 without any."""
     hidden = np.sort(np.where(valid, values, np.inf), axis=1)
     number = valid.sum(axis=1)
     lower, upper = np.maximum(number - 1, 0) // 2, number // 2
@@ -363,8 +366,8 @@ def _median_of(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(number > 0, middle, 0.0).astype(values.dtype)
 
 
-def _middle(gain: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """(3,) median of the gains of the photos with points."""
+def _median_gain(gain: np.ndarray, total: np.ndarray) -> np.ndarray:
+    """(3,) median gain of the photos with enough points."""
     known = (total >= MIN_POINTS).all(axis=1)
     if not known.any():
         return np.zeros(3, gain.dtype)

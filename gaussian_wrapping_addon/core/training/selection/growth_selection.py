@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""When more Gaussians stop paying: the fall of the error against the growth of their number."""
+"""Decide when to stop densification: error reduction per doubling of the Gaussians."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ import numpy as np
 from .model_selection import Decision
 
 MIN_GAIN_DB = 0.2
-"""Growth stops where twice the Gaussians would lower the error of the trained photos by less than
-this. Twice the Gaussians cost up to twice the time. Gains of growth fall with each doubling; where
-each brings about half of the one before, all that would still come is no more than this again."""
+"""Growth stops if twice the Gaussians would lower the error of the training photos by less than
+this. Twice the Gaussians cost up to twice the time. Gains fall with each doubling; if each is about
+half of the one before, all further gains add up to no more than this again."""
 
 MIN_GROWTH = 1.15
-"""Two visits of a photo are compared where Gaussians have become this many times as many in
-between: below, the noise of single visits divided by the growth says nothing."""
+"""Least growth of the number of Gaussians between two compared errors of a photo: below it, the
+noise of single errors dominates the gain per doubling."""
 
 MAX_GROWTH = 3.0
-"""And no older visit than that, so that early gains do not speak for late ones."""
+"""Largest such growth: older errors are ignored, as early gains do not predict late ones."""
 
 MIN_VIEWS = 5
-"""No decision from fewer photos that were visited before and after."""
+"""Fewest photos with errors before and after the growth for a decision."""
 
 CERTAINTY = 2.0
-"""Standard errors that must lie between the gain and :data:`MIN_GAIN_DB`. Growth is asked about
-after every round and stops for good: with one, a scene of 40 photos stopped by chance at 36 000 of
-80 000 Gaussians and lost 3.5 dB on photos that were kept back."""
+"""Standard errors required between the gain and :data:`MIN_GAIN_DB`. Growth is tested after every
+densification and stops for good: with one standard error, a scene of 40 photos stopped by chance at
+36 000 of 80 000 Gaussians and lost 3.5 dB on held-out photos."""
 
 CAPACITY = 32_768
-"""Visits that are remembered; older ones are forgotten."""
+"""Entries kept; older ones are dropped."""
 
 _COLUMNS = 5
 _SPREAD_OF_MAD = 1.4826
@@ -40,23 +40,23 @@ _ERROR_FLOOR = 1e-10
 
 
 @dataclass(frozen=True)
-class GrowthNeed:
-    """Whether growth pays at a moment."""
+class GrowthEvidence:
+    """Estimate of whether growth still pays."""
 
     pays: bool
-    """Also where it is not known yet: only evidence stops growth."""
+    """True also if not known yet: only evidence stops growth."""
     known: bool
     gain_db: float
-    """Median over the photos: fall of the error per doubling of the Gaussians; NaN if unknown."""
+    """Median over the photos of the error reduction per doubling; NaN if unknown."""
     spread_db: float
     """Standard error of that median; NaN if unknown."""
     views: int
-    """Photos that it is the median of."""
+    """Number of photos in the median."""
     gaussians: int
     iteration: int
 
     def decision(self, setting: str = "auto") -> Decision:
-        """Return the record: ``"stopped"``, ``"to the cap"`` or ``"none added"``."""
+        """Return the decision: ``"stopped"``, ``"to the cap"`` or ``"none added"``."""
         chosen = {
             "auto": "to the cap" if self.pays else "stopped",
             "on": "to the cap",
@@ -64,12 +64,12 @@ class GrowthNeed:
         }.get(setting, "")
         figures = {"gaussians": float(self.gaussians), "iteration": float(self.iteration)}
         if not self.known:
-            evidence = "Too few parts of photos were seen again after the Gaussians grew in number."
+            evidence = "Too few photos were rendered before and after the Gaussians grew in number."
             return Decision("growth", setting, chosen, evidence, figures)
         evidence = (
             f"At iteration {self.iteration}, with {self.gaussians} Gaussians, twice as many would "
             f"have lowered the error by about {self.gain_db:.2f} dB (± {self.spread_db:.2f}, from "
-            f"{self.views} photos; worth it from {MIN_GAIN_DB:.1f} dB)."
+            f"{self.views} photos; threshold {MIN_GAIN_DB:.1f} dB)."
         )
         figures |= {
             "gain_db": self.gain_db,
@@ -80,8 +80,8 @@ class GrowthNeed:
         return Decision("growth", setting, chosen, evidence, figures)
 
 
-class GrowthHistory:
-    """The errors of the trained photos, visit by visit; part of a training's state."""
+class ErrorHistory:
+    """Colour errors of the training photos by iteration; part of the training state."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[int, int, int, float, int]] = []
@@ -92,7 +92,7 @@ class GrowthHistory:
     def add(
         self, iteration: int, view: int, gaussians: int, mean_squared: float, divisor: int
     ) -> None:
-        """Remember one iteration.
+        """Record one iteration.
 
         Parameters
         ----------
@@ -100,22 +100,22 @@ class GrowthHistory:
         mean_squared : float
             Mean squared colour error of the photo, before the step.
         divisor : int
-            Of the pyramid's level: only visits at the same size are compared.
+            Divisor of the image size: only errors at the same size are compared.
         """
         self._rows.append((iteration, view, gaussians, mean_squared, divisor))
         if len(self._rows) > CAPACITY:
             del self._rows[: len(self._rows) - CAPACITY]
 
     def clear(self) -> None:
-        """Forget all visits, as after an opacity reset."""
+        """Drop all entries, as after an opacity reset."""
         self._rows.clear()
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return all that is remembered, by name."""
+        """Return all entries, by name; the key ``visits`` is that of checkpoints."""
         return {"visits": np.array(self._rows, np.float64).reshape(-1, _COLUMNS)}
 
     @classmethod
-    def restore(cls, arrays: dict[str, np.ndarray]) -> GrowthHistory:
+    def restore(cls, arrays: dict[str, np.ndarray]) -> ErrorHistory:
         """Build from :meth:`to_arrays`.
 
         Raises
@@ -123,51 +123,51 @@ class GrowthHistory:
         KeyError, ValueError
             The array is missing or has another shape.
         """
-        visits = arrays["visits"]
-        if visits.ndim != 2 or visits.shape[1] != _COLUMNS:
-            raise ValueError(f"visits are {visits.shape}")
+        errors = arrays["visits"]
+        if errors.ndim != 2 or errors.shape[1] != _COLUMNS:
+            raise ValueError(f"visits are {errors.shape}")
         history = cls()
-        for row in visits.tolist():
+        for row in errors.tolist():
             history.add(int(row[0]), int(row[1]), int(row[2]), row[3], int(row[4]))
         return history
 
-    def need(self) -> GrowthNeed:
-        """Return whether more Gaussians still pay.
+    def growth_evidence(self) -> GrowthEvidence:
+        """Estimate whether more Gaussians still pay.
 
-        The last visit of each photo is compared with the latest earlier one that had fewer
-        Gaussians by :data:`MIN_GROWTH`, at the same image size: photos differ in error several
-        times over, and only a comparison of each with itself is not drowned by that. The median
-        over the photos is not moved by single bad ones. What training itself has gained between the
-        visits counts for the growth, so the decision errs towards growing on; it stops only where
-        the median lies below :data:`MIN_GAIN_DB` by :data:`CERTAINTY` standard errors. Errors that
-        rise say nothing about growth: another term of the loss began, or Gaussians were removed.
+        The last error of each photo is compared with its latest earlier one at which there were
+        fewer Gaussians by :data:`MIN_GROWTH`, at the same image size: errors differ several times
+        over between photos, so that each photo is compared with itself only. The median over the
+        photos is robust against outliers. Gains of training itself between the two errors count as
+        gains of growth, so the decision errs towards further growth; it stops only if the median
+        lies below :data:`MIN_GAIN_DB` by :data:`CERTAINTY` standard errors. Rising errors say
+        nothing about growth: another loss term started, or Gaussians were removed.
         """
         iteration, _, gaussians, _, _ = self._rows[-1] if self._rows else (0, 0, 0, 0.0, 1)
         gains = np.array(list(self._gains()))
         nan = math.nan
         if len(gains) < MIN_VIEWS:
-            return GrowthNeed(True, False, nan, nan, len(gains), gaussians, iteration)
+            return GrowthEvidence(True, False, nan, nan, len(gains), gaussians, iteration)
         median = float(np.median(gains))
-        # Of a median of normally spread values: 1.2533 times that of a mean.
+        # The standard error of a median is 1.2533 times that of a mean, for normal values.
         spread = _SPREAD_OF_MAD * float(np.median(np.abs(gains - median)))
         spread *= 1.2533 / math.sqrt(len(gains))
-        if median + CERTAINTY * spread < -MIN_GAIN_DB:  # something else made the errors rise
-            return GrowthNeed(True, False, nan, nan, len(gains), gaussians, iteration)
+        if median + CERTAINTY * spread < -MIN_GAIN_DB:  # errors rose for other reasons
+            return GrowthEvidence(True, False, nan, nan, len(gains), gaussians, iteration)
         pays = median + CERTAINTY * spread >= MIN_GAIN_DB
-        return GrowthNeed(pays, True, median, spread, len(gains), gaussians, iteration)
+        return GrowthEvidence(pays, True, median, spread, len(gains), gaussians, iteration)
 
     def _gains(self) -> Iterator[float]:
-        """Yield dB per doubling of each photo that can be compared."""
+        """Yield the gain of each comparable photo, dB per doubling."""
         by_view: dict[int, list[tuple[int, int, int, float, int]]] = {}
         for row in self._rows:
             by_view.setdefault(row[1], []).append(row)
         for view in sorted(by_view):
-            visits = by_view[view]
-            _, _, now, error, divisor = visits[-1]
-            # A photo not seen at the current size says nothing about the present.
+            errors = by_view[view]
+            _, _, now, error, divisor = errors[-1]
+            # Skip photos not rendered at the current image size.
             if divisor != self._rows[-1][4]:
                 continue
-            for _, _, then, before, size in reversed(visits[:-1]):
+            for _, _, then, before, size in reversed(errors[:-1]):
                 growth = now / max(1, then)
                 if size != divisor or growth > MAX_GROWTH:
                     break

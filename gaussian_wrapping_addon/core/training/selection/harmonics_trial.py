@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Spherical harmonics fitted to a few photos in closed form, without training.
+"""Fit spherical harmonics to a few photos in closed form, without training.
 
-Colours enter an image linearly: the residuals of a photo, sent backwards, give the mean residual of
-each Gaussian in it, and a small regression over the viewing directions its coefficients
-(docs/method.md, section 4.4). What that tells of a scene is judged in :mod:`.harmonics_selection`.
+Images are linear in the colours: back-projecting the residuals of a photo gives the mean residual
+of each Gaussian in it, and a small regression over the viewing directions gives its coefficients
+(docs/method.md, section 4.4). :mod:`.harmonics_selection` evaluates the result.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from ...render.types.gradients import ImageGradients
 from ...render.types.options import RenderOptions
 from ...render.view_renderer import ViewRenderer
 
-SETTLING = 3
-"""Fits without the degree before the comparison. Colours that training has not settled yet lend any
-further unknown a gain: on a matte sphere with colours 0.15 off, degree 1 gains 0.11 dB without."""
+LOWER_DEGREE_FITS = 3
+"""Fits without the degree before the comparison. With unconverged colours any further parameter
+shows a gain: on a matte sphere with colours 0.15 off, degree 1 gains 0.11 dB without these fits."""
 
 RIDGE_SHARE = 0.05
 RIDGE_PX = 2.0
-"""Ridge of the regressions, in shares of a Gaussian's weight in all views, the judging ones too,
-and in pixels. It holds what few or one-sided views cannot tell: a Gaussian close to a camera fills
-the view of that camera and is a few pixels elsewhere."""
+"""Ridge of the regressions, as a share of a Gaussian's weight in all views, including those for
+evaluation, and in pixels. It constrains coefficients that few or one-sided views do not determine:
+a Gaussian close to a camera fills the view of that camera and is a few pixels elsewhere."""
 
-COARSE_SHARE = 1.0 / 8.0
-"""Residuals are averaged over squares of this share of the long side. Reflections change colours
-slowly over a surface; errors of shape and detail change with the view as well, but average out."""
+LOW_PASS_SHARE = 1.0 / 8.0
+"""Residuals are box-filtered with this share of the long side. Reflections vary slowly over a
+surface; errors of shape and detail also depend on the view, but average out."""
 
 _C0 = 0.5 / math.sqrt(math.pi)
 _BLOCK = 4096
@@ -46,67 +46,73 @@ _STEP_RIDGE = 1e-6
 _ERROR_FLOOR = 1e-12
 
 Correction = tuple[np.ndarray, np.ndarray]
-"""Gain and offset, (3,) each: what the photo shows is ``gain * render + offset``."""
+"""Gain and offset, (3,) each: the photo is ``gain * render + offset``."""
 
 
 @dataclass(frozen=True)
-class NeedView:
-    """A photo at a small size, to fit to or to judge by."""
+class TrialView:
+    """A photo at a small size, for fitting or evaluation."""
 
     camera: Camera
     photo: np.ndarray
     """(h, w, 3) uint8, or floats in [0, 1]."""
     mask: np.ndarray | None = None
-    """(h, w) bool, true where the photo counts."""
+    """(h, w) bool, true for pixels that count."""
     correction: Correction | None = None
-    """The photo's exposure, where it is known."""
+    """The photo's exposure, if known."""
 
 
 @dataclass(frozen=True)
-class Compared:
-    """A photo that was not fitted to, judged without a degree and with it."""
+class TrialErrors:
+    """Errors of a photo excluded from the fit, without and with the degree."""
 
     without: np.ndarray
-    """(n,) sums over the pixels of squared :func:`coarse` errors, blended back to the Gaussians."""
+    """(n,) sums over the pixels of squared :func:`low_pass` errors, back-projected to the
+    Gaussians."""
     with_degree: np.ndarray
     weights: np.ndarray
-    """(n,) sums of blending weights of the pixels that count."""
-    slow: tuple[float, float]
-    """Mean squared :func:`coarse` error of the photo without the degree and with it."""
-    whole: float
+    """(n,) sums of blending weights over the unmasked pixels."""
+    low_frequency: tuple[float, float]
+    """Mean squared :func:`low_pass` error of the photo without the degree and with it."""
+    total: float
     """Mean squared error without the degree."""
 
 
 class HarmonicsTrial:
-    """Coefficients of the harmonics of all Gaussians, fitted to some photos.
+    """Fit of the harmonics of all Gaussians to some photos.
 
-    Every Gaussian is fitted alone; the length of the step is then chosen by least squares of the
-    fitted views' residuals: Gaussians overlap, so single fits overshoot.
+    Every Gaussian is fitted separately; the length of the common step is then chosen by least
+    squares of the fitted views' residuals, since separate fits of overlapping Gaussians overshoot.
 
     Parameters
     ----------
     gaussians : OrientedGaussians
         Coefficients of ``degree`` and above are taken as 0. Scene frame.
-    fitted : sequence of NeedView
+    fitted : sequence of TrialView
     degree : int
         The degree to try, 1 to 3.
-    shown : (n,) array
-        Weights of the Gaussians in all views, fitted or not (:func:`shown_weights`), pixels.
+    weight_sums : (n,) array
+        Weights of the Gaussians in all views, fitted or not (:func:`summed_weights`), pixels.
     threads : int
     check : callable
-        Called before each view is rendered; what it raises ends the trial.
+        Called before each view is rendered; an exception ends the trial.
     """
 
     def __init__(
         self,
         gaussians: OrientedGaussians,
-        fitted: Sequence[NeedView],
+        fitted: Sequence[TrialView],
         degree: int,
-        shown: np.ndarray,
+        weight_sums: np.ndarray,
         threads: int,
         check: Callable[[], None],
     ) -> None:
-        self.check, self.threads, self.degree, self.shown = check, threads, degree, shown
+        self.check, self.threads, self.degree, self.weight_sums = (
+            check,
+            threads,
+            degree,
+            weight_sums,
+        )
         self.renderer = ViewRenderer()
         self.raw = raw = RawArrays.from_gaussians(gaussians)
         count, kept = len(raw), min(raw.sh.shape[1], degree**2)
@@ -117,52 +123,52 @@ class HarmonicsTrial:
         self.directions = [_directions(raw.means, view.camera) for view in self.fitted]
         self.targets = [_target(view, None) for view in self.fitted]
 
-    def settle(self) -> None:
-        """Fit the lower degrees first, so that both sides of the comparison begin there."""
-        for _ in range(SETTLING):
+    def fit_lower_degrees(self) -> None:
+        """Fit the lower degrees, the common start of both sides of the comparison."""
+        for _ in range(LOWER_DEGREE_FITS):
             (self.start,) = self.fit(self.degree - 1)
 
     def fit(self, *degrees: int) -> list[np.ndarray]:
-        """Return (n, k, 3) float32 coefficients for each degree, all up to it fitted."""
+        """Return (n, k, 3) float32 coefficients for each degree, fitted up to that degree."""
         count = len(self.raw)
-        sums = np.zeros((len(self.fitted), count, 3), np.float32)  # blended residuals, in pixels
+        sums = np.zeros((len(self.fitted), count, 3), np.float32)  # back-projected, pixels
         weights = np.zeros((len(self.fitted), count), np.float32)
         before, residuals = [], []
         options = RenderOptions(depth=False, threads=self.threads, statistics=True)
-        start = self._with(self.start)
+        start = self._with_coefficients(self.start)
         for row, (view, (target, counts)) in enumerate(zip(self.fitted, self.targets, strict=True)):
             self.check()
             image = self.renderer.render(start, view.camera, options)
             assert image.statistics is not None
             before.append(image.color.copy())
-            residuals.append(coarse(target - image.color, counts))
+            residuals.append(low_pass(target - image.color, counts))
             seen = image.backward(ImageGradients(color=residuals[-1].astype(np.float32)))
             sums[row, seen.ids] = seen.sh[:, 0] / _C0
             if view.mask is None:
                 weights[row] = image.statistics.weight_sum
-            else:  # the same sums, of the pixels that count alone
+            else:  # the same sums over unmasked pixels only
                 ones = np.repeat(counts[..., None], 3, 2).astype(np.float32)
                 seen = image.backward(ImageGradients(color=ones))
                 weights[row, seen.ids] = seen.sh[:, 0].max(1) / _C0
         out = []
         for degree in degrees:
-            step = _regress(sums, weights, self.shown, self.directions, degree)
-            length = self._length(step, before, residuals)
-            out.append(self._moved(length * step))
+            step = _regress(sums, weights, self.weight_sums, self.directions, degree)
+            length = self._step_length(step, before, residuals)
+            out.append(self._stepped(length * step))
         return out
 
-    def compare(self, view: NeedView, without: np.ndarray, with_degree: np.ndarray) -> Compared:
-        """Judge two sets of coefficients by a photo that took no part in fitting them.
+    def compare(self, view: TrialView, without: np.ndarray, with_degree: np.ndarray) -> TrialErrors:
+        """Evaluate two sets of coefficients on a photo excluded from the fit.
 
-        Where exposures are known, a photo whose own is not is matched to the settled image.
+        Where exposures are known, a photo without one is matched to the image of the start.
         """
         matched = self.corrected and view.correction is None
         target, counts = _target(view, self._image(self.start, view.camera) if matched else None)
         differences = [self._image(sh, view.camera) - target for sh in (without, with_degree)]
-        squares = [np.square(coarse(d, counts)).mean(2) for d in differences]  # (h, w) each
-        # Zero coefficients show a grey that is not clamped, so that all three channels blend alike.
+        squares = [np.square(low_pass(d, counts)).mean(2) for d in differences]  # (h, w) each
+        # Zero coefficients give unclamped grey, so that all three channels have the same gradient.
         self.check()
-        grey = self._with(np.zeros((len(self.raw), 1, 3), np.float32))
+        grey = self._with_coefficients(np.zeros((len(self.raw), 1, 3), np.float32))
         image = self.renderer.render(
             grey, view.camera, RenderOptions(depth=False, sh_degree=0, threads=self.threads)
         )
@@ -170,81 +176,81 @@ class HarmonicsTrial:
         seen = image.backward(ImageGradients(color=sent))
         blended = np.zeros((len(self.raw), 3), np.float64)
         blended[seen.ids] = seen.sh[:, 0] / _C0
-        slow = [float(square[counts].mean()) for square in squares]
-        whole = float((differences[0][counts].astype(np.float64) ** 2).mean())
-        return Compared(
-            blended[:, 0], blended[:, 1], blended[:, 2], (slow[0], slow[1]), whole
+        low_frequency = [float(square[counts].mean()) for square in squares]
+        total = float((differences[0][counts].astype(np.float64) ** 2).mean())
+        return TrialErrors(
+            blended[:, 0], blended[:, 1], blended[:, 2], (low_frequency[0], low_frequency[1]), total
         )  # fmt: skip
 
     def _image(self, sh: np.ndarray, camera: Camera) -> np.ndarray:
         self.check()
         options = RenderOptions(depth=False, threads=self.threads)
-        return self.renderer.render(self._with(sh), camera, options).color.copy()
+        return self.renderer.render(self._with_coefficients(sh), camera, options).color.copy()
 
-    def _with(self, sh: np.ndarray) -> RawArrays:
+    def _with_coefficients(self, sh: np.ndarray) -> RawArrays:
         raw = self.raw
         return RawArrays(
             raw.means, raw.log_scales, raw.quats, raw.opacity_logits,
             np.ascontiguousarray(sh, raw.means.dtype), raw.orientation, raw.filter_3d,
         )  # fmt: skip
 
-    def _moved(self, step: np.ndarray) -> np.ndarray:
+    def _stepped(self, step: np.ndarray) -> np.ndarray:
         sh = self.start.copy()
         sh[:, : step.shape[1]] += step.astype(np.float32)
         return sh
 
-    def _length(
+    def _step_length(
         self, step: np.ndarray, before: list[np.ndarray], residuals: list[np.ndarray]
     ) -> float:
-        """Return the length of a step that leaves the fitted views the least squared residual."""
+        """Return the step length that minimises the squared residuals of the fitted views."""
         normal, right = _ERROR_FLOOR, 0.0
-        moved = self._moved(step)
+        moved = self._stepped(step)
         for view, (_, counts), base, residual in zip(
             self.fitted, self.targets, before, residuals, strict=True
         ):
-            part = coarse(self._image(moved, view.camera) - base, counts)[counts]
+            part = low_pass(self._image(moved, view.camera) - base, counts)[counts]
             right += float((part * residual[counts]).sum())
             normal += (1.0 + _STEP_RIDGE) * float((part * part).sum())
         return right / normal
 
 
-def shown_weights(
+def summed_weights(
     gaussians: OrientedGaussians,
-    views: Sequence[NeedView],
+    views: Sequence[TrialView],
     threads: int,
     check: Callable[[], None],
 ) -> np.ndarray:
     """Return (n,) sums of blending weights over all views, pixels."""
     renderer, raw = ViewRenderer(), RawArrays.from_gaussians(gaussians)
     options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
-    shown = np.zeros(len(raw), np.float64)
+    weight_sums = np.zeros(len(raw), np.float64)
     for view in views:
         check()
         statistics = renderer.render(raw, view.camera, options).statistics
         assert statistics is not None
-        shown += statistics.weight_sum
-    return shown
+        weight_sums += statistics.weight_sum
+    return weight_sums
 
 
 def _regress(
     sums: np.ndarray,
     weights: np.ndarray,
-    shown: np.ndarray,
+    weight_sums: np.ndarray,
     directions: list[Callable[[int, int, int], np.ndarray]],
     degree: int,
 ) -> np.ndarray:
-    """Return (n, k, 3) float32 ridge regressions of mean residuals on the harmonics.
+    """Return (n, k, 3) float32 ridge regressions of the mean residuals on the harmonics.
 
     Parameters
     ----------
     sums : (v, n, 3)
-        Sums of blended residuals.
+        Sums of back-projected residuals.
     weights : (v, n)
         Sums of blending weights.
-    shown : (n,)
-        The same over all views, those too that are not fitted to.
+    weight_sums : (n,)
+        The same over all views, including those not fitted to.
     directions : list of callables
-        Of each view, the harmonics of a range of Gaussians.
+        For each view, a function that evaluates the harmonics of a range of Gaussians.
     """
     views, count = weights.shape
     size = (degree + 1) ** 2
@@ -258,14 +264,14 @@ def _regress(
             weight = weights[view, begin:end].astype(np.float64)  # (m,)
             normal += (weight[:, None] * basis)[:, :, None] * basis[:, None, :]
             right += basis[:, :, None] * sums[view, begin:end, None, :]
-        ridge = _C0**2 * (RIDGE_SHARE * shown[begin:end] + RIDGE_PX)  # (m,)
+        ridge = _C0**2 * (RIDGE_SHARE * weight_sums[begin:end] + RIDGE_PX)  # (m,)
         normal[:, np.arange(size), np.arange(size)] += ridge[:, None]
         out[begin:end] = np.linalg.solve(normal, right)
     return out
 
 
 def _directions(means: np.ndarray, camera: Camera) -> Callable[[int, int, int], np.ndarray]:
-    """Return what gives the harmonics (m, k) of a range of Gaussians as the camera sees them."""
+    """Return a function for the (m, k) harmonics of a range of Gaussians seen from a camera."""
     center = camera.center
 
     def basis(begin: int, end: int, degree: int) -> np.ndarray:
@@ -277,16 +283,16 @@ def _directions(means: np.ndarray, camera: Camera) -> Callable[[int, int, int], 
     return basis
 
 
-def _target(view: NeedView, image: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the photo as the Gaussians should show it, and (h, w) bool where it counts.
+def _target(view: TrialView, image: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the target image in the Gaussians' exposure, and (h, w) bool of the pixels that count.
 
-    A photo whose exposure is not known is matched to ``image`` where that is given.
+    A photo of unknown exposure is matched to ``image`` if given.
     """
     camera, photo = view.camera, view.photo
     if photo.shape != (camera.height, camera.width, 3):
         raise UsageError(
             f"Photo {camera.name} is {photo.shape}, its camera {camera.width} x {camera.height}.",
-            "Give both at one size.",
+            "Give both at the same size.",
         )
     target = photo.astype(np.float32) / np.float32(255 if photo.dtype == np.uint8 else 1)
     counts = np.ones(photo.shape[:2], np.bool_) if view.mask is None else view.mask
@@ -300,9 +306,9 @@ def _target(view: NeedView, image: np.ndarray | None) -> tuple[np.ndarray, np.nd
 
 
 def match_exposure(image: np.ndarray, photo: np.ndarray) -> Correction:
-    """Return the gain and offset per channel that bring a render closest to a photo.
+    """Return the gain and offset per channel that match a render to a photo.
 
-    Least squares over (p, 3) colours; a channel that does not vary keeps gain 1.
+    Least squares over (p, 3) colours; a constant channel keeps gain 1.
     """
     image, photo = image.astype(np.float64), photo.astype(np.float64)
     mean, wanted = image.mean(0), photo.mean(0)
@@ -313,8 +319,8 @@ def match_exposure(image: np.ndarray, photo: np.ndarray) -> Correction:
     return gain, wanted - gain * mean
 
 
-def coarse(difference: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return an image's averages over squares of :data:`COARSE_SHARE`, of the pixels that count.
+def low_pass(difference: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Box-filter an image over the pixels that count, with sides of :data:`LOW_PASS_SHARE`.
 
     Parameters
     ----------
@@ -324,9 +330,9 @@ def coarse(difference: np.ndarray, counts: np.ndarray) -> np.ndarray:
     Returns
     -------
     (h, w, 3) float64
-        0 where a pixel does not count.
+        0 at pixels that do not count.
     """
-    size = max(1, round(COARSE_SHARE * max(counts.shape)))
+    size = max(1, round(LOW_PASS_SHARE * max(counts.shape)))
     weight = uniform_filter(counts.astype(np.float64), size, mode="constant")  # (h, w)
     kept = np.where(counts[..., None], difference, 0.0).astype(np.float64)
     sums = uniform_filter(kept, (size, size, 1), mode="constant")

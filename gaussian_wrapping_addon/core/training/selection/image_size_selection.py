@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How fine the finest training image need be: do photos hold more detail than half their size?"""
+"""Choose the finest training image size: do photos hold detail that is lost at half size?"""
 
 from __future__ import annotations
 
@@ -11,69 +11,69 @@ import numpy as np
 from .model_selection import Decision
 
 DETAIL_RMS = 0.01
-"""Detail, in shares of full brightness, below which nothing is lost by halving: where half the size
-reproduces the photo with 40 dB, training, which reaches 20 to 35 dB, cannot tell the two apart."""
+"""Detail, relative to full brightness, below which halving loses nothing: if half the size
+reproduces the photo with 40 dB, training, which reaches 20 to 35 dB, cannot tell them apart."""
 
 DETAIL_QUANTILE = 0.9
-"""Detail is that of the blocks which have most of it: fine spokes before a plain wall count."""
+"""Quantile over the blocks that defines detail: fine spokes before a plain wall count."""
 
 NOISE_QUANTILE = 0.1
-"""Noise is that of the blocks which have least of everything."""
+"""Quantile over the blocks that defines noise: the quietest ones."""
 
 NOISE_FACTOR = 2.0
-"""Energy up to this many times the noise's is taken for noise: it grows with brightness, and
-compression leaves more of it at some places than at others."""
+"""Energy up to this multiple of the noise's is attributed to noise, which grows with brightness and
+is left unevenly by compression."""
 
 BLOCK_PX = 16
 SMALLEST_SIDE_PX = 240
-"""No photo is halved below this."""
+"""Photos are not halved below this long side."""
 
 MIN_BLOCKS = 8
 
 _NOISE_LOST = 0.75
-"""Share of the energy of white noise that halving loses: three quarters of all frequencies."""
+"""Share of the energy of white noise that halving removes: three quarters of all frequencies."""
 
 
 @dataclass(frozen=True)
 class PhotoDetail:
-    """What halving a photo loses."""
+    """Detail that a photo loses by halving."""
 
     side_px: int
     """Long side."""
     useful_px: int
-    """The smallest long side of its halvings that loses no detail."""
+    """Smallest long side, of repeated halvings, that loses no detail."""
     detail: float
-    """RMS of what the first halving loses where most is lost, noise taken off; brightness 1."""
+    """RMS lost by the first halving in the most detailed blocks, less noise; brightness 1."""
     noise: float
     """Standard deviation of the noise, brightness 1."""
 
 
 @dataclass(frozen=True)
-class ImageNeed:
-    """The largest useful size of a scene's photos."""
+class ImageSizeEvidence:
+    """Largest useful size of a scene's photos."""
 
     useful_px: int
     """Long side: the median over the photos."""
     side_px: int
-    """Long side of the photo that is this median."""
+    """Original long side of the photo that is this median."""
     detail: float
     noise: float
     photos: int
 
-    def wants_full(self, setting: str = "auto") -> bool:
-        """Tell whether photos are trained on at full size; else at half of it."""
+    def uses_full_size(self, setting: str = "auto") -> bool:
+        """Tell whether to train on photos at full size instead of half size."""
         return setting == "on" or (setting == "auto" and 2 * self.useful_px > self.side_px)
 
     def decision(self, setting: str = "auto") -> Decision:
-        """Return the record; the setting ``max_image_px`` bounds the size as well."""
+        """Return the decision; the setting ``max_image_px`` also bounds the size."""
         fine = self.useful_px >= self.side_px
         evidence = (
             f"Halved from {self.side_px} px, {self.photos} photos lose detail of "
             f"{100.0 * self.detail:.2f} % of full brightness beyond their noise of "
-            f"{100.0 * self.noise:.2f} % (worth keeping from {100.0 * DETAIL_RMS:.0f} %)."
+            f"{100.0 * self.noise:.2f} % (threshold {100.0 * DETAIL_RMS:.0f} %)."
         )
         if not fine:
-            evidence += f" They show nothing finer than images of {self.useful_px} px do."
+            evidence += f" Images of {self.useful_px} px hold all of their detail."
         figures = {
             "useful_px": float(self.useful_px),
             "side_px": float(self.side_px),
@@ -82,21 +82,21 @@ class ImageNeed:
             "photos": float(self.photos),
             "limit": DETAIL_RMS,
         }
-        size_px = self.side_px if self.wants_full(setting) else self.side_px // 2
+        size_px = self.side_px if self.uses_full_size(setting) else self.side_px // 2
         return Decision("full_size", setting, f"{size_px} px", evidence, figures)
 
 
 def photo_detail(photo: np.ndarray, mask: np.ndarray | None = None) -> PhotoDetail:
     """Measure what a photo loses by halving and enlarging again.
 
-    The noise is estimated from the diagonal differences of 2 x 2 pixels, which hardly any edge
-    reaches, in the quietest blocks (the idea of Donoho's estimate from the finest wavelet band).
+    The noise is estimated from the diagonal differences of 2 x 2 pixels, to which edges hardly
+    contribute, in the quietest blocks (after Donoho's estimate from the finest wavelet band).
 
     Parameters
     ----------
     photo : (h, w, 3) uint8, or floats in [0, 1]
     mask : (h, w) bool, optional
-        Only blocks that count as a whole are looked at.
+        Only fully unmasked blocks are used.
     """
     scale = np.float32(255 if photo.dtype == np.uint8 else 1)
     # Twice the green, which has the least noise in photos.
@@ -121,21 +121,21 @@ def photo_detail(photo: np.ndarray, mask: np.ndarray | None = None) -> PhotoDeta
     return PhotoDetail(side, useful, detail, noise)
 
 
-def image_need(details: Sequence[PhotoDetail]) -> ImageNeed:
-    """Return the useful size of a spread of photos: of half of them it keeps all detail.
+def select_image_size(details: Sequence[PhotoDetail]) -> ImageSizeEvidence:
+    """Return the useful size of a sample of photos: it keeps all detail of half of them.
 
     Raises
     ------
     ValueError
-        There are none.
+        There are no photos.
     """
     if not details:
         raise ValueError("no photo was measured")
-    # The upper one of two middle photos: detail is kept where half of the photos have it.
+    # The upper median: detail is kept if half of the photos have it.
     chosen = sorted(details, key=lambda d: (d.useful_px, d.side_px))[len(details) // 2]
-    return ImageNeed(
+    return ImageSizeEvidence(
         chosen.useful_px,
-        chosen.side_px,  # of the same photo: sizes may differ without any being halved
+        chosen.side_px,  # of the same photo, as original sizes may differ
         float(np.median([d.detail for d in details])),
         float(np.median([d.noise for d in details])),
         len(details),
@@ -174,7 +174,7 @@ def _diagonal(grey: np.ndarray) -> np.ndarray:
 
 
 def _blocks(values: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """Return the means over blocks that count as a whole."""
+    """Return the means over fully unmasked blocks."""
     rows, columns = values.shape[0] // BLOCK_PX, values.shape[1] // BLOCK_PX
     shape = (rows, BLOCK_PX, columns, BLOCK_PX)
     cut = values[: rows * BLOCK_PX, : columns * BLOCK_PX].reshape(shape)

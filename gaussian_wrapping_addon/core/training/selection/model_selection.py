@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a scene needs: decisions with their evidence, and the rules that need no rendering.
+"""Decisions of the model selection, their evidence, and the criteria that need no rendering.
 
 docs/method.md, section 4.4: more model than needed costs time and invites error, so each part of
-the model is switched on by what the photos say, says why, and can be overridden by a setting.
+the model is enabled by evidence from the photos, records that evidence, and can be overridden by a
+setting.
 """
 
 from __future__ import annotations
@@ -16,47 +17,47 @@ from typing import Any
 import numpy as np
 
 from ...errors import UsageError
-from ...settings import DECISIONS
+from ...settings import SELECTION_MODES
 
 ON, OFF = "on", "off"
 
 TWO_SIDED_ERROR = 0.5
-"""Mean normal error from which a Gaussian counts as seen against its orientation: 60 degrees. One
-that is seen from both sides alike has about 1, whatever way it points."""
+"""Mean normal error from which a Gaussian counts as two-sided: 60 degrees. A Gaussian seen equally
+from both sides has about 1, whatever its orientation."""
 
 WRAPPING_SHARE = 0.04
-"""Share of the shown surface with at least that error from which wrapping is needed. Contours and
-creases of a solid leave some behind that clones would not mend: 1.6 to 2.4 % on rendered solids, up
-to 3.1 % on real photos, where spokes and a thin cup have 10 % (640 pixels)."""
+"""Share of the visible surface with at least that error from which wrapping is selected. Contours
+and creases of a solid cause some that clones would not fix: 1.6 to 2.4 % on rendered solids, up to
+3.1 % on real photos, whereas spokes and a thin cup have 10 % (640 pixels)."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """One thing that was decided for a scene, and why."""
+    """One decision of the model selection with its evidence."""
 
     name: str
-    """Which; the setting's name of :class:`~.settings.TrainingSettings` where there is one."""
+    """Name; that of the :class:`~.settings.TrainingSettings` field if there is one."""
     setting: str
-    """What was asked for: ``"auto"``, ``"on"`` or ``"off"``."""
+    """Requested value: ``"auto"``, ``"on"`` or ``"off"``."""
     chosen: str
-    """What was done: ``"on"``, ``"off"``, or a value such as ``"degree 1"``."""
+    """Chosen value: ``"on"``, ``"off"``, or for instance ``"degree 1"``."""
     evidence: str
-    """A plain sentence with figures."""
+    """One sentence with figures, for the report."""
     figures: dict[str, float] = field(default_factory=dict)
     """The figures of the evidence, finite."""
     measured: bool = True
-    """Whether the photos were asked; false where the settings alone decide."""
+    """Whether the photos were measured; false if the settings alone decide."""
 
     def __post_init__(self) -> None:
-        if self.setting not in DECISIONS:
+        if self.setting not in SELECTION_MODES:
             raise UsageError(
                 f"The setting {self.name} is {self.setting!r}.",
-                f"Give one of {', '.join(DECISIONS)}.",
+                f"Give one of {', '.join(SELECTION_MODES)}.",
             )
 
     @property
     def overridden(self) -> bool:
-        """Whether a person decided and not the photos."""
+        """Whether a setting decided instead of the photos."""
         return self.setting != "auto"
 
     def to_json(self) -> dict[str, Any]:
@@ -72,7 +73,7 @@ class Decision:
         Raises
         ------
         UsageError
-            An entry is missing or of the wrong type.
+            An entry is missing or has the wrong type.
         """
         try:
             name, setting, chosen, evidence = texts = [
@@ -85,13 +86,13 @@ class Decision:
             raise UsageError(
                 f"A stored decision cannot be read ({error}).", "Train the scene again."
             ) from error
-        measured = values.get("measured") is not False  # version 0.1.0 did not tell
+        measured = values.get("measured") is not False  # not stored by version 0.1.0
         return cls(name, setting, chosen, evidence, figures, measured)
 
 
 @dataclass(frozen=True)
-class Needs:
-    """The decisions of a scene, in the order in which they were first taken; one of each name."""
+class ModelSelection:
+    """Decisions for a scene, in the order in which they were first taken; one per name."""
 
     decisions: tuple[Decision, ...] = ()
 
@@ -102,60 +103,62 @@ class Needs:
         return len(self.decisions)
 
     def get(self, name: str) -> Decision | None:
-        """Return the decision of a name, or ``None`` before it was taken."""
+        """Return the decision with a name, or ``None`` if not taken yet."""
         return next((d for d in self.decisions if d.name == name), None)
 
     def chose(self, name: str, value: str = ON) -> bool:
-        """Tell whether a decision was taken and chose ``value``."""
+        """Tell whether the decision was taken and its choice is ``value``."""
         decision = self.get(name)
         return decision is not None and decision.chosen == value
 
-    def with_decision(self, decision: Decision) -> Needs:
-        """Return these and one more; a later decision takes the place of one of the same name."""
+    def with_decision(self, decision: Decision) -> ModelSelection:
+        """Return a copy with a decision added; it replaces one of the same name."""
         if self.get(decision.name) is None:
-            return Needs((*self.decisions, decision))
-        return Needs(tuple(decision if d.name == decision.name else d for d in self.decisions))
+            return ModelSelection((*self.decisions, decision))
+        return ModelSelection(
+            tuple(decision if d.name == decision.name else d for d in self.decisions)
+        )
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return plain JSON values."""
         return [decision.to_json() for decision in self.decisions]
 
     @classmethod
-    def from_json(cls, values: Any) -> Needs:
+    def from_json(cls, values: Any) -> ModelSelection:
         """Build from :meth:`to_json`'s values.
 
         Raises
         ------
         UsageError
-            They are no list of decisions.
+            ``values`` is not a list of decisions.
         """
         if not isinstance(values, list):
-            raise UsageError("Stored decisions are no list.", "Train the scene again.")
-        needs = cls()
+            raise UsageError("Stored decisions are not a list.", "Train the scene again.")
+        model_selection = cls()
         for entry in values:
-            needs = needs.with_decision(Decision.from_json(entry))
-        return needs
+            model_selection = model_selection.with_decision(Decision.from_json(entry))
+        return model_selection
 
 
 def decide(
     name: str, setting: str, needed: bool, evidence: str, figures: dict[str, float] | None = None
 ) -> Decision:
-    """Return ``"on"`` where it is needed, or what the setting asks for instead of the evidence."""
+    """Decide ``"on"`` or ``"off"`` by the evidence, unless the setting overrides it."""
     chosen = (ON if needed else OFF) if setting == "auto" else setting
     return Decision(name, setting, chosen, evidence, dict(figures or {}))
 
 
-def multi_view_need(neighbours: Sequence[np.ndarray], setting: str = "auto") -> Decision:
+def select_multi_view(neighbours: Sequence[np.ndarray], setting: str = "auto") -> Decision:
     """Decide whether the multi-view terms are used (docs/method.md, section 3.4).
 
-    They compare a photo with one taken from a similar place, and are on as soon as any photo has
-    such a neighbour: photos without one skip them and cost nothing. Without any neighbour they stay
-    off whatever was asked for, as there is nothing to compare.
+    They compare a photo with one taken from a nearby pose, and are on if any photo has such a
+    neighbour: photos without one skip them at no cost. Without any neighbour they stay off,
+    whatever the setting, as there is nothing to compare.
 
     Parameters
     ----------
     neighbours : sequence of (k,) int arrays
-        Of each training view, its neighbours.
+        Neighbours of each training view.
     setting : str
     """
     count = len(neighbours)
@@ -168,36 +171,36 @@ def multi_view_need(neighbours: Sequence[np.ndarray], setting: str = "auto") -> 
     }
     if paired == 0:
         evidence = (
-            f"None of the {count} photos has another one taken from a similar place and direction, "
-            "so there is nothing to compare."
+            f"None of the {count} photos has a neighbour taken from a similar position and "
+            "direction, so there is nothing to compare."
         )
         return Decision("multi_view", setting, OFF, evidence, figures)
     evidence = (
-        f"{paired} of {count} photos ({100.0 * share:.0f} %) have another one taken from a similar "
-        f"place and direction, {figures['neighbours_per_photo']:.1f} on average."
+        f"{paired} of {count} photos ({100.0 * share:.0f} %) have neighbours taken from a similar "
+        f"position and direction, {figures['neighbours_per_photo']:.1f} on average."
     )
     return decide("multi_view", setting, True, evidence, figures)
 
 
-def wrapping_need(errors: np.ndarray, weights: np.ndarray, setting: str = "auto") -> Decision:
-    """Decide whether orientation is trained and clones of opposite orientation are made.
+def select_wrapping(errors: np.ndarray, weights: np.ndarray, setting: str = "auto") -> Decision:
+    """Decide whether orientations are trained and clones of opposite orientation are made.
 
-    Behind a thin part the orientation of its Gaussians is seen from the wrong side. Such Gaussians
-    disagree with the depth's normals in about half of their views, those of a solid hardly
-    anywhere: the share of them on what is shown is the evidence (docs/method.md, section 4.2).
+    Gaussians of a thin part are seen from both sides, so their orientation disagrees with the
+    normals of the depth map in about half of their views; Gaussians of a solid hardly ever do.
+    Their share of the visible surface is the evidence (docs/method.md, section 4.2).
 
     Parameters
     ----------
     errors : (n,) float
         Mean normal error ``1 - N . n_depth`` of each Gaussian over the views, in [0, 2], after the
-        orientation's first guess.
+        initial orientation.
     weights : (n,) float
-        How much each shows: pixels, or sums of blending weights; at least 0.
+        Visible weight of each: pixels, or sums of blending weights; at least 0.
 
     Raises
     ------
     UsageError
-        The arrays do not fit together.
+        The shapes differ, or are not one-dimensional.
     """
     if errors.shape != weights.shape or errors.ndim != 1:
         raise UsageError(
@@ -206,13 +209,14 @@ def wrapping_need(errors: np.ndarray, weights: np.ndarray, setting: str = "auto"
     known = np.isfinite(errors) & (weights > 0)
     total = float(weights[known].sum(dtype=np.float64))
     if total <= 0.0:
-        evidence = "No Gaussian is seen, so nothing can be said about thin parts."
+        evidence = "No Gaussian is visible, so thin parts cannot be detected."
         return decide("wrapping", setting, False, evidence)
     against = float(weights[known & (errors >= TWO_SIDED_ERROR)].sum(dtype=np.float64)) / total
     mean = float(np.average(errors[known].astype(np.float64), weights=weights[known]))
     figures = {"mean_normal_error": mean, "share_two_sided": against, "limit": WRAPPING_SHARE}
     evidence = (
-        f"Of the shown surface {100.0 * against:.1f} % faces another way than its depth says, as "
-        f"thin parts that are seen from behind do (limit {100.0 * WRAPPING_SHARE:.0f} %)."
+        f"On {100.0 * against:.1f} % of the visible surface, orientations disagree with the depth "
+        "map's normals, as on thin parts that are seen from both sides (limit "
+        f"{100.0 * WRAPPING_SHARE:.0f} %)."
     )
     return decide("wrapping", setting, against >= WRAPPING_SHARE, evidence, figures)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.frames.ground import main_plane
+from gaussian_wrapping_addon.core.dataset.frames.ground import find_ground_plane
 
 UP = np.array([0.0, 0.0, 1.0])
 Faces = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -46,7 +46,7 @@ def tilt(faces: Faces, degrees: float) -> tuple[Faces, np.ndarray]:
 @pytest.mark.parametrize(("scale", "away"), [(1.0, 0.0), (1e-3, 0.0), (1e4, 0.0), (1.0, 1e3)])
 def test_a_table_is_found_and_levelled(degrees: float, scale: float, away: float) -> None:
     (centers, normals, areas), true_up = tilt(table(), degrees)
-    plane = main_plane(scale * centers + away, normals, scale**2 * areas, UP)
+    plane = find_ground_plane(scale * centers + away, normals, scale**2 * areas, UP)
     assert plane is not None
     assert np.degrees(np.arccos(min(plane.normal @ true_up, 1.0))) < 0.2
     assert abs((plane.point - away) @ true_up) < 2e-3 * scale
@@ -55,14 +55,14 @@ def test_a_table_is_found_and_levelled(degrees: float, scale: float, away: float
 def test_a_rough_ground_is_found_within_its_noise() -> None:
     centers, normals, areas = table()
     centers = centers + 0.01 * np.random.default_rng(1).normal(size=centers.shape)
-    plane = main_plane(centers, normals, areas, UP)
+    plane = find_ground_plane(centers, normals, areas, UP)
     assert plane is not None
     assert abs(plane.point[2]) < 2e-3
     assert plane.normal[2] > np.cos(np.radians(0.5))
 
 
 def test_the_cap_of_a_region_that_cuts_through_does_not_count() -> None:
-    plane = main_plane(*together(table(), sheet(1.4, 6.0, (0, 0, 1))), UP)
+    plane = find_ground_plane(*together(table(), sheet(1.4, 6.0, (0, 0, 1))), UP)
     assert plane is not None
     assert abs(plane.point[2]) < 1e-3
 
@@ -86,4 +86,4 @@ def cube() -> Faces:
     ids=["ball", "top of a cube", "shelves", "ceiling", "nothing", "one point", "nan"],
 )
 def test_no_plane_where_none_is_clear(faces: Faces) -> None:
-    assert main_plane(*faces, UP) is None
+    assert find_ground_plane(*faces, UP) is None

@@ -11,8 +11,8 @@ import pytest
 from gaussian_wrapping_addon.core.dataset.loading.check import check_input
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import (
-    cameras_around,
-    even_directions,
+    cameras_on_spheres,
+    fibonacci_directions,
     scene_frame,
     splat_extent,
 )
@@ -27,12 +27,12 @@ OFFSET = np.array([5e5, -4e6, 30.0])
 
 
 def test_the_far_cameras_hold_the_whole_and_look_at_its_middle() -> None:
-    points = OFFSET + 7.0 * even_directions(500)
+    points = OFFSET + 7.0 * fibonacci_directions(500)
     extent = splat_extent(points, np.ones(500))
     assert np.linalg.norm(extent.center - OFFSET) < 0.1
     assert extent.radius == pytest.approx(7.0, rel=0.02)
     assert not extent.has_surroundings
-    cameras = cameras_around(extent)
+    cameras = cameras_on_spheres(extent)
     assert len(cameras) == len({camera.name for camera in cameras}) == 48
     for index, camera in enumerate(cameras):
         np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
@@ -47,7 +47,7 @@ def test_the_far_cameras_hold_the_whole_and_look_at_its_middle() -> None:
 
 
 def test_the_scene_frame_keeps_the_axes_and_fits_the_radius() -> None:
-    cameras = cameras_around(splat_extent(OFFSET + even_directions(200), np.ones(200)))
+    cameras = cameras_on_spheres(splat_extent(OFFSET + fibonacci_directions(200), np.ones(200)))
     frame = scene_frame(cameras)
     assert np.array_equal(frame.rotation, np.eye(3))
     centers = frame.points(np.stack([camera.center for camera in cameras]))
@@ -57,8 +57,8 @@ def test_the_scene_frame_keeps_the_axes_and_fits_the_radius() -> None:
 
 
 def test_surroundings_do_not_push_the_cameras_out() -> None:
-    far = 60.0 * even_directions(150)
-    points = np.concatenate([even_directions(500), far, 1e4 * np.ones((400, 3))])
+    far = 60.0 * fibonacci_directions(150)
+    points = np.concatenate([fibonacci_directions(500), far, 1e4 * np.ones((400, 3))])
     opacities = np.concatenate([np.full(650, 0.9), np.full(400, 0.01)])
     extent = splat_extent(points, opacities)
     assert extent.has_surroundings
@@ -68,7 +68,7 @@ def test_surroundings_do_not_push_the_cameras_out() -> None:
 
 def test_transparent_and_collapsed_splats_are_refused() -> None:
     with pytest.raises(DatasetError, match="transparent"):
-        splat_extent(even_directions(50), np.zeros(50))
+        splat_extent(fibonacci_directions(50), np.zeros(50))
     with pytest.raises(DatasetError, match="one place"):
         splat_extent(np.ones((50, 3)), np.ones(50))
 

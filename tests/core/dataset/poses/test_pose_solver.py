@@ -12,7 +12,10 @@ from scipy import ndimage
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
-from gaussian_wrapping_addon.core.dataset.loading.start_points import random_points, views_of_points
+from gaussian_wrapping_addon.core.dataset.loading.start_points import (
+    count_observing_views,
+    random_points,
+)
 from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
 from gaussian_wrapping_addon.core.dataset.poses.match_pairs import pairs_by_order, pairs_by_pose
 from gaussian_wrapping_addon.core.dataset.readers.source_model import quaternion_from_rotation
@@ -84,7 +87,7 @@ def test_photos_alone_are_solved_with_progress(tmp_path: Path) -> None:
     assert len(scene.points) > 300
     # Full-size photos give 1733 px at a width of 1000.
     assert scene.cameras[0].fx / scene.cameras[0].width == pytest.approx(1.733, rel=0.1)
-    seen = views_of_points(scene.cameras, scene.points)
+    seen = count_observing_views(scene.cameras, scene.points)
     assert np.mean(seen >= 2) > 0.99
     fractions = [event.fraction for event in events]
     assert fractions == sorted(fractions)
@@ -152,7 +155,7 @@ def test_posed_photos_without_texture_start_from_random_points(tmp_path: Path) -
     assert scene.facts["start_points"] == "random"
     assert len(scene.points) > 1000
     assert "random ones are used" in " ".join(w.text for w in scene.warnings)
-    assert (views_of_points(scene.cameras, scene.points) >= 2).all()
+    assert (count_observing_views(scene.cameras, scene.points) >= 2).all()
 
 
 def test_random_points_lie_where_cameras_look() -> None:
@@ -162,7 +165,7 @@ def test_random_points_lie_where_cameras_look() -> None:
     ]
     points = random_points(cameras, seed=0, count=500)
     assert points.shape == (500, 3)
-    assert (views_of_points(cameras, points) >= 2).all()
+    assert (count_observing_views(cameras, points) >= 2).all()
     assert np.linalg.norm(points, axis=1).max() < SCENE_RADIUS
     np.testing.assert_array_equal(points, random_points(cameras, seed=0, count=500))
 

@@ -48,4 +48,4 @@ def test_clouds_with_broken_headers_are_refused(
 ) -> None:
     with pytest.raises(ParseError) as caught:
         read(tmp_path, HEADER.format(XYZ).replace(old, new), b"1 2 3\n")
-    assert caught.value.place == place
+    assert caught.value.location == place

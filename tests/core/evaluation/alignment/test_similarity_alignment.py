@@ -114,7 +114,7 @@ def test_ransac_survives_forty_percent_of_outliers() -> None:
 
 def test_pairs_that_do_not_belong_together_are_refused() -> None:
     rng = np.random.default_rng(4)
-    with pytest.raises(DatasetError, match="do not belong together"):
+    with pytest.raises(DatasetError, match="do not correspond"):
         umeyama_ransac(
             rng.normal(size=(20, 3)), rng.normal(size=(20, 3)) * 9,
             threshold=1e-6, iterations=500, seed=0, with_scale=True,
@@ -155,7 +155,7 @@ def test_icp_leaves_far_points_out() -> None:
 
 def test_icp_refuses_what_it_cannot_pair() -> None:
     target = bumpy_sphere(100)
-    with pytest.raises(DatasetError, match="first alignment is wrong"):
+    with pytest.raises(DatasetError, match="initial alignment is wrong"):
         icp(target + 50.0, target, Similarity(), max_distance=0.1, with_scale=True)
     with pytest.raises(DatasetError, match="at least 3 source points"):
         icp(target[:2], target, Similarity(), max_distance=0.1, with_scale=True)

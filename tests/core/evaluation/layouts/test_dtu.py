@@ -134,7 +134,7 @@ def test_cameras_of_another_scene_are_refused(folder: Path) -> None:
         replace(c, cam_from_world=c.cam_from_world * [1, 1, 1, (-1) ** i])
         for i, c in enumerate(mixed)
     ]
-    with pytest.raises(DatasetError, match=r"miss those of Calibration/cal18 by"):
+    with pytest.raises(DatasetError, match=r"are off those of Calibration/cal18 by"):
         align_to_scan(other, truth)
     named = [replace(c, name=f"{i + 900}.png") for i, c in enumerate(CAMERAS)]
     with pytest.raises(DatasetError, match="0 of 12 photos"):

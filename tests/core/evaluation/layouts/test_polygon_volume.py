@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The crop volume follows a concave polygon along every axis and refuses what it cannot read."""
+"""Crop volumes: concave polygons along every axis, and errors of invalid files."""
 
 from __future__ import annotations
 

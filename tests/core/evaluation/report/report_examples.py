@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A report with all that a job measures, for tests of what is made of it."""
+"""A report with every figure that a job measures, for tests of the report."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Strips show photo, rendering and error where they say; curves and sizes are what they claim."""
+"""Strips of photo, rendering and error; learning curves; sizes in world units."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.core.evaluation.report.pictures import (
     ERROR_GAIN,
     GAP_PX,
     error_map,
-    heat,
+    heat_colors,
     strip,
     worst_to_best,
     write_held_out,
@@ -36,7 +36,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 def test_heat_rises_in_brightness() -> None:
-    colors = heat(np.linspace(-0.5, 1.5, 201)[None])[0].astype(float)
+    colors = heat_colors(np.linspace(-0.5, 1.5, 201)[None])[0].astype(float)
     grey = colors @ [0.299, 0.587, 0.114]
     assert (np.diff(grey) >= -0.5).all()
     assert (colors[:51] == 0).all()
@@ -52,8 +52,8 @@ def test_error_map_is_black_without_error_and_outside_of_the_mask() -> None:
     mask = np.ones((4, 6), bool)
     mask[3, 3] = False
     shown = error_map(photo, rendering, mask)
-    assert np.array_equal(shown[1, 2], heat(np.ones((1, 1)))[0, 0])
-    assert np.array_equal(shown[2, 3], heat(np.full((1, 1), 0.375))[0, 0])
+    assert np.array_equal(shown[1, 2], heat_colors(np.ones((1, 1)))[0, 0])
+    assert np.array_equal(shown[2, 3], heat_colors(np.full((1, 1), 0.375))[0, 0])
     shown[1, 2] = shown[2, 3] = 0
     assert (shown == 0).all()
 
@@ -120,7 +120,7 @@ def test_learning_curve_shows_every_entry(tmp_path: Path) -> None:
     assert [len(points) for points in lines] == [5, 5]
     texts = " ".join(e.text or "" for e in root.iter(f"{SVG}text"))
     assert "PSNR (dB)" in texts
-    assert "held out" in texts
+    assert "held-out photos" in texts
     history[2]["psnr"] = None
     assert write_learning_curve(training, path)
     first = next(ElementTree.parse(path).getroot().iter(f"{SVG}polyline"))

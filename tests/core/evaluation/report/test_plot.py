@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Plots: what stands where on both kinds of axes."""
+"""Plots: positions on linear and logarithmic axes."""
 
 from __future__ import annotations
 
@@ -65,4 +65,4 @@ def test_rows_of_panels_and_words_beside_points(tmp_path: Path) -> None:
 def test_a_panel_without_points_says_so(tmp_path: Path) -> None:
     write_svg([Panel("t", "x", "y", [Series("s", [(0.0, 1.0)])])], tmp_path / "p.svg")
     root = ElementTree.parse(tmp_path / "p.svg").getroot()
-    assert "nothing was measured" in [text.text for text in root.findall(f"{SPACE}text")]
+    assert "no data" in [text.text for text in root.findall(f"{SPACE}text")]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report tells all that was measured and warned of, and never what was not measured."""
+"""The report holds every measured figure and every warning, and nothing that was not measured."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from gaussian_wrapping_addon.core.evaluation.report.text import (
     percent,
     table,
 )
-from gaussian_wrapping_addon.core.files import finite
+from gaussian_wrapping_addon.core.files import finite_json
 from gaussian_wrapping_addon.core.report_warning import ReportWarning, read_warnings
 from gaussian_wrapping_addon.core.settings import JobSettings, to_json
 from tests.core.evaluation.report.report_examples import (
@@ -101,15 +101,15 @@ def test_every_warning_is_listed_with_stage_and_next_step(tmp_path: Path) -> Non
     entries = [line for line in warnings.splitlines() if line.startswith("- ")]
     expected = [
         ("cameras", "2 of 16 photos could not be placed"),
-        ("cameras", "miss their points by 3.50 px"),
+        ("cameras", "reprojection error of the cameras is 3.50 px"),
         ("training", "numbers were not finite"),
-        ("training", "Only 2 photos held out: too few to trust"),
+        ("training", "Only 2 photos held out: too few for a reliable mean"),
         ("training", "more than twice the error"),
         (f"mesh {REGION}", "The edge length was raised to 0.02."),
         (f"mesh {REGION}", "not closed (4 open edges)"),
-        (f"mesh {REGION}", "one vertex in a hundred the mesh is not on the surface"),
-        (f"mesh {REGION}", "3 faces without area"),
-        (f"texture {REGION}", "most of it was filled in"),
+        (f"mesh {REGION}", "do not lie on the reconstructed surface"),
+        (f"mesh {REGION}", "3 faces with zero area"),
+        (f"texture {REGION}", "the rest is filled in"),
         (f"texture {REGION}", "the unwrapper crashed"),
         (f"texture {REGION}", "5 faces smaller than a texel"),
         (f"texture {REGION}", "2 texels belong to two faces"),
@@ -180,7 +180,9 @@ def good() -> dict[str, Any]:
 
 def test_nothing_is_judged_where_nothing_is_wrong(tmp_path: Path) -> None:
     assert collect_warnings(good()) == []
-    assert "had anything to warn about" in section(report_markdown(good(), tmp_path), "## Warnings")
+    assert "No stage reported a warning" in section(
+        report_markdown(good(), tmp_path), "## Warnings"
+    )
 
 
 def test_a_boundary_that_is_open_by_request_is_no_defect(tmp_path: Path) -> None:
@@ -190,19 +192,23 @@ def test_a_boundary_that_is_open_by_request_is_no_defect(tmp_path: Path) -> None
     region["provenance"].update(boundary="open")
     assert collect_warnings(report) == []
     text = report_markdown(report, tmp_path)
-    assert "open by request where the region cuts through things" in text
+    assert "open by request at the region boundary" in text
     assert "not closed" not in text
 
 
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [
-        (("cameras", "facts", "mean_reprojection_error_px"), 2.01, "miss their points"),
+        (("cameras", "facts", "mean_reprojection_error_px"), 2.01, "reprojection error"),
         (("training", "held_out_psnr"), 23.9, "twice the error"),
         (("training", "held_out"), [], "No photo was held out"),
         (("regions", REGION, "texture", "coverage"), 0.499, "filled in"),
         (("regions", REGION, "texture", "coverage"), 0.0, "plain grey"),
-        (("regions", REGION, "provenance", "level_error_p99"), 0.251, "not on the surface"),
+        (
+            ("regions", REGION, "provenance", "level_error_p99"),
+            0.251,
+            "not lie on the reconstructed surface",
+        ),
     ],
 )
 def test_each_judgement_stands_alone(path: tuple[str, ...], value: Any, words: str) -> None:
@@ -227,9 +233,9 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         "PSNR of 23.0 dB",
         "typical error of 7.1 % of full brightness",  # 10 ** (-23 / 20)
         "photos saw 25.0 % of the texture",
-        f'The textured mesh of "{escaped(REGION)}": 20.0 dB (2 photos, counted where the mesh is',
-        ": 62.5 % of the photo; the texture compared was baked without the held-out photos)",
-        "too few to trust",
+        f'The textured mesh of "{escaped(REGION)}": 20.0 dB (2 photos, over the pixels the mesh',
+        "covers: 62.5 % of the photo; the texture compared was baked without the held-out photos)",
+        "too few for a reliable mean",
     ):
         assert words in summary, words
     stages = section(text, "## Time and memory")
@@ -253,12 +259,12 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         ("Edge length, mean", "0.04 world units"),
         ("Edge length, median", "0.03 world units"),
         ("Residual, median", "0.002 of vacancy"),
-        ("Residual, 99 % of vertices below", "0.31 of vacancy"),
+        ("Residual, 99th percentile", "0.31 of vacancy"),
         ("Residual, largest", "0.45 of vacancy"),
-        ("Size", "512 x 512 texels, chosen from the photos"),
+        ("Size", "512 x 512 texels, chosen from the resolution of the photos"),
         ("Texel density", "8.8 texels per world unit"),
         ("Coverage: seen by photos", "25.0 %"),
-        ("Surface area seen", "30.0 %"),
+        ("Surface area seen by photos", "30.0 %"),
         ("Area of faces smaller than a texel", "0.2 %"),
     ):
         assert row(region, name) == figure
@@ -291,18 +297,18 @@ def test_defects_of_the_last_check_are_told_and_what_was_cleaned_up(tmp_path: Pa
     _, text = write(tmp_path, None, {REGION: region})
     told = section(text, f"## Region {escaped(REGION)}")
     for name, figure in (
-        ("Check of closedness and manifold", "edges have one face only: 4"),
-        ("Removed for their size", "2 floaters, 1 small cavity: 3.0 % of the area"),
-        ("Removed after opening at the region", "2 small pieces: 1.0 % of the area"),
+        ("Check of the mesh (closed, manifold)", "edges have one face only: 4"),
+        ("Small components removed", "2 floaters, 1 small cavity: 3.0 % of the area"),
+        ("Small open components removed", "2 small pieces: 1.0 % of the area"),
         ("Smoothed", "3 steps"),
         ("Faces before decimation", "9,000 faces"),
-        ("Faces asked for", "196 faces"),
+        ("Target number of faces", "196 faces"),
     ):
         assert row(told, name) == figure
     assert "edges have one face only: 4" in section(text, "## Warnings")
     region["check"] = {"good": True, "defects": []}
     found = collect_warnings({"regions": {REGION: region}})
-    assert not [w for w in found if "check of the finished mesh" in w.text]
+    assert not [w for w in found if "check of the final mesh" in w.text]
     assert "| no defect |" in write(tmp_path, None, {REGION: region})[1]
 
 
@@ -312,14 +318,14 @@ def test_tiles_processes_and_what_no_camera_saw_are_told(tmp_path: Path) -> None
         tiles=3, tile_processes=2, field_evaluations=4000, unseen_evaluations=50, unseen="occupied"
     )
     told = section(write(tmp_path, None, {REGION: region})[1], f"## Region {escaped(REGION)}")
-    assert row(told, "Made in") == "3 tiles, by 2 processes"
-    assert row(told, "Seen by no camera") == "1.2 % of the points asked for, taken as occupied"
+    assert row(told, "Tiles") == "3 tiles, by 2 processes"
+    assert row(told, "Seen by no camera") == "1.2 % of the points evaluated, treated as occupied"
     region["provenance"].update(tiles=1, tile_processes=1, unseen_evaluations=0, unseen="empty")
     told = section(write(tmp_path, None, {REGION: region})[1], f"## Region {escaped(REGION)}")
-    assert row(told, "Made in") == "1 tile, by 1 process"
-    assert row(told, "Seen by no camera") == "0.0 % of the points asked for, taken as empty"
+    assert row(told, "Tiles") == "1 tile, by 1 process"
+    assert row(told, "Seen by no camera") == "0.0 % of the points evaluated, treated as empty"
     told = section(write(tmp_path)[1], f"## Region {escaped(REGION)}")
-    assert "Made in" not in told
+    assert "| Tiles |" not in told
     assert "Seen by no camera" not in told
     assert "before decimation" not in told
 
@@ -327,12 +333,12 @@ def test_tiles_processes_and_what_no_camera_saw_are_told(tmp_path: Path) -> None
 def test_pictures_are_linked_exactly_where_they_are(tmp_path: Path) -> None:
     _, text = write(tmp_path)
     assert LINK.findall(text) == []
-    assert "no pictures of the photos held out" in text
+    assert "no pictures of the held-out photos" in text
     write_pictures(tmp_path)
     _, text = write(tmp_path)
     links = [urllib.parse.unquote(link) for link in LINK.findall(text)]
     assert sorted(links) == sorted(PICTURES)
-    assert r"*p\|q.jpg, 18.5 dB. Left the photo, right the textured mesh.*" in text
+    assert r"*p\|q.jpg, 18.5 dB. Left: the photo. Right: the textured mesh.*" in text
     summary = full_summary()
     summary["training"]["pictures"] = [{"file": "../../secret.jpg", "name": "x", "psnr": 1.0}]
     (tmp_path.parent / "secret.jpg").write_bytes(b"x")
@@ -354,7 +360,7 @@ def test_tables_are_well_formed(tmp_path: Path, perceptual: bool) -> None:
         assert len(widths) == 1, lines
         assert all(set(c.strip()) <= {"-", ":"} and "---" in c for c in cells(lines[1]))
         assert len(lines) > 2
-    assert ("LPIPS (0 is equal)" in text) == perceptual
+    assert ("LPIPS (0 is identical)" in text) == perceptual
     # Markup of outside names is shown, not obeyed.
     assert text.splitlines()[0] == r"# Report: a\|b &lt;i&gt;\*photos\*&lt;/i&gt;"
 
@@ -388,7 +394,7 @@ def test_perceptual_figures_of_held_out_photos(tmp_path: Path) -> None:
     summary = full_summary()
     summary["training"].pop("lpips_note")
     _, text = write(tmp_path, summary)
-    assert "LPIPS (likeness as people see it) was not measured." in section(text, "## Training")
+    assert "LPIPS (perceptual distance) was not measured." in section(text, "## Training")
     for figure, value in zip(summary["training"]["held_out"], (0.25, 0.35), strict=True):
         figure["lpips"] = value
     summary["training"]["held_out_lpips"] = 0.3
@@ -411,7 +417,7 @@ def test_one_bad_figure_never_breaks_a_report(tmp_path: Path, value: Any) -> Non
         place[path[-1]] = value
         if path[:2] == ("training", "pictures"):
             continue
-        values = finite(report)
+        values = finite_json(report)
         text = report_markdown(values, tmp_path)
         body = text[: text.index("<details>")].replace("none ran", "").replace("black is none", "")
         assert WRONG_NUMBER.search(body) is None, path

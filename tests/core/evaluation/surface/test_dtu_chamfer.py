@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Chamfer in the manner of DTU: plates at known distances, the mask, the plane and the thinning."""
+"""DTU Chamfer distance: plates at known distances, the mask, the plane and the thinning."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Samples of a surface: even, exact, deterministic, and the same at huge coordinates."""
+"""Surface samples: uniform, exact, deterministic, and the same at huge coordinates."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.core.evaluation.surface.samples import (
     sample_legacy,
     sample_uniformly,
     scan_virtually,
-    thin_out,
+    voxel_downsample,
 )
 from gaussian_wrapping_addon.core.mesh.depth_buffer import NEAR_DEPTH
 from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
@@ -98,7 +98,7 @@ def test_bad_meshes_are_refused(sample: str) -> None:
     for bad in (np.nan, np.inf):
         with pytest.raises(MeshingError, match="not finite"):
             run(np.where(vertices == 1, bad, vertices), faces)
-    with pytest.raises(UsageError, match="outside of 0 to 2"):
+    with pytest.raises(UsageError, match="outside 0 to 2"):
         run(vertices, faces + 1)
     # A vertex that no face uses does not matter.
     run(np.concatenate([vertices, [[np.nan] * 3]]), faces)
@@ -232,15 +232,15 @@ def test_thinning_takes_the_mean_of_each_cell() -> None:
         cells.setdefault(tuple(cell.tolist()), []).append(row)
     expected = np.array([points[rows].mean(0) for _, rows in sorted(cells.items())])
     turned = np.array([normals[rows].mean(0) for _, rows in sorted(cells.items())])
-    thin = thin_out(SurfaceSamples(points, normals), voxel)
+    thin = voxel_downsample(SurfaceSamples(points, normals), voxel)
     assert np.allclose(thin.points, expected, atol=1e-14)
     assert np.allclose(
         thin.normals, turned / np.linalg.norm(turned, axis=1, keepdims=True), atol=1e-12
     )
     order = rng.permutation(500)
-    again = thin_out(SurfaceSamples(points[order], normals[order]), voxel)
+    again = voxel_downsample(SurfaceSamples(points[order], normals[order]), voxel)
     assert np.allclose(again.points, thin.points, atol=1e-14)
-    far = thin_out(SurfaceSamples(points + OFFSET, normals), voxel)
+    far = voxel_downsample(SurfaceSamples(points + OFFSET, normals), voxel)
     assert len(far.points) == len(thin.points)
     assert np.abs(far.points - OFFSET - thin.points).max() < 2e-9
 
@@ -249,7 +249,7 @@ def test_the_chosen_sample_is_the_nearest_to_the_mean_of_its_cell() -> None:
     rng = np.random.default_rng(2)
     points = np.repeat(rng.uniform(-1, 1, (300, 3)), 2, 0)  # each twice: ties
     samples = SurfaceSamples(points, np.arange(1800.0).reshape(600, 3))
-    means, chosen = thin_out(samples, 0.5), choose_per_cell(samples, 0.5)
+    means, chosen = voxel_downsample(samples, 0.5), choose_per_cell(samples, 0.5)
     assert len(chosen) == len(means) < 200
     cell = np.floor((points - points.min(0)) / 0.5 + 0.5)
     for mean, point, normal in zip(means.points, chosen.points, chosen.normals, strict=True):
@@ -259,23 +259,23 @@ def test_the_chosen_sample_is_the_nearest_to_the_mean_of_its_cell() -> None:
         others = (cell == cell[row]).all(1)
         nearest = np.linalg.norm(points[others] - mean, axis=1).min()
         assert np.linalg.norm(point - mean) == pytest.approx(nearest, abs=1e-12)
-    assert len(choose_per_cell(SurfaceSamples.none(), 0.5)) == 0
+    assert len(choose_per_cell(SurfaceSamples.empty(), 0.5)) == 0
 
 
 def test_thinning_at_the_ends_of_its_range() -> None:
-    nothing = SurfaceSamples.none()
-    assert len(thin_out(nothing, 1.0)) == 0
+    nothing = SurfaceSamples.empty()
+    assert len(voxel_downsample(nothing, 1.0)) == 0
     opposite = SurfaceSamples(np.zeros((2, 3)), np.array([[0, 0, 1.0], [0, 0, -1.0]]))
-    thin = thin_out(opposite, 1.0)
+    thin = voxel_downsample(opposite, 1.0)
     assert thin.points.tolist() == [[0, 0, 0]]
     assert thin.normals.tolist() == [[0, 0, 0]]
     apart = SurfaceSamples(np.array([[0.0, 0, 0], [1, 1, 1]]), np.zeros((2, 3)))
-    assert len(thin_out(apart, 1e-3)) == 2
+    assert len(voxel_downsample(apart, 1e-3)) == 2
     for voxel in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(UsageError):
-            thin_out(apart, voxel)
+            voxel_downsample(apart, voxel)
     with pytest.raises(UsageError, match="too small"):
-        thin_out(apart, 1e-9)
+        voxel_downsample(apart, 1e-9)
 
 
 def test_distances_to_a_cube_match_the_closed_form() -> None:

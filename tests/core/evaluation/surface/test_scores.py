@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Surface scores: perfect on the truth, closed forms on spheres, and the bias of the old way."""
+"""Surface scores: perfect on the truth, closed forms on spheres, bias of legacy sampling."""
 
 from __future__ import annotations
 
@@ -309,7 +309,7 @@ def test_the_crop_chooses_what_is_judged_not_what_it_is_measured_against() -> No
     assert part.predicted_count == whole.predicted_count < 4000
     assert part.accuracy_mean == whole.accuracy_mean
     outside = dataclasses.replace(cropped, crop=RegionCrop(Region.box("off", [5] * 3, [6] * 3)))
-    with pytest.raises(UsageError, match="inside of the crop"):
+    with pytest.raises(UsageError, match="inside the crop"):
         uniform(mesh, outside, 0.01)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ground truth of a scene's folder: read as written, refused with its entry named."""
+"""Ground-truth folders: read as written; errors state the invalid entry."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_a_wrong_entry_is_named(tmp_path: Path, name: str, value: np.ndarray | N
     with pytest.raises(ParseError) as caught:
         read_truth(tmp_path)
     assert caught.value.path.name == "truth.npz"
-    assert name in f"{caught.value.place} {caught.value.message}" or "ground truth" in str(
+    assert name in f"{caught.value.location} {caught.value.message}" or "ground truth" in str(
         caught.value
     )
     assert caught.value.hint
@@ -118,7 +118,7 @@ def test_a_truth_must_be_whole() -> None:
     with pytest.raises(DatasetError, match="not both"):
         Truth(samples, np.zeros((3, 3)))
     with pytest.raises(DatasetError, match="no samples"):
-        Truth(SurfaceSamples.none())
+        Truth(SurfaceSamples.empty())
     with pytest.raises(DatasetError, match="seen"):
         Truth(samples, seen=np.zeros(3, bool))
     assert Truth(samples).judged().all()

@@ -18,7 +18,7 @@ from gaussian_wrapping_addon.core.evaluation.views.textured_rendering import (
     BACKGROUND,
     TexturedRenderer,
 )
-from gaussian_wrapping_addon.core.imaging.lpips import PLACES_VARIABLE, Lpips
+from gaussian_wrapping_addon.core.imaging.lpips import WEIGHTS_VARIABLE, Lpips
 from gaussian_wrapping_addon.core.imaging.view_metrics import PSNR_CAP_DB
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
@@ -191,7 +191,7 @@ def test_lpips_is_measured_where_it_is_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path, *random_states())
-    monkeypatch.setenv(PLACES_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
     metric = Lpips.load()
     textured, cameras, photos = flat_wall(2)
     photos[1] = 255 - photos[1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A job's mesh beside the job's photos: which photos, what is told, what is written."""
+"""Comparison of a job's mesh with photos: choice of photos, notes, files written."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from PIL import Image
 
 from gaussian_wrapping_addon.core.errors import ParseError
 from gaussian_wrapping_addon.core.evaluation.views import photo_comparison
-from gaussian_wrapping_addon.core.evaluation.views.held_out_texture import texture_without
+from gaussian_wrapping_addon.core.evaluation.views.held_out_texture import bake_held_out_texture
 from gaussian_wrapping_addon.core.evaluation.views.photo_comparison import (
     LONG_SIDE_PX,
     MAX_PHOTOS,
@@ -54,7 +54,7 @@ def test_photos_are_chosen_evenly_and_held_out_ones_first(tmp_path: Path) -> Non
     assert names_of(values) == [f"{i}.jpg" for i in range(0, 22, 3)]
     assert len(values["views"]) == MAX_PHOTOS
     assert values["held_out"] is False
-    assert "all photos, these included" in values["note"]
+    assert "all photos, including those compared" in values["note"]
     values = compared(photos, {"3.jpg", "9.jpg"}, tmp_path)
     assert names_of(values) == ["3.jpg", "9.jpg"]
     assert values["held_out"] is True
@@ -75,7 +75,7 @@ def test_a_held_out_photo_is_judged_by_a_texture_without_it(tmp_path: Path) -> N
     scores = {view["name"]: view["psnr"] for view in values["views"]}
     assert scores.keys() == {"2.jpg", "4.jpg"}
     assert max(scores.values()) < 12.0
-    assert values["note"] == photo_comparison.WITHOUT
+    assert values["note"] == photo_comparison.NOTE_HELD_OUT
     assert values["texture_size_px"] == len(wall.albedo)
     assert values["bake_s"] >= 0.0
     assert sorted(p.name for p in tmp_path.iterdir()) == values["pictures"]
@@ -85,7 +85,7 @@ def test_a_held_out_photo_is_judged_by_a_texture_without_it(tmp_path: Path) -> N
         from_gaussians=True,
     )  # fmt: skip
     assert {view["name"]: view["psnr"] for view in values["views"]}["2.jpg"] > 40.0
-    assert values["note"] == photo_comparison.FROM_GAUSSIANS
+    assert values["note"] == photo_comparison.NOTE_GAUSSIANS
 
 
 @pytest.mark.parametrize(("reduction", "size_px"), [(1, 1024), (3, 512), (4, 256), (99, 256)])
@@ -93,7 +93,7 @@ def test_the_texture_without_them_is_as_coarse_as_the_pictures(
     tmp_path: Path, reduction: int, size_px: int
 ) -> None:
     photos = wall_photos(3)
-    textured = texture_without(
+    textured = bake_held_out_texture(
         gradient_wall(1024), scene_of(photos), photos, {"1.jpg"}, reduction, tmp_path, Progress(),
         threads=1,
     )  # fmt: skip

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The preview: a photo and the mesh from its camera, well chosen."""
+"""Preview picture: choice of the photo, and the mesh rendered from its camera."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is rendered is what an exact ray caster sees."""
+"""Renderings of textured meshes agree with an exact ray caster."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vacancy where photos are masked, and where no camera sees."""
+"""Vacancy of masked and of unseen points."""
 
 from __future__ import annotations
 

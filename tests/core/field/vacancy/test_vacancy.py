@@ -287,11 +287,11 @@ def test_no_gaussians_and_no_points() -> None:
 def test_cameras_that_win_are_asked_first() -> None:
     arrays = shell_arrays(0.9, count=300)
     field = VacancyField(arrays, cameras_around(6), threads=1)
-    assert sorted(field.visiting_order().tolist()) == list(range(6))
+    assert sorted(field.evaluation_order().tolist()) == list(range(6))
     target = field.cameras[4].center / 4.0
     field.vacancy(target + 0.05 * np.random.default_rng(0).normal(size=(200, 3)))
     assert field.wins.sum() == 200
-    assert field.visiting_order()[0] == np.argmax(field.wins)
+    assert field.evaluation_order()[0] == np.argmax(field.wins)
     assert field.evaluations == 200
 
 

@@ -10,13 +10,13 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, ResourceError
 from gaussian_wrapping_addon.core.jobs.stages.oom_retry import (
-    GAUSSIANS_STEP,
-    IMAGE_STEP,
+    GAUSSIANS_FACTOR,
+    IMAGE_FACTOR,
     MIN_GAUSSIANS,
     MIN_IMAGE_PX,
     killed_hint,
-    one_smaller,
-    train_within_memory,
+    reduced_settings,
+    train_with_oom_retry,
 )
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 
@@ -52,7 +52,7 @@ def failing(error: Exception, times: int) -> tuple[Callable, list[tuple[int, int
 def test_steps_down_and_says_so(tmp_path: Path, error: Exception, times: int) -> None:
     train, seen = failing(error, times)
     forgotten: list[int] = []
-    trained = train_within_memory(train, ASKED, tmp_path, lambda: forgotten.append(len(seen)))
+    trained = train_with_oom_retry(train, ASKED, tmp_path, lambda: forgotten.append(len(seen)))
     assert seen == [(10_000, 400), FIRST, SECOND][: times + 1]
     assert trained.result == seen[-1]
     assert (trained.settings.max_gaussians, trained.settings.max_image_px) == seen[-1]
@@ -66,7 +66,7 @@ def test_steps_down_and_says_so(tmp_path: Path, error: Exception, times: int) ->
 def test_the_third_failure_is_told(tmp_path: Path) -> None:
     train, seen = failing(MemoryError("full"), 9)
     with pytest.raises(ResourceError, match="even with at most 3600 Gaussians") as caught:
-        train_within_memory(train, ASKED, tmp_path, lambda: None)
+        train_with_oom_retry(train, ASKED, tmp_path, lambda: None)
     assert len(seen) == 3
     assert caught.value.hint
 
@@ -77,7 +77,7 @@ def test_the_third_failure_is_told(tmp_path: Path) -> None:
 def test_other_failures_are_passed_on_at_once(tmp_path: Path, error: Exception) -> None:
     train, seen = failing(error, 1)
     with pytest.raises(type(error)):
-        train_within_memory(train, ASKED, tmp_path, lambda: pytest.fail("nothing to forget"))
+        train_with_oom_retry(train, ASKED, tmp_path, lambda: pytest.fail("nothing to forget"))
     assert len(seen) == 1
     assert list(tmp_path.iterdir()) == []
 
@@ -90,9 +90,9 @@ def test_a_resumed_run_stays_as_small_as_it_was(tmp_path: Path) -> None:
         raise MemoryError if len(sizes) == 1 else Cancelled
 
     with pytest.raises(Cancelled):
-        train_within_memory(interrupted, ASKED, tmp_path, lambda: None)
+        train_with_oom_retry(interrupted, ASKED, tmp_path, lambda: None)
     train, seen = failing(MemoryError(), 0)
-    trained = train_within_memory(train, ASKED, tmp_path, lambda: pytest.fail("kept checkpoints"))
+    trained = train_with_oom_retry(train, ASKED, tmp_path, lambda: pytest.fail("kept checkpoints"))
     assert seen == [FIRST]
     assert len(trained.warnings) == 1
 
@@ -112,21 +112,21 @@ def test_memory_of_the_failed_try_is_free_before_the_next(tmp_path: Path) -> Non
         alive.append(weakref.ref(large))
         raise MemoryError
 
-    assert train_within_memory(train, ASKED, tmp_path, lambda: None).result == 0
+    assert train_with_oom_retry(train, ASKED, tmp_path, lambda: None).result == 0
 
 
 def test_a_step_has_a_floor_and_never_goes_up() -> None:
     settings: TrainingSettings | None = TrainingSettings(max_gaussians=1500, max_image_px=120)
     steps = 0
-    while (smaller := one_smaller(settings)) is not None:
-        assert smaller.max_gaussians <= settings.max_gaussians
-        assert smaller.max_image_px <= settings.max_image_px
-        settings, steps = smaller, steps + 1
+    while (reduced := reduced_settings(settings)) is not None:
+        assert reduced.max_gaussians <= settings.max_gaussians
+        assert reduced.max_image_px <= settings.max_image_px
+        settings, steps = reduced, steps + 1
     assert (settings.max_gaussians, settings.max_image_px) == (MIN_GAUSSIANS, MIN_IMAGE_PX)
     assert 0 < steps < 5
-    assert one_smaller(TrainingSettings(max_gaussians=500, max_image_px=64)) is None
+    assert reduced_settings(TrainingSettings(max_gaussians=500, max_image_px=64)) is None
 
 
 def test_a_killed_worker_is_told_a_number() -> None:
     assert "--max-gaussians 6000" in killed_hint(ASKED)
-    assert (GAUSSIANS_STEP, IMAGE_STEP) == (0.6, 0.75)
+    assert (GAUSSIANS_FACTOR, IMAGE_FACTOR) == (0.6, 0.75)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_wrapping_addon.core.jobs.store.blend_file import set_aside_stale, shown_result
+from gaussian_wrapping_addon.core.jobs.store.blend_file import back_up_stale_blend, result_state
 
 
 @pytest.fixture
@@ -19,9 +19,9 @@ def result(tmp_path: Path) -> Path:
 
 
 def test_an_unchanged_result_keeps_its_file(result: Path) -> None:
-    before = shown_result(result)
+    before = result_state(result)
     (result / "ball" / "figures.json").write_text('{"seconds": 1}')
-    assert not set_aside_stale(result, before)
+    assert not back_up_stale_blend(result, before)
     assert (result / "scene.blend").read_bytes() == b"first"
 
 
@@ -29,20 +29,20 @@ def test_an_unchanged_result_keeps_its_file(result: Path) -> None:
 def test_a_changed_and_a_new_region_set_the_file_aside(
     result: Path, region: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    before = shown_result(result)
+    before = result_state(result)
     (result / region).mkdir(exist_ok=True)
     (result / region / "figures.json").write_text('{"seconds": 2}')
     with caplog.at_level("INFO", "gaussian_wrapping"):
-        assert set_aside_stale(result, before)
+        assert back_up_stale_blend(result, before)
     assert not (result / "scene.blend").exists()
     assert (result / "scene.blend1").read_bytes() == b"first"
     assert "scene.blend1" in caplog.text
-    assert not set_aside_stale(result, before), "there is none to set aside"
+    assert not back_up_stale_blend(result, before), "there is none to set aside"
     (result / "scene.blend").write_bytes(b"second")
-    assert set_aside_stale(result, before)
+    assert back_up_stale_blend(result, before)
     assert (result / "scene.blend1").read_bytes() == b"second"
 
 
 def test_a_folder_without_a_result_is_no_error(tmp_path: Path) -> None:
-    assert shown_result(tmp_path / "missing") == {}
-    assert not set_aside_stale(tmp_path / "missing", {})
+    assert result_state(tmp_path / "missing") == {}
+    assert not back_up_stale_blend(tmp_path / "missing", {})

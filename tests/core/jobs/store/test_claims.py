@@ -15,7 +15,12 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError, ParseError
 from gaussian_wrapping_addon.core.jobs.store import claims as claims_module
-from gaussian_wrapping_addon.core.jobs.store.claims import Claims, Task, this_place, work_through
+from gaussian_wrapping_addon.core.jobs.store.claims import (
+    Claims,
+    Task,
+    host_and_pid_namespace,
+    run_tasks,
+)
 from gaussian_wrapping_addon.core.meshing.tiles.plan import Field
 from gaussian_wrapping_addon.core.meshing.tiles.store import (
     faces_path,
@@ -48,27 +53,33 @@ SETTINGS = MeshingSettings(points=1200, spacing="uniform")
 
 def claim_of(folder: Path, name: str, **changes: object) -> Path:
     path = folder / f"{name}.json"
-    values = {"place": this_place(), "pid": 2**22 + 5, "started": 1, "token": "t", **changes}
+    values = {
+        "place": host_and_pid_namespace(),
+        "pid": 2**22 + 5,
+        "started": 1,
+        "token": "t",
+        **changes,
+    }
     path.write_text(json.dumps(values))
     return path
 
 
 def test_a_claim_is_held_by_one_and_given_back(tmp_path: Path) -> None:
     first, second = Claims(tmp_path / "c"), Claims(tmp_path / "c")
-    with first.taken("a") as free:
+    with first.held("a") as free:
         assert free
-        with second.taken("a") as also:
+        with second.held("a") as also:
             assert not also
-        with second.taken("b") as other:
+        with second.held("b") as other:
             assert other
     assert not list((tmp_path / "c").iterdir())
-    with second.taken("a") as free:
+    with second.held("a") as free:
         assert free
 
 
 def test_a_claim_is_given_back_after_an_error(tmp_path: Path) -> None:
     claims = Claims(tmp_path / "c")
-    with pytest.raises(MeshingError), claims.taken("a"):
+    with pytest.raises(MeshingError), claims.held("a"):
         raise MeshingError("no")
     assert not claims.path("a").exists()
 
@@ -76,7 +87,7 @@ def test_a_claim_is_given_back_after_an_error(tmp_path: Path) -> None:
 def test_the_claim_of_a_dead_process_is_taken_at_once(tmp_path: Path) -> None:
     claims = Claims(tmp_path)
     claim_of(tmp_path, "a")
-    with claims.taken("a") as free:
+    with claims.held("a") as free:
         assert free
         assert json.loads(claims.path("a").read_text())["token"] != "t"
 
@@ -88,9 +99,9 @@ def test_a_foreign_claim_is_left_until_it_is_stale(tmp_path: Path, content: str 
         path.write_text(content)
     patient, hasty = Claims(tmp_path, stale_s=1e6), Claims(tmp_path, stale_s=0.0)
     for _ in range(2):
-        with patient.taken("a") as free:
+        with patient.held("a") as free:
             assert not free
-    with hasty.taken("a") as free:
+    with hasty.held("a") as free:
         assert free
 
 
@@ -99,18 +110,18 @@ def test_a_foreign_claim_that_is_refreshed_lives(tmp_path: Path) -> None:
     claims = Claims(tmp_path, stale_s=0.15)
     for turn in range(4):
         os.utime(path, ns=(turn, turn))
-        with claims.taken("a") as free:
+        with claims.held("a") as free:
             assert not free
         time.sleep(0.1)
     time.sleep(0.2)
-    with claims.taken("a") as free:
+    with claims.held("a") as free:
         assert free
 
 
 def test_a_holder_refreshes_its_claim(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(claims_module, "BEAT_S", 0.02)
+    monkeypatch.setattr(claims_module, "REFRESH_S", 0.02)
     claims = Claims(tmp_path)
-    with claims.taken("a"):
+    with claims.held("a"):
         before = claims.path("a").stat().st_mtime_ns
         limit_s = time.monotonic() + 10
         while claims.path("a").stat().st_mtime_ns == before:
@@ -128,7 +139,7 @@ def test_tasks_run_in_order_of_need_and_errors_pass(tmp_path: Path) -> None:
         )  # fmt: skip
 
     tasks = [task("c", "b"), task("b", "a"), task("a")]
-    assert work_through(tasks, Claims(tmp_path), Progress()) == 3
+    assert run_tasks(tasks, Claims(tmp_path), Progress()) == 3
     assert done == ["a", "b", "c"]
 
     def fail(_: Progress) -> None:
@@ -137,10 +148,10 @@ def test_tasks_run_in_order_of_need_and_errors_pass(tmp_path: Path) -> None:
     broken = Task("d", lambda: False, lambda: True, fail)
     done_here: list[str] = []
     with pytest.raises(MeshingError):
-        work_through([task("e"), broken], Claims(tmp_path), Progress(), done_here=done_here)
+        run_tasks([task("e"), broken], Claims(tmp_path), Progress(), done_here=done_here)
     assert done_here == ["e"]
     assert not list(tmp_path.glob("*.json"))
-    assert Claims(tmp_path).workers() == 2
+    assert Claims(tmp_path).worker_count() == 2
 
 
 def planned(folder: Path) -> Field:
@@ -172,12 +183,12 @@ def test_two_processes_and_a_killed_one_give_the_mesh_of_one(tmp_path: Path) -> 
         time.sleep(0.002)
     killed.kill()
     killed.wait()
-    workers = [start(folder), start(folder)]
-    shares = [int(worker.communicate(timeout=200)[0]) for worker in workers]
+    worker_count = [start(folder), start(folder)]
+    shares = [int(worker.communicate(timeout=200)[0]) for worker in worker_count]
     assert all(task.done() for task in torus_tasks(folder))
     assert not list(folder.glob("claims/*.json"))
     assert 1 <= sum(shares) <= 9
-    known = Claims(folder / "claims").workers()
+    known = Claims(folder / "claims").worker_count()
     at_work = sum(share > 0 for share in shares)
     assert at_work <= known <= at_work + 1, "one that was killed may have done a part"
     plan, origin = load_plan(folder)

@@ -12,10 +12,10 @@ from gaussian_wrapping_addon.core.errors import DatasetError, UsageError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.continue_training import (
-    bring_checkpoints,
     checkpoints,
-    job_with_more,
+    continue_training_job,
     lineage,
+    link_checkpoints,
     shorter_training,
 )
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
@@ -41,7 +41,7 @@ def test_more_adds_up_and_keeps_all_else(tmp_path: Path) -> None:
     folder = JobFolder(tmp_path)
     stage(folder.stages, "a")
     job = job_of(tmp_path, iterations=70, extra_iterations=5)
-    longer = job_with_more(folder, job, 30)
+    longer = continue_training_job(folder, job, 30)
     assert longer.command == "more"
     assert longer.settings.training.extra_iterations == 35
     training = replace(longer.settings.training, extra_iterations=5)
@@ -52,13 +52,13 @@ def test_more_adds_up_and_keeps_all_else(tmp_path: Path) -> None:
 def test_more_without_a_finished_training_or_checkpoint_is_refused(tmp_path: Path) -> None:
     folder, job = JobFolder(tmp_path), job_of(tmp_path)
     with pytest.raises(DatasetError, match="no finished training"):
-        job_with_more(folder, job, 5)
+        continue_training_job(folder, job, 5)
     stage(folder.stages, "a", iterations=())
     with pytest.raises(DatasetError, match="no checkpoint") as caught:
-        job_with_more(folder, job, 5)
+        continue_training_job(folder, job, 5)
     assert "--iterations" in caught.value.hint
     with pytest.raises(UsageError, match="adds nothing"):
-        job_with_more(folder, job, 0)
+        continue_training_job(folder, job, 0)
 
 
 def test_the_longest_shorter_training_of_the_same_base_is_found(tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_brought_checkpoints_are_equal_and_leave_the_origin_alone(tmp_path: Path
     before = {p.name: p.read_bytes() for p in source.iterdir()}
     target = tmp_path / "train-b"
     target.mkdir()
-    bring_checkpoints(source, target, ("smaller.json", "missing.json"))
+    link_checkpoints(source, target, ("smaller.json", "missing.json"))
     assert [p.name for p in checkpoints(target)] == [p.name for p in checkpoints(source)]
     assert {p.name: p.read_bytes() for p in target.iterdir()} == {
         name: data for name, data in before.items() if name != "done.json"

@@ -18,8 +18,8 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import (
     JobFile,
     make_job,
     read_job,
-    refuse_other_regions,
-    refuse_replacing,
+    reject_folder_conflicts,
+    reject_region_conflicts,
     write_job,
 )
 from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER
@@ -109,7 +109,7 @@ def test_names_that_differ_in_case_alone_are_one() -> None:
 
 def test_two_names_for_one_folder_are_both_told() -> None:
     requests = ["x/a b.json", "x/auto.json", "x/a_b.json"]
-    with pytest.raises(UsageError, match="a_b: 'a b' and 'a_b' are kept in one folder"):
+    with pytest.raises(UsageError, match="a_b: 'a b' and 'a_b' use the same folder"):
         region_names(requests, {})
     assert region_names(requests[:2], {})[0] == "a_b"
 
@@ -131,7 +131,7 @@ def test_a_job_that_would_replace_another_result_never_starts(tmp_path: Path) ->
     with pytest.raises(UsageError, match="'a b' would replace the result of region 'a_b'"):
         JobClient.start(job, requests[0], python="none")
     assert not (job / "job.json").exists()
-    refuse_replacing(job / "result", requests[1])
+    reject_region_conflicts(job / "result", requests[1])
 
 
 def test_regions_without_a_name_in_ascii_are_told_apart() -> None:
@@ -148,7 +148,7 @@ def test_a_region_does_not_replace_the_result_of_another(
     (tmp_path / "W_rfel" / "region.json").write_text('{"blender_object_name": "Würfel"}')
     folder = region_name("r.json", {"blender_object_name": new})
     with pytest.raises(UsageError, match="Würfel") if refused else nullcontext():
-        refuse_other_regions(tmp_path, {"auto": "auto", new: folder})
+        reject_folder_conflicts(tmp_path, {"auto": "auto", new: folder})
 
 
 def test_a_region_name_never_hides_the_automatic_one() -> None:
@@ -191,7 +191,7 @@ def test_a_region_that_is_no_file_is_told_by_all_commands(
     region: str,
     message: str,
 ) -> None:
-    monkeypatch.setattr(worker_call, "end_with", lambda _parent: None)
+    monkeypatch.setattr(worker_call, "exit_with_parent", lambda _parent: None)
     path = str(tmp_path / region)
     with pytest.raises(DatasetError, match=message):
         make_job("mesh", tmp_path, JobSettings(regions=(path,)))

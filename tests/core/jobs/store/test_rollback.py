@@ -14,12 +14,12 @@ import pytest
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.commands.tile_worker import help_with_tiles
+from gaussian_wrapping_addon.core.jobs.commands.tile_worker import work_on_tiles
 from gaussian_wrapping_addon.core.jobs.stages.mesh_keys import mesh_stages
-from gaussian_wrapping_addon.core.jobs.stages.region_meshing import open_lists
+from gaussian_wrapping_addon.core.jobs.stages.region_meshing import unfinished_tile_lists
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
-from gaussian_wrapping_addon.core.jobs.store.rollback import NAME, finished_job, keep_finished
+from gaussian_wrapping_addon.core.jobs.store.rollback import NAME, finished_job, save_rollback
 from gaussian_wrapping_addon.core.meshing.tiles.store import LIST_NAME
 from gaussian_wrapping_addon.core.settings import JobSettings, TextureSettings
 
@@ -68,7 +68,7 @@ def begin(folder: JobFolder, command: str = "mesh", **settings: object) -> JobFi
     """Write a job into the folder as the client does."""
     changed = replace(read_job(folder.job_path).settings, **settings)
     job = make_job(command, folder.root.parent / "photos", changed)
-    keep_finished(folder, job)
+    save_rollback(folder, job)
     write_job(folder.job_path, job)
     folder.write_status(JobStatus())
     return job
@@ -79,7 +79,7 @@ def test_a_failed_mesh_leaves_the_job_as_it_was(folder: JobFolder) -> None:
     begin(folder, regions=("all",))
     assert finished_job(folder) == job
     client = JobClient.attach(folder.root)
-    client._seen_at_work = True
+    client._seen_active = True
     assert work(folder) == 3
     assert read_job(folder.job_path) == job
     after = folder.read_status()
@@ -145,14 +145,14 @@ def test_tiles_are_open_for_the_job_that_they_are_of_alone(folder: JobFolder) ->
     write_json(tiles / LIST_NAME, {})
     for state in ("NEW", "LOST", "CANCELLED", "FAILED"):
         folder.write_status(JobStatus(state))
-        assert open_lists(folder) == [tiles]
+        assert unfinished_tile_lists(folder) == [tiles]
     # The texture is another one, the mesh the same.
     begin(folder, regions=("auto", "all"), texture=TextureSettings(size_px=256))
-    assert open_lists(folder) == [tiles]
+    assert unfinished_tile_lists(folder) == [tiles]
     begin(folder, regions=("auto",))
-    assert open_lists(folder) == []
+    assert unfinished_tile_lists(folder) == []
     with pytest.raises(UsageError, match="no tiles to work on"):
-        help_with_tiles(folder, 1, 0.0)
+        work_on_tiles(folder, 1, 0.0)
     assert work(folder, 'MeshingError("a")') == 3
     assert not tiles.exists()
     # Nor where the job is done and another one, which ended well, has left them.
@@ -161,7 +161,7 @@ def test_tiles_are_open_for_the_job_that_they_are_of_alone(folder: JobFolder) ->
     write_json(tiles / LIST_NAME, {})
     begin(folder, regions=("auto",))
     assert work(folder, "") == 0
-    assert open_lists(folder) == []
+    assert unfinished_tile_lists(folder) == []
 
 
 def test_a_mesh_that_ends_well_is_the_finished_job(folder: JobFolder) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
-    note_interrupted,
+    record_interrupted_time,
     run_stage,
     source_fingerprint,
     stage_key,
@@ -44,7 +44,7 @@ def test_an_interrupted_stage_is_run_again_in_the_same_folder(tmp_path: Path) ->
 
     with pytest.raises(Cancelled):
         run_stage(tmp_path, "train", "abc", Progress(), interrupted)
-    note_interrupted(tmp_path, "train", "abc", 100.0)
+    record_interrupted_time(tmp_path, "train", "abc", 100.0)
     stage = run_stage(tmp_path, "train", "abc", Progress(), work)
     assert not stage.reused
     assert stage.done["seconds"] >= 100.0

@@ -11,8 +11,12 @@ import pytest
 from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError
 from gaussian_wrapping_addon.core.mesh.distance import distances_to_mesh
 from gaussian_wrapping_addon.core.mesh.simplification import decimation
-from gaussian_wrapping_addon.core.mesh.simplification.decimation import LIMITS, Decimated, decimate
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.mesh.simplification.decimation import (
+    LIMITS,
+    DecimationResult,
+    decimate,
+)
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 from tests.core.meshing.closed_shapes import (
@@ -38,7 +42,7 @@ SHAPES: dict[str, Callable[[], Mesh]] = {
 }
 
 
-def decimated(mesh: Mesh, target: int, **options: object) -> Decimated:
+def decimated(mesh: Mesh, target: int, **options: object) -> DecimationResult:
     return decimate(*mesh, target, Progress(), **options)
 
 
@@ -46,10 +50,10 @@ def decimated(mesh: Mesh, target: int, **options: object) -> Decimated:
 @pytest.mark.parametrize("name", SHAPES)
 def test_target_is_met_and_the_mesh_stays_closed_with_its_genus(name: str, share: float) -> None:
     mesh = SHAPES[name]()
-    before = check_mesh(*mesh)
+    before = validate_manifold(*mesh)
     target = round(share * len(mesh[1]))
     result = decimated(mesh, target)
-    after = check_mesh(result.vertices, result.faces)
+    after = validate_manifold(result.vertices, result.faces)
     assert result.reached
     assert target - 2 < len(result.faces) <= target
     assert after.good, after.defects()
@@ -75,7 +79,7 @@ def test_flat_faces_cost_nothing() -> None:
 def test_thin_plate_keeps_its_two_sides_apart() -> None:
     mesh = slab((1, 1, 0.005), 0.05)
     result = decimated(mesh, 60)
-    check = check_mesh(result.vertices, result.faces)
+    check = validate_manifold(result.vertices, result.faces)
     assert check.good
     assert check.volume == pytest.approx(2 * 2 * 0.01, rel=0.01)
 
@@ -84,12 +88,12 @@ def test_small_targets_end_at_what_the_shape_allows() -> None:
     mesh = ball(2)
     assert len(decimated(mesh, 4).faces) <= 8
     two = decimated(joined(ball(2), (ball(1)[0] + 4, ball(1)[1])), 4)
-    check = check_mesh(two.vertices, two.faces)
+    check = validate_manifold(two.vertices, two.faces)
     assert (check.good, len(check.parts), two.reached) == (True, 2, False)
     hole = decimated(ring(), 4)
     assert not hole.reached
-    assert [part.genus for part in check_mesh(hole.vertices, hole.faces).parts] == [1]
-    assert check_mesh(hole.vertices, hole.faces).good
+    assert [part.genus for part in validate_manifold(hole.vertices, hole.faces).parts] == [1]
+    assert validate_manifold(hole.vertices, hole.faces).good
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-3, 0.0), (1e4, 0.0), (1.0, 4e6), (1e4, 4e6)])
@@ -105,7 +109,7 @@ def test_neither_scale_nor_place_changes_the_result(scale: float, shift: float) 
     error = distances_to_mesh((there.vertices - shift) / power, here.vertices, here.faces)[0]
     assert len(there.faces) == len(here.faces)
     assert error.max() < 2e-3 * size
-    assert check_mesh(there.vertices, there.faces).good
+    assert validate_manifold(there.vertices, there.faces).good
 
 
 def test_the_same_mesh_gives_the_same_bits() -> None:
@@ -125,7 +129,7 @@ def test_vertices_on_the_region_stay_on_it_and_none_leaves_it() -> None:
     vertices[free] += 0.02 * rng.normal(size=(free.sum(), 3))
     vertices[free] = np.minimum(vertices[free], 1.0 - 1e-3)
     result = decimated((vertices, faces), 300, region=region)
-    check = check_mesh(result.vertices, result.faces)
+    check = validate_manifold(result.vertices, result.faces)
     assert check.good, check.defects()
     assert len(result.faces) <= 300
     assert region.contains(result.vertices, 1e-12).all()
@@ -150,9 +154,9 @@ def test_an_open_boundary_stays_as_it_is() -> None:
     faces = faces[(vertices[faces][:, :, 2] <= 0.0).all(1)]
     used, index = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], index.reshape(-1, 3)
-    before = check_mesh(vertices, faces)
+    before = validate_manifold(vertices, faces)
     result = decimated((vertices, faces), len(faces) // 4)
-    after = check_mesh(result.vertices, result.faces)
+    after = validate_manifold(result.vertices, result.faces)
     assert after.open_edges == before.open_edges > 0
     assert (after.euler, after.nonmanifold_edges, after.nonmanifold_vertices) == (1, 0, 0)
     rim = vertices[np.abs(vertices[:, 2]) < 1e-9]
@@ -180,7 +184,7 @@ def test_bad_input_is_refused() -> None:
 
 
 def test_it_can_be_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decimation, "LOOKS_PER_CALL", 50)
+    monkeypatch.setattr(decimation, "EDGES_PER_CALL", 50)
     asked = []
 
     def is_cancelled() -> bool:

@@ -6,7 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.mesh.simplification.corners import drop_dead, merge
+from gaussian_wrapping_addon.core.mesh.simplification.corners import (
+    merge_vertices,
+    unlink_dead_faces,
+)
 from gaussian_wrapping_addon.core.mesh.simplification.counters import (
     DONE,
     FULL,
@@ -25,7 +28,7 @@ from gaussian_wrapping_addon.core.mesh.simplification.quadrics import (
     error_of_one,
 )
 from gaussian_wrapping_addon.core.mesh.simplification.vertex_selection import select_vertices
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 RNG = np.random.default_rng(0)
@@ -101,9 +104,9 @@ def test_merging_keeps_a_closed_manifold() -> None:
     run = started(points, faces)
     before = run.mesh[4].copy()
     for vertex in (2, 3):
-        drop_dead(vertex, *run.mesh[1:4])
-    merge(2, 3, run.mesh, run.counts)
-    check = check_mesh(points, run.faces())
+        unlink_dead_faces(vertex, *run.mesh[1:4])
+    merge_vertices(2, 3, run.mesh, run.counts)
+    check = validate_manifold(points, run.faces())
     assert (check.open_edges, check.nonmanifold_edges, check.inconsistent_edges) == (0, 0, 0)
     assert (check.nonmanifold_vertices, check.euler) == (0, 2)
     assert run.faces_left == len(run.faces()) == len(faces) - 2

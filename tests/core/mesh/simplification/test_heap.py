@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The heap gives entries in the order of their costs, whole, and equal costs by their ties."""
+"""The heap pops complete entries in order of cost, and equal costs in order of their ties."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.mesh.simplification.counters import COUNTERS, HEAP_SIZE
-from gaussian_wrapping_addon.core.mesh.simplification.heap import drop_first, take_in_last
+from gaussian_wrapping_addon.core.mesh.simplification.heap import pop_first, sift_up_last
 
 Entry = tuple[float, ...]
 
@@ -20,12 +20,12 @@ def empty(size: int, columns: int) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
 def push(heap: tuple[np.ndarray, ...], counts: np.ndarray, entry: Entry) -> None:
     for column, value in zip(heap, entry, strict=True):
         column[counts[HEAP_SIZE]] = value
-    take_in_last(heap, counts)
+    sift_up_last(heap, counts)
 
 
 def popped(heap: tuple[np.ndarray, ...], counts: np.ndarray) -> Entry:
     entry = tuple(column[0].item() for column in heap)
-    drop_first(heap, counts)
+    pop_first(heap, counts)
     return entry
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vertices selected from dense closed meshes of known shapes."""
+"""Vertex selection on dense closed meshes of known shapes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Smoothing and decimation of a real mesh of a region, as the mesh stage asks for them."""
+"""Smoothing and decimation of a region's mesh, as in the mesh stage."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from gaussian_wrapping_addon.core.meshing.cleanup.clean_up import clean_up
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.progress import Progress
@@ -48,7 +48,10 @@ def test_off_means_untouched(mesh: SurfaceMesh) -> None:
 def test_what_was_asked_for_is_done_and_told(mesh: SurfaceMesh, steps: int, share: float) -> None:
     target = round(share * len(mesh.faces))
     result = cleaned(mesh, smooth_steps=steps, target_faces=target)
-    before, after = check_mesh(mesh.vertices, mesh.faces), check_mesh(result.vertices, result.faces)
+    before, after = (
+        validate_manifold(mesh.vertices, mesh.faces),
+        validate_manifold(result.vertices, result.faces),
+    )
     assert before.good
     assert after.good, after.defects()
     assert [p.genus for p in after.parts] == [p.genus for p in before.parts] == [1]
@@ -88,14 +91,14 @@ def test_the_dense_mesh_is_kept_where_faces_went(mesh: SurfaceMesh) -> None:
 def test_more_faces_than_there_are_is_said(mesh: SurfaceMesh) -> None:
     result = cleaned(mesh, target_faces=10**6)
     np.testing.assert_array_equal(result.faces, mesh.faces)
-    assert any("1000000 asked for" in note["text"] for note in result.provenance["notes"])
+    assert any("1000000 requested" in note["text"] for note in result.provenance["notes"])
 
 
 def test_a_target_out_of_reach_is_said(mesh: SurfaceMesh) -> None:
     result = cleaned(mesh, target_faces=4)
-    assert check_mesh(result.vertices, result.faces).good
+    assert validate_manifold(result.vertices, result.faces).good
     assert len(result.faces) > 4
-    assert any("4 asked for" in note["text"] for note in result.provenance["notes"])
+    assert any("4 requested" in note["text"] for note in result.provenance["notes"])
 
 
 def test_colours_follow_their_vertices(mesh: SurfaceMesh) -> None:

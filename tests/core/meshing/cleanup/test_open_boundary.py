@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes opened at their region: what stays is oriented, manifold, open on the planes alone."""
+"""Meshes without caps: oriented, manifold and open on the region's planes alone."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
-from gaussian_wrapping_addon.core.meshing.cleanup.open_boundary import opened, split_fans
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
+from gaussian_wrapping_addon.core.meshing.cleanup.open_boundary import split_fans, without_caps
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.convex_region import Region
@@ -37,15 +37,17 @@ def test_primal_adaptive_meshes(shape: str, spacing: str) -> None:
         field, field, arrays, field.cameras, region,
         MeshingSettings(points=1500, spacing=spacing), Progress(), seed=0, threads=1,
     )  # fmt: skip
-    mesh = opened(closed, region)
-    check = check_mesh(mesh.vertices, mesh.faces, region)
+    mesh = without_caps(closed, region)
+    check = validate_manifold(mesh.vertices, mesh.faces, region)
     assert check.defects() == []
     assert check.open_at_region == check.open_edges > 10
     assert mesh.provenance["boundary"] == "open"
     assert mesh.provenance["cap_faces_left_out"] == len(closed.faces) - len(mesh.faces) > 0
     # No face of the caps is left: each has a corner inside the region.
     assert (region.distance(mesh.vertices[mesh.faces].mean(1)) < -1e-9).all()
-    assert check_mesh(mesh.vertices, mesh.faces).defects()[0].startswith("edges have one face")
+    assert (
+        validate_manifold(mesh.vertices, mesh.faces).defects()[0].startswith("edges have one face")
+    )
 
 
 @pytest.mark.parametrize("moved", [False, True])
@@ -63,9 +65,9 @@ def test_a_round_region_of_many_planes_is_not_left(moved: bool) -> None:
         vertices = closed.vertices.copy()
         vertices[inner] += 1e-4 * (body.center - vertices[inner])
         closed = replace(closed, vertices=vertices)
-    mesh = opened(closed, body)
+    mesh = without_caps(closed, body)
     assert body.distance(mesh.vertices).max() < 1e-9
-    check = check_mesh(mesh.vertices, mesh.faces, body)
+    check = validate_manifold(mesh.vertices, mesh.faces, body)
     if not moved:
         assert check.defects() == []
     assert check.open_edges > 50
@@ -73,9 +75,9 @@ def test_a_round_region_of_many_planes_is_not_left(moved: bool) -> None:
 
 def test_a_mesh_within_its_region_stays_as_it_is() -> None:
     vertices, faces = ball(3)
-    mesh = opened(mesh_from(vertices, faces), cube(3.0))
+    mesh = without_caps(mesh_from(vertices, faces), cube(3.0))
     assert len(mesh.faces) == len(faces)
-    assert check_mesh(mesh.vertices, mesh.faces).good
+    assert validate_manifold(mesh.vertices, mesh.faces).good
     assert mesh.provenance["cap_faces_left_out"] == 0
 
 
@@ -83,8 +85,8 @@ def test_a_plate_through_the_region_falls_into_two_sheets() -> None:
     vertices, faces = slab((2, 2, 0.1), 0.2)
     low, high = vertices.min(0), vertices.max(0)
     region = Region.box("r", np.append(low[:2], -5), np.append(high[:2], 5))
-    mesh = opened(mesh_from(vertices, faces), region)
-    check = check_mesh(mesh.vertices, mesh.faces, region)
+    mesh = without_caps(mesh_from(vertices, faces), region)
+    check = validate_manifold(mesh.vertices, mesh.faces, region)
     assert check.defects() == []
     assert [part.euler for part in check.parts] == [1, 1]
 
@@ -99,11 +101,11 @@ def test_small_pieces_left_by_opening_go_as_floaters_do() -> None:
         (long[0] + [-3, 0, 1.99], long[1]),  # small in area alone
     )
     region = Region.box("r", np.full(3, -9.0), np.array([9.0, 9.0, 2.0]))
-    whole = opened(mesh_from(vertices, faces), region)
-    assert len(check_mesh(whole.vertices, whole.faces, region).parts) == 4
+    whole = without_caps(mesh_from(vertices, faces), region)
+    assert len(validate_manifold(whole.vertices, whole.faces, region).parts) == 4
     assert whole.provenance["removed_open_pieces"] == 0
-    mesh = opened(mesh_from(vertices, faces), region, 0.01)
-    check = check_mesh(mesh.vertices, mesh.faces, region)
+    mesh = without_caps(mesh_from(vertices, faces), region, 0.01)
+    check = validate_manifold(mesh.vertices, mesh.faces, region)
     assert check.defects() == []
     assert len(check.parts) == mesh.provenance["components"] == 2
     assert mesh.provenance["removed_open_pieces"] == 2
@@ -113,14 +115,14 @@ def test_small_pieces_left_by_opening_go_as_floaters_do() -> None:
     assert mesh.vertices[:, 0].min() < -2.9
     assert mesh.vertices[:, :2].max() <= 2.0
     # Whatever is asked for, the largest piece stays.
-    assert len(opened(mesh_from(vertices, faces), region, 1.0).faces) == len(body[1]) * 5 // 6
+    assert len(without_caps(mesh_from(vertices, faces), region, 1.0).faces) == len(body[1]) * 5 // 6
 
 
 def test_a_region_inside_of_the_solid_leaves_nothing() -> None:
     vertices, faces = slab((2, 2, 2), 0.5)
     region = Region.box("deep", vertices.min(0), vertices.max(0))
     with pytest.raises(MeshingError, match="'deep' lies within a solid"):
-        opened(mesh_from(vertices, faces), region)
+        without_caps(mesh_from(vertices, faces), region)
 
 
 def test_vertices_that_repair_moved_go_back_to_the_plane() -> None:
@@ -130,9 +132,9 @@ def test_vertices_that_repair_moved_go_back_to_the_plane() -> None:
     inner = np.flatnonzero((vertices[:, 0] == low[0]) & (np.abs(vertices[:, 1:]).max(1) < 0.6))
     moved = vertices.copy()
     moved[inner[0], 0] += 0.001
-    mesh = opened(mesh_from(moved, faces), region)
-    assert check_mesh(mesh.vertices, mesh.faces, region).defects() == []
-    assert len(mesh.faces) == len(opened(mesh_from(vertices, faces), region).faces)
+    mesh = without_caps(mesh_from(moved, faces), region)
+    assert validate_manifold(mesh.vertices, mesh.faces, region).defects() == []
+    assert len(mesh.faces) == len(without_caps(mesh_from(vertices, faces), region).faces)
 
 
 def test_fans_that_meet_in_one_vertex_are_parted() -> None:
@@ -149,7 +151,7 @@ def test_colours_follow_their_vertices() -> None:
     low, high = vertices.min(0), vertices.max(0)
     region = Region.box("r", np.array([low[0], low[1] - 1, low[2] - 1]), high + 1)
     colors = np.arange(3 * len(vertices)).reshape(-1, 3).astype(np.uint8)
-    mesh = opened(replace(mesh_from(vertices, faces), colors=colors), region)
+    mesh = without_caps(replace(mesh_from(vertices, faces), colors=colors), region)
     for vertex, color in zip(mesh.vertices, mesh.colors, strict=True):
         assert np.array_equal(color, colors[np.argmin(np.abs(vertices - vertex).sum(1))])
 
@@ -157,8 +159,8 @@ def test_colours_follow_their_vertices() -> None:
 def test_open_edges_elsewhere_are_defects() -> None:
     vertices, faces = slab((2, 2, 2), 0.5)
     region = Region.box("r", vertices.min(0) - [0, 1, 1], vertices.max(0) + 1)
-    mesh = opened(mesh_from(vertices, faces), region)
-    hole = check_mesh(mesh.vertices, np.delete(mesh.faces, len(mesh.faces) // 2, 0), region)
+    mesh = without_caps(mesh_from(vertices, faces), region)
+    hole = validate_manifold(mesh.vertices, np.delete(mesh.faces, len(mesh.faces) // 2, 0), region)
     assert hole.open_edges > hole.open_at_region
     assert not hole.good
     assert "edges have one face only" in hole.defects()[0]

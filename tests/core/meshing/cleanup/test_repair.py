@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Non-manifold sets of faces, degenerate faces, floaters, and the figures that tell of them."""
+"""Repair of non-manifold and degenerate faces, floaters, and the statistics that report them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from gaussian_wrapping_addon.core.mesh.components import without_floaters
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import mesh_statistics
 from gaussian_wrapping_addon.core.meshing.cleanup.degenerate import narrow_faces, remove_degenerate
-from gaussian_wrapping_addon.core.meshing.cleanup.repair import Repaired, split_nonmanifold
+from gaussian_wrapping_addon.core.meshing.cleanup.repair import RepairResult, split_nonmanifold
 from gaussian_wrapping_addon.core.meshing.tetrahedra.boundary_faces import (
     boundary_faces,
     tetrahedron_neighbours,
 )
-from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import delaunay, far_points
+from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import bounding_points, delaunay
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 from tests.core.meshing.meshing_scenes import assert_closed_manifold
@@ -48,7 +48,7 @@ def as_mesh(vertices: np.ndarray, faces: np.ndarray) -> SurfaceMesh:
     return SurfaceMesh(vertices, faces.astype(np.int32))
 
 
-def repaired_mesh(result: Repaired) -> SurfaceMesh:
+def repaired_mesh(result: RepairResult) -> SurfaceMesh:
     return as_mesh(result.vertices, result.faces)
 
 
@@ -101,7 +101,7 @@ def test_edge_whose_both_ends_are_joined_elsewhere() -> None:
 def test_random_labels_of_tetrahedra_become_manifold(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(120, 3))
-    points = np.concatenate([points, far_points(points, seed)])
+    points = np.concatenate([points, bounding_points(points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=Progress())
     inside = rng.random(len(tetrahedra)) < 0.5
     inside &= (tetrahedra < 120).all(1)

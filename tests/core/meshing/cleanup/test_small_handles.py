@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Handles below the resolution go; openings, tubes and everything else stay."""
+"""Small handles are closed; openings, tubes and all else are kept."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.mesh.components import compacted
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import MeshCheck, check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import (
+    ManifoldCheck,
+    validate_manifold,
+)
 from gaussian_wrapping_addon.core.meshing.cleanup import small_handles
 from gaussian_wrapping_addon.core.meshing.cleanup.small_handles import without_small_handles
 
@@ -37,9 +40,9 @@ def surface_of(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vertices + noise, np.concatenate([index[:, [0, 1, 2]], index[:, [0, 2, 3]]])
 
 
-def checked(vertices: np.ndarray, faces: np.ndarray) -> MeshCheck:
+def checked(vertices: np.ndarray, faces: np.ndarray) -> ManifoldCheck:
     vertices, faces, _ = compacted(vertices, faces)
-    result = check_mesh(vertices, faces)
+    result = validate_manifold(vertices, faces)
     assert result.good, result.defects()
     return result
 
@@ -130,7 +133,7 @@ def test_a_ring_around_a_wire_is_left() -> None:
 
 def test_what_cannot_be_closed_is_left_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = surface_of(with_arch(block((16, 16, 4)), 6, 7, 4))
-    monkeypatch.setattr(small_handles, "MAX_LOOP", 3)
+    monkeypatch.setattr(small_handles, "MAX_LOOP_EDGES", 3)
     closed = without_small_handles(vertices, faces, 1.0)
     assert (closed.closed, closed.left) == (0, 1)
     np.testing.assert_array_equal(closed.faces, faces)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Smoothing lowers noise, keeps volume, closedness, caps and thin parts."""
+"""Smoothing lowers noise and preserves volume, closedness, caps and thin parts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from gaussian_wrapping_addon.core.meshing.cleanup.smoothing import smooth
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.convex_region import Region
@@ -37,7 +37,7 @@ def test_every_part_keeps_its_volume_and_the_mesh_stays_good(
     make: Callable[[], Mesh], steps: int
 ) -> None:
     mesh = make()
-    before, after = check_mesh(*mesh), check_mesh(smoothed(mesh, steps), mesh[1])
+    before, after = validate_manifold(*mesh), validate_manifold(smoothed(mesh, steps), mesh[1])
     assert after.good, after.defects()
     for first, second in zip(before.parts, after.parts, strict=True):
         assert second.genus == first.genus
@@ -49,9 +49,9 @@ def test_a_part_too_coarse_for_the_filter_stays_as_it_was() -> None:
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     flat = tetrahedron * [1, 1, 1e-3]
     after = smoothed((flat, faces), 30)
-    check = check_mesh(after, faces)
+    check = validate_manifold(after, faces)
     assert check.good
-    assert check.volume == pytest.approx(check_mesh(flat, faces).volume, rel=0.0101)
+    assert check.volume == pytest.approx(validate_manifold(flat, faces).volume, rel=0.0101)
 
 
 def test_caps_stay_in_their_planes_and_the_mesh_in_its_region() -> None:
@@ -68,7 +68,7 @@ def test_caps_stay_in_their_planes_and_the_mesh_in_its_region() -> None:
     corner = on_cap.all(1)
     np.testing.assert_array_equal(after[corner], vertices[corner])
     assert (after[free] != vertices[free]).any(1).mean() > 0.9
-    assert check_mesh(after, faces).good
+    assert validate_manifold(after, faces).good
 
 
 def test_a_boundary_stays_where_it_is() -> None:

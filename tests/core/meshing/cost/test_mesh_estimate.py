@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Estimates of meshes: the ranges hold what comes out; what cannot fit is refused with advice."""
+"""Mesh estimates: ranges contain the measured values; requests that cannot fit are refused."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from gaussian_wrapping_addon.core.meshing.cost.mesh_estimate import (
     AREA_HIGH,
     AREA_LOW,
     BASE_BYTES,
-    area_of,
+    box_counting_area,
     estimate_mesh,
-    occupied_boundary,
+    occupied_boundary_area,
 )
-from gaussian_wrapping_addon.core.meshing.points.resolution import Request
+from gaussian_wrapping_addon.core.meshing.points.resolution import ResolutionRequest
 from gaussian_wrapping_addon.core.meshing.points.spacing import resolved_edges
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 from tests.core.meshing.meshing_scenes import gaussians_on, some_cameras, sphere
@@ -36,35 +36,37 @@ def on_ball(count: int) -> np.ndarray:
 @pytest.mark.parametrize("count", [2000, 60_000])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
 def test_area_of_a_ball_and_a_tilted_plane(count: int, scale: float) -> None:
-    found = area_of(scale * on_ball(count) + 7.0 * scale)
+    found = box_counting_area(scale * on_ball(count) + 7.0 * scale)
     assert AREA_LOW < 4 * np.pi * scale**2 / found < AREA_HIGH
     plane = np.random.default_rng(1).uniform(0, 1, (count, 2)) @ np.array(
         [[0.6, 0.0, 0.8], [0.48, 0.8, -0.36]]
     )
-    assert AREA_LOW < scale**2 / area_of(scale * plane) < AREA_HIGH
+    assert AREA_LOW < scale**2 / box_counting_area(scale * plane) < AREA_HIGH
 
 
 def test_area_of_nothing_and_of_one_place() -> None:
-    assert area_of(np.zeros((0, 3))) == 0.0
-    assert area_of(np.ones((5, 3))) == 0.0
-    assert area_of(np.ones((500, 3))) == 0.0
+    assert box_counting_area(np.zeros((0, 3))) == 0.0
+    assert box_counting_area(np.ones((5, 3))) == 0.0
+    assert box_counting_area(np.ones((500, 3))) == 0.0
 
 
 def test_boundary_in_the_solid() -> None:
     field = ShapeField(lambda p: p[:, 2] - 0.5, 0.01)  # solid below z = 0.5
     region = Region.box("box", np.zeros(3), np.ones(3))
-    assert occupied_boundary(region, field.is_empty) == pytest.approx(1 + 4 * 0.5, rel=0.03)
+    assert occupied_boundary_area(region, field.is_empty) == pytest.approx(1 + 4 * 0.5, rel=0.03)
 
 
-@pytest.mark.parametrize("request_", [Request(0.08, 0), Request(0.0, 3000)], ids=["edge", "points"])
-def test_range_holds_the_mesh(request_: Request) -> None:
+@pytest.mark.parametrize(
+    "request_", [ResolutionRequest(0.08, 0), ResolutionRequest(0.0, 3000)], ids=["edge", "points"]
+)
+def test_range_holds_the_mesh(request_: ResolutionRequest) -> None:
     field = ShapeField(sphere(), SIGMA)
     region = Region.box("half", np.array([-1.3, -1.3, 0.1]), np.full(3, 1.3))
     upper = on_ball(40_000)
     upper = upper[region.contains(upper)]
-    cap_area = occupied_boundary(region, field.is_empty)
+    cap_area = occupied_boundary_area(region, field.is_empty)
     assert cap_area == pytest.approx(np.pi * 0.99, rel=0.1)
-    expected = estimate_mesh(area_of(upper), cap_area, request_, adaptive=False)
+    expected = estimate_mesh(box_counting_area(upper), cap_area, request_, adaptive=False)
     mesh = mesh_in_tiles(
         field, field, gaussians_on(sphere(), region, 800, SIGMA), some_cameras(), region,
         MeshingSettings(points=request_.points, spacing="uniform"), Progress(), tiles=1, seed=0,
@@ -74,15 +76,17 @@ def test_range_holds_the_mesh(request_: Request) -> None:
     assert expected.points_high < 5 * expected.points_low
 
 
-@pytest.mark.parametrize("request_", [Request(0.12, 0), Request(0.0, 800)], ids=["edge", "points"])
-def test_range_of_adaptive_spacing_holds_both_meshes(request_: Request) -> None:
+@pytest.mark.parametrize(
+    "request_", [ResolutionRequest(0.12, 0), ResolutionRequest(0.0, 800)], ids=["edge", "points"]
+)
+def test_range_of_adaptive_spacing_holds_both_meshes(request_: ResolutionRequest) -> None:
     field = ShapeField(sphere(), SIGMA)
     region = Region.box("half", np.array([-1.3, -1.3, 0.1]), np.full(3, 1.3))
     upper = on_ball(40_000)
     upper = upper[region.contains(upper)]
     expected = estimate_mesh(
-        area_of(upper), occupied_boundary(region, field.is_empty), request_, adaptive=True,
-        resolved=resolved_edges(upper[::8], some_cameras()),
+        box_counting_area(upper), occupied_boundary_area(region, field.is_empty), request_,
+        adaptive=True, resolved=resolved_edges(upper[::8], some_cameras()),
     )  # fmt: skip
     mesh = mesh_in_tiles(
         field, field, gaussians_on(sphere(), region, 800, SIGMA), some_cameras(), region,
@@ -97,7 +101,9 @@ def test_range_of_adaptive_spacing_holds_both_meshes(request_: Request) -> None:
 
 def test_photos_that_resolve_less_lower_the_least() -> None:
     sharp, blurred = (
-        estimate_mesh(10.0, 0.0, Request(0.01, 0), adaptive=True, resolved=np.full(9, edge))
+        estimate_mesh(
+            10.0, 0.0, ResolutionRequest(0.01, 0), adaptive=True, resolved=np.full(9, edge)
+        )
         for edge in (1e-4, 0.05)
     )
     assert blurred.dense_low < 0.05 * sharp.dense_low
@@ -106,7 +112,11 @@ def test_photos_that_resolve_less_lower_the_least() -> None:
 
 
 def test_region_within_the_solid_or_in_empty_space() -> None:
-    for request in (Request(0.0, 0), Request(0.0, 1000), Request(0.01, 0)):
+    for request in (
+        ResolutionRequest(0.0, 0),
+        ResolutionRequest(0.0, 1000),
+        ResolutionRequest(0.01, 0),
+    ):
         within = estimate_mesh(0.0, 6.0, request, adaptive=True)
         assert 0 <= within.points_low <= within.points_high
         assert within.points_high > 0
@@ -115,35 +125,39 @@ def test_region_within_the_solid_or_in_empty_space() -> None:
 
 
 def test_finer_edges_cost_in_proportion_to_the_points() -> None:
-    coarse = estimate_mesh(10.0, 0.0, Request(0.02, 0), adaptive=False, evaluation_s=1e-5)
-    fine = estimate_mesh(10.0, 0.0, Request(0.01, 0), adaptive=False, evaluation_s=1e-5)
+    coarse = estimate_mesh(10.0, 0.0, ResolutionRequest(0.02, 0), adaptive=False, evaluation_s=1e-5)
+    fine = estimate_mesh(10.0, 0.0, ResolutionRequest(0.01, 0), adaptive=False, evaluation_s=1e-5)
     assert fine.points_high == pytest.approx(4 * coarse.points_high, rel=0.01)
     assert fine.seconds_high < 4 * coarse.seconds_high
     ratio = (fine.memory_bytes - BASE_BYTES) / (coarse.memory_bytes - BASE_BYTES)
     assert ratio == pytest.approx(4, rel=0.01)
-    finest = estimate_mesh(10.0, 0.0, Request(0.002, 0), adaptive=False)
+    finest = estimate_mesh(10.0, 0.0, ResolutionRequest(0.002, 0), adaptive=False)
     assert finest.tiled_memory_bytes < finest.memory_low_bytes
 
 
 def test_adaptive_spacing_counts_the_mesh_from_which_it_selects() -> None:
     for edge in (0.03, 0.004):
-        uniform = estimate_mesh(10.0, 0.0, Request(edge, 0), adaptive=False)
-        adaptive = estimate_mesh(10.0, 0.0, Request(edge, 0), adaptive=True)
+        uniform = estimate_mesh(10.0, 0.0, ResolutionRequest(edge, 0), adaptive=False)
+        adaptive = estimate_mesh(10.0, 0.0, ResolutionRequest(edge, 0), adaptive=True)
         assert adaptive.points_high == pytest.approx(0.5 * uniform.points_high, rel=0.01)
         assert adaptive.dense_low >= 2 * adaptive.points_low - 1
         assert adaptive.memory_bytes >= uniform.memory_bytes - 1e4
     with pytest.raises(ResourceError) as refused:
-        estimate_mesh(10.0, 0.0, Request(0.002, 0), adaptive=True).refuse(2 << 30, tiled=True)
+        estimate_mesh(10.0, 0.0, ResolutionRequest(0.002, 0), adaptive=True).refuse(
+            2 << 30, tiled=True
+        )
     factor = float(refused.value.hint.split("edges ")[1].split(" times")[0])
-    estimate_mesh(10.0, 0.0, Request(0.002 * factor, 0), adaptive=True).refuse(2 << 30, tiled=True)
+    estimate_mesh(10.0, 0.0, ResolutionRequest(0.002 * factor, 0), adaptive=True).refuse(
+        2 << 30, tiled=True
+    )
     # A number of points may be any that the settings allow: memory decides.
-    estimate_mesh(10.0, 0.0, Request(0.0, 5_000_000), adaptive=True).refuse(0, tiled=True)
+    estimate_mesh(10.0, 0.0, ResolutionRequest(0.0, 5_000_000), adaptive=True).refuse(0, tiled=True)
 
 
 def test_what_cannot_fit_is_refused_with_what_would() -> None:
-    with pytest.raises(ResourceError, match="is the most"):
-        estimate_mesh(10.0, 0.0, Request(0.0009, 0), adaptive=False).refuse(0, tiled=True)
-    expected = estimate_mesh(10.0, 0.0, Request(0.002, 0), adaptive=False)
+    with pytest.raises(ResourceError, match="the limit is"):
+        estimate_mesh(10.0, 0.0, ResolutionRequest(0.0009, 0), adaptive=False).refuse(0, tiled=True)
+    expected = estimate_mesh(10.0, 0.0, ResolutionRequest(0.002, 0), adaptive=False)
     expected.refuse(0, tiled=False)  # unknown memory refuses nothing
     expected.refuse(1 << 50, tiled=False)
     with pytest.raises(ResourceError, match=r"times longer .*, or tiles"):
@@ -153,10 +167,12 @@ def test_what_cannot_fit_is_refused_with_what_would() -> None:
         expected.refuse(2 << 30, tiled=True)
     # What the hint asks for does fit.
     factor = float(refused.value.hint.split("edges ")[1].split(" times")[0])
-    estimate_mesh(10.0, 0.0, Request(0.002 * factor, 0), adaptive=False).refuse(2 << 30, tiled=True)
+    estimate_mesh(10.0, 0.0, ResolutionRequest(0.002 * factor, 0), adaptive=False).refuse(
+        2 << 30, tiled=True
+    )
     with pytest.raises(ResourceError, match="Close other programs"):
         expected.refuse(BASE_BYTES, tiled=True)
     assert expected.tiles_for(0)
-    small = estimate_mesh(10.0, 0.0, Request(0.05, 0), adaptive=False)
+    small = estimate_mesh(10.0, 0.0, ResolutionRequest(0.05, 0), adaptive=False)
     assert not small.tiles_for(0)
     assert small.tiles_for(BASE_BYTES)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Estimates of meshes by pivots: ranges hold what comes out; too little memory is refused."""
+"""Pivot mesh estimates: ranges contain the measured values; too little memory is refused."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import MeshingError, ResourceError
-from gaussian_wrapping_addon.core.meshing.cost.pivot_estimate import estimate_pivots
+from gaussian_wrapping_addon.core.meshing.cost.pivot_estimate import estimate_pivot_mesh
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
 from gaussian_wrapping_addon.core.meshing.points.pivots import PIVOTS
 from gaussian_wrapping_addon.core.progress import Progress
@@ -31,7 +31,7 @@ HALF = Region.box("half", np.array([-0.1, -2, -2]), np.array([2, 2, 2]))
 @pytest.mark.parametrize("shape", [sphere, torus])
 def test_ranges_hold_the_mesh(shape, region: Region, pivots: int) -> None:
     arrays = gaussians_on(shape(), cube(1.5), 4000, SIGMA)
-    expected = estimate_pivots(arrays, region, pivots, 0)
+    expected = estimate_pivot_mesh(arrays, region, pivots, 0)
     settings = MeshingSettings(method="pivots", pivots=pivots)
     mesh = mesh_by_pivots(
         ShapeField(shape(), SIGMA), arrays, some_cameras(), region, settings, Progress(), seed=0
@@ -45,20 +45,22 @@ def test_ranges_hold_the_mesh(shape, region: Region, pivots: int) -> None:
 
 def test_more_pivots_and_sightings_cost_more() -> None:
     arrays = gaussians_on(sphere(), cube(1.5), 4000, SIGMA)
-    two, nine = (estimate_pivots(arrays, cube(1.5), k, 0, evaluation_s=1e-5) for k in (2, 9))
+    two, nine = (estimate_pivot_mesh(arrays, cube(1.5), k, 0, evaluation_s=1e-5) for k in (2, 9))
     assert nine.tetrahedra_high > 2 * two.tetrahedra_high
     assert nine.memory_low_bytes > two.memory_low_bytes
     assert nine.seconds_high > two.seconds_high
-    seen = estimate_pivots(arrays, cube(1.5), 2, 10_000)
+    seen = estimate_pivot_mesh(arrays, cube(1.5), 2, 10_000)
     assert seen.pivots_low == two.pivots_low + 10_000
     assert seen.pivots_high == two.pivots_high + 40_000
-    many = estimate_pivots(arrays, cube(1.5), 2, 10**7)
+    many = estimate_pivot_mesh(arrays, cube(1.5), 2, 10**7)
     assert many.pivots_high <= two.pivots_high + 240_000, "as many as a job looks for"
     assert two.lines()[0].startswith("tetrahedra: ")
 
 
 def test_too_little_memory_is_refused_with_what_would_fit() -> None:
-    expected = estimate_pivots(gaussians_on(sphere(), cube(1.5), 4000, SIGMA), cube(1.5), 9, 9000)
+    expected = estimate_pivot_mesh(
+        gaussians_on(sphere(), cube(1.5), 4000, SIGMA), cube(1.5), 9, 9000
+    )
     expected.refuse(0)  # unknown memory refuses nothing
     expected.refuse(expected.memory_low_bytes)
     with pytest.raises(ResourceError, match="Gaussians by pivots needs at least") as refused:
@@ -70,4 +72,4 @@ def test_a_region_without_gaussians_is_an_error() -> None:
     arrays = gaussians_on(sphere(), cube(1.5), 300, SIGMA)
     far = Region.box("far", np.full(3, 50.0), np.full(3, 51.0))
     with pytest.raises(MeshingError, match="'far'"):
-        estimate_pivots(arrays, far, 2, 0)
+        estimate_pivot_mesh(arrays, far, 2, 0)

@@ -11,8 +11,8 @@ from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.meshing.tetrahedra import delaunay as module
 from gaussian_wrapping_addon.core.meshing.tetrahedra.boundary_faces import tetrahedron_neighbours
 from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import (
+    bounding_points,
     delaunay,
-    far_points,
     signed_volumes,
 )
 from gaussian_wrapping_addon.core.progress import Progress
@@ -56,7 +56,7 @@ def check(points: np.ndarray, tetrahedra: np.ndarray) -> None:
 
 @pytest.mark.parametrize("name", HARD)
 def test_hard_points_with_far_points(name: str) -> None:
-    points = np.concatenate([HARD[name], far_points(HARD[name], 0)])
+    points = np.concatenate([HARD[name], bounding_points(HARD[name], 0)])
     check(points, delaunay(points, seed=0, progress=Progress()))
 
 
@@ -89,18 +89,18 @@ def test_fallback_in_a_helper_process(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ValueError("points are degenerate")
 
     monkeypatch.setattr(shull, "Delaunay3d", refuse)
-    points = np.concatenate([HARD["lattice"], far_points(HARD["lattice"], 0)])
+    points = np.concatenate([HARD["lattice"], bounding_points(HARD["lattice"], 0)])
     check(points, delaunay(points, seed=0, progress=Progress()))
 
 
 def test_fallback_reports_points_it_cannot_connect() -> None:
-    with pytest.raises(Exception, match="could not be connected") as caught:
+    with pytest.raises(Exception, match="could not be triangulated") as caught:
         module.qhull_tetrahedra(np.full((10, 3), np.nan), Progress())
     assert caught.value.hint  # type: ignore[attr-defined]
 
 
 def test_seed_decides_the_result() -> None:
-    points = np.concatenate([HARD["lattice"], far_points(HARD["lattice"], 0)])
+    points = np.concatenate([HARD["lattice"], bounding_points(HARD["lattice"], 0)])
     first, again, other = (delaunay(points, seed=s, progress=Progress()) for s in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert first.shape != other.shape or (first != other).any()

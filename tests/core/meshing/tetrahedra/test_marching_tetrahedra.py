@@ -10,7 +10,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import mesh_statistics
-from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import delaunay, far_points
+from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import bounding_points, delaunay
 from gaussian_wrapping_addon.core.meshing.tetrahedra.marching_tetrahedra import (
     bisect,
     case_tables,
@@ -59,7 +59,7 @@ def test_tables_cover_all_codes() -> None:
 @pytest.mark.parametrize("points", [2000, 16000])
 def test_sphere_is_closed_and_its_volume_converges(points: int) -> None:
     cloud = np.random.default_rng(0).uniform(-1.2, 1.2, (points, 3))
-    cloud = np.concatenate([cloud, far_points(cloud, 0)])
+    cloud = np.concatenate([cloud, bounding_points(cloud, 0)])
     tetrahedra = delaunay(cloud, seed=0, progress=Progress())
     empty = lambda p: np.linalg.norm(p, axis=1) > 0.8  # noqa: E731
     edges, faces = marching_tetrahedra(tetrahedra, ~empty(cloud))
@@ -78,7 +78,7 @@ def test_sphere_is_closed_and_its_volume_converges(points: int) -> None:
 def test_sign_change_exactly_on_points_stays_closed() -> None:
     axis = np.linspace(-1, 1, 9)
     cloud = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
-    cloud = np.concatenate([cloud, far_points(cloud, 0)])
+    cloud = np.concatenate([cloud, bounding_points(cloud, 0)])
     tetrahedra = delaunay(cloud, seed=0, progress=Progress())
     empty = lambda p: np.abs(p).max(1) > 0.5  # noqa: E731 - points lie exactly on the boundary
     edges, faces = marching_tetrahedra(tetrahedra, ~empty(cloud))

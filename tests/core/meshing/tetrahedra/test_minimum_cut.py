@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Minimum cut: the labels of an independent solver, on random, long, tied and large graphs."""
+"""Minimum cut: agreement with an independent solver on random, long, tied and large graphs."""
 
 from __future__ import annotations
 

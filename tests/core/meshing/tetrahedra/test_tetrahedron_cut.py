@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tetrahedra cut by a region: they fill it, face to face, whatever the position."""
+"""Tetrahedra clipped to a region fill it face to face, in any position."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from gaussian_wrapping_addon.core.meshing.tetrahedra.boundary_faces import (
     boundary_faces,
     tetrahedron_neighbours,
 )
 from gaussian_wrapping_addon.core.meshing.tetrahedra.delaunay import (
+    bounding_points,
     delaunay,
-    far_points,
     signed_volumes,
 )
 from gaussian_wrapping_addon.core.meshing.tetrahedra.tetrahedron_cut import (
@@ -29,7 +29,7 @@ from tests.core.meshing.meshing_scenes import cube
 
 
 def tetrahedra_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    points = np.concatenate([points, far_points(points, 0)])
+    points = np.concatenate([points, bounding_points(points, 0)])
     return points, delaunay(points, seed=0, progress=Progress())
 
 
@@ -63,7 +63,7 @@ def assert_fills(cut: CutTetrahedra, region: Region) -> None:
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
                           axis=1).sum() / 2  # fmt: skip
     assert area == pytest.approx(region.area, rel=1e-9)
-    check = check_mesh(cut.points, hull)
+    check = validate_manifold(cut.points, hull)
     assert check.open_edges == check.nonmanifold_edges == check.inconsistent_edges == 0
     assert check.nonmanifold_vertices == 0
     assert check.parts[0].euler == 2
@@ -96,7 +96,7 @@ def test_every_numbering_of_two_tetrahedra_agrees_on_their_common_face() -> None
                 cut.tetrahedra, tetrahedron_neighbours(cut.tetrahedra),
                 np.ones(len(cut.tetrahedra), np.bool_),
             )  # fmt: skip
-            check = check_mesh(cut.points, hull)
+            check = validate_manifold(cut.points, hull)
             assert check.open_edges == check.nonmanifold_edges == check.inconsistent_edges == 0
             assert check.euler == 2
             assert (signed_volumes(cut.points, cut.tetrahedra) > 0).all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Comparing a rendering on the (emulated) GPU with the CPU kernels or the float64 definition."""
+"""Compare a rendering on the (emulated) GPU with the CPU kernels or the float64 definition."""
 
 from __future__ import annotations
 

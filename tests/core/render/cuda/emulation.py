@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CUDA text on the host: compiled by g++ with ``emulator.cpp``, run on CPU tensors."""
+"""CUDA kernels emulated on the host: compiled by g++ with ``emulator.cpp``, run on CPU tensors."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The renderer on a real GPU equals the CPU's; without one, it says why it cannot run."""
+"""The renderer on a real GPU equals the CPU's; without one, it reports why it cannot run."""
 
 from __future__ import annotations
 
@@ -164,5 +164,5 @@ def test_nothing_visible_and_no_gaussian_on_the_gpu(gpu: str) -> None:
 @pytest.mark.gpu
 def test_a_budget_too_small_is_a_typed_error(gpu: str) -> None:
     gaussians = leaves(random_gaussians(50, seed=1, dtype=torch.float32), torch.float32, gpu)
-    with pytest.raises(ResourceError, match="pairs of Gaussian"):
+    with pytest.raises(ResourceError, match="tile intersections"):
         render_cuda(gaussians, CAMERA, budget_bytes=1000)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is said to NVIDIA's driver, heard by a stand-in: order, contexts, arguments, errors."""
+"""Calls to the CUDA driver, recorded by a mock: order, contexts, arguments, errors."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CUDA text, emulated on the host, on the cases where a renderer goes wrong."""
+"""CUDA kernels, emulated on the host, in numerically difficult cases."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CUDA text, emulated on the host, equals definition and CPU kernels on generic scenes."""
+"""CUDA kernels, emulated on the host, equal definition and CPU kernels on generic scenes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CUDA text, emulated on the host: depths where a solver goes wrong, and absurd parameters."""
+"""CUDA kernels, emulated on the host: difficult isosurface depths and extreme parameters."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The emulator finds what it is there to find: missing barriers, threads that wait for ever."""
+"""The emulator detects missing barriers and deadlocked threads."""
 
 from __future__ import annotations
 

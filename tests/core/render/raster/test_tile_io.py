@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rows that the image's edge cuts hold, bit for bit, what whole rows hold."""
+"""Rows cut by the image's edge are bitwise equal to whole rows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gaussian_wrapping_addon.core.render.raster.blend import (
     RenderBuffers,
     ScreenView,
     blend,
-    pair_gradients,
+    write_intersection_gradients,
 )
 from gaussian_wrapping_addon.core.render.render import project_view
 from gaussian_wrapping_addon.core.render.simd.raster_math import ROW_VALUES, TILE, aligned_zeros
@@ -64,7 +64,7 @@ def cut_view(view: ScreenView, width: int, height: int) -> ScreenView:
         lists,
         start=np.cumsum([0, *(len(run) for run in runs)]),
         gaussian_ids=lists.gaussian_ids[chosen],
-        pair_slots=lists.pair_slots[chosen],
+        intersection_slots=lists.intersection_slots[chosen],
         tiles_x=tiles_x,
         tiles_y=tiles_y,
     )
@@ -138,14 +138,16 @@ def test_gradients_of_a_cut_image_are_those_of_a_part(lanes: int, depth: bool) -
             part = grad[:height, :width]
             part[:] = random.normal(size=part.shape)
         smaller, expected = cut_view(view, width, height), np.zeros(shape, np.float32)
-        pair_gradients(view, images, grads, DirtyBuffers(), expected, depth=depth, absolute=True)
+        write_intersection_gradients(
+            view, images, grads, DirtyBuffers(), expected, depth=depth, absolute=True
+        )
         cut = {name: np.ascontiguousarray(a[:height, :width]) for name, a in _all(images).items()}
         parts = [np.ascontiguousarray(grad[:height, :width]) for grad in grads]
         found = np.full(shape, np.nan, np.float32)
-        pair_gradients(
+        write_intersection_gradients(
             smaller, Images(**cut), parts, DirtyBuffers(), found, depth=depth, absolute=True
         )
-        slots = smaller.lists.pair_slots
+        slots = smaller.lists.intersection_slots
         assert width * height < 100 or np.abs(expected[slots]).max() > 0.1
         np.testing.assert_array_equal(found[slots], expected[slots])
         found[slots] = np.nan
@@ -198,8 +200,10 @@ def test_no_gradient_without_a_loss() -> None:
     images = Images.allocate(view.camera, view.options)
     blend(view, images, RenderBuffers())
     grads = [np.zeros_like(image) for image in graded(images)]
-    slots = view.lists.pair_slots
+    slots = view.lists.intersection_slots
     pairs = np.full((slots.max() + 1, ROW_VALUES), np.nan, np.float32)
-    pair_gradients(view, images, grads, DirtyBuffers(), pairs, depth=True, absolute=False)
+    write_intersection_gradients(
+        view, images, grads, DirtyBuffers(), pairs, depth=True, absolute=False
+    )
     assert len(slots)
     assert not pairs[slots].any()

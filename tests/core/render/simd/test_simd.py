@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Explicit vectors do what their operators say, at both widths."""
+"""Operators of explicit vectors against numpy, at both widths."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_arithmetic_and_choices(lanes: int) -> None:
     np.testing.assert_array_equal(
         _unary(lanes, lambda b, v, _: v.max(0.25).min(0.5))(x), x.clip(0.25, 0.5)
     )
-    chosen = _unary(lanes, lambda b, v, _: ((v > 0.0) & ~(v >= 1.0)).choose(2.0, v))(x)
+    chosen = _unary(lanes, lambda b, v, _: ((v > 0.0) & ~(v >= 1.0)).select(2.0, v))(x)
     np.testing.assert_array_equal(chosen, np.where((x > 0) & (x < 1), np.float32(2), x))
     np.testing.assert_allclose(_unary(lanes, lambda b, v, _: 1.0 / v)(x), 1.0 / x, rtol=1e-6)
 

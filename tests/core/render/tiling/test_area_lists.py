@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lists of the Gaussians that reach anywhere into a tile."""
+"""Tile lists by area: all Gaussians that reach any point of a tile."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Masks name every block that sees a Gaussian, and almost no other."""
+"""Block masks include every block that a Gaussian reaches, and almost no other."""
 
 from __future__ import annotations
 

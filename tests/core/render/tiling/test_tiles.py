@@ -85,9 +85,9 @@ def test_order_is_lexsort_and_slots_are_contiguous(scene: dict[str, object]) -> 
     order = np.lexsort((ids, screen.depths[ids], tiles))
     np.testing.assert_array_equal(order, np.arange(len(ids)))
     assert len(np.unique(tiles * len(screen) + ids)) == len(ids)
-    np.testing.assert_array_equal(np.sort(lists.pair_slots), np.arange(len(ids)))
+    np.testing.assert_array_equal(np.sort(lists.intersection_slots), np.arange(len(ids)))
     np.testing.assert_array_equal(
-        np.searchsorted(lists.pair_offsets, lists.pair_slots, side="right") - 1, ids
+        np.searchsorted(lists.intersection_offsets, lists.intersection_slots, side="right") - 1, ids
     )
 
 
@@ -135,30 +135,30 @@ def test_any_number_of_threads_gives_the_same_lists() -> None:
             np.testing.assert_array_equal(getattr(many, field.name), getattr(one, field.name))
 
 
-@pytest.mark.parametrize("most_pairs", [1, 150, 600])
-def test_bands_hold_the_pairs_of_the_whole(most_pairs: int) -> None:
+@pytest.mark.parametrize("max_intersections", [1, 150, 600])
+def test_bands_hold_the_pairs_of_the_whole(max_intersections: int) -> None:
     screen, _ = make(1, 300, scale=(0.003, 0.6), filter_size=0.0)
     whole = bin_gaussians(screen, CAMERA.width, CAMERA.height, 1)
     binning = TileBinning(screen, CAMERA.width, CAMERA.height, 2, ArrayStore())
-    bands = binning.bands(most_pairs)
+    bands = binning.bands(max_intersections)
     assert [band[0] for band in bands] + [20] == [0] + [band[1] for band in bands]
     np.testing.assert_array_equal(binning.ids, np.unique(whole.gaussian_ids))
     for first, end in bands[::-1]:  # in any order
         lists = binning.lists(first, end)
         begin, stop = whole.start[first], whole.start[end]
         pairs = stop - begin
-        assert pairs <= most_pairs or end == first + 1
+        assert pairs <= max_intersections or end == first + 1
         np.testing.assert_array_equal(lists.gaussian_ids, whole.gaussian_ids[begin:stop])
         np.testing.assert_array_equal(lists.start, whole.start.clip(begin, stop) - begin)
         np.testing.assert_array_equal(
-            lists.pair_offsets,
+            lists.intersection_offsets,
             np.concatenate(
                 [[0], np.cumsum(np.bincount(lists.gaussian_ids, minlength=len(screen)))]
             ),
         )
-        np.testing.assert_array_equal(np.sort(lists.pair_slots), np.arange(pairs))
+        np.testing.assert_array_equal(np.sort(lists.intersection_slots), np.arange(pairs))
         np.testing.assert_array_equal(
-            np.searchsorted(lists.pair_offsets, lists.pair_slots, side="right") - 1,
+            np.searchsorted(lists.intersection_offsets, lists.intersection_slots, side="right") - 1,
             lists.gaussian_ids,
         )
     if len(bands) > 1:
@@ -219,8 +219,8 @@ def test_nothing_visible(count: int) -> None:
     screen = ScreenGaussians.allocate(count)
     lists = bin_gaussians(screen, 33, 16, 2)
     np.testing.assert_array_equal(lists.start, np.zeros(4))
-    assert len(lists.gaussian_ids) == len(lists.pair_slots) == 0
-    np.testing.assert_array_equal(lists.pair_offsets, np.zeros(count + 1))
+    assert len(lists.gaussian_ids) == len(lists.intersection_slots) == 0
+    np.testing.assert_array_equal(lists.intersection_offsets, np.zeros(count + 1))
     assert (lists.pixel_ranges[:, 0] > lists.pixel_ranges[:, 1]).all()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Texturing from renderings of the Gaussians: their diffuse colour, and only where they are."""
+"""Texturing from renderings of the Gaussians: diffuse colour, limited to covered pixels."""
 
 from __future__ import annotations
 

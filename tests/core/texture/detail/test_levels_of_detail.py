@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Levels of detail: closed, of the faces asked for, coloured as the mesh they come from."""
+"""Levels of detail: closed, with the target number of faces, coloured like their source."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.evaluation.report.report_warnings import collect_warnings
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import check_mesh
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import validate_manifold
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TextureSettings
 from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
 from gaussian_wrapping_addon.core.texture.atlas.texel_points import texel_points
-from gaussian_wrapping_addon.core.texture.bake.fill import grow
+from gaussian_wrapping_addon.core.texture.bake.fill import dilate
 from gaussian_wrapping_addon.core.texture.detail import levels_of_detail as levels_module
 from gaussian_wrapping_addon.core.texture.detail.chart_pyramid import chart_pyramid
 from gaussian_wrapping_addon.core.texture.detail.levels_of_detail import levels_of_detail
@@ -52,8 +52,8 @@ def painted(tmp_path_factory) -> TexturedMesh:
     # As the texture stage does: averages across chart borders are of the chart's own colours.
     empty = raster_atlas(uvs, SIDE_PX, THREADS).face < 0
     ring = np.where((image == 128).all(axis=2), -1, 0).astype(np.int16)
-    grow(image, ring, np.where(empty, -1, 0).astype(np.int32), 1, inside=True)
-    grow(image, ring, np.where(empty, -1, 0).astype(np.int32), 8, inside=False)
+    dilate(image, ring, np.where(empty, -1, 0).astype(np.int32), 1, inside=True)
+    dilate(image, ring, np.where(empty, -1, 0).astype(np.int32), 8, inside=False)
     return TexturedMesh(mesh, uvs, image)
 
 
@@ -66,7 +66,7 @@ def test_each_level_is_closed_a_quarter_and_looks_alike(
     assert [level.albedo.shape[0] for level in levels] == [256, 128]
     assert list(tmp_path.iterdir()) == []
     for level in levels:
-        check = check_mesh(level.mesh.vertices, level.mesh.faces, None)
+        check = validate_manifold(level.mesh.vertices, level.mesh.faces, None)
         assert check.good
         texels, points = positions(level.mesh, level.corner_uvs, level.albedo.shape[0])
         # Rays along the normals lean: a colour is met beside the place where it is looked for.
@@ -105,7 +105,7 @@ def test_no_colour_of_another_chart_comes_in(level: int) -> None:
     face = generator.integers(0, len(mesh.faces), 4000)
     weights = generator.dirichlet([1, 1, 1], 4000)
     uv = np.einsum("nc,ncx->nx", weights, uvs[face].astype(np.float64))
-    found = pyramid.looked_up(uv, face, level)
+    found = pyramid.sample_level(uv, face, level)
     np.testing.assert_array_equal(found, palette[face // 2])
 
 

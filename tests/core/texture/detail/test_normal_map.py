@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Normal maps: decoded again they are the dense mesh's normals, whatever the mesh's place."""
+"""Normal maps decode to the dense mesh's normals, at any position of the mesh."""
 
 from __future__ import annotations
 
@@ -142,10 +142,10 @@ def test_the_other_side_of_a_plate_is_not_taken() -> None:
     surface = DenseSurface(dense)
     cage = cage_distance(light, DenseSurface(light), surface)
     assert 0.01 <= cage < 0.03
-    places = surface.corresponding(points, normals, cage)
-    assert (places.how == BY_RAY).all()
-    assert surface.normals(places) == pytest.approx(normals, abs=1e-9)
-    assert surface.points(places)[:, 2] == pytest.approx(points[:, 2] - 0.01, abs=1e-7)
+    matches = surface.correspondences(points, normals, cage)
+    assert (matches.method == BY_RAY).all()
+    assert surface.normals(matches) == pytest.approx(normals, abs=1e-9)
+    assert surface.points(matches)[:, 2] == pytest.approx(points[:, 2] - 0.01, abs=1e-7)
 
 
 def test_where_rays_miss_the_nearest_point_serves_and_else_the_own_normal() -> None:
@@ -153,10 +153,10 @@ def test_where_rays_miss_the_nearest_point_serves_and_else_the_own_normal() -> N
     surface = DenseSurface(dense)
     points = np.array([[0.1, 0.2, 0.3], [1.2, 0.0, 0.1], [0.0, 0.0, -0.2]])
     normals = np.array([[0.0, 0, 1], [0, 0, 1], [0, 0, -1]])
-    places = surface.corresponding(points, normals, 1.0)
-    assert places.how.tolist() == [BY_RAY, BY_NEAREST, NO_HIT]
-    assert places.face[2] == -1
-    assert surface.points(places)[:2] == pytest.approx(np.array([[0.1, 0.2, 0], [1, 0, 0]]))
+    matches = surface.correspondences(points, normals, 1.0)
+    assert matches.method.tolist() == [BY_RAY, BY_NEAREST, NO_HIT]
+    assert matches.face[2] == -1
+    assert surface.points(matches)[:2] == pytest.approx(np.array([[0.1, 0.2, 0], [1, 0, 0]]))
 
 
 def test_rays_end_at_their_reach() -> None:

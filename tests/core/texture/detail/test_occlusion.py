@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ambient occlusion against cases that are known in closed form."""
+"""Ambient occlusion against closed forms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
 from gaussian_wrapping_addon.core.texture.detail.dense_surface import DenseSurface
-from gaussian_wrapping_addon.core.texture.detail.occlusion import bake_occlusion, openness
+from gaussian_wrapping_addon.core.texture.detail.occlusion import bake_occlusion, sky_visibility
 from tests.core.texture.detail_scenes import flat_uvs, grid
 from tests.core.texture.texture_scenes import joined, mesh_of, sphere
 
@@ -21,9 +21,9 @@ NOISE = 0.03
 
 def open_at(mesh: SurfaceMesh, points: np.ndarray, reach: float) -> np.ndarray:
     surface = DenseSurface(mesh)
-    places, distance = surface.nearest(points)
+    matches, distance = surface.nearest(points)
     assert distance.max() < 1e-9
-    return openness(surface, places, reach, np.arange(len(points)) * 7919)
+    return sky_visibility(surface, matches, reach, np.arange(len(points)) * 7919)
 
 
 def turned(mesh: SurfaceMesh, matrix: np.ndarray, offset: np.ndarray) -> SurfaceMesh:

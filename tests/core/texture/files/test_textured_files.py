@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Mesh files: read back by independent readers, exact where promised, refused where bad."""
+"""Mesh files: read back by independent readers, lossless where specified; bad meshes refused."""
 
 from __future__ import annotations
 
@@ -306,7 +306,7 @@ def test_unknown_formats_and_names_with_spaces_are_refused(tmp_path: Path) -> No
     good = cube()
     with pytest.raises(UsageError, match="fbx"):
         write_textured(good, tmp_path, ("fbx",), Similarity())
-    with pytest.raises(UsageError, match="cannot name"):
+    with pytest.raises(UsageError, match="cannot refer to"):
         write_obj(
             tmp_path / "m.obj", good.mesh.vertices, good.mesh.faces, good.corner_uvs, "my image.png"
         )

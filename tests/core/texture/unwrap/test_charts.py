@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Charts: overlaps found exactly, folds cut, faces relaxed to their true shapes."""
+"""Charts: exact overlaps, splits at folds, relaxation to the true shapes of faces."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import pytest
 
 from gaussian_wrapping_addon.core.mesh.face_graph import components, face_graph
 from gaussian_wrapping_addon.core.texture.unwrap.chart_overlaps import (
-    conflicts,
+    find_overlaps,
     overlapping_pairs,
     signed_areas,
     split_overlaps,
 )
 from gaussian_wrapping_addon.core.texture.unwrap.chart_shapes import (
     chart_points,
-    even_density,
-    flat_faces,
+    equalise_density,
+    flatten_faces,
     relax,
-    smoothed_copy,
+    smooth_vertices,
 )
 from tests.core.texture.texture_scenes import sphere
 
@@ -43,8 +43,8 @@ def test_faces_that_touch_do_not_overlap() -> None:
     vertices, faces, _ = strip(30, 1.0)
     labels = np.zeros(len(faces), np.int32)
     flat = vertices[faces][..., :2]
-    assert len(conflicts(flat, labels)) == 0
-    assert len(conflicts(flat.astype(np.float32) * 1e-4 + 0.9, labels)) == 0
+    assert len(find_overlaps(flat, labels)) == 0
+    assert len(find_overlaps(flat.astype(np.float32) * 1e-4 + 0.9, labels)) == 0
 
 
 def test_overlaps_are_those_of_brute_force() -> None:
@@ -65,7 +65,7 @@ def test_overlaps_are_those_of_brute_force() -> None:
         for j in range(i + 1, 60)
         if labels[i] == labels[j] and shared[i, j] > 0
     }
-    found = {(min(pair), max(pair)) for pair in conflicts(flat, labels).tolist()}
+    found = {(min(pair), max(pair)) for pair in find_overlaps(flat, labels).tolist()}
     assert len(expected) > 10
     assert expected <= found
     # What the grid is too coarse to see still touches.
@@ -79,9 +79,9 @@ def test_a_strip_that_runs_over_itself_is_cut_once() -> None:
     vertices, faces, uvs = strip(120, 2.5 * np.pi)
     graph = face_graph(vertices, faces)
     labels = np.zeros(len(faces), np.int32)
-    assert len(conflicts(uvs, labels)) > 0
+    assert len(find_overlaps(uvs, labels)) > 0
     split = split_overlaps(uvs, labels, graph)
-    assert len(conflicts(uvs, split)) == 0
+    assert len(find_overlaps(uvs, split)) == 0
     assert split.max() + 1 <= 3  # from its middle a piece of one turn, and the two ends
     other = np.where(graph.opposite >= 0, graph.opposite // 3, 0)
     parts = components(graph, split[other] == split[:, None])
@@ -96,7 +96,7 @@ def test_faces_turned_over_leave_their_chart() -> None:
     assert split.max() >= 1
     turn = np.sign(signed_areas(flat))
     assert all(len(np.unique(turn[split == chart])) == 1 for chart in range(split.max() + 1))
-    assert len(conflicts(flat, split)) == 0
+    assert len(find_overlaps(flat, split)) == 0
 
 
 def test_good_charts_stay_as_they_are() -> None:
@@ -112,8 +112,8 @@ def test_a_flat_piece_is_relaxed_to_its_shape(scale: float) -> None:
     vertices, faces, uvs = strip(40, 1.5)
     vertices = vertices * scale
     labels = np.zeros(len(faces), np.int32)
-    shapes = flat_faces(vertices, faces)
-    flat = even_density(uvs, labels, shapes)
+    shapes = flatten_faces(vertices, faces)
+    flat = equalise_density(uvs, labels, shapes)
     assert signed_areas(flat).sum() == pytest.approx(signed_areas(shapes).sum())
 
     def error(now: np.ndarray) -> float:
@@ -125,7 +125,7 @@ def test_a_flat_piece_is_relaxed_to_its_shape(scale: float) -> None:
     relaxed = relax(turned, labels, shapes)
     assert error(relaxed) < 0.5 * error(turned)
     assert (signed_areas(relaxed) > 0).all()
-    assert len(conflicts(relaxed, labels)) == 0
+    assert len(find_overlaps(relaxed, labels)) == 0
 
 
 def test_points_of_charts_are_not_shared() -> None:
@@ -141,7 +141,7 @@ def test_smoothing_moves_nothing_further_than_half_an_edge() -> None:
     mesh = sphere(3)
     far = mesh.vertices * 1e-3 + [5e3, -2e4, 10.0]
     noise = np.random.default_rng(0).normal(size=far.shape) * 1e-4
-    moved = np.linalg.norm(smoothed_copy(far + noise, mesh.faces) - far - noise, axis=1)
+    moved = np.linalg.norm(smooth_vertices(far + noise, mesh.faces) - far - noise, axis=1)
     corners = (far + noise)[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max()
     assert 0.0 < moved.max() <= 0.5 * longest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Unwrap: chunks, xatlas in its helper, the fallback, and what both promise."""
+"""Unwrap: chunks, xatlas in its helper, the fallback, and the guarantees of both."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.texture.atlas.atlas_raster import raster_atlas
 from gaussian_wrapping_addon.core.texture.unwrap import charts as charts_module
 from gaussian_wrapping_addon.core.texture.unwrap import unwrap as unwrap_module
-from gaussian_wrapping_addon.core.texture.unwrap.chart_overlaps import conflicts
+from gaussian_wrapping_addon.core.texture.unwrap.chart_overlaps import find_overlaps
 from gaussian_wrapping_addon.core.texture.unwrap.chunks import MAX_CHUNK_FACES, split_into_chunks
 from gaussian_wrapping_addon.core.texture.unwrap.stretch import texture_stretch
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import Unwrap, unwrap
@@ -168,7 +168,7 @@ def test_folds_of_a_noisy_bowl_are_cut(noise: float, tmp_path: Path) -> None:
     unwrapped = unwrap(mesh, 1024, 4, tmp_path, Progress(), threads=2)
     assert unwrapped.method == "xatlas"
     assert_usable(mesh, unwrapped, 1024, 4)
-    assert len(conflicts(unwrapped.corner_uvs, unwrapped.charts)) == 0
+    assert len(find_overlaps(unwrapped.corner_uvs, unwrapped.charts)) == 0
 
 
 def test_noise_does_not_shatter_the_surface(tmp_path: Path) -> None:

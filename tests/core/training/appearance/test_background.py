@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Masks as background: compositing, its gradients, and points that masks allow."""
+"""Masks as background: compositing, its gradients, points inside masks."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trained exposure: gradients, known gains found again, a pinned mean, bitwise resume, fits."""
+"""Trained exposure: gradients, recovery of known gains, pinned mean, bitwise resume, fits."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The estimate grows with what costs, holds measured trainings, and refuses a full disk."""
+"""Training estimate: monotonicity, range of measured trainings, check of a full disk."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training.cost.training_estimate import (
     Machine,
     SceneFacts,
+    check_resources,
     estimate,
     gaussian_counts,
-    judge,
     this_machine,
 )
 from gaussian_wrapping_addon.core.training.schedule import Schedule
@@ -105,12 +105,12 @@ def test_growth_off_keeps_the_start_and_on_reaches_the_cap() -> None:
 def test_a_full_disk_is_refused_and_little_memory_is_told() -> None:
     found = estimate(FACTS, PLAIN, MACHINE)
     plenty = Machine(2, 1.0, 10 * found.memory_bytes, 10 * found.disk_bytes)
-    assert judge(found, plenty) == []
-    assert judge(found, MACHINE) == []  # a system that tells nothing
+    assert check_resources(found, plenty) == []
+    assert check_resources(found, MACHINE) == []  # a system that tells nothing
     with pytest.raises(ResourceError, match="free") as caught:
-        judge(found, replace(plenty, disk_free_bytes=found.disk_bytes - 1))
+        check_resources(found, replace(plenty, disk_free_bytes=found.disk_bytes - 1))
     assert caught.value.hint
-    (warning,) = judge(found, replace(plenty, memory_bytes=found.memory_bytes))
+    (warning,) = check_resources(found, replace(plenty, memory_bytes=found.memory_bytes))
     assert warning.code == "memory-short"
     assert "--max-gaussians" in warning.text
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Density control: who is cloned, split and pruned, the cap, and the opacity reset."""
+"""Density control: cloning, splitting, pruning, the cap, the opacity reset."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Wrapping: shrinking, shifting and flipping, whose error counts, and the first orientation."""
+"""Wrapping: shrinking, shifting, flipping, normal errors, initial orientation."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Splats in other frames look the same, fit the filter, are capped, checked and oriented."""
+"""Training from a splat: transforms, 3D filter, cap, check against photos, orientation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import even_directions
+from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import fibonacci_directions
 from gaussian_wrapping_addon.core.dataset.readers.source_model import rotation_from_quaternion
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
@@ -24,15 +24,15 @@ from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training.density.orientation import voted_orientation
-from gaussian_wrapping_addon.core.training.initialisation.splat_motion import (
-    move_gaussians,
-    with_degree,
-)
 from gaussian_wrapping_addon.core.training.initialisation.splat_start import (
     FILTER_MULTIPLE,
     baked,
     fit_filter,
     start_from_splat,
+)
+from gaussian_wrapping_addon.core.training.initialisation.splat_transform import (
+    transform_gaussians,
+    with_degree,
 )
 from tests.core.gaussians.splat_files import splat_columns, write_ply
 from tests.core.render.scenes import look_at, random_gaussians
@@ -66,7 +66,7 @@ def test_moved_gaussians_look_the_same_from_the_moved_camera(degree: int) -> Non
     camera = look_at((2.0, -3.0, 1.0))
     near = RenderOptions(near_z=0.1)
     before = render_reference(gaussians, camera, near)
-    moved = move_gaussians(gaussians, WORLD_FROM_SCENE)
+    moved = transform_gaussians(gaussians, WORLD_FROM_SCENE)
     after = render_reference(
         moved, camera.moved(WORLD_FROM_SCENE), replace(near, near_z=0.1 * WORLD_FROM_SCENE.scale)
     )
@@ -81,7 +81,9 @@ def test_moved_gaussians_look_the_same_from_the_moved_camera(degree: int) -> Non
 
 def test_moving_forth_and_back_gives_the_same_gaussians() -> None:
     gaussians = random_gaussians(10, 4, sh_degree=3)
-    back = move_gaussians(move_gaussians(gaussians, WORLD_FROM_SCENE), WORLD_FROM_SCENE.inverse())
+    back = transform_gaussians(
+        transform_gaussians(gaussians, WORLD_FROM_SCENE), WORLD_FROM_SCENE.inverse()
+    )
     for name, tensor in gaussians.tensors():
         np.testing.assert_allclose(getattr(back, name), tensor, atol=1e-10, err_msg=name)
 
@@ -124,7 +126,7 @@ def test_a_baked_filter_changes_no_picture() -> None:
 
 def test_the_vote_turns_a_shell_of_discs_outwards() -> None:
     shell, normals = shell_of_discs(1500)
-    cameras = [look_at(tuple(4.0 * d)) for d in even_directions(12)]
+    cameras = [look_at(tuple(4.0 * d)) for d in fibonacci_directions(12)]
     voted = voted_orientation(shell, cameras, threads=1)
     seen = voted[:, 3] != 0
     assert seen.mean() > 0.95
@@ -136,7 +138,7 @@ def _scene(shell: OrientedGaussians) -> tuple[Scene, Pictures]:
     """Return a scene whose photos show a shell that stands in the scene frame."""
     cameras = [
         look_at(tuple(4.0 * d), width=96, height=96, focal=110.0, name=f"{i}")
-        for i, d in enumerate(even_directions(9))
+        for i, d in enumerate(fibonacci_directions(9))
     ]
     options = RenderOptions(depth=False, threads=1)
     photos = [
@@ -152,7 +154,7 @@ def _scene(shell: OrientedGaussians) -> tuple[Scene, Pictures]:
 def test_a_splat_in_the_world_frame_starts_in_the_scene_frame(tmp_path: Path) -> None:
     shell, normals = shell_of_discs(800, sh_degree=3)
     scene, photos = _scene(with_degree(shell, 2))
-    world = move_gaussians(shell, WORLD_FROM_SCENE)
+    world = transform_gaussians(shell, WORLD_FROM_SCENE)
     columns = splat_columns(world)
     path = write_ply(tmp_path / "a.ply", columns, kinds=dict.fromkeys(columns, "f8"))
     start = start_from_splat(path, scene, photos, range(9), SETTINGS, Progress(), threads=1)
@@ -173,8 +175,8 @@ def test_a_splat_in_the_world_frame_starts_in_the_scene_frame(tmp_path: Path) ->
 def test_the_cap_keeps_what_photos_show(tmp_path: Path) -> None:
     shell, _ = shell_of_discs(400)
     scene, photos = _scene(shell)
-    world = move_gaussians(shell, WORLD_FROM_SCENE)
-    inside = move_gaussians(
+    world = transform_gaussians(shell, WORLD_FROM_SCENE)
+    inside = transform_gaussians(
         shell.replaced(means=0.3 * shell.means, log_scales=shell.log_scales - 2.0),
         WORLD_FROM_SCENE,
     )
@@ -192,6 +194,6 @@ def test_a_splat_in_another_frame_is_refused(tmp_path: Path) -> None:
     shell, _ = shell_of_discs(400)
     scene, photos = _scene(shell)
     path = write_ply(tmp_path / "a.ply", splat_columns(shell))  # scene frame, not the world's
-    with pytest.raises(DatasetError, match="does not show") as caught:
+    with pytest.raises(DatasetError, match="does not match") as caught:
         start_from_splat(path, scene, photos, range(9), SETTINGS, Progress(), threads=1)
     assert "camera poses" in caught.value.hint

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The price on overlap: its value, and that its gradient shrinks what covers much."""
+"""Footprint regulariser: its value, and its gradient on the scales."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.render.types.gradients import VisibleGradients
-from gaussian_wrapping_addon.core.training.losses.footprint_regulariser import add_overlap_price
+from gaussian_wrapping_addon.core.training.losses.footprint_regulariser import (
+    add_footprint_regulariser,
+)
 
 
 def no_gradients(ids: list[int]) -> VisibleGradients:
@@ -21,14 +23,14 @@ def no_gradients(ids: list[int]) -> VisibleGradients:
 def test_price_is_the_mean_number_of_boxes_over_a_pixel() -> None:
     boxes = np.array([[0, 0, 10, 10], [0, 0, 5, 10], [90, 90, 99, 99]], np.float32)
     gradients = no_gradients([0, 1])  # the third is not seen
-    mean = add_overlap_price(gradients, np.zeros((3, 3), np.float32), boxes, (10, 10), 0.5)
+    mean = add_footprint_regulariser(gradients, np.zeros((3, 3), np.float32), boxes, (10, 10), 0.5)
     assert mean == pytest.approx(1.5)
 
 
 def test_what_lies_outside_of_the_image_costs_nothing() -> None:
     boxes = np.array([[-20, -20, 10, 10]], np.float32)
     gradients = no_gradients([0])
-    mean = add_overlap_price(gradients, np.zeros((1, 3), np.float32), boxes, (20, 10), 1.0)
+    mean = add_footprint_regulariser(gradients, np.zeros((1, 3), np.float32), boxes, (20, 10), 1.0)
     assert mean == pytest.approx(0.5)
 
 
@@ -38,7 +40,7 @@ def test_gradient_is_that_of_an_area_that_grows_with_the_scales() -> None:
     boxes = np.array([[0, 0, 4, 4], [0, 0, 6, 1]], np.float32)
     gradients = no_gradients([0, 1])
     gradients.log_scales[...] = 0.25
-    add_overlap_price(gradients, np.log(scales), boxes, (10, 10), 0.1)
+    add_footprint_regulariser(gradients, np.log(scales), boxes, (10, 10), 0.1)
     added = gradients.log_scales - 0.25
     # d area / d log s over both axes of a disc together is twice the area.
     assert added[0, :2] == pytest.approx([0.016, 0.016], rel=1e-3)

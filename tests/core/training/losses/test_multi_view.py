@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The multi-view terms end to end against their definition in torch, and what they leave out."""
+"""Multi-view losses end to end against their definition in torch; excluded pixels."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ def losses(
     )  # fmt: skip
 
 
-def bilinear(grey: torch.Tensor, places: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def bilinear(grey: torch.Tensor, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return values at (..., 2) pixels and whether they lie between pixel centres."""
-    x, y = places[..., 0] - 0.5, places[..., 1] - 0.5
+    x, y = positions[..., 0] - 0.5, positions[..., 1] - 0.5
     height, width = grey.shape
     inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
     column, row = (v.detach().floor().clamp(0, n - 2).long() for v, n in ((x, width), (y, height)))
@@ -99,13 +99,13 @@ def definition(
     centres = torch.stack([column + 0.5, row + 0.5, torch.ones_like(row)], 1).double()
     point = depth[:, None] * (centres @ torch.linalg.inv(k_r).T)
     there = (point @ turn.T + shift) @ k_c.T
-    places = there[:, :2] / there[:, 2:]
+    positions = there[:, :2] / there[:, 2:]
     # The terms round places to float32 too.
-    places = places + (places.detach().float().double() - places.detach())
-    found = query_depth(gaussians, OTHER, places, RenderOptions()).double()
+    positions = positions + (positions.detach().float().double() - positions.detach())
+    found = query_depth(gaussians, OTHER, positions, RenderOptions()).double()
     ones = torch.ones_like(found)[:, None]
-    back = found[:, None] * (torch.cat([places, ones], 1) @ torch.linalg.inv(k_c).T)
-    again = ((back - shift) @ turn) @ k_r.T
+    reprojected = found[:, None] * (torch.cat([positions, ones], 1) @ torch.linalg.inv(k_c).T)
+    again = ((reprojected - shift) @ turn) @ k_r.T
     again = again[:, :2] / again[:, 2:]
     noise = (again - centres[:, :2]).norm(dim=1)
     size_px = torch.tensor([REFERENCE.width, REFERENCE.height])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The multi-view kernels on an exact plane: zero where they should be, slopes, what they skip."""
+"""Multi-view kernels on an exact plane: zero errors, derivatives, skipped pixels."""
 
 from __future__ import annotations
 
@@ -185,49 +185,51 @@ def test_patches_end_at_borders_and_masks() -> None:
 def test_points_come_back_to_their_pixel() -> None:
     view = plane_view(REFERENCE)
     pair = pair_of(view, PIXELS)
-    places, _ = pair.lift(NO_MASK)
+    positions, _ = pair.lift(NO_MASK)
     point = REFERENCE.center + view.depth[..., None] * (REFERENCE.rays() @ REFERENCE.rotation)
     wanted, depth = OTHER.project(point.reshape(-1, 3)[PIXELS])
-    assert np.abs(places - wanted).max() < 1e-5
-    noise, by_found, by_places = pair.back(places, depth.astype(np.float32))
+    assert np.abs(positions - wanted).max() < 1e-5
+    noise, by_found, by_positions = pair.reproject(positions, depth.astype(np.float32))
     assert noise.max() < 1e-4
     assert np.isfinite(by_found).all()
-    assert np.isfinite(by_places).all()
+    assert np.isfinite(by_positions).all()
 
 
 def test_derivatives_of_the_way_back() -> None:
     view = moved(plane_view(REFERENCE), depth=plane_depth(REFERENCE, 0.02))
     pair = pair_of(view, PIXELS)
-    places, moves = (array.astype(np.float64) for array in pair.lift(NO_MASK))
+    positions, position_slopes = (array.astype(np.float64) for array in pair.lift(NO_MASK))
     _, found = OTHER.project(
         (REFERENCE.center + view.depth[..., None] * (REFERENCE.rays() @ REFERENCE.rotation))
         .reshape(-1, 3)[PIXELS]
     )  # fmt: skip
     found = found + 0.01
-    noise, by_found, by_places = pair.back(places, found)
+    noise, by_found, by_positions = pair.reproject(positions, found)
     assert (noise < np.inf).all()
     assert noise.min() > 1e-3
     step = 1e-6
-    slope = (pair.back(places, found + step)[0] - pair.back(places, found - step)[0]) / (2 * step)
+    slope = (
+        pair.reproject(positions, found + step)[0] - pair.reproject(positions, found - step)[0]
+    ) / (2 * step)
     assert np.abs(slope - by_found).max() < 1e-6 * np.abs(by_found).max()
     for axis in range(2):
         shift = step * np.eye(2)[axis]
-        ends = [pair.back(places + sign * shift, found)[0] for sign in (1, -1)]
-        assert np.abs((ends[0] - ends[1]) / (2 * step) - by_places[:, axis]).max() < 1e-7
+        ends = [pair.reproject(positions + sign * shift, found)[0] for sign in (1, -1)]
+        assert np.abs((ends[0] - ends[1]) / (2 * step) - by_positions[:, axis]).max() < 1e-7
     step = 1e-2  # places are float32
     ends = [
         pair_of(moved(view, depth=view.depth + sign * step), PIXELS).lift(NO_MASK)[0]
         for sign in (1, -1)
     ]
-    assert np.abs((ends[0] - ends[1]) / (2 * step) - moves).max() < 2e-3
+    assert np.abs((ends[0] - ends[1]) / (2 * step) - position_slopes).max() < 2e-3
 
 
 def test_no_way_back() -> None:
     view = plane_view(REFERENCE)
     pair = pair_of(view, PIXELS)
-    places, _ = pair.lift(NO_MASK)
+    positions, _ = pair.lift(NO_MASK)
     for found in (0.0, np.nan, np.inf, 0.1, 1.0, 9.0):
-        noise, by_found, _ = pair.back(places, np.full(len(PIXELS), found, np.float32))
+        noise, by_found, _ = pair.reproject(positions, np.full(len(PIXELS), found, np.float32))
         assert np.isinf(noise).all()
         assert not by_found.any()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Neighbouring cameras: limits, order, and that no camera's choice changes another's."""
+"""Neighbouring cameras: limits, order, independence of other cameras."""
 
 from __future__ import annotations
 

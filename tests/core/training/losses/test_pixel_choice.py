@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Chosen pixels: different ones, where they may be, spread out, more where the texture is."""
+"""Sampled pixels: distinct, inside the mask, stratified, more of them on texture."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The in-place Adam against torch's, and the surgery on its rows."""
+"""In-place Adam against torch's, and rebuilding of its rows."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whether photos differ in exposure, decided on colours of known gains, occluded and noisy."""
+"""Selection of exposures on colours with known gains, occlusion and noise."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from gaussian_wrapping_addon.core.training.appearance.photo_exposure import SRGB
 from gaussian_wrapping_addon.core.training.selection.exposure_selection import (
     NEEDED_SPREAD,
     PARTS,
-    exposure_need,
-    judge,
+    exposure_evidence,
     sample_points,
+    select_exposure,
     solve_log_gains,
-    split_by_place,
+    split_spatially,
 )
 from tests.core.render.scenes import look_at
 from tests.core.training.small_scene import PhotosInMemory, ring_cameras
@@ -56,8 +56,8 @@ def seen_colors(
 
 def decide(colors, valid, own, places):
     found = solve_log_gains(colors, valid, own)
-    parts = [solve_log_gains(colors[p], valid[p], own[p]) for p in split_by_place(places)]
-    return judge(found, parts, range(colors.shape[1]), colors.shape[1], len(places))
+    parts = [solve_log_gains(colors[p], valid[p], own[p]) for p in split_spatially(places)]
+    return exposure_evidence(found, parts, range(colors.shape[1]), colors.shape[1], len(places))
 
 
 @pytest.mark.parametrize("with_reference", [True, False])
@@ -86,7 +86,7 @@ def test_decision_beside_occlusions(largest: float, needed: bool) -> None:
     assert found.known
     assert found.needed == needed
     assert (found.spread > 1.5 * NEEDED_SPREAD) if needed else (found.spread < NEEDED_SPREAD / 1.5)
-    assert "parts agree (limit 2.5 %" in found.evidence
+    assert "parts (limit 2.5 %" in found.evidence
 
 
 def test_two_altered_photos_of_sixteen_are_noticed() -> None:
@@ -118,7 +118,7 @@ def test_too_little_is_not_known() -> None:
     assert not blind.known
     assert not blind.needed
     assert not blind.log_gains.any()
-    assert blind.evidence.startswith("Not known")
+    assert blind.evidence.startswith("Unknown")
     one = decide(colors[:, :1], valid[:, :1], own, places)
     assert not one.known
     few = valid.copy()
@@ -128,10 +128,10 @@ def test_too_little_is_not_known() -> None:
 
 def test_parts_are_halves_by_place() -> None:
     places = np.random.default_rng(0).uniform(-1, 1, (1000, 3))
-    parts = split_by_place(places)
+    parts = split_spatially(places)
     assert [len(part) for part in parts] == [125] * PARTS
     assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(1000))
-    assert len(split_by_place(places[:100])) == 1
+    assert len(split_spatially(places[:100])) == 1
 
 
 def sphere_color(places: np.ndarray) -> np.ndarray:
@@ -167,11 +167,11 @@ def altered_scene(log_light: np.ndarray) -> tuple[Scene, PhotosInMemory]:
 
 
 def test_photos_of_a_sphere() -> None:
-    plain = exposure_need(*altered_scene(np.zeros((12, 3))), range(1, 12))
+    plain = select_exposure(*altered_scene(np.zeros((12, 3))), range(1, 12))
     assert plain.known
     assert not plain.needed
     light = np.random.default_rng(1).uniform(-0.4, 0.4, (12, 1)) * np.ones(3)
-    altered = exposure_need(*altered_scene(light), range(1, 12))
+    altered = select_exposure(*altered_scene(light), range(1, 12))
     assert altered.needed
     assert not altered.log_gains[0].any()  # held out: not looked at
     truth = light[1:] / 2.4
@@ -182,10 +182,10 @@ def test_photos_of_a_sphere() -> None:
 def test_black_photos_one_photo_and_no_points() -> None:
     scene, photos = altered_scene(np.zeros((12, 3)))
     black = PhotosInMemory(scene, [np.zeros_like(p) for p in photos.photos])
-    assert not exposure_need(scene, black, range(12)).known
-    assert not exposure_need(scene, photos, [4]).known
+    assert not select_exposure(scene, black, range(12)).known
+    assert not select_exposure(scene, photos, [4]).known
     empty = Scene(scene.views, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), Similarity())
-    found = exposure_need(empty, photos, range(12))
+    found = select_exposure(empty, photos, range(12))
     assert not found.known
     assert "0 sparse points" in found.evidence
 
@@ -200,7 +200,7 @@ def test_cameras_that_see_nothing_and_masks() -> None:
     _, valid = sample_points(scene.points, masked, range(12))
     assert valid[:, 0].any()
     assert not valid[:, [1, 11]].any()
-    found = exposure_need(turned, masked, range(12))
+    found = select_exposure(turned, masked, range(12))
     assert found.photos == 10
     assert not found.needed
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Growth goes on while it pays, stops when it does not; noise of single photos decides nothing."""
+"""Selection of growth: continues while it pays, stops otherwise, robust against noisy photos."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gaussian_wrapping_addon.core.training.selection.growth_selection import (
     CAPACITY,
     CERTAINTY,
     MIN_GAIN_DB,
-    GrowthHistory,
+    ErrorHistory,
 )
 
 VIEWS = 30
@@ -25,11 +25,11 @@ def history(
     seed: int = 0,
     divisor_from: int = 10**9,
     outliers: int = 0,
-) -> GrowthHistory:
+) -> ErrorHistory:
     """Visits of all photos, the error falling by ``gain_db`` per doubling of the Gaussians."""
     random = np.random.default_rng(seed)
     own = np.exp(random.normal(0, 0.6, VIEWS))  # photos differ in error
-    found, iteration, count = GrowthHistory(), 0, 2000
+    found, iteration, count = ErrorHistory(), 0, 2000
     for step in range(rounds):
         for place, view in enumerate(random.permutation(VIEWS).tolist()):
             error = 1e-3 * own[view] * 10 ** (-gain_db * np.log2(count / 2000) / 10)
@@ -47,22 +47,22 @@ def history(
 
 @pytest.mark.parametrize("gain_db", [1.0, 0.5])
 def test_growth_that_pays_goes_on(gain_db: float) -> None:
-    need = history(gain_db).need()
-    assert need.pays
-    assert need.known
-    assert need.views == VIEWS
-    assert abs(need.gain_db - gain_db) < 4 * need.spread_db
+    evidence = history(gain_db).growth_evidence()
+    assert evidence.pays
+    assert evidence.known
+    assert evidence.views == VIEWS
+    assert abs(evidence.gain_db - gain_db) < 4 * evidence.spread_db
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_saturated_growth_stops(seed: int) -> None:
-    need = history(0.0, seed=seed, noise=0.01).need()
-    assert not need.pays
-    assert need.gain_db + CERTAINTY * need.spread_db < MIN_GAIN_DB
+    evidence = history(0.0, seed=seed, noise=0.01).growth_evidence()
+    assert not evidence.pays
+    assert evidence.gain_db + CERTAINTY * evidence.spread_db < MIN_GAIN_DB
 
 
 def test_one_standard_error_is_not_enough_to_stop() -> None:
-    found = [history(0.0, seed=seed, noise=0.1).need() for seed in range(40)]
+    found = [history(0.0, seed=seed, noise=0.1).growth_evidence() for seed in range(40)]
     close = [
         n for n in found if n.gain_db + n.spread_db < MIN_GAIN_DB <= n.gain_db + 2 * n.spread_db
     ]
@@ -71,13 +71,16 @@ def test_one_standard_error_is_not_enough_to_stop() -> None:
 
 
 def test_errors_that_rise_are_no_evidence_about_growth() -> None:
-    need = history(-1.0).need()
-    assert need.pays
-    assert not need.known
+    evidence = history(-1.0).growth_evidence()
+    assert evidence.pays
+    assert not evidence.known
 
 
 def test_noise_that_hides_the_answer_lets_it_grow() -> None:
-    clear, hidden = history(0.1, noise=0.005).need(), history(0.1, noise=1.0).need()
+    clear, hidden = (
+        history(0.1, noise=0.005).growth_evidence(),
+        history(0.1, noise=1.0).growth_evidence(),
+    )
     assert not clear.pays
     assert hidden.known
     assert hidden.pays
@@ -85,52 +88,52 @@ def test_noise_that_hides_the_answer_lets_it_grow() -> None:
 
 
 def test_single_bad_photos_do_not_stop_it() -> None:
-    assert history(0.6, outliers=6).need().pays
+    assert history(0.6, outliers=6).growth_evidence().pays
     mean_would = np.mean([0.6] * (VIEWS - 6) + [-20 / np.log2(1.21)] * 6)
     assert mean_would < MIN_GAIN_DB
 
 
 def test_the_jump_to_a_finer_level_is_not_taken_for_harm() -> None:
     # One round after the jump, no photo was seen twice at the new size.
-    fresh = history(0.6, divisor_from=7 * VIEWS).need()
+    fresh = history(0.6, divisor_from=7 * VIEWS).growth_evidence()
     assert fresh.pays
     assert not fresh.known
-    later = history(0.6, divisor_from=4 * VIEWS).need()
+    later = history(0.6, divisor_from=4 * VIEWS).growth_evidence()
     assert later.known
     assert later.pays
     assert later.gain_db > 0
 
 
 def test_without_growth_nothing_is_known() -> None:
-    need = history(0.0, growth=1.0).need()
-    assert need.pays
-    assert not need.known
-    assert need.views == 0
-    assert "Too few" in need.decision().evidence
-    assert GrowthHistory().need().pays
+    evidence = history(0.0, growth=1.0).growth_evidence()
+    assert evidence.pays
+    assert not evidence.known
+    assert evidence.views == 0
+    assert "Too few" in evidence.decision().evidence
+    assert ErrorHistory().growth_evidence().pays
 
 
 def test_it_is_restored_exactly_and_bounded() -> None:
     found = history(0.3)
-    again = GrowthHistory.restore(found.to_arrays())
-    assert again.need() == found.need()
+    again = ErrorHistory.restore(found.to_arrays())
+    assert again.growth_evidence() == found.growth_evidence()
     assert len(again) == len(found)
-    assert len(GrowthHistory.restore(GrowthHistory().to_arrays())) == 0
+    assert len(ErrorHistory.restore(ErrorHistory().to_arrays())) == 0
     for i in range(CAPACITY + 5):
         found.add(i, 0, 10, 0.1, 1)
     assert len(found) == CAPACITY
     found.clear()
     assert len(found) == 0
     with pytest.raises(ValueError, match="visits"):
-        GrowthHistory.restore({"visits": np.zeros((3, 2))})
+        ErrorHistory.restore({"visits": np.zeros((3, 2))})
 
 
 def test_the_record_tells_figures_and_obeys_the_setting() -> None:
-    need = history(0.0, noise=0.01).need()
-    auto = need.decision()
+    evidence = history(0.0, noise=0.01).growth_evidence()
+    auto = evidence.decision()
     assert auto.chosen == "stopped"
-    assert f"{need.gaussians} Gaussians" in auto.evidence
-    assert auto.figures["gain_db"] == need.gain_db
-    assert need.decision("on").chosen == "to the cap"
-    assert need.decision("off").chosen == "none added"
-    assert history(1.0).need().decision().chosen == "to the cap"
+    assert f"{evidence.gaussians} Gaussians" in auto.evidence
+    assert auto.figures["gain_db"] == evidence.gain_db
+    assert evidence.decision("on").chosen == "to the cap"
+    assert evidence.decision("off").chosen == "none added"
+    assert history(1.0).growth_evidence().decision().chosen == "to the cap"

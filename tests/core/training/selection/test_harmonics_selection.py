@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A degree is asked for where colours depend on the view, and not where photos differ otherwise."""
+"""Selection of the SH degree: view-dependent colours against other differences of photos."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.training.selection.harmonics_selection import (
     NEEDED_SHARE,
-    HarmonicsNeed,
+    HarmonicsEvidence,
     _halves,
-    harmonics_need,
+    select_harmonics,
 )
-from gaussian_wrapping_addon.core.training.selection.harmonics_trial import NeedView, match_exposure
+from gaussian_wrapping_addon.core.training.selection.harmonics_trial import (
+    TrialView,
+    match_exposure,
+)
 from tests.core.training.small_scene import ring_cameras, sphere_gaussians
 
 VIEWS, SIZE_PX = 40, 40
@@ -46,13 +49,13 @@ def glossy(degree: int) -> OrientedGaussians:
     return matte.replaced(sh=torch.from_numpy(sh))
 
 
-def split(views: list[NeedView]) -> tuple[list[NeedView], list[NeedView]]:
+def split(views: list[TrialView]) -> tuple[list[TrialView], list[TrialView]]:
     held_out = views[::6]
     return [v for v in views if not any(v is h for h in held_out)], held_out
 
 
-def photographed(truth: OrientedGaussians) -> list[NeedView]:
-    return [NeedView(c, shown(truth, c)) for c in ring_cameras(VIEWS, SIZE_PX)]
+def photographed(truth: OrientedGaussians) -> list[TrialView]:
+    return [TrialView(c, shown(truth, c)) for c in ring_cameras(VIEWS, SIZE_PX)]
 
 
 def untrained(gaussians: OrientedGaussians) -> OrientedGaussians:
@@ -65,7 +68,7 @@ def untrained(gaussians: OrientedGaussians) -> OrientedGaussians:
     return gaussians.replaced(sh=sh, means=gaussians.means + torch.from_numpy(shift))
 
 
-def altered(views: list[NeedView], known: bool) -> list[NeedView]:
+def altered(views: list[TrialView], known: bool) -> list[TrialView]:
     """The photos under an exposure that changes around the object, as a moving sun would."""
     out = []
     for view in views:
@@ -79,8 +82,8 @@ def altered(views: list[NeedView], known: bool) -> list[NeedView]:
 
 
 def test_a_glossy_scene_asks_for_its_degree_and_a_matte_one_does_not() -> None:
-    gloss = harmonics_need(untrained(glossy(1)), *split(photographed(glossy(1))), 1, threads=1)
-    matte = harmonics_need(
+    gloss = select_harmonics(untrained(glossy(1)), *split(photographed(glossy(1))), 1, threads=1)
+    matte = select_harmonics(
         untrained(sphere_gaussians()), *split(photographed(sphere_gaussians())), 1, threads=1
     )
     assert gloss.needed
@@ -89,17 +92,17 @@ def test_a_glossy_scene_asks_for_its_degree_and_a_matte_one_does_not() -> None:
     assert not matte.needed
     assert matte.share < 0.01
     assert matte.coefficients is None
-    assert gloss.judged == matte.judged == VIEWS
+    assert gloss.evaluated == matte.evaluated == VIEWS
     assert gloss.well_seen > 0.8
 
 
 def test_the_coefficients_lower_the_error_of_a_held_out_photo() -> None:
     start = untrained(glossy(1))
     train, held_out = split(photographed(glossy(1)))
-    need = harmonics_need(start, train, held_out, 1, threads=1)
-    assert need.coefficients is not None
-    assert need.coefficients.shape == (len(start), 4, 3)
-    better = start.replaced(sh=torch.from_numpy(need.coefficients))
+    evidence = select_harmonics(start, train, held_out, 1, threads=1)
+    assert evidence.coefficients is not None
+    assert evidence.coefficients.shape == (len(start), 4, 3)
+    better = start.replaced(sh=torch.from_numpy(evidence.coefficients))
     for view in held_out:
         before = np.mean((shown(start, view.camera) - view.photo) ** 2)
         assert np.mean((shown(better, view.camera) - view.photo) ** 2) < 0.8 * before
@@ -109,10 +112,10 @@ def test_held_out_photos_judge_and_are_never_fitted_to() -> None:
     start = untrained(glossy(1))
     train, held_out = split(photographed(glossy(1)))
     darker = [dataclasses.replace(v, photo=0.8 * v.photo) for v in held_out]
-    honest, spoiled = (harmonics_need(start, train, h, 1, threads=1) for h in (held_out, darker))
-    without = harmonics_need(start, train, [], 1, threads=1)
-    assert honest.judged == VIEWS
-    assert without.judged == len(train)
+    honest, spoiled = (select_harmonics(start, train, h, 1, threads=1) for h in (held_out, darker))
+    without = select_harmonics(start, train, [], 1, threads=1)
+    assert honest.evaluated == VIEWS
+    assert without.evaluated == len(train)
     assert without.needed
     assert spoiled.gain_db < honest.gain_db
     assert honest.coefficients is not None
@@ -129,9 +132,9 @@ def test_wrong_places_are_not_taken_for_gloss_and_do_not_hide_it() -> None:
     for truth in (matte, matte.replaced(sh=sh)):
         start = untrained(matte)
         bent = start.replaced(means=start.means + shift)
-        need = harmonics_need(bent, *split(photographed(truth)), 1, threads=1)
-        assert need.judged == VIEWS
-        shares.append(need.share)
+        evidence = select_harmonics(bent, *split(photographed(truth)), 1, threads=1)
+        assert evidence.evaluated == VIEWS
+        shares.append(evidence.share)
     assert shares[0] < 0.5 * NEEDED_SHARE
     assert shares[1] > 0.5
 
@@ -143,7 +146,7 @@ def test_gloss_of_a_part_is_measured_as_a_part() -> None:
         sh = shiny.sh.clone()
         sh[shiny.means[:, 2] < height, 1:] = 0.0
         views = photographed(shiny.replaced(sh=sh))
-        shares.append(harmonics_need(untrained(matte), *split(views), 1, threads=1).share)
+        shares.append(select_harmonics(untrained(matte), *split(views), 1, threads=1).share)
     # Slow errors reach a little beyond the part.
     assert 0.1 < shares[0] < 0.3 < shares[1] < 0.5 < 0.9 < shares[2]
 
@@ -161,19 +164,19 @@ def test_halves_part_neighbours_and_alternating_captures() -> None:
 
 def test_what_a_lower_degree_explains_does_not_count_for_a_higher_one() -> None:
     start = untrained(glossy(1))
-    need = harmonics_need(start, *split(photographed(glossy(1))), 2, threads=1)
-    assert not need.needed
+    evidence = select_harmonics(start, *split(photographed(glossy(1))), 2, threads=1)
+    assert not evidence.needed
 
 
 def test_known_exposures_are_not_taken_for_gloss() -> None:
     truth = sphere_gaussians()
     start, views = untrained(truth), photographed(truth)
-    unknown = harmonics_need(start, *split(altered(views, known=False)), 1, threads=1)
+    unknown = select_harmonics(start, *split(altered(views, known=False)), 1, threads=1)
     assert unknown.needed  # the photos' differences do look like gloss
     train, held_out = split(altered(views, known=True))
     blind = [dataclasses.replace(view, correction=None) for view in held_out]
     for judges in (held_out, blind):
-        assert not harmonics_need(start, train, judges, 1, threads=1).needed
+        assert not select_harmonics(start, train, judges, 1, threads=1).needed
 
 
 def test_masked_pixels_count_nowhere() -> None:
@@ -187,42 +190,46 @@ def test_masked_pixels_count_nowhere() -> None:
         photo[~mask] = random.random(size=photo[~mask].shape)
         clean.append(dataclasses.replace(view, mask=mask))
         spoiled.append(dataclasses.replace(view, photo=photo, mask=mask))
-    first = harmonics_need(start, *split(clean), 1, threads=1)
-    second = harmonics_need(start, *split(spoiled), 1, threads=1)
-    assert first.judged == VIEWS
+    first = select_harmonics(start, *split(clean), 1, threads=1)
+    second = select_harmonics(start, *split(spoiled), 1, threads=1)
+    assert first.evaluated == VIEWS
     assert first.gain_db != 0.0
     assert first == second
 
 
 def test_the_result_does_not_depend_on_the_threads() -> None:
     start, views = untrained(glossy(1)), split(photographed(glossy(1)))
-    one, two = (harmonics_need(start, *views, 1, threads=n) for n in (1, 2))
+    one, two = (select_harmonics(start, *views, 1, threads=n) for n in (1, 2))
     assert (one.gain_db, one.share) == (two.gain_db, two.share)
     assert one.coefficients is not None
     assert two.coefficients is not None
     assert np.array_equal(one.coefficients, two.coefficients)
 
 
-def unknown(need: HarmonicsNeed) -> bool:
-    return not need.needed and need.judged == 0 and need.gain_db == need.share == 0.0
+def unknown(evidence: HarmonicsEvidence) -> bool:
+    return (
+        not evidence.needed
+        and evidence.evaluated == 0
+        and evidence.gain_db == evidence.share == 0.0
+    )
 
 
 def test_too_few_photos_decide_nothing() -> None:
     views = photographed(glossy(1))
     start = untrained(glossy(1))
-    need = harmonics_need(start, views[:7], views[7:], 1, threads=1)  # a half of 3 photos
-    assert unknown(need)
-    assert need.decision().chosen == "degree 0"
-    assert "Too few photos" in need.decision().evidence
-    assert unknown(harmonics_need(start.replaced(means=start.means + 99), *split(views), 1))
+    evidence = select_harmonics(start, views[:7], views[7:], 1, threads=1)  # a half of 3 photos
+    assert unknown(evidence)
+    assert evidence.decision().chosen == "degree 0"
+    assert "Too few photos" in evidence.decision().evidence
+    assert unknown(select_harmonics(start.replaced(means=start.means + 99), *split(views), 1))
 
 
 def test_the_record_names_degree_and_figures() -> None:
-    gloss = harmonics_need(untrained(glossy(1)), *split(photographed(glossy(1))), 1, threads=1)
+    gloss = select_harmonics(untrained(glossy(1)), *split(photographed(glossy(1))), 1, threads=1)
     decision = gloss.decision()
     assert decision.chosen == "degree 1"
-    assert f"On {100 * gloss.share:.1f} % of the well-seen surface" in decision.evidence
-    assert f"judged on {VIEWS} photos" in decision.evidence
+    assert f"on {100 * gloss.share:.1f} % of the well-observed surface" in decision.evidence
+    assert f"cross-validated on {VIEWS} photos" in decision.evidence
     assert decision.figures["share"] == gloss.share
     assert decision.figures["limit_share"] == NEEDED_SHARE
     assert decision.figures["gain_db"] == gloss.gain_db
@@ -233,10 +240,10 @@ def test_the_record_names_degree_and_figures() -> None:
 def test_bad_input_is_refused() -> None:
     views = photographed(sphere_gaussians())
     with pytest.raises(UsageError, match="Degree 4"):
-        harmonics_need(sphere_gaussians(), views, [], 4)
+        select_harmonics(sphere_gaussians(), views, [], 4)
     wrong = [dataclasses.replace(views[0], photo=views[0].photo[1:]), *views[1:]]
     with pytest.raises(UsageError, match="one size"):
-        harmonics_need(sphere_gaussians(), wrong, [], 1, threads=1)
+        select_harmonics(sphere_gaussians(), wrong, [], 1, threads=1)
 
 
 def test_matching_finds_gain_and_offset() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sharp photos keep their size, blurred and enlarged ones do not, noise is not taken for detail."""
+"""Selection of the image size: sharp, blurred, enlarged and noisy photos."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from scipy import ndimage
 from gaussian_wrapping_addon.core.training.selection.image_size_selection import (
     DETAIL_RMS,
     PhotoDetail,
-    image_need,
     photo_detail,
+    select_image_size,
 )
 
 HEIGHT, WIDTH = 480, 640
@@ -94,19 +94,19 @@ def test_small_photos_are_left_alone() -> None:
 
 def test_half_of_the_photos_decide() -> None:
     fine, coarse = PhotoDetail(640, 640, 0.03, 0.01), PhotoDetail(640, 320, 0.001, 0.02)
-    assert image_need([fine, coarse, coarse]).useful_px == 320
-    assert image_need([fine, coarse]).useful_px == 640
-    need = image_need([coarse, coarse, fine])
-    decision = need.decision()
+    assert select_image_size([fine, coarse, coarse]).useful_px == 320
+    assert select_image_size([fine, coarse]).useful_px == 640
+    evidence = select_image_size([coarse, coarse, fine])
+    decision = evidence.decision()
     assert decision.chosen == "320 px"
     assert "320 px" in decision.evidence
     assert decision.figures["detail"] == 0.001
-    assert need.photos == 3
-    assert "nothing finer" not in image_need([fine]).decision().evidence
+    assert evidence.photos == 3
+    assert "hold all of their detail" not in select_image_size([fine]).decision().evidence
     with pytest.raises(ValueError, match="no photo"):
-        image_need([])
+        select_image_size([])
 
 
 def test_photos_of_several_sizes_are_not_taken_for_halved_ones() -> None:
     details = [PhotoDetail(side, side, 0.03, 0.01) for side in (794, 790, 790)]
-    assert "nothing finer" not in image_need(details).decision().evidence
+    assert "hold all of their detail" not in select_image_size(details).decision().evidence

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Decisions are kept with their evidence, in order, and a setting overrides them."""
+"""Model selection: decisions with evidence, their order, overriding settings."""
 
 from __future__ import annotations
 
@@ -14,31 +14,33 @@ from gaussian_wrapping_addon.core.training.selection.model_selection import (
     TWO_SIDED_ERROR,
     WRAPPING_SHARE,
     Decision,
-    Needs,
+    ModelSelection,
     decide,
-    multi_view_need,
-    wrapping_need,
+    select_multi_view,
+    select_wrapping,
 )
 
 
 def test_json_gives_back_the_same_decisions_in_order() -> None:
-    needs = Needs()
+    model_selection = ModelSelection()
     for name in ("growth", "exposure", "harmonics"):
-        needs = needs.with_decision(decide(name, "auto", True, "Because of 3.", {"a": 3.0}))
-    values = json.loads(json.dumps(needs.to_json(), allow_nan=False))
-    assert Needs.from_json(values) == needs
-    assert [d.name for d in needs] == ["growth", "exposure", "harmonics"]
+        model_selection = model_selection.with_decision(
+            decide(name, "auto", True, "Because of 3.", {"a": 3.0})
+        )
+    values = json.loads(json.dumps(model_selection.to_json(), allow_nan=False))
+    assert ModelSelection.from_json(values) == model_selection
+    assert [d.name for d in model_selection] == ["growth", "exposure", "harmonics"]
 
 
 def test_a_later_decision_takes_the_place_of_the_earlier() -> None:
-    needs = (
-        Needs()
+    model_selection = (
+        ModelSelection()
         .with_decision(decide("a", "auto", True, ""))
         .with_decision(decide("b", "auto", True, ""))
     )
-    changed = needs.with_decision(decide("a", "auto", False, "now"))
+    changed = model_selection.with_decision(decide("a", "auto", False, "now"))
     assert [(d.name, d.chosen) for d in changed] == [("a", "off"), ("b", "on")]
-    assert needs.chose("a")
+    assert model_selection.chose("a")
     assert not changed.chose("a")
     assert changed.chose("a", "off")
     assert not changed.chose("c")
@@ -72,43 +74,43 @@ def test_figures_that_are_not_finite_are_left_out_of_json() -> None:
 )
 def test_other_json_is_refused(values: object) -> None:
     with pytest.raises(UsageError):
-        Needs.from_json(values)
+        ModelSelection.from_json(values)
     with pytest.raises(UsageError):
         Decision.from_json(values)
 
 
 def test_multi_view_is_on_where_any_photo_has_a_neighbour() -> None:
     none, some = np.zeros(0, np.int64), np.array([1, 2])
-    found = multi_view_need([some, none, none, some])
+    found = select_multi_view([some, none, none, some])
     assert found.chosen == "on"
     assert found.figures["share_with_neighbour"] == 0.5
     assert found.figures["neighbours_per_photo"] == 1.0
     assert "2 of 4 photos" in found.evidence
-    assert multi_view_need([some], "off").chosen == "off"
+    assert select_multi_view([some], "off").chosen == "off"
     for setting in ("auto", "on", "off"):
-        assert multi_view_need([none, none], setting).chosen == "off"
-    assert multi_view_need([]).chosen == "off"
+        assert select_multi_view([none, none], setting).chosen == "off"
+    assert select_multi_view([]).chosen == "off"
 
 
 def test_wrapping_follows_the_share_of_what_is_seen_from_behind() -> None:
     errors = np.full(1000, 0.1)
     weights = np.ones(1000)
-    assert wrapping_need(errors, weights).chosen == "off"
+    assert select_wrapping(errors, weights).chosen == "off"
     few, many = round(0.9 * WRAPPING_SHARE * 1000), round(1.1 * WRAPPING_SHARE * 1000)
     for count, chosen in ((few, "off"), (many, "on")):
         two_sided = errors.copy()
         two_sided[:count] = 2 * TWO_SIDED_ERROR
-        found = wrapping_need(two_sided, weights)
+        found = select_wrapping(two_sided, weights)
         assert found.chosen == chosen
         assert found.figures["share_two_sided"] == pytest.approx(count / 1000)
     # What hardly shows decides nothing.
     two_sided[:many], weights[:many] = 2.0, 1e-6
-    assert wrapping_need(two_sided, weights).chosen == "off"
-    assert wrapping_need(two_sided, weights, "on").chosen == "on"
+    assert select_wrapping(two_sided, weights).chosen == "off"
+    assert select_wrapping(two_sided, weights, "on").chosen == "on"
 
 
 def test_wrapping_without_anything_seen_or_with_wrong_arrays() -> None:
-    assert wrapping_need(np.array([1.0]), np.array([0.0])).chosen == "off"
-    assert wrapping_need(np.array([math.nan, 1.0]), np.array([9.0, 1.0])).chosen == "on"
+    assert select_wrapping(np.array([1.0]), np.array([0.0])).chosen == "off"
+    assert select_wrapping(np.array([math.nan, 1.0]), np.array([9.0, 1.0])).chosen == "on"
     with pytest.raises(UsageError):
-        wrapping_need(np.zeros(3), np.zeros(2))
+        select_wrapping(np.zeros(3), np.zeros(2))

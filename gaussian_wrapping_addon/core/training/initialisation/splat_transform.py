@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussians in another frame: shapes, orientations and harmonics move along with the means."""
+"""Similarity transforms of Gaussians: means, shapes, orientations and harmonics."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...dataset.loading.splat_cameras import even_directions
+from ...dataset.loading.splat_cameras import fibonacci_directions
 from ...dataset.readers.source_model import quaternion_from_rotation
 from ...dataset.similarity import Similarity
 from ...gaussians.model import OrientedGaussians
 from ...render.reference.reference_projection import harmonics_basis
 
 _DIRECTIONS = 64
-"""Directions in which rotated harmonics must agree; 16 would do, more are better conditioned."""
+"""Directions for the fit of rotated harmonics; 16 would do, more are better conditioned."""
 
 
-def move_gaussians(
+def transform_gaussians(
     gaussians: OrientedGaussians, target_from_source: Similarity
 ) -> OrientedGaussians:
-    """Return what looks from a moved camera as the Gaussians do from the camera before.
+    """Transform Gaussians to another frame.
+
+    They look the same from transformed cameras.
 
     Parameters
     ----------
@@ -37,22 +39,22 @@ def move_gaussians(
         float64, target frame.
     """
     wide = {name: t.detach().cpu().double() for name, t in gaussians.tensors()}
-    move = target_from_source
-    rotation = torch.from_numpy(np.array(move.rotation, np.float64))
-    means = torch.from_numpy(move.points(wide["means"].numpy()))
+    similarity = target_from_source
+    rotation = torch.from_numpy(np.array(similarity.rotation, np.float64))
+    means = torch.from_numpy(similarity.points(wide["means"].numpy()))
     direction = wide["orientation"][:, :3] @ rotation.T
     return OrientedGaussians(
         means=means,
-        log_scales=wide["log_scales"] + math.log(move.scale),
-        quats=_turned(wide["quats"], quaternion_from_rotation(move.rotation)),
+        log_scales=wide["log_scales"] + math.log(similarity.scale),
+        quats=_rotated(wide["quats"], quaternion_from_rotation(similarity.rotation)),
         opacity_logits=wide["opacity_logits"],
         sh=rotate_harmonics(wide["sh"], rotation),
         orientation=torch.cat([direction, wide["orientation"][:, 3:]], dim=1),
-        filter_3d=wide["filter_3d"] * move.scale,
+        filter_3d=wide["filter_3d"] * similarity.scale,
     )
 
 
-def _turned(quats: Tensor, turn: np.ndarray) -> Tensor:
+def _rotated(quats: Tensor, turn: np.ndarray) -> Tensor:
     """Return the (n, 4) products ``turn * quats`` of quaternions w x y z."""
     a, b, c, d = turn.tolist()
     left = quats.new_tensor([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
@@ -62,20 +64,20 @@ def _turned(quats: Tensor, turn: np.ndarray) -> Tensor:
 def rotate_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
     """Rotate functions on the sphere, given by real spherical harmonics.
 
-    The coefficients are those that agree with the function before in :data:`_DIRECTIONS`
-    directions, by least squares for each degree; the degrees do not mix, so the fit is exact.
+    The coefficients are fitted to the function in :data:`_DIRECTIONS` directions, by least squares
+    for each degree; rotations do not mix degrees, so the fit is exact.
 
     Parameters
     ----------
     sh : (n, (degree + 1)^2, 3)
         Of degree 0 to 3.
     rotation : (3, 3)
-        Of the frame: the result at ``rotation @ d`` is the input at ``d``.
+        Rotation of the frame: the result at ``rotation @ d`` equals the input at ``d``.
 
     Returns
     -------
     Tensor
-        Of the shape and type of ``sh``.
+        Same shape and type as ``sh``.
     """
     degree = math.isqrt(sh.shape[1]) - 1
     if torch.equal(rotation, torch.eye(3, dtype=rotation.dtype)):
@@ -93,12 +95,12 @@ def rotate_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
 
 @functools.cache
 def _directions() -> Tensor:
-    """(m, 3) unit vectors spread evenly: a spherical Fibonacci lattice."""
-    return torch.from_numpy(even_directions(_DIRECTIONS))
+    """Return (m, 3) evenly spread unit vectors: a spherical Fibonacci lattice."""
+    return torch.from_numpy(fibonacci_directions(_DIRECTIONS))
 
 
 def with_degree(gaussians: OrientedGaussians, degree: int) -> OrientedGaussians:
-    """Return the Gaussians with harmonics of a degree: cut, or filled up with zeros."""
+    """Return the Gaussians with harmonics of a degree, truncated or zero-padded."""
     wanted = (degree + 1) ** 2
     sh = gaussians.sh[:, :wanted]
     missing = sh.new_zeros((len(sh), wanted - sh.shape[1], 3))

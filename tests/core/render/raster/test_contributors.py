@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lists hold for each block the pairs whose masks name it; lit blocks let light through."""
+"""Contributor lists contain the intersections whose masks include a block; active blocks."""
 
 from __future__ import annotations
 
@@ -10,17 +10,21 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.render.raster.visits import VISITS_ROOM, list_visits, lit_blocks
+from gaussian_wrapping_addon.core.render.raster.contributors import (
+    CONTRIBUTORS_PADDING,
+    active_blocks,
+    list_contributors,
+)
 
 BEGIN, SPARE = 37, -5
 
 
 @numba.njit
-def _run(lanes, masks, begin, count, room, visits, counts):  # type: ignore[no-untyped-def]
+def _run(lanes, masks, begin, count, room, contributors, counts):  # type: ignore[no-untyped-def]
     if lanes == 16:
-        list_visits(16, masks, begin, count, room, visits, counts)
+        list_contributors(16, masks, begin, count, room, contributors, counts)
     else:
-        list_visits(8, masks, begin, count, room, visits, counts)
+        list_contributors(8, masks, begin, count, room, contributors, counts)
 
 
 def _masks(kind: str, total: int, bits: int) -> np.ndarray:
@@ -36,22 +40,22 @@ def _masks(kind: str, total: int, bits: int) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["none", "all", "random"])
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 100])
 def test_lists(lanes: int, kind: str, count: int) -> None:
-    blocks, room = 256 // lanes, count + VISITS_ROOM
+    blocks, room = 256 // lanes, count + CONTRIBUTORS_PADDING
     # The masks end with the tile's last pair: nothing behind it may be read.
     masks: Any = _masks(kind, BEGIN + count, blocks)
-    visits = np.full(blocks * room + 8, SPARE, np.int32)
+    contributors = np.full(blocks * room + 8, SPARE, np.int32)
     counts = np.full(blocks, SPARE, np.int64)
-    _run(lanes, masks, BEGIN, count, room, visits, counts)
+    _run(lanes, masks, BEGIN, count, room, contributors, counts)
     for block in range(blocks):
         expected = BEGIN + np.flatnonzero((masks[BEGIN:] >> np.uint32(block)) & 1)
         assert counts[block] == len(expected)
-        np.testing.assert_array_equal(visits[block * room :][: len(expected)], expected)
-    assert (visits[blocks * room :] == SPARE).all()
+        np.testing.assert_array_equal(contributors[block * room :][: len(expected)], expected)
+    assert (contributors[blocks * room :] == SPARE).all()
 
 
 @numba.njit
 def _lit(lanes, m, plane):  # type: ignore[no-untyped-def]
-    return lit_blocks(16, m, plane) if lanes == 16 else lit_blocks(8, m, plane)
+    return active_blocks(16, m, plane) if lanes == 16 else active_blocks(8, m, plane)
 
 
 @pytest.mark.parametrize("lanes", [8, 16])

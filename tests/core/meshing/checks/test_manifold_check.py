@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The check of closed meshes: it agrees with trimesh, and every kind of defect is found."""
+"""Manifold check: it agrees with trimesh and finds every kind of defect."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import pytest
 import trimesh
 
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
-from gaussian_wrapping_addon.core.meshing.checks.mesh_check import (
+from gaussian_wrapping_addon.core.meshing.checks.manifold_check import (
+    MAX_LISTED_PARTS,
     MIN_HEIGHT_SHARE,
-    PARTS_TOLD,
-    check_mesh,
+    validate_manifold,
 )
 from gaussian_wrapping_addon.core.meshing.checks.mesh_statistics import mesh_statistics
 from tests.core.meshing.cleanup.test_repair import cubes
@@ -37,7 +37,7 @@ def test_good_meshes_pass_and_trimesh_agrees(name: str, scale: float, shift: flo
     make, genus = SHAPES[name]
     vertices, faces = make()
     vertices = vertices * scale + shift
-    check = check_mesh(vertices, faces)
+    check = validate_manifold(vertices, faces)
     assert (check.good, check.defects()) == (True, [])
     assert tuple(part.genus for part in check.parts) == genus
     other = trimesh.Trimesh(vertices - shift, faces, process=False)
@@ -109,7 +109,7 @@ DEFECTS: dict[str, tuple[Callable[[], Mesh], str, int]] = {
 @pytest.mark.parametrize("name", DEFECTS)
 def test_every_defect_is_found_and_counted(name: str) -> None:
     make, count, wanted = DEFECTS[name]
-    check = check_mesh(*make())
+    check = validate_manifold(*make())
     assert not check.good
     assert getattr(check, count) == wanted
     assert check.defects()
@@ -119,12 +119,12 @@ def test_every_defect_is_found_and_counted(name: str) -> None:
 
 
 def test_a_face_a_little_higher_than_the_tolerance_is_none_of_them() -> None:
-    assert check_mesh(*_flattened(3 * MIN_HEIGHT_SHARE)).good
+    assert validate_manifold(*_flattened(3 * MIN_HEIGHT_SHARE)).good
 
 
 def test_defects_do_not_hide_one_another() -> None:
     vertices, faces = joined(DEFECTS["hole"][0](), cubes((0, 0, 0), (1, 1, 0)), _turned())
-    check = check_mesh(np.concatenate([vertices, [[0, 0, 9.0]]]), faces)
+    check = validate_manifold(np.concatenate([vertices, [[0, 0, 9.0]]]), faces)
     counts = (
         check.open_edges, check.nonmanifold_edges, check.inconsistent_edges, check.unused_vertices,
     )  # fmt: skip
@@ -135,15 +135,18 @@ def test_defects_do_not_hide_one_another() -> None:
 
 def test_corners_are_found_beside_other_defects_too() -> None:
     vertices, faces = joined(cubes((0, 0, 0), (1, 1, 1)), DEFECTS["hole"][0]())
-    assert check_mesh(vertices, faces).nonmanifold_vertices == 1
+    assert validate_manifold(vertices, faces).nonmanifold_vertices == 1
 
 
 def test_inside_out_and_empty_meshes_are_no_good() -> None:
     vertices, faces = ball(1)
-    inside_out = check_mesh(vertices, faces[:, ::-1])
+    inside_out = validate_manifold(vertices, faces[:, ::-1])
     assert (inside_out.volume < 0, inside_out.good) == (True, False)
     assert inside_out.defects() == ["the enclosed volume is not positive"]
-    for empty in (check_mesh(np.zeros((0, 3)), np.zeros((0, 3))), check_mesh(vertices, faces[:0])):
+    for empty in (
+        validate_manifold(np.zeros((0, 3)), np.zeros((0, 3))),
+        validate_manifold(vertices, faces[:0]),
+    ):
         assert (empty.good, empty.parts) == (False, ())
         assert "the mesh has no faces" in empty.defects()
 
@@ -151,14 +154,14 @@ def test_inside_out_and_empty_meshes_are_no_good() -> None:
 def test_a_cavity_is_a_part_of_negative_volume() -> None:
     outer, inner = ball(2), ball(1)
     mesh = joined(outer, (0.5 * inner[0], inner[1][:, ::-1]))
-    check = check_mesh(*mesh)
+    check = validate_manifold(*mesh)
     assert check.good
     assert [part.volume > 0 for part in check.parts] == [True, False]
 
 
 def test_only_the_largest_parts_are_told_one_by_one() -> None:
-    balls = [(ball(1)[0] + 3 * k, ball(1)[1]) for k in range(PARTS_TOLD + 5)]
-    told = check_mesh(*joined(ball(2), *balls)).to_json()
-    assert told["part_count"] == PARTS_TOLD + 6
-    assert len(told["parts"]) == PARTS_TOLD
+    balls = [(ball(1)[0] + 3 * k, ball(1)[1]) for k in range(MAX_LISTED_PARTS + 5)]
+    told = validate_manifold(*joined(ball(2), *balls)).to_json()
+    assert told["part_count"] == MAX_LISTED_PARTS + 6
+    assert len(told["parts"]) == MAX_LISTED_PARTS
     assert told["parts"][0]["faces"] == 320

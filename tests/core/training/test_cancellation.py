@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A request to cancel is noticed in every loop over views before the next view is rendered."""
+"""Cancellation is checked in every loop over views before the next view is rendered."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import trainer
-from gaussian_wrapping_addon.core.training.cancelling import CheckedPhotos, checked
+from gaussian_wrapping_addon.core.training.cancellation import CancellablePhotos, cancellable
 from gaussian_wrapping_addon.core.training.density.contribution import contributions
 from gaussian_wrapping_addon.core.training.density.wrapping import (
     WrapView,
@@ -22,8 +22,8 @@ from gaussian_wrapping_addon.core.training.density.wrapping import (
     start_orientation,
 )
 from gaussian_wrapping_addon.core.training.optimizer.adam import Adam
-from gaussian_wrapping_addon.core.training.selection.harmonics_selection import harmonics_need
-from gaussian_wrapping_addon.core.training.selection.harmonics_trial import NeedView
+from gaussian_wrapping_addon.core.training.selection.harmonics_selection import select_harmonics
+from gaussian_wrapping_addon.core.training.selection.harmonics_trial import TrialView
 from tests.core.training.small_scene import sphere_gaussians, sphere_scene
 
 VIEWS = 5
@@ -58,19 +58,19 @@ def test_no_view_is_rendered_after_the_request(
     progress = Progress(is_cancelled=lambda: len(rendered) >= after)
     views = (WrapView(photos.camera(i), None) for i in range(VIEWS))
     with pytest.raises(Cancelled):
-        loop(adam, checked(views, progress))
+        loop(adam, cancellable(views, progress))
     assert len(rendered) == after
     assert all((before[name] == adam.array(name)).all() for name in before)
 
 
 def test_without_a_request_every_item_comes_once() -> None:
-    assert list(checked(range(VIEWS), Progress())) == list(range(VIEWS))
-    assert list(checked(np.arange(0), Progress())) == []
+    assert list(cancellable(range(VIEWS), Progress())) == list(range(VIEWS))
+    assert list(cancellable(np.arange(0), Progress())) == []
 
 
 def test_a_trial_of_harmonics_ends_before_the_next_view() -> None:
     _, photos = sphere_scene()
-    views = [NeedView(photos.camera(i), photos.photo(i)) for i in range(8)]
+    views = [TrialView(photos.camera(i), photos.photo(i)) for i in range(8)]
     calls = [0]
 
     def check() -> None:
@@ -79,7 +79,7 @@ def test_a_trial_of_harmonics_ends_before_the_next_view() -> None:
             raise Cancelled()
 
     with pytest.raises(Cancelled):
-        harmonics_need(sphere_gaussians(40), views, views[:2], 1, threads=1, check=check)
+        select_harmonics(sphere_gaussians(40), views, views[:2], 1, threads=1, check=check)
     assert calls[0] == 5
 
 
@@ -90,7 +90,7 @@ def test_looking_at_photos_before_the_first_iteration_can_be_cancelled(
     scene, photos = sphere_scene()
     seen = [0]
 
-    class Counted(CheckedPhotos):
+    class Counted(CancellablePhotos):
         def photo(self, index: int, divisor: int = 1) -> np.ndarray:
             seen[0] += 1
             return super().photo(index, divisor)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cancelling inside the loops of a training that look at many views for one iteration."""
+"""Cancellation inside the loops of a training that render many views per iteration."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from ..progress import Progress
 Item = TypeVar("Item")
 
 
-def checked(items: Iterable[Item], progress: Progress) -> Iterator[Item]:
-    """Yield the items, asking for cancelling before each one is made.
+def cancellable(items: Iterable[Item], progress: Progress) -> Iterator[Item]:
+    """Yield the items, checking for cancellation before each one is made.
 
     A wrapping round renders up to sixty views, which takes longer than the two seconds within
-    which a cancelled job stops. Where such a loop changes the state of a training only after its
-    last view, ending it early leaves the state as it was before.
+    which a cancelled job stops. A loop that changes the training state only after its last view
+    leaves the state unchanged when it ends early.
 
     Raises
     ------
     Cancelled
-        Before the item after the request is asked for.
+        Before the next item, once cancellation was requested.
     """
     iterator = iter(items)
     while True:
@@ -37,17 +37,17 @@ def checked(items: Iterable[Item], progress: Progress) -> Iterator[Item]:
         yield item
 
 
-class CheckedPhotos:
-    """Photos that ask for cancelling whenever one is fetched.
+class CancellablePhotos:
+    """Photo source that checks for cancellation on every access.
 
-    For what looks at all photos before the first iteration, or after the last.
+    For loops over all photos before the first iteration or after the last.
     """
 
     def __init__(self, photos: PhotoSource, progress: Progress) -> None:
         self._photos, self._progress = photos, progress
 
     def camera(self, index: int, divisor: int = 1) -> Camera:
-        """Return the camera of a level."""
+        """Return the camera at a pyramid level."""
         return self._photos.camera(index, divisor)
 
     def photo(self, index: int, divisor: int = 1) -> np.ndarray:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The last check of a mesh, by other means than the code that makes and measures meshes.
+"""Validate that a mesh is an oriented 2-manifold, independently of the code that made it.
 
-It walks around vertices and over edges by permutations of half-edges alone and shares nothing with
-:mod:`..cleanup.repair` and :mod:`.mesh_statistics`, so that a fault there does not hide itself
-here.
+The checks use permutations of half-edges and share no code with :mod:`..cleanup.repair` and
+:mod:`.mesh_statistics`, so that a bug there does not hide itself here.
 """
 
 from __future__ import annotations
@@ -17,20 +16,20 @@ import numpy as np
 from ...regions.convex_region import Region
 
 MIN_HEIGHT_SHARE = 1e-6
-"""A face lower than this share of its longest edge counts as degenerate. Files hold float32, about
-seven digits: below that such a face has no direction any more."""
+"""A face with a height below this share of its longest edge counts as degenerate. Files hold
+float32, about seven digits: below that a face has no defined normal."""
 
 ON_PLANE_SHARE = 1e-7
-"""A vertex so near the plane of a region's face lies on it, in diagonals of the region: what
-float32 can tell apart."""
+"""Tolerance for a vertex on the plane of a region's face, in diagonals of the region: float32
+resolves no less."""
 
-PARTS_TOLD = 20
-"""Parts that the report lists one by one, the largest."""
+MAX_LISTED_PARTS = 20
+"""The report lists this many of the largest parts."""
 
 
 @dataclass(frozen=True)
-class CheckedPart:
-    """One connected part (over shared vertices)."""
+class CheckedComponent:
+    """A part connected by shared vertices."""
 
     faces: int
     euler: int
@@ -41,12 +40,12 @@ class CheckedPart:
 
 
 @dataclass(frozen=True)
-class MeshCheck:
-    """What is wrong with a mesh; every count is 0 and ``volume`` positive where nothing is."""
+class ManifoldCheck:
+    """Defects of a mesh; a valid one has counts of 0 and a positive ``volume``."""
 
     faces: int
     bad_indices: int
-    """Faces that name a vertex that is not there; they are left out of all other counts."""
+    """Faces with an index out of range; they are left out of all other counts."""
     not_finite_vertices: int
     unused_vertices: int
     open_edges: int
@@ -54,33 +53,33 @@ class MeshCheck:
     nonmanifold_edges: int
     """Edges with more than two faces."""
     inconsistent_edges: int
-    """Edges whose two faces run along them the same way."""
+    """Edges whose two faces have opposite orientations."""
     nonmanifold_vertices: int
-    """Vertices whose faces are more than one ring."""
+    """Vertices whose faces form more than one ring."""
     degenerate_faces: int
-    """Faces with a repeated corner, or lower than :data:`MIN_HEIGHT_SHARE`."""
+    """Faces with a repeated corner, or with a height below :data:`MIN_HEIGHT_SHARE`."""
     euler: int
     volume: float
-    parts: tuple[CheckedPart, ...]
+    parts: tuple[CheckedComponent, ...]
     """From the largest number of faces to the smallest."""
     open_at_region: int | None = None
-    """Of the open edges, those that lie on one plane of the region's boundary. ``None`` where the
-    mesh is to be closed."""
+    """Open edges that lie on one plane of the region's boundary; ``None`` if the mesh must be
+    closed."""
 
     @property
     def good(self) -> bool:
-        """Whether the mesh is an oriented 2-manifold without defect.
+        """Whether the mesh is an oriented 2-manifold without defects.
 
-        It must be closed, with positive volume; or open on the region's planes alone, if asked so.
+        It must be closed with positive volume, or, if requested, open on the region's planes alone.
         """
         return not self.defects()
 
     def defects(self) -> list[str]:
-        """Return the defects in words, none for a good mesh."""
+        """Return descriptions of the defects, none for a good mesh."""
         if self.faces == 0:
             return ["the mesh has no faces"]
         counted = (
-            (self.bad_indices, "faces name vertices that are not there"),
+            (self.bad_indices, "faces refer to vertices that do not exist"),
             (self.not_finite_vertices, "vertices are not finite"),
             (self.unused_vertices, "vertices belong to no face"),
             (self.open_edges - (self.open_at_region or 0), "edges have one face only"),
@@ -97,7 +96,7 @@ class MeshCheck:
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values, with ``good``, ``defects`` and the number of parts."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        values["parts"] = [dataclasses.asdict(part) for part in self.parts[:PARTS_TOLD]]
+        values["parts"] = [dataclasses.asdict(part) for part in self.parts[:MAX_LISTED_PARTS]]
         for holder in (values, *values["parts"]):
             if not np.isfinite(holder["volume"]):
                 holder["volume"] = None
@@ -105,8 +104,10 @@ class MeshCheck:
         return {**values, **counts}
 
 
-def check_mesh(vertices: np.ndarray, faces: np.ndarray, open_at: Region | None = None) -> MeshCheck:
-    """Check a triangle mesh; anything is accepted, an empty one too.
+def validate_manifold(
+    vertices: np.ndarray, faces: np.ndarray, open_at: Region | None = None
+) -> ManifoldCheck:
+    """Check a triangle mesh; any input is accepted, also an empty mesh.
 
     Parameters
     ----------
@@ -114,7 +115,7 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, open_at: Region | None =
     faces : (f, 3) int
         Counter-clockwise seen from outside.
     open_at : Region, optional
-        The mesh may be open where an edge lies on a face of this region.
+        Region whose faces may hold boundary edges of the mesh.
     """
     vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
@@ -126,21 +127,21 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, open_at: Region | None =
     used[faces] = True
     edges = _Edges(faces, count)
     part = _parts(faces, count)
-    sound = edges.open + edges.crowded + edges.turned == 0 and not repeated.any()
-    rings = _rings(edges.twin, faces, count) if sound else None
+    sound = edges.open + edges.nonmanifold + edges.inconsistent == 0 and not repeated.any()
+    rings = _nonmanifold_vertices(edges.twin, faces, count) if sound else None
     corners = vertices[faces]  # (f, 3, 3)
     parts, volume = _measure_parts(corners, faces, part, edges, sound and rings == 0)
     allowed = None if open_at is None else _on_boundary(vertices, edges.open_pairs, open_at)
-    return MeshCheck(
+    return ManifoldCheck(
         faces=given,
         bad_indices=given - len(faces),
         not_finite_vertices=int((~finite).sum()),
         unused_vertices=int((~used).sum()),
         open_edges=edges.open,
-        nonmanifold_edges=edges.crowded,
-        inconsistent_edges=edges.turned,
-        nonmanifold_vertices=_slow_rings(faces) if rings is None else rings,
-        degenerate_faces=int((repeated | _flat(corners)).sum()),
+        nonmanifold_edges=edges.nonmanifold,
+        inconsistent_edges=edges.inconsistent,
+        nonmanifold_vertices=_nonmanifold_vertices_any(faces) if rings is None else rings,
+        degenerate_faces=int((repeated | _degenerate(corners)).sum()),
         euler=int(used.sum()) - edges.count + len(faces),
         volume=volume,
         parts=parts,
@@ -149,29 +150,29 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, open_at: Region | None =
 
 
 class _Edges:
-    """Half-edge ``3 f + k`` leads from corner k of face f to the next."""
+    """Edges of a mesh; half-edge ``3 f + k`` leads from corner k of face f to the next."""
 
     def __init__(self, faces: np.ndarray, vertex_count: int) -> None:
         begin, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
         forward, backward = begin * vertex_count + end, end * vertex_count + begin
-        lines, self.line, sizes = np.unique(
+        unique_edges, self.edge_index, sizes = np.unique(
             np.minimum(forward, backward), return_inverse=True, return_counts=True
         )
-        self.count = len(lines)
-        self.open, self.crowded = int((sizes == 1).sum()), int((sizes > 2).sum())
-        once = sizes[self.line] == 1
+        self.count = len(unique_edges)
+        self.open, self.nonmanifold = int((sizes == 1).sum()), int((sizes > 2).sum())
+        once = sizes[self.edge_index] == 1
         self.open_pairs = np.stack([begin[once], end[once]], 1)
-        """(o, 2) ends of the edges with one face."""
-        balance = np.bincount(self.line, weights=np.where(begin < end, 1.0, -1.0))
-        self.turned = int(((sizes == 2) & (balance != 0)).sum()) if len(lines) else 0
+        """(o, 2) end points of the edges with one face."""
+        balance = np.bincount(self.edge_index, weights=np.where(begin < end, 1.0, -1.0))
+        self.inconsistent = int(((sizes == 2) & (balance != 0)).sum()) if len(unique_edges) else 0
         order = np.argsort(forward, kind="stable")
-        place = np.searchsorted(forward[order], backward)
-        self.twin = order[np.minimum(place, max(len(order) - 1, 0))]
+        position = np.searchsorted(forward[order], backward)
+        self.twin = order[np.minimum(position, max(len(order) - 1, 0))]
         """The opposite half-edge; only where the mesh is closed and consistent."""
 
 
 def _on_boundary(vertices: np.ndarray, pairs: np.ndarray, region: Region) -> int:
-    """Count the edges (o, 2) with both ends on one plane of the region."""
+    """Count the edges (o, 2) with both end points on one plane of the region."""
     found = np.zeros(len(pairs), np.bool_)
     for normal, offset in zip(*region.half_spaces, strict=True):
         away = np.abs((vertices[pairs] - region.center) @ normal - offset)  # (o, 2)
@@ -179,11 +180,11 @@ def _on_boundary(vertices: np.ndarray, pairs: np.ndarray, region: Region) -> int
     return int(found.sum())
 
 
-def _rings(twin: np.ndarray, faces: np.ndarray, vertex_count: int) -> int:
+def _nonmanifold_vertices(twin: np.ndarray, faces: np.ndarray, vertex_count: int) -> int:
     """Count vertices with more than one ring, on a closed and consistently oriented mesh.
 
-    The half-edge before one in its face, seen from the other side, is the next one that leaves the
-    same vertex: a permutation, each of whose cycles is one ring.
+    The twin of the previous half-edge in a face is the next one that leaves the same vertex. This
+    is a permutation; each of its cycles is one ring.
     """
     half = np.arange(faces.size)
     turn = twin[half - half % 3 + (half + 2) % 3]
@@ -193,7 +194,7 @@ def _rings(twin: np.ndarray, faces: np.ndarray, vertex_count: int) -> int:
 
 
 def _cycle_minima(step: np.ndarray) -> np.ndarray:
-    """Return the least member of the cycle of each element, by doubling the way looked ahead."""
+    """Return the least member of the cycle of each element, by pointer doubling."""
     lowest, ahead = np.arange(len(step)), step
     while True:
         better = np.minimum(lowest, lowest[ahead])
@@ -202,16 +203,16 @@ def _cycle_minima(step: np.ndarray) -> np.ndarray:
         lowest, ahead = better, ahead[ahead]
 
 
-def _slow_rings(faces: np.ndarray) -> int:
-    """Count vertices whose faces are more than one piece, on any mesh."""
+def _nonmanifold_vertices_any(faces: np.ndarray) -> int:
+    """Count vertices whose faces form more than one piece, on any mesh."""
     around: dict[int, list[tuple[int, int]]] = {}
     for a, b, c in faces.tolist():
         for v, first, second in ((a, b, c), (b, c, a), (c, a, b)):
             around.setdefault(v, []).append((first, second))
-    return sum(_pieces(links) > 1 for links in around.values())
+    return sum(_connected_pieces(edges) > 1 for edges in around.values())
 
 
-def _pieces(links: list[tuple[int, int]]) -> int:
+def _connected_pieces(edges: list[tuple[int, int]]) -> int:
     """Count the connected pieces of a few edges."""
     leader: dict[int, int] = {}
 
@@ -220,19 +221,19 @@ def _pieces(links: list[tuple[int, int]]) -> int:
             x = leader[x]
         return x
 
-    for first, second in links:
+    for first, second in edges:
         leader[find(first)] = find(second)
     return len({find(x) for x in leader})
 
 
 def _parts(faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """Return the least vertex of the part of each face, (f,) int64."""
+    """Label each face by the least vertex of its part, (f,) int64."""
     leader = np.arange(vertex_count)
     while True:
         low = leader[faces].min(1)  # (f,)
         before = leader.copy()
         for k in range(3):
-            # Both the corner and its leader learn of the least leader of the face.
+            # Propagate the least leader of the face to the corner and to its leader.
             np.minimum.at(leader, leader[faces[:, k]], low)
             np.minimum.at(leader, faces[:, k], low)
         leader = leader[leader]
@@ -240,8 +241,8 @@ def _parts(faces: np.ndarray, vertex_count: int) -> np.ndarray:
             return leader[faces[:, 0]]
 
 
-def _flat(corners: np.ndarray) -> np.ndarray:
-    """(f,) bool: faces whose least height is below the tolerance; not finite ones count."""
+def _degenerate(corners: np.ndarray) -> np.ndarray:
+    """(f,) bool: faces with a height below the tolerance; faces that are not finite count."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     sides = np.stack([b - a, c - b, a - c], 1)  # (f, 3, 3)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -253,25 +254,25 @@ def _flat(corners: np.ndarray) -> np.ndarray:
 
 def _measure_parts(
     corners: np.ndarray, faces: np.ndarray, part: np.ndarray, edges: _Edges, manifold: bool
-) -> tuple[tuple[CheckedPart, ...], float]:
-    """Return the parts, the largest first, and the volume of all."""
+) -> tuple[tuple[CheckedComponent, ...], float]:
+    """Return the parts, largest first, and the total volume."""
     _, index, sizes = np.unique(part, return_inverse=True, return_counts=True)
     count = len(sizes)
     if count == 0:
         return (), 0.0
     with np.errstate(invalid="ignore", over="ignore"):
-        # Volumes of tetrahedra over a corner of the mesh: far origins would cost digits.
+        # Tetrahedra over a corner of the mesh: a distant origin would lose digits.
         a, b, c = (corners[:, k] - corners[0, 0] for k in range(3))
         each = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
     volumes = np.bincount(index, weights=each, minlength=count)
-    line_part = np.zeros(edges.count, np.int64)
-    line_part[edges.line] = np.repeat(index, 3)
+    edge_part = np.zeros(edges.count, np.int64)
+    edge_part[edges.edge_index] = np.repeat(index, 3)
     _, first = np.unique(faces, return_index=True)
     vertex_count = np.bincount(index[first // 3], minlength=count)
-    eulers = vertex_count - np.bincount(line_part, minlength=count) + sizes
+    eulers = vertex_count - np.bincount(edge_part, minlength=count) + sizes
     order = np.argsort(-sizes, kind="stable")
     parts = tuple(
-        CheckedPart(
+        CheckedComponent(
             int(sizes[i]),
             int(eulers[i]),
             1 - int(eulers[i]) // 2 if manifold else None,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which pairs reach each block of a tile, and which blocks still let light through."""
+"""Contributor lists of the blocks of a tile, and which blocks are not yet opaque."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from ..simd.simd import Block
 from ..simd.vector_runs import lowest_bit
 
 _GROUP = TILE
-VISITS_ROOM = _GROUP
-"""Values behind the end of a list that may be overwritten."""
+CONTRIBUTORS_PADDING = _GROUP
+"""Values past the end of a list that may be overwritten."""
 _WORD, _INDEX = ir.IntType(32), ir.IntType(64)
 
 
 @intrinsic
-def _pack_groups(typingctx, masks, begin, groups, block, visits, at):  # type: ignore[no-untyped-def]
-    """Write to ``visits[at ..]`` which of ``16 groups`` pairs reach a block; return how many.
+def _pack_groups(typingctx, masks, begin, groups, block, contributors, at):  # type: ignore[no-untyped-def]
+    """Write the intersections that reach a block to ``contributors[at ..]``; return their number.
 
-    Sixteen pairs are one vector, of which those that count are moved to the front.
+    ``16 groups`` intersections are tested, sixteen per vector, which is compressed.
     """
 
     def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
         words, bits = ir.VectorType(_WORD, _GROUP), ir.VectorType(ir.IntType(1), _GROUP)
         zeros, anything = ir.Constant(words, None), ir.Constant(words, ir.Undefined)
 
-        def vector_at(place: int, at: Any) -> Any:
-            data = context.make_array(sig.args[place])(context, builder, args[place]).data
+        def vector_at(argument: int, at: Any) -> Any:
+            data = context.make_array(sig.args[argument])(context, builder, args[argument]).data
             return builder.bitcast(builder.gep(data, [at]), words.as_pointer())
 
         def repeated(value: Any) -> Any:
@@ -51,33 +51,33 @@ def _pack_groups(typingctx, masks, begin, groups, block, visits, at):  # type: i
             first = builder.add(begin_, builder.mul(loop.index, ir.Constant(_INDEX, _GROUP)))
             own = builder.load(vector_at(0, first), align=4)
             reached = builder.icmp_unsigned("!=", builder.and_(own, wanted), zeros)
-            pairs = builder.add(repeated(builder.trunc(first, _WORD)), steps)
-            place = builder.load(end)
-            packed = builder.call(compress, [pairs, reached, anything])
-            builder.store(packed, vector_at(4, place), align=4)
+            intersections = builder.add(repeated(builder.trunc(first, _WORD)), steps)
+            position = builder.load(end)
+            packed = builder.call(compress, [intersections, reached, anything])
+            builder.store(packed, vector_at(4, position), align=4)
             number = builder.ctpop(builder.bitcast(reached, ir.IntType(_GROUP)))
-            builder.store(builder.add(place, builder.zext(number, _INDEX)), end)
+            builder.store(builder.add(position, builder.zext(number, _INDEX)), end)
         return builder.sub(builder.load(end), at_)
 
     index = types.intp
-    return types.intp(masks, index, index, index, visits, index), generate
+    return types.intp(masks, index, index, index, contributors, index), generate
 
 
 @inline
-def list_visits(
-    lanes: Any, masks: Any, begin: Any, count: Any, room: Any, visits: Any, counts: Any
+def list_contributors(
+    lanes: Any, masks: Any, begin: Any, count: Any, capacity: Any, contributors: Any, counts: Any
 ) -> None:
-    """List the pairs ``begin .. begin + count`` of a tile by the blocks that they reach.
+    """List, for each block, which intersections ``begin .. begin + count`` of a tile reach it.
 
     Parameters
     ----------
     lanes : int
         8 or 16.
-    masks : (pairs,) uint32
-    room : int
-        Values of ``visits`` for one block, at least ``count + VISITS_ROOM``.
-    visits : (blocks * room,) int32
-        Receives the numbers of the pairs of block b from ``b * room`` on, increasing.
+    masks : (intersections,) uint32
+    capacity : int
+        Values of ``contributors`` per block, at least ``count + CONTRIBUTORS_PADDING``.
+    contributors : (blocks * capacity,) int32
+        Receives the intersections of block b, increasing, from ``b * capacity`` on.
     counts : (blocks,) int64
         Receives the length of each list.
     """
@@ -85,46 +85,46 @@ def list_visits(
     if lanes == TILE:
         groups = count // _GROUP
         for block in range(blocks):
-            at = block * room
-            n = at + _pack_groups(masks, begin, groups, block, visits, at)  # type: ignore[call-arg]
+            at = block * capacity
+            n = at + _pack_groups(masks, begin, groups, block, contributors, at)  # type: ignore[call-arg]
             for k in range(begin + groups * _GROUP, begin + count):
-                visits[n] = k
+                contributors[n] = k
                 n += np.int64((masks[k] >> np.uint32(block)) & np.uint32(1))
             counts[block] = n - at
     else:
-        # Without instructions that pack vectors, elsewhere bit by bit.
+        # Bit by bit, where no instruction compresses vectors.
         for block in range(blocks):
             counts[block] = 0
         for k in range(begin, begin + count):
             bits = np.uint64(masks[k])
             while bits != np.uint64(0):
-                named = np.int64(lowest_bit(bits)) & (blocks - 1)
-                visits[named * room + counts[named]] = k
-                counts[named] += 1
+                target = np.int64(lowest_bit(bits)) & (blocks - 1)
+                contributors[target * capacity + counts[target]] = k
+                counts[target] += 1
                 bits &= bits - np.uint64(1)
 
 
-def _lit_intrinsic(lanes: int) -> Any:
+def _active_intrinsic(lanes: int) -> Any:
     @intrinsic
-    def lit(typingctx, m, plane):  # type: ignore[no-untyped-def]
+    def active(typingctx, m, plane):  # type: ignore[no-untyped-def]
         def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
             block, bits = Block(lanes, context, builder), ir.Constant(_INDEX, 0)
             state = block.data(sig.args[0], args[0])
             for number in range(PLANE // lanes):
-                light = block.load(state, block.offset(args[1], number * lanes))
-                passes = builder.zext((light >= float(TRANSMITTANCE_MIN)).any(), _INDEX)
+                transmittance = block.load(state, block.offset(args[1], number * lanes))
+                passes = builder.zext((transmittance >= float(TRANSMITTANCE_MIN)).any(), _INDEX)
                 bits = builder.or_(bits, builder.shl(passes, ir.Constant(_INDEX, number)))
             return bits
 
         return types.uint64(m, types.intp), generate
 
-    return lit
+    return active
 
 
-_lit_16, _lit_8 = _lit_intrinsic(16), _lit_intrinsic(8)
+_active_16, _active_8 = _active_intrinsic(16), _active_intrinsic(8)
 
 
 @inline
-def lit_blocks(lanes: Any, m: Any, plane: Any) -> Any:
-    """Return as bits the blocks with a pixel whose transmittance, at ``m[plane ..]``, counts."""
-    return _lit_16(m, plane) if lanes == 16 else _lit_8(m, plane)
+def active_blocks(lanes: Any, m: Any, plane: Any) -> Any:
+    """Return as bits the blocks with a pixel that is not opaque; T is at ``m[plane ..]``."""
+    return _active_16(m, plane) if lanes == 16 else _active_8(m, plane)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled sums of what the pairs of one band hold, added to the rows of the seen Gaussians."""
+"""Compiled reduction of per-intersection values of one band to the visible Gaussians."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from .raster_backward import ABS_U, ABS_V
 
 
 @kernel(fast=False)
-def add_pair_gradients(
+def add_intersection_gradients(
     begin: int,
     end: int,
     ids: np.ndarray,
-    pairs: np.ndarray,
-    pair_offsets: np.ndarray,
+    intersections: np.ndarray,
+    intersection_offsets: np.ndarray,
     fresh: bool,
     grad_params: np.ndarray,
 ) -> None:
-    """Add the pair gradients of the Gaussians ``ids[begin .. end]`` to ``grad_params (n, 24)``.
+    """Add the intersection gradients of the Gaussians ``ids[begin .. end]`` to ``grad_params``.
 
-    With ``fresh`` the rows start at 0, whatever they hold. The last two columns receive sums of
-    absolute values. Slots are added one after the other, so the order is that of the tiles.
+    With ``fresh`` the rows of ``grad_params (n, 24)`` start at 0, whatever their content. The last
+    two columns receive sums of absolute values. Slots are added in order, which is that of tiles.
     """
     total = np.zeros(ROW_VALUES, np.float32)
     for k in range(begin, end):
@@ -35,15 +35,15 @@ def add_pair_gradients(
         else:
             for column in range(ROW_VALUES):
                 total[column] = grad_params[i, column]
-        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
+        for slot in range(intersection_offsets[i], intersection_offsets[i + 1]):
             for column in range(ROW_VALUES):
-                total[column] += pairs[slot, column]
+                total[column] += intersections[slot, column]
         for column in range(ROW_VALUES):
             grad_params[i, column] = total[column]
 
 
 @kernel(fast=False)
-def take_screen_gradients(
+def write_screen_gradients(
     begin: int,
     end: int,
     ids: np.ndarray,
@@ -51,10 +51,10 @@ def take_screen_gradients(
     grad_px: np.ndarray,
     grad_abs_px: np.ndarray,
 ) -> None:
-    """Write the lengths of the gradient on (u, v) and of its sum of absolute values.
+    """Write the norms of the gradient on (u, v) and of its sum of absolute values.
 
-    The columns that held the absolute values become 0: params have none there. So does a row that
-    float32 could not hold.
+    The columns of the absolute values are then set to 0, as params have none there, and so are rows
+    that overflow float32.
     """
     for k in range(begin, end):
         i = ids[k]
@@ -73,27 +73,27 @@ def take_screen_gradients(
 
 
 @kernel(fast=False)
-def add_pair_weights(
+def add_intersection_weights(
     begin: int,
     end: int,
     ids: np.ndarray,
-    pair_weights: np.ndarray,
-    pair_offsets: np.ndarray,
+    intersection_weights: np.ndarray,
+    intersection_offsets: np.ndarray,
     weight_sum: np.ndarray,
     weight_max: np.ndarray,
 ) -> None:
-    """Combine the blending weights of the pairs of the Gaussians ``ids[begin .. end]``."""
+    """Reduce the blending weights of the Gaussians ``ids[begin .. end]`` over intersections."""
     for k in range(begin, end):
         i = ids[k]
         total, largest = weight_sum[i], weight_max[i]
-        for slot in range(pair_offsets[i], pair_offsets[i + 1]):
-            total += pair_weights[slot, 0]
-            largest = max(largest, pair_weights[slot, 1])
+        for slot in range(intersection_offsets[i], intersection_offsets[i + 1]):
+            total += intersection_weights[slot, 0]
+            largest = max(largest, intersection_weights[slot, 1])
         weight_sum[i], weight_max[i] = total, largest
 
 
 @kernel(fast=False)
-def mark_seen(
+def mark_visible(
     begin: int,
     end: int,
     ids: np.ndarray,
@@ -101,7 +101,7 @@ def mark_seen(
     visible: np.ndarray,
     radii_px: np.ndarray,
 ) -> None:
-    """Mark the Gaussians ``ids[begin .. end]``; write half of the longer side of their boxes."""
+    """Mark the Gaussians ``ids[begin .. end]`` visible; write half their boxes' longer side."""
     for k in range(begin, end):
         i = ids[k]
         visible[i] = True
