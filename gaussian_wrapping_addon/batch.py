@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The command line: ``blender --background -P batch.py -- wrap INPUT --out DIR``, or plain Python.
 
-It starts the same worker as the buttons do, shows its progress, and writes ``scene.blend``. The
+It starts the same worker as the buttons, shows its progress, and writes ``scene.blend``. The
 commands and their options are in ``command_line/``.
 """
 
@@ -19,7 +19,7 @@ _logger = logging.getLogger("gaussian_wrapping")
 def main(arguments: list[str], program: str = "batch.py") -> int:
     """Run one command and return the exit code (0 to 5, see ``docs/command-line.md``).
 
-    ``program`` is how help and usage call it.
+    ``program`` is the name shown in help and usage.
     """
     from .command_line.options.option_names import with_option_name
     from .command_line.parser import build_parser
@@ -41,7 +41,7 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
             raise
         ready = ready_worker()
         worker = interpreter_of(ready)[0] if ready else "that of Blender, or of the worker"
-        _logger.error("error: This Python lacks %s. Use another one: %s", error.name, worker)
+        _logger.error("error: This Python lacks %s. Use another Python: %s", error.name, worker)
         return EXIT_OTHER
     except OSError as error:
         if error.errno in DISK_FULL_ERRNOS:
@@ -78,7 +78,7 @@ def _arguments(argv: list[str]) -> list[str]:
 
 
 def _main_as_script() -> int:
-    """Load the package from where this file lies, then run its ``batch`` module."""
+    """Load the package that contains this file, then run its ``batch`` module."""
     name = "gaussian_wrapping_addon"
     root = Path(__file__).resolve().parent
     spec = importlib.util.spec_from_file_location(
@@ -89,7 +89,7 @@ def _main_as_script() -> int:
     package = importlib.util.module_from_spec(spec)
     sys.modules[name] = package
     spec.loader.exec_module(package)
-    # The folder of this file would put ``core``, ``ops`` and ``ui`` on the path as top-level names.
+    # The folder of this file would make ``core``, ``ops`` and ``ui`` importable as top-level names.
     sys.path[:] = [p for p in sys.path if not p or Path(p).resolve() != root]
     return int(importlib.import_module(f"{name}.batch").main(_arguments(sys.argv)))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A copy of the package in which one setting more is declared, and nothing else is changed."""
+"""Make a copy of the package that declares one more setting and is otherwise unchanged."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def test_a_python_without_numpy_is_told_what_to_use(entry: tuple[str, str]) -> N
     lacking = run_entry(entry, "check", "photos", prelude="sys.modules['numpy'] = None")
     assert lacking.returncode == 1
     assert "This Python lacks numpy" in lacking.stdout
-    assert lacking.stdout.rstrip().endswith("Use another one: that of Blender, or of the worker")
+    assert lacking.stdout.rstrip().endswith("Use another Python: that of Blender, or of the worker")
 
 
 def test_the_wheel_is_complete(entry: tuple[str, str], tmp_path: Path) -> None:

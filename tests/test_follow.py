@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the command line says of a job: nothing that is not so."""
+"""The command line reports the progress and outcome of a job correctly."""
 
 from __future__ import annotations
 
@@ -55,5 +55,5 @@ def test_a_mesh_that_failed(
     assert "[ 80.0 %] mesh" in caplog.text
     assert "100.0 %" not in caplog.text
     assert "error: No." in caplog.text
-    assert ("are as they were before" in caplog.text) == (not changed)
+    assert ("are unchanged" in caplog.text) == (not changed)
     assert ("its result is not" in caplog.text) == changed

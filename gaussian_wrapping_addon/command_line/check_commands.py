@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``check`` and ``doctor``: findings about an input, and about the worker's Python."""
+"""The commands ``check`` and ``doctor``: findings about an input and the worker's Python."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What several commands share: their list, and where a job lies."""
+"""Options shared by several commands: job folder, threads, Blender files."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ from .options.setting_options import add_option
 
 
 class Commands(Protocol):
-    """The list of commands that a parser has."""
+    """The subcommands of a parser."""
 
     def add_parser(self, name: str, *, help: str) -> Any:
         """Return the parser of a new command."""
 
 
 def add_out(parser: ArgumentParser) -> None:
-    """Add where the job lies."""
+    """Add ``--out``, the job folder."""
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
 
 
 def add_threads(parser: ArgumentParser) -> None:
-    """Add how many threads may work."""
+    """Add ``--threads``."""
     threads = declared("threads")
     add_option(parser, threads, default=threads.default)
 
 
 def add_no_blend(parser: ArgumentParser) -> None:
-    """Add whether Blender files are written."""
-    parser.add_argument("--no-blend", action="store_true", help="needs no bpy")
+    """Add ``--no-blend``: write no Blender files."""
+    parser.add_argument(
+        "--no-blend", action="store_true", help="write no scene.blend; needs no bpy"
+    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``evaluate``: a mesh or a job against a ground truth."""
+"""The command ``evaluate``: score a mesh or a job against a ground truth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .common import Commands, add_threads
 
 def add_evaluate(commands: Commands) -> None:
     """Add ``evaluate``."""
-    parser = commands.add_parser("evaluate", help="a mesh or a job against a ground truth")
+    parser = commands.add_parser("evaluate", help="score a mesh or a job against a ground truth")
     parser.add_argument(
         "mesh", type=Path, metavar="MESH_OR_JOB", help="PLY, OBJ, GLB, STL or OFF; or a job folder"
     )
@@ -23,26 +23,30 @@ def add_evaluate(commands: Commands) -> None:
         "--layout",
         choices=("auto", "scene", "mesh", "tanks", "dtu"),
         default="auto",
-        help="of the truth; auto tells it by the files there",
+        help="layout of the truth; auto detects it from its files",
     )
     parser.add_argument("--scan", type=int, help="number of the DTU scan")
-    parser.add_argument("--region", help="of the job, where it has several")
+    parser.add_argument("--region", help="region of the job, if it has several")
     parser.add_argument("--cameras", type=Path, help="cameras of a mesh file: COLMAP, transforms")
     parser.add_argument(
         "--thresholds", type=_floats, help="shares of the truth's diagonal, comma separated"
     )
-    parser.add_argument("--distances", type=_floats, help="lengths instead, comma separated")
+    parser.add_argument(
+        "--distances", type=_floats, help="thresholds as lengths instead, comma separated"
+    )
     parser.add_argument(
         "--align",
         choices=("none", "cameras", "icp"),
-        help="how the mesh is placed on the truth first: as it is, by cameras of equal names, by "
-        "nearest points (default: none; tanks icp, dtu cameras)",
+        help="alignment of the mesh to the truth: none, by cameras of equal names, by nearest "
+        "points (default: none; tanks icp, dtu cameras)",
     )
     parser.add_argument("--protocols", help="comma separated, of uniform,scan,legacy")
     parser.add_argument("--samples", type=int, help="points drawn on the mesh (uniform protocol)")
-    parser.add_argument("--seed", type=int, default=0, help="of these points")
+    parser.add_argument("--seed", type=int, default=0, help="seed of these points")
     add_threads(parser)
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="all figures, for programs")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.json", help="write all figures to this file"
+    )
     parser.set_defaults(run=_evaluate)
 
 

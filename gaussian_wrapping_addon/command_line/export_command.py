@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``export``: results of a finished job as files for other programs."""
+"""The command ``export``: write the results of a finished job for other programs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ def add_export(commands: Commands) -> None:
     """Add ``export``."""
     from ..core.export_formats import BLENDER_FORMATS, EXPORT_FORMATS, SHADINGS
 
-    parser = commands.add_parser("export", help="meshes of a finished job for other programs")
+    parser = commands.add_parser(
+        "export", help="export meshes of a finished job for other programs"
+    )
     parser.add_argument("job", type=Path, metavar="JOB", help="job folder, or its result folder")
     parser.add_argument(
         "--format",
@@ -37,9 +39,10 @@ def add_export(commands: Commands) -> None:
         "--shading",
         choices=SHADINGS,
         default="auto",
-        help="of the material; auto is lit, but for GLB without a normal map or occlusion",
+        help="shading of the material; auto: lit, but unlit for GLB without a normal or occlusion "
+        "map",
     )
-    parser.add_argument("--pack", action="store_true", help="textures into USD and FBX files")
+    parser.add_argument("--pack", action="store_true", help="pack textures into USD and FBX files")
     parser.set_defaults(run=_export)
 
 
@@ -60,10 +63,11 @@ def _export(options: Namespace) -> int:
         )  # fmt: skip
     by_blender = [f for f in formats if f in BLENDER_FORMATS]
     if by_blender and not has_bpy():
-        # Before anything is written: half of what was asked for is easily taken for all.
+        # Raise before anything is written: a partial export is easily mistaken for a complete one.
         raise UsageError(
             f"Writing {by_blender[0].upper()} needs bpy, which this Python does not have.",
-            "Run blender --background -P batch.py -- export ..., pip install bpy, or leave it out.",
+            "Run blender --background -P batch.py -- export ..., pip install bpy, or omit the"
+            " format.",
         )
     result, out = result_of(options.job), options.out.resolve()
     own = [f for f in formats if f not in BLENDER_FORMATS]

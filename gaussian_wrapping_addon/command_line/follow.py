@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A job from its start to its files, as the command line shows it."""
+"""Follow a job on the command line: show its progress, then write the Blender files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def has_bpy() -> bool:
 
 
 def require_bpy(job: JobFile, options: Namespace) -> None:
-    """Refuse before the start what could not be finished without bpy."""
+    """Raise before the job starts if its Blender files could not be written without bpy."""
     from ..core.errors import UsageError
     from ..core.export_formats import BLENDER_FORMATS
 
@@ -44,7 +44,7 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     from ..core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
     from ..core.jobs.store.blend_file import result_state
 
-    before = result_state(client.folder.result)  # the worker writes it last
+    before = result_state(client.folder.result)  # the worker replaces it at its end
     shown_s, shown, interrupted_s = 0.0, ("", ""), 0.0
     while True:
         try:
@@ -53,7 +53,7 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
             news = (status.stage, status.message)
             due = status.stage != shown[0] or now_s - shown_s > LINE_EVERY_S
             failed = status.state in ("FAILED", "LOST")
-            # What has failed was at another place: a finished job that is put back says 100 %.
+            # Not after a failure: the status of a rolled-back job shows 100 %.
             if status.stage and due and news != shown and not failed:
                 shown_s, shown = now_s, news
                 left = (
@@ -84,8 +84,8 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
         if client.folder.read_status().state == "DONE":
             same = result_state(client.folder.result) == before
             _logger.info(
-                "the job and its result are as they were before: %s" if same
-                else "the job is as it was before, its result is not; mesh it again: %s",
+                "the job and its result are unchanged: %s" if same
+                else "the job is unchanged, but its result is not; mesh it again: %s",
                 client.folder.root,
             )  # fmt: skip
         return status.exit_code or EXIT_OTHER
@@ -93,7 +93,7 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
 
 
 def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Namespace) -> int:
-    """Write the Blender files; one that shows the result ``before`` does not stay."""
+    """Write the Blender files; a ``scene.blend`` of the result ``before`` is renamed."""
     from ..core.jobs.store.blend_file import NAME, back_up_stale_blend
 
     if options.no_blend:

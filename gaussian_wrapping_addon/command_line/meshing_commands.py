@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``mesh``, ``estimate-mesh`` and ``work-tiles``: regions of a finished training."""
+"""The commands ``mesh``, ``estimate-mesh`` and ``work-tiles``: mesh a finished training."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_WAIT_S = 7 * 86400.0
 def add_mesh(commands: Commands) -> None:
     """Add ``mesh``."""
     parser = commands.add_parser(
-        "mesh", help="another region or resolution, from a finished training"
+        "mesh", help="mesh another region or resolution of a finished training"
     )
     add_out(parser)
     add_method_options(parser)
@@ -51,7 +51,7 @@ def _mesh(options: Namespace) -> int:
 def add_estimate_mesh(commands: Commands) -> None:
     """Add ``estimate-mesh``."""
     parser = commands.add_parser(
-        "estimate-mesh", help="triangles, time and memory of a region's mesh, before it is made"
+        "estimate-mesh", help="estimate triangles, time and memory of a region's mesh"
     )
     parser.add_argument("--region", default="auto", metavar="auto|all|REGION.json")
     add_out(parser)
@@ -86,12 +86,12 @@ def _estimate_mesh(options: Namespace) -> int:
 def add_work_tiles(commands: Commands) -> None:
     """Add ``work-tiles``."""
     parser = commands.add_parser(
-        "work-tiles", help="help a job that meshes in tiles, from another process or machine"
+        "work-tiles", help="mesh tiles of a running job, in another process or on another machine"
     )
     parser.add_argument("out", type=Path, metavar="DIR", help="job folder of that job")
     add_threads(parser)
     parser.add_argument(
-        "--wait", type=float, default=0.0, metavar="S", help="seconds to wait for tiles, at most"
+        "--wait", type=float, default=0.0, metavar="S", help="longest time to wait for tiles, in s"
     )
     parser.set_defaults(run=_work_tiles)
 

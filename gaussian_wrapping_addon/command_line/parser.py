@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The parser of the command line: every command, each from its own file."""
+"""The parser of the command line with all commands."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _COMMANDS = (
     add_doctor,
     add_set_up_worker,
 )
-"""In the order of the help."""
+"""In the order shown by ``--help``."""
 
 
 class Parser(ArgumentParser):
-    """Raises our usage error instead of leaving the process, so that Blender ends in order."""
+    """Raise :class:`UsageError` instead of exiting the process, so that Blender exits cleanly."""
 
     def error(self, message: str) -> NoReturn:
         from ..core.errors import UsageError
@@ -42,7 +42,7 @@ class Parser(ArgumentParser):
 
 
 def build_parser(program: str = "batch.py") -> Parser:
-    """Return a parser whose options have ``run``: the command, given the options."""
+    """Return the parser; the parsed options have ``run``, a function that takes the options."""
     parser = Parser(prog=program, description="Photos in, a textured mesh out.")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
     for add in _COMMANDS:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``set-up-worker``: make or remove the private environment that workers run in."""
+"""The command ``set-up-worker``: create or remove the private worker environment."""
 
 from __future__ import annotations
 
@@ -24,24 +24,30 @@ LINE_EVERY_S = 5.0
 def add_set_up_worker(commands: Commands) -> None:
     """Add ``set-up-worker``."""
     parser = commands.add_parser(
-        "set-up-worker", help="make the private environment that workers run in"
+        "set-up-worker", help="create the private environment that workers run in"
     )
-    parser.add_argument("--python", default="", metavar="P", help="3.11 or newer; found if absent")
-    parser.add_argument("--to", type=Path, metavar="DIR", help="the add-on's own folder if absent")
     parser.add_argument(
-        "--find-links", default="", metavar="DIR", help="take wheels from here and nowhere else"
+        "--python", default="", metavar="P", help="Python 3.11 or newer (default: searched for)"
+    )
+    parser.add_argument(
+        "--to", type=Path, metavar="DIR", help="folder (default: the add-on's own folder)"
+    )
+    parser.add_argument(
+        "--find-links", default="", metavar="DIR", help="install wheels only from this folder"
     )
     parser.add_argument(
         "--torch", choices=("cpu", "cuda", "index"), default="cpu",
-        help="index: whatever pip's own index gives",
+        help="build of torch; index: the default of pip's index",
     )  # fmt: skip
-    parser.add_argument("--requirements", type=Path, metavar="FILE", help="another list")
-    parser.add_argument("--dry-run", action="store_true", help="show the commands only")
+    parser.add_argument(
+        "--requirements", type=Path, metavar="FILE", help="another list of packages"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="only show the commands")
     action = parser.add_mutually_exclusive_group()
     action.add_argument(
-        "--repair", action="store_true", help="make it anew with the Python and torch it has"
+        "--repair", action="store_true", help="create it again with its present Python and torch"
     )
-    action.add_argument("--remove", action="store_true", help="delete what was made")
+    action.add_argument("--remove", action="store_true", help="delete the environment")
     parser.set_defaults(run=_set_up_worker)
 
 
@@ -69,7 +75,7 @@ def _set_up_worker(options: Namespace) -> int:
     if options.repair:
         marker = environment.marker()
         if not marker:
-            raise UsageError(f"{root} holds no worker environment.", "Leave --repair out.")
+            raise UsageError(f"{root} holds no worker environment.", "Omit --repair.")
         name, torch = name or str(marker.get("python", "")), str(marker.get("torch", torch))
     python = probe(name) if name else next(iter(find_pythons(sys.executable)), None)
     if python is None:
@@ -85,7 +91,7 @@ def _set_up_worker(options: Namespace) -> int:
 
 
 def _follow(request: SetupRequest) -> int:
-    """Carry it out, showing progress; return the exit code."""
+    """Run the set-up and show its progress; return the exit code."""
     from ..core.errors import EXIT_OTHER
     from ..core.setup.install import SetupTask
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``wrap``, ``more``, ``resume`` and ``estimate``: jobs that train."""
+"""The commands ``wrap``, ``more``, ``resume`` and ``estimate``: jobs that train."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _logger = logging.getLogger("gaussian_wrapping")
 def add_wrap(commands: Commands) -> None:
     """Add ``wrap``."""
     parser = commands.add_parser(
-        "wrap", help="photos, a COLMAP project or a transforms.json -> mesh"
+        "wrap", help="make a textured mesh of photos, a COLMAP project or a transforms.json"
     )
     parser.add_argument("input", type=Path)
     add_training_options(parser)
@@ -51,7 +51,9 @@ def _wrap(options: Namespace) -> int:
 
 def add_continue_training(commands: Commands) -> None:
     """Add ``more``."""
-    parser = commands.add_parser("more", help="train a finished job further, and mesh it again")
+    parser = commands.add_parser(
+        "more", help="continue the training of a finished job, then mesh it again"
+    )
     add_out(parser)
     entry = declared("training.extra_iterations")
     add_option(parser, entry, dest="iterations", required=True)
@@ -73,10 +75,10 @@ def _continue_training(options: Namespace) -> int:
 
 def add_resume(commands: Commands) -> None:
     """Add ``resume``."""
-    parser = commands.add_parser("resume", help="continue a job that was stopped")
+    parser = commands.add_parser("resume", help="resume a job that was stopped")
     parser.add_argument("out", type=Path, metavar="DIR")
     entry = declared("training.max_gaussians")
-    add_option(parser, entry, dest="max_gaussians", help="train anew with another cap")
+    add_option(parser, entry, dest="max_gaussians", help="train anew with this maximum")
     add_no_blend(parser)
     parser.set_defaults(run=_resume)
 
@@ -90,7 +92,7 @@ def _resume(options: Namespace) -> int:
     require_bpy(job, options)
     if options.max_gaussians is None:
         return follow(JobClient.resume(options.out, python=worker_python()), job, options)
-    # A training with another cap starts anew: there is nothing that it could add to.
+    # A training with another maximum starts anew: extra iterations do not apply.
     training = replace(
         job.settings.training, max_gaussians=options.max_gaussians, extra_iterations=0
     )
@@ -101,7 +103,7 @@ def _resume(options: Namespace) -> int:
 
 def add_estimate(commands: Commands) -> None:
     """Add ``estimate``."""
-    parser = commands.add_parser("estimate", help="time, memory and disk of a training, before")
+    parser = commands.add_parser("estimate", help="estimate time, memory and disk of a training")
     parser.add_argument("input", type=Path)
     add_training_options(parser)
     parser.set_defaults(run=_estimate)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options that become settings of meshes and textures, of all commands that make one."""
+"""Meshing and texture options of all commands that make a mesh."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _IGNORED_BY_PIVOTS: dict[str, tuple[Any, ...]] = {
     "spacing": (),
     "tiles": ("auto", "off"),
 }
-"""Settings that the method pivots ignores, and values of them that ask for nothing: an edge length
-or number of 0, and tiles that pivots do without anyway."""
+"""Settings that the method pivots ignores, and their values without effect: an edge length or
+number of 0, and tiles that pivots do not use anyway."""
 
 
 def add_method_options(parser: ArgumentParser) -> None:
-    """Add how a mesh is made, and how finely."""
+    """Add the meshing method and resolution."""
     add_options(parser, "method")
 
 
 def method_settings(options: Namespace) -> dict[str, Any]:
-    """Return the meshing settings, by name, that :func:`add_method_options` was given.
+    """Return the meshing settings, by name, of :func:`add_method_options`.
 
-    What was not given has its default, not that of an earlier mesh.
+    Options that are not given have their defaults, not the values of an earlier mesh.
 
     Raises
     ------
@@ -43,14 +43,14 @@ def method_settings(options: Namespace) -> dict[str, Any]:
             if name in given and given[name] not in no_effect:
                 option = option_of(f"meshing.{name}")
                 raise UsageError(
-                    f"{option} {given[name]} does not go with --method pivots, which is as fine "
-                    "as the Gaussians lie and makes the mesh whole.",
-                    f"Leave one of the two out; --method pam heeds {option}.",
+                    f"{option} {given[name]} has no effect with --method pivots, whose resolution "
+                    "is that of the Gaussians and which makes the mesh in one piece.",
+                    f"Omit one of the two; --method pam uses {option}.",
                 )
     elif "pivots" in given:
         raise UsageError(
-            f"--pivots {given['pivots']} does not go with --method {method}.",
-            "Add --method pivots, or leave --pivots out.",
+            f"--pivots {given['pivots']} has no effect with --method {method}.",
+            "Add --method pivots, or omit --pivots.",
         )
     return {
         entry.name: given.get(entry.name, entry.default) for entry in declared_options("method")
@@ -58,19 +58,19 @@ def method_settings(options: Namespace) -> dict[str, Any]:
 
 
 def add_region_options(parser: ArgumentParser) -> None:
-    """Add what ``wrap`` and ``mesh`` share: regions, the field, clean-up, texture, files."""
+    """Add the options shared by ``wrap`` and ``mesh``: regions, field, clean-up, texture, files."""
     add_options(parser, "region")
 
 
 def region_settings(settings: JobSettings, options: Namespace) -> JobSettings:
-    """Return settings with what :func:`add_method_options` and :func:`add_region_options` gave.
+    """Return settings with the options of :func:`add_method_options` and `add_region_options`.
 
-    What was not given has its default, not that of an earlier mesh.
+    Options that are not given have their defaults, not the values of an earlier mesh.
 
     Raises
     ------
     UsageError
-        An option is given that the method ignores, or a text cannot be read.
+        An option is given that the method ignores, or a value cannot be parsed.
     """
     given = given_settings(options, "region")
     values = {entry.path: entry.default for entry in declared_options("region")}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Errors about a setting name the option that was typed."""
+"""Name the command-line option in errors about a setting."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from .setting_options import option_of
 
 
 def with_option_name(error: SettingError) -> SettingError:
-    """Return the same error, naming the option where a setting is named."""
+    """Return the error with the setting's option in place of its path."""
     return SettingError(error.setting, error.wanted, called=option_of(error.setting))

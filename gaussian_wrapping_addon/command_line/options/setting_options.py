@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options of the command line, made from the declarations of the settings."""
+"""Add command-line options generated from the declarations of the settings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def declared_options(scope: Scope) -> tuple[Declaration, ...]:
 
 
 def add_options(parser: ArgumentParser, scope: Scope) -> None:
-    """Add the options of a scope. What is not given stays ``None``."""
+    """Add the options of a scope. Options that are not given are ``None``."""
     exclusive: dict[str, Any] = {}
     for entry in declared_options(scope):
         assert entry.option is not None
@@ -33,12 +33,12 @@ def add_options(parser: ArgumentParser, scope: Scope) -> None:
 
 
 def add_option(parser: Any, entry: Declaration, **changes: Any) -> None:
-    """Add the option of one setting to a parser or a group of it.
+    """Add the option of one setting to a parser or argument group.
 
     Parameters
     ----------
     changes : dict
-        Keywords of ``add_argument`` that are other than declared.
+        Keywords of ``add_argument`` that replace the declared ones.
     """
     option = entry.option
     assert option is not None
@@ -49,7 +49,7 @@ def add_option(parser: Any, entry: Declaration, **changes: Any) -> None:
     if option.flag:
         keywords |= {"action": "store_const", "const": option.flag}
     else:
-        # Without choices, argparse would show the dotted path.
+        # Without a metavar or choices, argparse would show the dotted path.
         shown = option.metavar or option.name.lstrip("-").replace("-", "_").upper()
         keywords["metavar"] = option.metavar or (None if entry.choices else shown)
         keywords["choices"] = entry.choices or None
@@ -66,7 +66,7 @@ def given_settings(options: Namespace, scope: Scope) -> dict[str, Any]:
     Raises
     ------
     UsageError
-        A text cannot be read.
+        A value cannot be parsed.
     """
     values = {}
     for entry in declared_options(scope):
@@ -78,6 +78,6 @@ def given_settings(options: Namespace, scope: Scope) -> dict[str, Any]:
 
 
 def option_of(path: str) -> str:
-    """Return the option that gives a setting, ``""`` where there is none."""
+    """Return the name of a setting's option, ``""`` if it has none."""
     options = {e.path: e.option.name for e in declarations(JobSettings) if e.option is not None}
     return options.get(path, "")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options that become training settings, of ``wrap`` and ``estimate``."""
+"""Training options of ``wrap`` and ``estimate``."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from ...core.settings import MODEL_SELECTION, JobSettings, preset, with_values
 from .setting_options import add_options, given_settings, option_of
 
 _SELECTION_VALUES = {"auto": "auto", "all": "on", "none": "off"}
-"""Words of ``--needs`` and what they set."""
+"""Values of ``--needs`` and the model selection that they set."""
 
 
 def add_training_options(parser: ArgumentParser) -> None:
-    """Add preset, seed, threads and everything that changes the training's settings."""
+    """Add preset, seed, threads and all options of the training."""
     add_options(parser, "training")
     names = ", ".join(option_of(f"training.{name}") for name in MODEL_SELECTION)
     parser.add_argument(
         "--needs",
         choices=tuple(_SELECTION_VALUES),
-        help=f"model selection: sets {names}, each of which wins over this option; "
-        "auto: by what the photos show; all: on; none: off",
+        help=f"model selection: sets {names}, each of which overrides this option; "
+        "auto: selected from the photos; all: on; none: off",
     )
 
 
 def training_settings(options: Namespace) -> JobSettings:
-    """Return the preset's settings with what :func:`add_training_options` was given.
+    """Return the preset's settings with the options of :func:`add_training_options`.
 
-    Ranges are checked where the job is made.
+    Ranges are checked when the job is made.
     """
     values = given_settings(options, "training")
     if options.needs is not None:

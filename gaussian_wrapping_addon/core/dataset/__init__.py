@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What was photographed: cameras, the scene that holds them, its file.
+"""Data sets: cameras, the scene with its views and points, and readers of inputs.
 
-The plain files here are the data classes; the folders read inputs and make a scene of them.
+The modules here are the data classes; the folders read inputs and make a scene of them.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What training, baking and pictures ask of a scene's photos."""
+"""Protocol of a source of photos, masks and matching cameras."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from .camera import Camera
 
 
 class PhotoSource(Protocol):
-    """Cameras, photos and masks of the scene's views at sizes divided by whole numbers.
+    """Cameras, photos and masks of the scene's views, downsampled by integer divisors.
 
-    :class:`~.photos.photo_store.PhotoStore` is one.
+    Implemented by :class:`~.photos.photo_store.PhotoStore`.
     """
 
     def camera(self, index: int, divisor: int = 1) -> Camera:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What was photographed: undistorted views, sparse points, and the scene frame."""
+"""The scene: undistorted views, sparse points, and the transform from the scene frame."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Scene:
 
     The scene frame is Z-up (automatic up direction), has the mean of the camera centres at 0, and
     is scaled so that 1.1 x the largest camera distance to 0 is ``tolerances.SCENE_RADIUS``.
-    ``world_from_scene`` leads back to the frame of the input, in float64.
+    ``world_from_scene`` maps back to the frame of the input, in float64.
     """
 
     views: tuple[View, ...]
@@ -40,9 +40,9 @@ class Scene:
     """(n, 3) uint8."""
     world_from_scene: Similarity
     warnings: tuple[ReportWarning, ...] = ()
-    """What a person should read."""
+    """Warnings for the user."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """What was read (kind of input, counts), for the report."""
+    """Kind of input and counts, for the report."""
 
     @property
     def cameras(self) -> list[Camera]:

@@ -42,9 +42,9 @@ def load_saved_scene(folder: Path) -> Scene:
     Raises
     ------
     ParseError
-        A file is missing, cut or of another version.
+        A file is missing, truncated or of another version.
     DatasetError
-        A photo is no longer where it was.
+        A photo no longer exists.
     """
     path = folder / SCENE_NAME
     if not path.is_file():
@@ -100,7 +100,7 @@ def scene_from_json(values: Any, folder: Path) -> Scene:
         for file in (view.photo_path, view.mask_path):
             if file is not None and not file.is_file():
                 raise DatasetError(
-                    f"Photo {file} is no longer there.", "Put it back, or start the job anew."
+                    f"Photo {file} no longer exists.", "Put it back, or start the job anew."
                 )
     points, colors = _read_points(folder / POINTS_NAME)
     return Scene(views, points, colors, world_from_scene, warnings, facts)
@@ -118,7 +118,7 @@ def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
             size_bytes = sum(entry.file_size for entry in archive.infolist())
         # 24 bytes of position and 3 of colour a point, and two headers.
         if size_bytes > 27 * limits.MAX_POINTS + 4096:
-            raise ParseError(path, "whole file", "the points are too many.", _AGAIN)
+            raise ParseError(path, "whole file", "there are too many points.", _AGAIN)
         with np.load(path, allow_pickle=False) as arrays:
             points, colors = arrays["points"], arrays["point_colors"]
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:

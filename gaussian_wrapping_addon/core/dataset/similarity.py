@@ -31,12 +31,12 @@ class Similarity:
         return np.asarray(directions, np.float64) @ self.rotation.T
 
     def inverse(self) -> Similarity:
-        """Return the transform that undoes this one."""
+        """Return the inverse transform."""
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
     def after(self, first: Similarity) -> Similarity:
-        """Return the transform that applies ``first``, then this one."""
+        """Return the composition that applies ``first``, then this transform."""
         return Similarity(
             self.scale * first.scale,
             self.rotation @ first.rotation,

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A job from request to result: runner, worker process, and the client that starts it.
+"""Jobs: the client that starts one, the worker process that runs it, and its runner.
 
-In: a job file. Out: a result folder. The folders hold its files, its stages and its commands.
+In: a job file. Out: a result folder. ``store`` holds the files of a job, ``stages`` its stages,
+``commands`` the commands that run in the worker's Python.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Start a worker process for a job folder, watch it, stop it. Needs neither torch nor bpy."""
+"""Start, watch and stop the worker process of a job folder. Needs neither torch nor bpy."""
 
 from __future__ import annotations
 
@@ -27,10 +27,12 @@ WORKER_MODULE = "jobs.worker"
 PYTHON_VARIABLE = "GAUSSIAN_WRAPPING_PYTHON"
 OUTPUT_TAIL_BYTES = 2000
 KILLED_CODES = (-9, 137)
-"""Of a process that SIGKILL ended, itself or under a shell: what the kernel does for memory."""
+"""Exit codes of a process ended by SIGKILL, directly or under a shell, as by the kernel when memory
+runs out."""
 
 CODE_WAIT_S = 0.5
-"""For the exit code of a worker that has ended; longer only where a launcher stands between."""
+"""How long to wait for the exit code of a worker that has ended; only a launcher in between takes
+longer."""
 KILL_GRACE_S = 2.0
 KILL_POLL_S = 0.05
 STAGES_AFTER_TRAINING = ("mesh", "texture", "export")
@@ -38,15 +40,15 @@ STAGES_AFTER_TRAINING = ("mesh", "texture", "export")
 
 
 def worker_python(preference: str = "") -> str:
-    """Return the interpreter for workers, or the folder of an environment that names one.
+    """Return the interpreter for workers, or the folder of a worker environment.
 
-    In this order: the preference, the environment variable, the environment that the add-on has
-    made, the Python that runs this where it has torch.
+    In this order: the preference, the environment variable, the environment made by the add-on,
+    the running Python if it has torch.
 
     Raises
     ------
     UsageError
-        The one that was named does not exist, or nothing is there.
+        The interpreter named does not exist, or none is set up.
     """
     chosen = preference or os.environ.get(PYTHON_VARIABLE, "")
     if chosen and not Path(chosen).exists():
@@ -65,7 +67,7 @@ def worker_python(preference: str = "") -> str:
 
 
 def _has_torch() -> bool:
-    """Tell whether the Python that runs this could be a worker; imports nothing."""
+    """Tell whether the running Python could be a worker; imports nothing."""
     try:
         return importlib.util.find_spec("torch") is not None
     except (ImportError, ValueError):
@@ -81,7 +83,7 @@ def _writing(root: Path) -> Iterator[None]:
 
 
 class JobClient:
-    """The view of one job from outside: Blender, or the command line."""
+    """Handle of one job for Blender or the command line."""
 
     def __init__(self, folder: JobFolder, process: subprocess.Popen[bytes] | None) -> None:
         self.folder = folder
@@ -109,7 +111,7 @@ class JobClient:
         python : str or None
             Interpreter that has torch; ``None`` asks :func:`worker_python`.
         keep_running : bool
-            Let the worker go on when this process ends.
+            Whether the worker continues when this process ends.
         """
         target = JobFolder(folder.resolve())
         source = Path(job.source)
@@ -130,7 +132,7 @@ class JobClient:
     def resume(
         cls, folder: Path, *, python: str | None = None, keep_running: bool = False
     ) -> JobClient:
-        """Start a worker for the job that lies in ``folder``; finished stages are re-used."""
+        """Start a worker for the job in ``folder``; finished stages are re-used."""
         target = JobFolder(folder.resolve())
         if not target.is_job():
             raise UsageError(
@@ -156,7 +158,7 @@ class JobClient:
 
     @classmethod
     def attach(cls, folder: Path) -> JobClient:
-        """Watch a job that this process did not start."""
+        """Watch a job started by another process."""
         target = JobFolder(folder.resolve())
         if not target.is_job():
             raise UsageError(f"{folder} holds no job.", "Choose a job folder.")
@@ -165,12 +167,12 @@ class JobClient:
     def poll(self) -> JobStatus:
         """Return the job's status; cheap enough for a timer, and never waits.
 
-        A job that is finished as before, but could not be meshed again, has failed for those who
-        saw it at work, and is done for all others.
+        A finished job whose new mesh failed was rolled back: it is FAILED for a client that saw it
+        running, and DONE for all others.
         """
         status = self._poll()
         if status.result:
-            # Where it is now: the job may have been moved, and one from elsewhere may name any.
+            # The stored path is not trusted: the job may have been moved or come from elsewhere.
             status = replace(status, result=str(self.folder.result))
         self._seen_active = self._seen_active or status.active
         if self._seen_active and status.state == "DONE" and status.put_back:
@@ -179,10 +181,10 @@ class JobClient:
 
     def _poll(self) -> JobStatus:
         code = None if self._process is None else self._process.poll()
-        # Read after the process was looked at: its last status may be its last deed.
+        # Read after polling the process: it may write its last status just before it ends.
         status = self.folder.read_status()
         if code is None and self._process is not None and status.state == "LOST":
-            # It has ended between our two looks: only its code tells of what.
+            # It ended between poll() and read_status(): only its exit code tells why.
             with contextlib.suppress(subprocess.TimeoutExpired):
                 code = self._process.wait(0.0)
             now_s = time.monotonic()
@@ -201,7 +203,7 @@ class JobClient:
         return status
 
     def _killed(self, status: JobStatus) -> JobStatus:
-        """Say what a worker dies of that could not say it itself."""
+        """Return the status of a worker ended by SIGKILL, which could not report an error."""
         failed = self._failed(
             status, "The worker was stopped by signal 9: killed, probably out of memory."
         )
@@ -224,7 +226,7 @@ class JobClient:
         )
 
     def output_tail(self) -> str:
-        """Return the end of what the worker wrote to its terminal."""
+        """Return the last line that the worker wrote to stdout and stderr."""
         try:
             with (self.folder.root / "worker-output.txt").open("rb") as output:
                 length = output.seek(0, os.SEEK_END)
@@ -236,15 +238,15 @@ class JobClient:
         return lines[-1] if lines else ""
 
     def cancel(self) -> None:
-        """Ask the worker to stop; it does within about two seconds and keeps a checkpoint."""
+        """Ask the worker to stop; it stops within about two seconds and keeps a checkpoint."""
         with contextlib.suppress(OSError):
             self.folder.cancel_path.touch()
 
     def kill(self) -> None:
         """End the worker and its helpers: terminate, wait two seconds, kill.
 
-        A worker that another process started is known from the job folder alone, which may come
-        from elsewhere: it is ended only where the system says that it is a worker.
+        A worker started by another process is known only from the job folder, which may come from
+        another machine: it is ended only if the system confirms that it is a worker.
         """
         if self._process is not None:
             kill_group(self._process)
@@ -268,7 +270,7 @@ class JobClient:
         Raises
         ------
         WorkerError
-            This client only watches a job that another process started.
+            The job was started by another process.
         """
         if self._process is None:
             raise WorkerError("This job was started by another process.", "Poll it instead.")
@@ -277,7 +279,7 @@ class JobClient:
 
 
 def _signal_group(pid: int, number: int) -> None:
-    """Signal a worker with its group; alone where its id names no group of its own."""
+    """Signal a worker's process group, or the worker alone if it does not lead a group."""
     if hasattr(os, "killpg") and os.getpgid(pid) == pid:
         os.killpg(pid, number)
     else:
@@ -285,7 +287,7 @@ def _signal_group(pid: int, number: int) -> None:
 
 
 def _is_worker(pid: int) -> bool:
-    """Tell whether a process is a worker of ours; false where the system does not say."""
+    """Tell whether a process is one of our workers; false where the system does not tell."""
     try:
         return WORKER_MODULE.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
     except OSError:

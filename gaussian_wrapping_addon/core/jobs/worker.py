@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The worker process: lock the folder, run the job, keep ``status.json`` true to the end."""
+"""The worker process: lock the job folder, run the job, keep ``status.json`` up to date."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ BUG_HINT = "Send the job folder's log.txt with a bug report."
 
 
 class _Reporter:
-    """Turns progress events into status writes, at a bounded rate, and polls for cancelling."""
+    """Write progress events to the status file at a bounded rate and poll for cancelling."""
 
     def __init__(self, folder: JobFolder, status: JobStatus) -> None:
         self.folder = folder
@@ -55,7 +55,7 @@ class _Reporter:
         self.stop_requested = False
 
     def event(self, event: ProgressEvent) -> None:
-        """Take one report of the runner; fraction and time left are of the whole job."""
+        """Handle a progress event of the runner; fraction and time left are of the whole job."""
         now_s = time.monotonic()
         changed = event.stage != self.status.stage
         with self._guard:
@@ -82,11 +82,11 @@ class _Reporter:
             self.folder.write_status(self.status)
 
     def cancelled(self) -> bool:
-        """Whether a cancel file lies there or the process was asked to terminate."""
+        """Whether a cancel file exists or the process was asked to terminate."""
         return self.stop_requested or self.folder.cancel_path.exists()
 
     def keep_heartbeat(self, parent: int) -> None:
-        """Keep the heartbeat; ask for a stop when the parent has gone. Runs in a thread."""
+        """Write the heartbeat; request a stop when the parent has ended. Runs in a thread."""
         requested_s = math.inf
         while not self._stop.wait(PARENT_POLL_S):
             if parent and os.getppid() != parent:
@@ -99,7 +99,7 @@ class _Reporter:
             if time.monotonic() - requested_s > limits.CANCEL_ALONE_S:
                 _logger.warning("busy with %r: ended without waiting", self.status.message)
                 self._exit_immediately()
-            # On a full disk the main thread ends the job, with words.
+            # On a full disk the main thread ends the job with an error message.
             with contextlib.suppress(OSError):
                 if self.cancelled() and self.status.state == "RUNNING":
                     self.write(state="CANCELLING")
@@ -107,29 +107,29 @@ class _Reporter:
                     self.write()
 
     def _exit_immediately(self) -> None:
-        """Leave while the main thread is in a long native call, such as a compilation.
+        """Exit while the main thread is in a long native call, such as a compilation.
 
-        What it is making is lost, as after a kill: a stage counts once ``done.json`` is there.
+        Work in progress is lost, as after a kill: a stage is finished once ``done.json`` exists.
         """
         self._final_status.acquire()
         if self._stop.is_set():
-            return  # the main thread was quicker, and says how it ended
+            return  # the main thread ended first and writes the final status
         _logger.info("cancelled")
         kill_helpers()
-        with contextlib.suppress(OSError):  # on a full disk, leaving is all that is left to do
+        with contextlib.suppress(OSError):  # on a full disk, exit all the same
             self.write(state="CANCELLED", error="", hint=RESUME_HINT, exit_code=Cancelled.exit_code)
             self.folder.unlock()
             logging.shutdown()
         os._exit(Cancelled.exit_code)
 
     def end(self) -> None:
-        """Stop the heartbeat; what the caller writes then is the last word."""
+        """Stop the heartbeat; the caller then writes the final status."""
         with self._final_status:
             self._stop.set()
 
 
 def _merged(known: dict[str, float], news: dict[str, float]) -> dict[str, float]:
-    """Return known figures with newer ones over them; JSON holds no NaN, nor any use for it."""
+    """Return the known figures updated by newer ones; values that are not finite are left out."""
     return {**known, **{name: value for name, value in news.items() if math.isfinite(value)}}
 
 
@@ -144,27 +144,27 @@ def _log_to(path: Path) -> None:
 
 
 def parent_to_watch(caller: str) -> int:
-    """Return the process with which to stop, 0 for none.
+    """Return the id of the process whose end stops the worker, 0 for none.
 
-    The caller's own id only tells whether there is one: where Python is started through a launcher
-    (``python.exe`` of a virtual environment on Windows), that launcher is the parent.
+    The id given by the caller only tells whether there is one: where Python is started through a
+    launcher (``python.exe`` of a virtual environment on Windows), the launcher is the parent.
     """
     return os.getppid() if int(caller) else 0
 
 
 def _roll_back(folder: JobFolder) -> JobStatus | None:
-    """Make the folder what it was before a mesh that has failed; that is told all the same."""
+    """Restore the folder after a failed mesh; the failure is reported all the same."""
     try:
         return roll_back(folder)
     except OSError:
-        _logger.exception("the earlier job cannot be put back")
+        _logger.exception("the earlier job cannot be restored")
         return None
 
 
 def main(arguments: list[str]) -> int:
     """Run the job of ``arguments = [folder, caller's pid or 0]``; return the exit code.
 
-    With 0 the worker goes on when its parent ends.
+    With 0 the worker continues when its parent ends.
     """
     folder = JobFolder(Path(arguments[0]))
     parent = parent_to_watch(arguments[1] if len(arguments) > 1 else "0")
@@ -182,7 +182,7 @@ def main(arguments: list[str]) -> int:
     try:
         folder.lock()
     except WrapError as refused:
-        # Another worker owns the folder: its status and its lock are not ours to write.
+        # Another worker owns the folder: leave its status and its lock alone.
         _logger.error("%s", refused)
         sys.stderr.write(f"{refused}\n")
         return refused.exit_code
@@ -213,7 +213,7 @@ def main(arguments: list[str]) -> int:
     except MemoryError:
         _logger.exception("out of memory")
         code, state = EXIT_RESOURCES, "FAILED"
-        error, hint = "Not enough memory.", "Use a smaller preset or close other programs."
+        error, hint = "Not enough memory.", "Close other programs, or choose a smaller preset."
     except Exception as failure:
         _logger.exception("unexpected failure")
         code, state = EXIT_OTHER, "FAILED"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Start of a helper process: set the memory limit, run the module, report typed failures."""
+"""Entry point of a helper process: set the memory limit, run the module, report failures."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def main(arguments: list[str]) -> int:
 
 
 def _request_parent_death_signal() -> None:
-    """Let Linux end us with the thread that started us: while a native call holds the GIL, no
-    thread of ours can look."""
+    """Let Linux kill this process with the thread that started it: while a native call holds the
+    GIL, no thread of ours can poll."""
     if not sys.platform.startswith("linux"):
         return
     import ctypes
@@ -51,7 +51,7 @@ def _request_parent_death_signal() -> None:
 
 
 def _exit_with_parent(parent: int) -> None:
-    """A helper must not outlive the worker that waits for it."""
+    """Exit when the parent has ended: a helper must not outlive its worker."""
     while os.getppid() == parent:
         time.sleep(_PARENT_POLL_S)
     os._exit(1)

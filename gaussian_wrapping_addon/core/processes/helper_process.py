@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Run foreign native code (xatlas, pycolmap) in a process with a deadline and a memory limit.
+"""Run third-party native code (xatlas, pycolmap) in a process with deadline and memory limit.
 
-A helper is a module with ``main(arguments) -> int``; it is given a folder, reads ``task.json`` and
-arrays there, writes its results there, and reports on stdout, one JSON object a line:
+A helper is a module with ``main(folder)``; it reads ``task.json`` and arrays in the folder, writes
+its results there, and reports on stdout, one JSON object per line:
 ``{"fraction": 0.5, "message": "..."}``. A typed failure is ``{"error": "...", "hint": "..."}``
-followed by exit code 3. The last line of every helper that ends in order is
-``{"peak_bytes": ...}``, its largest memory.
+followed by exit code 3. The last line of every helper that exits normally is
+``{"peak_bytes": ...}``, its peak memory.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def child_command(module: str, *arguments: str, python: str | None = None) -> li
     Parameters
     ----------
     python : str or None
-        An interpreter, or the folder of a worker's environment; None for the one that runs this,
-        with the packages that it was given.
+        An interpreter, or the folder of a worker environment; None for the running interpreter
+        with its packages.
     """
     entry = Path(__file__).with_name("worker_main.py")
     if python:
@@ -56,13 +56,13 @@ def child_command(module: str, *arguments: str, python: str | None = None) -> li
 
 
 def emit(**values: Any) -> None:
-    """Write one JSON line to stdout; helpers and the worker speak through this."""
+    """Write one JSON line to stdout: the protocol of helpers and commands."""
     sys.stdout.write(json.dumps(values, allow_nan=False) + "\n")
     sys.stdout.flush()
 
 
 def kill_helpers() -> None:
-    """Kill the helpers that run now; for a process that is about to leave without unwinding."""
+    """Kill all running helpers; for a process about to exit without unwinding the stack."""
     for process in list(_running):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             if hasattr(os, "killpg"):
@@ -79,18 +79,18 @@ def run_helper(
     deadline_s: float = limits.HELPER_DEADLINE_S,
     memory_bytes: int | None = None,
 ) -> None:
-    """Run ``core.<module>`` on ``folder`` and wait, passing its progress on.
+    """Run ``core.<module>`` on ``folder`` and wait for it, forwarding its progress.
 
     Raises
     ------
     Cancelled
-        The user asked to stop; the helper is ended first.
+        The user asked to stop; the helper has been ended.
     DatasetError
         The helper reported a typed failure.
     ResourceError
         The deadline passed.
     WorkerError
-        The helper crashed; the message names the signal and its last words.
+        The helper crashed; the message names the signal and the end of its output.
     """
     command = child_command("processes.helper_entry", module, str(folder), str(memory_bytes or 0))
     process = spawn(command)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The largest memory that this process and its helper processes have held."""
+"""Peak memory of this process and of its helper processes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ _largest_helper_bytes = 0
 
 
 def own_peak_bytes() -> int:
-    """Return the largest resident size of this process so far; 0 where it is not known.
+    """Return the peak resident size of this process so far; 0 if unknown.
 
-    Linux tells it of the program that runs now (``VmHWM``). ``ru_maxrss`` is not asked there: it
-    begins at the size of the process that started this one. macOS has nothing else, so that its
-    figure may be the parent's; Windows tells none.
+    On Linux it is ``VmHWM`` of the current program, not ``ru_maxrss``, which starts at the size of
+    the parent process. macOS has only ``ru_maxrss``, so that the figure may be the parent's;
+    on Windows it is unknown.
     """
     if sys.platform == "win32":
         return 0
@@ -30,20 +30,20 @@ def own_peak_bytes() -> int:
 
 
 def peak_memory_bytes() -> dict[str, int]:
-    """Return the largest resident size so far of this process and of its largest helper.
+    """Return the peak resident size so far of this process and of its largest helper.
 
-    Empty where the system does not tell.
+    Empty if unknown.
     """
     own_bytes = own_peak_bytes()
     return {"worker": own_bytes, "largest_helper": largest_helper_bytes()} if own_bytes else {}
 
 
 def record_helper_peak(peak_bytes: int) -> None:
-    """Keep what a helper process says of itself, where it is the largest so far."""
+    """Record the peak reported by a helper process if it is the largest so far."""
     global _largest_helper_bytes
     _largest_helper_bytes = max(_largest_helper_bytes, peak_bytes)
 
 
 def largest_helper_bytes() -> int:
-    """Return the peak of the largest helper so far; 0 where none ran, or none ended in order."""
+    """Return the peak of the largest helper so far; 0 if none exited normally."""
     return _largest_helper_bytes

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Start child processes, all in the same way, and end them with what they have started."""
+"""Start child processes in groups of their own and end them with their descendants."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from typing import IO, Any
 
 
 def child_environment() -> dict[str, str]:
-    """Return the environment for a child: nothing of ours that steers its Python.
+    """Return the environment for a child, without variables that configure Python.
 
-    Idle OpenMP threads of torch wait instead of spinning: while they spin, they take the cores
-    that our own threads compute on (measured: rendering took twice the processor time).
+    Idle OpenMP threads of torch wait instead of spinning: spinning threads occupy the cores that
+    our own threads compute on (measured: rendering took twice the processor time).
     """
     kept = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     return {"OMP_WAIT_POLICY": "PASSIVE", **kept}
 
 
 def group_options() -> dict[str, Any]:
-    """Return the options of ``Popen`` by which a child leads a group of its own.
+    """Return the options of ``Popen`` that make a child the leader of a new process group.
 
-    A signal to the group ends the child with all that it has started, and Ctrl-C in the parent's
-    terminal does not reach it. On Windows no console window opens.
+    A signal to the group ends the child with its descendants, and Ctrl-C in the parent's terminal
+    does not reach it. On Windows no console window opens.
     """
     if sys.platform == "win32":
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
@@ -42,18 +42,18 @@ def spawn(
     environment: dict[str, str] | None = None,
     folder: Path | None = None,
 ) -> subprocess.Popen[bytes]:
-    """Start a child in a process group of its own; it inherits no files.
+    """Start a child in a new process group; it inherits no open files.
 
     Parameters
     ----------
     command : list of str
-        Program and arguments; no shell sees them. A Python of ours is started isolated (``-I``).
+        Program and arguments, without a shell. Our own Python is started isolated (``-I``).
     stdin, stdout, stderr : int or file
-        As ``subprocess`` takes them; a child reads nothing unless told.
+        As in ``subprocess``; by default a child has no input.
     environment : dict, optional
-        :func:`child_environment` without it.
+        Default: :func:`child_environment`.
     folder : Path, optional
-        Its working directory; the parent's without it.
+        Working directory; default: the parent's.
 
     Raises
     ------
@@ -73,25 +73,25 @@ def spawn(
 
 
 def run_to_end(command: list[str], deadline_s: float) -> tuple[int, str, str]:
-    """Start a child and wait for it; return its exit code and what it wrote.
+    """Start a child and wait for it; return its exit code and output.
 
     Returns
     -------
     code : int
-    output, words : str
-        Of stdout and stderr.
+    output, error_output : str
+        Text of stdout and stderr.
 
     Raises
     ------
     OSError
         The program does not start.
     subprocess.TimeoutExpired
-        It took longer; it has been ended.
+        The deadline passed; the child has been ended.
     """
     process = spawn(command)
     try:
         output, error_output = process.communicate(timeout=deadline_s)
-    except BaseException:  # a group of its own: nobody else would end it
+    except BaseException:  # in a group of its own, nothing else would end it
         kill_group(process)
         raise
     return (
@@ -102,7 +102,7 @@ def run_to_end(command: list[str], deadline_s: float) -> tuple[int, str, str]:
 
 
 def kill_group(process: subprocess.Popen[Any], grace_s: float = 2.0) -> None:
-    """End a child that leads its own group: terminate, wait, then kill the whole group."""
+    """End a child that leads a process group: terminate, wait, then kill the whole group."""
     for number in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)):
         if process.poll() is not None:
             return

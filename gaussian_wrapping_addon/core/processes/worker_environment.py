@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where the private environment of workers lies, whether it is whole, and how it is started.
+"""Locate the private worker environment, check that it is complete, and find its interpreter.
 
 Its folder holds the marker (only a folder with it is ever removed), ``log.txt``, one folder with a
-venv, or with packages where a Python cannot make a venv, and ``ready.json``, without which no job
+venv, or with packages if the Python cannot create a venv, and ``ready.json``, without which no job
 uses it. The marker names the folder in use; a set-up builds another one beside it.
 """
 
@@ -23,12 +23,12 @@ VENV = "venv"
 PACKAGES = "packages"
 """The two kinds of environment."""
 FOLDERS = ("env", "env-2", "packages")
-"""Names that the folder in use may have; the last one was used by 0.1.0."""
+"""Possible names of the folder in use; the last one was used by 0.1.0."""
 
 DATA_VARIABLE = "GAUSSIAN_WRAPPING_DATA"
-"""Names the folder for data of the user that belongs to no Blender."""
+"""Environment variable: folder for user data outside of Blender."""
 PACKAGES_OPTION = "gwrap_packages"
-"""``-X gwrap_packages=DIR`` tells a child, and it alone, where its packages lie."""
+"""``-X gwrap_packages=DIR`` gives a child process the folder of its packages."""
 
 _POINTER = "worker-location.json"
 _ADDON = "gaussian_wrapping_addon"
@@ -37,13 +37,13 @@ _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True)
 class WorkerEnvironment:
-    """Paths of one environment; reading them starts nothing."""
+    """Paths of one environment; reading them starts no process."""
 
     root: Path
 
     @property
     def marker_path(self) -> Path:
-        """Says that we made this folder, from which Python, its kind and the folder in use."""
+        """Marker file: states that we made this folder, its Python, kind and folder in use."""
         return self.root / MARKER
 
     @property
@@ -53,7 +53,7 @@ class WorkerEnvironment:
 
     @property
     def folder(self) -> Path:
-        """Folder in use of the venv or the packages."""
+        """The folder in use, with the venv or the packages."""
         marker = self.marker()
         name = marker.get("folder")
         if name not in FOLDERS:  # made by 0.1.0
@@ -70,17 +70,17 @@ class WorkerEnvironment:
         return bool(self.marker())
 
     def is_ready(self) -> bool:
-        """Tell whether it was finished and its interpreter is there."""
+        """Tell whether it is complete and its interpreter exists."""
         return bool(self.ready_path.is_file() and self.is_ours() and self.worker())
 
     def marker(self) -> dict[str, Any]:
-        """Return what the marker says; nothing where there is none."""
+        """Return the content of the marker; empty if there is none."""
         return _read_object(self.marker_path, "made_by", _ADDON)
 
     def worker(self) -> str:
-        """Return what :func:`~.helper_process.child_command` starts; ``""`` where it is not there.
+        """Return the ``python`` for :func:`~.helper_process.child_command`; ``""`` if missing.
 
-        That is the venv's interpreter, or this folder where a plain Python is given its packages.
+        It is the venv's interpreter, or this folder if a plain Python uses its packages.
         """
         marker, python = self.marker(), venv_python(self.folder)
         if marker.get("kind") == PACKAGES:
@@ -106,7 +106,7 @@ def _read_object(path: Path, key: str, value: str | None = None) -> dict[str, An
 
 
 def interpreter_of(worker: str) -> tuple[str, str]:
-    """Return the interpreter of a worker's path, and the folder of its packages or ``""``."""
+    """Return the interpreter of a worker path, and the folder of its packages or ``""``."""
     environment = WorkerEnvironment(Path(worker))
     if environment.root.is_dir():
         marker = environment.marker()
@@ -117,7 +117,7 @@ def interpreter_of(worker: str) -> tuple[str, str]:
 
 
 def user_data() -> Path:
-    """Return the folder for our data outside of any Blender; it need not exist."""
+    """Return the folder for user data outside of Blender; it need not exist."""
     chosen = os.environ.get(DATA_VARIABLE)
     if chosen:
         return Path(chosen)
@@ -129,9 +129,9 @@ def user_data() -> Path:
 
 
 def installed_root() -> Path | None:
-    """Return where the extension that this file belongs to has its environment, if it is one.
+    """Return the environment folder of the Blender extension that contains this file, if any.
 
-    The same folder as ``bpy.utils.extension_path_user`` gives, so that the command line of an
+    It is the folder returned by ``bpy.utils.extension_path_user``, so that the command line of an
     installed extension finds it without Blender.
     """
     repository = _PACKAGE_ROOT.parent
@@ -142,26 +142,26 @@ def installed_root() -> Path | None:
 
 
 def default_root() -> Path:
-    """Return where an environment is made unless another folder is chosen."""
+    """Return the default folder of a new environment."""
     return installed_root() or user_data() / "worker"
 
 
 def register_environment(root: Path) -> None:
-    """Note where an environment was made, so that every later call finds it."""
+    """Record the folder of an environment, so that later processes find it."""
     pointer = user_data() / _POINTER
     pointer.parent.mkdir(parents=True, exist_ok=True)
     write_json(pointer, {"root": str(root)})
 
 
 def unregister_environment(root: Path) -> None:
-    """Drop the note of an environment that is being removed."""
+    """Delete the record of an environment that is being removed."""
     pointer = user_data() / _POINTER
     if _read_object(pointer, "root", str(root)):
         pointer.unlink(missing_ok=True)
 
 
 def known_environments() -> list[WorkerEnvironment]:
-    """Return the environments that may be there, the nearest first."""
+    """Return the environments that may exist, in order of preference."""
     registered = _read_object(user_data() / _POINTER, "root").get("root")
     roots = [
         installed_root(),
@@ -172,5 +172,5 @@ def known_environments() -> list[WorkerEnvironment]:
 
 
 def ready_worker() -> str:
-    """Return what starts the first environment that is whole; ``""`` where there is none."""
+    """Return the worker of the first complete environment; ``""`` if there is none."""
     return next((e.worker() for e in known_environments() if e.is_ready()), "")

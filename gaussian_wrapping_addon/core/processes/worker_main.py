@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Entry of every child process: ``python -I worker_main.py MODULE [ARGUMENT ...]``.
+"""Entry point of every child process: ``python -I worker_main.py MODULE [ARGUMENT ...]``.
 
-Run as a file, never imported. It loads the package from where this file lies, without putting the
-parent folder (which inside Blender holds every other extension) on ``sys.path``, then calls
-``main(arguments)`` of the module named relative to ``core``, such as ``jobs.worker``.
+Run as a file, never imported. It loads the package that contains this file, without adding the
+parent folder (which inside Blender holds every other extension) to ``sys.path``, then calls
+``main(arguments)`` of a module named relative to ``core``, such as ``jobs.worker``.
 """
 
 from __future__ import annotations

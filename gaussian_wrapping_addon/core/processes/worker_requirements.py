@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The pinned packages of ``requirements-worker.txt``."""
+"""Read the pinned packages of ``requirements-worker.txt``."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True)
 class Requirement:
-    """One package and the versions of it that do."""
+    """One package and its allowed versions."""
 
     name: str
     versions: str
     """Such as ``==2.13.0`` or ``>=1.26,<3``; empty for any."""
 
     def allows(self, version: str) -> bool:
-        """Tell whether an installed version does; a local part (``+cpu``) does not count."""
+        """Tell whether an installed version is allowed; a local part (``+cpu``) is ignored."""
         clauses = re.findall(r"([<>=!]=|[<>])([^,]+)", self.versions)
         return all(_COMPARE[sign](_numbers(version), _numbers(wanted)) for sign, wanted in clauses)
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Return the numbers of a version without zeros at its end: 2.13.0 is 2.13."""
+    """Return the numbers of a version without trailing zeros: 2.13.0 equals 2.13."""
     text = re.sub(r"(\.0+)+$", "", re.split(r"[+a-zA-Z]", version)[0])
     return tuple(int(n) for n in re.findall(r"\d+", text))
 
 
 def requirements_file() -> Path:
-    """Return the add-on's list: beside the package's files in the zip, or in the repository.
+    """Return the add-on's requirements file, in the installed package or in the repository.
 
     Raises
     ------
     UsageError
-        It is missing.
+        The file is missing.
     """
     for folder in (_PACKAGE_ROOT, _PACKAGE_ROOT.parent):
         if (folder / FILE_NAME).is_file():
@@ -54,12 +54,12 @@ def requirements_file() -> Path:
 
 
 def read_requirements(path: Path) -> list[Requirement]:
-    """Return the packages of a list; pip judges whether its lines are right.
+    """Return the packages of a list; its syntax is left to pip.
 
     Raises
     ------
     UsageError
-        It cannot be read or names no package.
+        The file cannot be read or names no package.
     """
     try:
         text = path.read_text(encoding="utf-8", errors="replace")

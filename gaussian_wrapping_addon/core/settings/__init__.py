@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Settings of a job, each declared once: default, range, option, panel property, help.
 
-In: values from command line, panel or job file. Out: frozen dataclasses that have been validated.
+In: values from command line, panel or job file. Out: validated frozen dataclasses.
 Standard library only, so that Blender can load it.
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of a setting's value: numeric ranges, words to choose from, and special cases."""
+"""Checks of a setting's value: numeric ranges, choices, subsets and other conditions."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any, Protocol
 
 
 class Check(Protocol):
-    """Tells good values from bad ones, and says what is wanted."""
+    """Condition that a setting's value must fulfil, with a description of valid values."""
 
     @property
     def wanted(self) -> str:
-        """What may be given, for the sentence "Give <wanted>."."""
+        """Description of valid values, for the sentence "Give <wanted>."."""
 
     def holds(self, value: Any) -> bool:
-        """Tell whether a value may be used."""
+        """Tell whether a value is valid."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Range:
     low: float
     high: float = math.inf
     zero: str = ""
-    """What 0 stands for, where it is allowed beside the range."""
+    """Meaning of 0, if it is allowed in addition to the range."""
     words: str = ""
-    """Takes the place of the generated description."""
+    """Replaces the generated description."""
     below_high: bool = False
     """Whether ``high`` itself is excluded."""
 
@@ -42,7 +42,7 @@ class Range:
 
     @property
     def lowest(self) -> float:
-        """The smallest value, 0 included where it has a meaning of its own."""
+        """The smallest valid value, 0 if it has a meaning of its own."""
         return 0 if self.zero else self.low
 
     def holds(self, value: Any) -> bool:
@@ -55,7 +55,7 @@ class Range:
 
 @dataclass(frozen=True)
 class Choices:
-    """One of a few words or numbers."""
+    """One of a list of words or numbers."""
 
     values: tuple[Any, ...]
 
@@ -83,7 +83,7 @@ class Subset:
 
 @dataclass(frozen=True)
 class Condition:
-    """Whatever a function accepts."""
+    """Any value that a function accepts."""
 
     accepts: Callable[[Any], bool]
     wanted: str

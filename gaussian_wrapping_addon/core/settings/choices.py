@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The words that settings are chosen from."""
+"""The choices of settings."""
 
 from __future__ import annotations
 
 PRESETS = ("draft", "standard", "fine")
 SELECTION_MODES = ("auto", "on", "off")
-"""Of a part of the model: ``"auto"`` selects it where the photos give evidence for it."""
+"""Of an optional part of the model; ``"auto"`` selects it by evidence in the photos."""
 SWITCH = ("off", "on")
 
 MASK_MODES = ("ignore", "background")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The declaration of a setting: one field of a settings class says all that is known about it.
+"""Declare a setting once, as a field of a settings class with metadata.
 
-Validation, command line, Blender properties, panels, job file and ``docs/settings.md`` are made
-from these declarations. To add a setting, add one field::
+Validation, command line, Blender properties, panels, job file and ``docs/settings.md`` are
+generated from these declarations. To add a setting, add one field::
 
     smoothness: float = setting(
         0.5,
@@ -28,18 +28,17 @@ from .choices import SWITCH
 _KEY = "setting"
 
 Scope = Literal["training", "method", "region", "more"]
-"""Options that belong together on the command line: how the Gaussians are trained; by which method
-and how finely a mesh is made (all that an estimate needs); everything else about a region; the
-command ``more``."""
+"""Groups of options on the command line: training; meshing method and resolution (all that an
+estimate needs); other options of regions; the command ``more`` (continue a training)."""
 
 Owner = Literal["scene", "training", "preferences"]
-"""Who has a property in Blender: ``Scene.gwrap``, ``Scene.gwrap.training``, or the add-on."""
+"""Owner of a property in Blender: ``Scene.gwrap``, ``Scene.gwrap.training``, or the add-on."""
 
 PanelName = Literal["train", "train_advanced", "mesh", "mesh_advanced", "texture", "preferences"]
 """A panel in Blender."""
 
 JOB = "job"
-"""Group of the settings that stand directly in the job's settings."""
+"""Group of the settings that are direct fields of the job's settings."""
 
 _SCOPES: Mapping[str, Scope] = {"training": "training", "meshing": "region", "texture": "region"}
 _PANEL_NAMES: Mapping[str, PanelName] = {
@@ -52,20 +51,20 @@ class Option:
     """How a setting is given on the command line."""
 
     name: str
-    """With its dashes."""
+    """With its leading dashes."""
     metavar: str = ""
     help: str = ""
-    """Takes the place of the setting's help."""
+    """Replaces the setting's help."""
     scope: Scope | None = None
     """``None``: by the setting's group."""
     exclusive: str = ""
-    """Options with the same word here exclude each other."""
+    """Options with the same name here exclude each other."""
     flag: str = ""
-    """An option without a value; giving it sets the setting to this word."""
+    """If not empty, the option takes no value and sets the setting to this word."""
     many: bool = False
-    """It takes several words, and may be given several times."""
+    """Whether it takes several values and may be repeated."""
     parse: Callable[[Any], Any] | None = None
-    """From the text (``many``: list of texts) to the setting's value; may raise ``UsageError``."""
+    """Converts the text (``many``: list of texts) to the setting's value; may raise UsageError."""
 
 
 @dataclass(frozen=True)
@@ -81,21 +80,21 @@ class Item:
 class PanelProperty:
     """How a setting is shown in Blender. Property names and identifiers are stored in .blend files.
 
-    Blender stores the index of an enum's entry: ``items`` may only be added at the end.
+    Blender stores the index of an enum's entry: new ``items`` must be appended at the end.
     """
 
     label: str
     description: str
     name: str = ""
-    """Of the property; empty takes the setting's."""
+    """Name of the property; empty uses the setting's."""
     items: tuple[Item, ...] = ()
     """Entries of an enum; identifiers are the values in upper case."""
     default: Any = None
-    """Of the property, where it differs from the setting's."""
+    """Default of the property, if it differs from the setting's."""
     preset_if_zero: bool = False
-    """Whether 0, the property's default, leaves the number to the preset."""
+    """Whether 0, the property's default, uses the preset's number."""
     low: float | None = None
-    """Smallest number, where it differs from the smallest that the check allows."""
+    """Smallest number, if it differs from the smallest that the check allows."""
     soft_low: float | None = None
     soft_high: float | None = None
     """Ends of the slider; larger numbers can be typed."""
@@ -109,34 +108,34 @@ class PanelProperty:
     panel_name: PanelName | None = None
     """The panel; ``None``: by the setting's group."""
     order: int = 100
-    """Place within the panel; equal numbers stand in the order of declaration."""
+    """Position within the panel; equal numbers keep the order of declaration."""
     drawn_label: str = ""
-    """Shorter label in the panel, where its title says the rest."""
+    """Shorter label in the panel, if its title provides the context."""
     expand: bool = False
     """Whether all entries of an enum are shown side by side."""
     shown_if: tuple[str, str | bool] | None = None
-    """Property of the scene and the value of it with which this one is shown."""
+    """Property of the scene and its value for which this one is shown."""
     default_if_hidden: bool = False
-    """Whether the setting has its default while the property is not shown."""
+    """Whether the setting takes its default while the property is hidden."""
 
 
 @dataclass(frozen=True)
 class Declaration:
-    """All that is known about one setting."""
+    """The declaration of one setting."""
 
     default: Any
     help: str
-    """What it does, in sentences."""
+    """What the setting does, in full sentences."""
     check: Check | None = None
     unit: str = ""
     presets: Mapping[str, Any] = field(default_factory=dict)
-    """Values of presets that differ from the default."""
+    """Values in presets that differ from the default."""
     option: Option | None = None
     panel: PanelProperty | None = None
     model_selection: bool = False
-    """Whether it switches a part of the model: ``--needs`` sets all of these."""
+    """Whether it selects a part of the model: ``--needs`` sets all of these."""
     affects_result: bool = True
-    """Whether the result depends on it; if not, it is left out of stage keys."""
+    """Whether the result depends on it; if not, stage keys exclude it."""
     path: str = ""
     """Dotted, within the job's settings, such as ``"training.iterations"``."""
     kind: Any = None
@@ -154,7 +153,7 @@ class Declaration:
 
     @property
     def choices(self) -> tuple[Any, ...]:
-        """The values it is chosen from, empty where there is no such list."""
+        """The choices of the setting, empty if it has none."""
         return self.check.values if isinstance(self.check, Choices) else ()
 
     @property
@@ -176,7 +175,7 @@ class Declaration:
 
     @property
     def property_owner(self) -> Owner:
-        """Who has its property in Blender."""
+        """The owner of its property in Blender."""
         assert self.panel is not None
         return self.panel.owner or ("training" if self.group == "training" else "scene")
 
@@ -187,14 +186,14 @@ class Declaration:
         return self.panel.panel_name or _PANEL_NAMES[self.group]
 
     def to_panel(self, value: Any) -> Any:
-        """Return what a property holds for a value of the setting."""
+        """Convert a value of the setting to its property's value."""
         assert self.panel is not None
         if self.is_switch:
             return value == "on"
         return str(value).upper() if self.panel.items else value
 
     def from_panel(self, stored: Any) -> Any:
-        """Return the setting's value for what a property holds.
+        """Convert a property's value to the setting's value.
 
         Raises
         ------
@@ -235,7 +234,7 @@ def declarations(kind: type) -> tuple[Declaration, ...]:
     Raises
     ------
     TypeError
-        A field is neither declared by :func:`setting` nor a group of settings.
+        A field is neither declared with :func:`setting` nor a group of settings.
     """
     return tuple(_walk(kind, ""))
 
@@ -259,7 +258,7 @@ def value_at(settings: Any, path: str) -> Any:
 
 
 def with_values(settings: Any, values: Mapping[str, Any]) -> Any:
-    """Return settings in which these values, by path, take the place of the present ones."""
+    """Return settings with some values replaced, by path."""
     changes: dict[str, Any] = {p: value for p, value in values.items() if "." not in p}
     for group in dict.fromkeys(path.partition(".")[0] for path in values if "." in path):
         inside = {

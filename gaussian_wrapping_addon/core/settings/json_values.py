@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Settings as JSON values and back, as they stand in ``job.json``."""
+"""Convert settings to JSON values and back, as in ``job.json``."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from ..errors import UsageError
 
 
 def to_json(settings: Any) -> dict[str, Any]:
-    """Turn a settings dataclass into plain JSON values."""
+    """Convert a settings dataclass to plain JSON values."""
     return dataclasses.asdict(settings)
 
 
 def from_json(kind: type, values: Any, location: str = "settings") -> Any:
-    """Build a settings dataclass from JSON values; unknown keys and wrong types are refused.
+    """Build a settings dataclass from JSON values.
 
     Raises
     ------
     UsageError
-        Names the place and what was expected.
+        A key is unknown or a value has the wrong type; names the location and the expected type.
     """
     if not isinstance(values, dict):
         raise UsageError(f"{location} must be an object.", "Write it as {...}.")

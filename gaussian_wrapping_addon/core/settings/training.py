@@ -330,7 +330,7 @@ class TrainingSettings:
 
 
 MODEL_SELECTION = tuple(d.name for d in declarations(TrainingSettings) if d.model_selection)
-"""Settings that switch a part of the model; ``"auto"`` decides by what the photos show."""
+"""Settings of the model selection; ``"auto"`` decides from the photos."""
 
 RESULT_INDEPENDENT = tuple(d.name for d in declarations(TrainingSettings) if not d.affects_result)
 """Settings that the result does not depend on."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Validation of settings by their declarations."""
+"""Validate settings by their declarations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .declaration import declarations, value_at
 
 
 def validate(settings: Any) -> None:
-    """Raise :class:`SettingError` naming the first setting whose value is out of range."""
+    """Raise :class:`SettingError` for the first setting whose value is invalid."""
     kind: type = type(settings)
     for declared in declarations(kind):
         check = declared.check

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The exact commands of a set-up: what is shown before is what runs.
+"""Build the exact commands of a set-up, for display and for execution.
 
-Which torch a plain ``pip install torch`` gives depends on the system: on Linux the build for CUDA,
-on Windows and macOS the one for the processor. The other one comes from PyTorch's own index.
+The torch that a plain ``pip install torch`` installs depends on the system: on Linux the build for
+CUDA, on Windows and macOS the one for the CPU. The other build comes from PyTorch's own index.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .pythons import FoundPython
 CPU = "cpu"
 CUDA = "cuda"
 INDEX = "index"
-"""Whatever pip's own index gives: for people behind a mirror."""
+"""The default of pip's own index, for users of a mirror."""
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
 
@@ -31,7 +31,7 @@ Command = tuple[str, ...]
 
 @dataclass(frozen=True)
 class SetupRequest:
-    """What a set-up is asked for."""
+    """The options of a set-up."""
 
     root: str
     """Folder of the environment."""
@@ -40,33 +40,33 @@ class SetupRequest:
     """Path of the list of packages."""
     torch: str = CPU
     find_links: str = ""
-    """Folder of wheels; nothing else is asked then."""
+    """Folder of wheels; if given, no package index is used."""
 
     @property
     def environment(self) -> WorkerEnvironment:
-        """The environment that is to be made."""
+        """The environment to create."""
         return WorkerEnvironment(Path(self.root))
 
 
 def as_line(command: Command) -> str:
-    """Return a command as it would be typed."""
+    """Return a command as a shell line."""
     return subprocess.list2cmdline(command) if sys.platform == "win32" else shlex.join(command)
 
 
 def cuda_present() -> bool:
-    """Tell whether an NVIDIA driver is here; looks at files only."""
+    """Tell whether an NVIDIA driver is installed; looks at files only."""
     if sys.platform == "darwin":
         return False
     return bool(shutil.which("nvidia-smi")) or Path("/proc/driver/nvidia/version").exists()
 
 
 def torch_index(choice: str, system: str = "") -> str:
-    """Return the extra index that a choice of torch needs on a system; ``""`` for none.
+    """Return the extra package index for a torch build on a system; ``""`` for none.
 
     Raises
     ------
     UsageError
-        There is no such build for the system.
+        The system has no such build.
     """
     system = system or platform.system()
     if choice == CUDA and system == "Darwin":
@@ -85,7 +85,7 @@ def all_commands(request: SetupRequest, python: FoundPython) -> list[Command]:
     options = ["install", "--disable-pip-version-check", "--no-input", "--only-binary", ":all:"]
     index = torch_index(request.torch)
     if request.find_links:
-        # Isolated: settings of pip that name an index or other folders do not count.
+        # Isolated: pip's configured indexes and folders are ignored.
         options = ["--isolated", *options, "--no-index", "--find-links", request.find_links]
     elif index:
         options += ["--extra-index-url", index]
@@ -106,12 +106,12 @@ def all_commands(request: SetupRequest, python: FoundPython) -> list[Command]:
 
 
 def check_folders(request: SetupRequest) -> None:
-    """Refuse folders that no set-up can work with; writes nothing.
+    """Raise if the folders of a set-up cannot be used; writes nothing.
 
     Raises
     ------
     UsageError
-        Names the folder.
+        A folder cannot be used; names it.
     """
     root, wheels = request.environment.root, request.find_links
     try:
@@ -121,8 +121,10 @@ def check_folders(request: SetupRequest) -> None:
         strange = True
     if strange:
         raise UsageError(
-            f"{root} is no folder, or holds other files and no {MARKER}.",
+            f"{root} is not a folder, or holds other files and no {MARKER}.",
             "Choose a new or empty folder.",
         )
     if wheels and not Path(wheels).is_dir():
-        raise UsageError(f"The wheel folder {wheels} does not exist.", "Choose that with wheels.")
+        raise UsageError(
+            f"The wheel folder {wheels} does not exist.", "Choose the folder that holds the wheels."
+        )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Make and remove the worker's environment, in a thread; its commands are processes of their own.
+"""Create and remove the worker environment in a thread that runs its commands as processes.
 
-A set-up builds in a folder that is not in use and takes it into use in the end: whatever stops it
-leaves the environment that was there before, or none.
+A set-up builds in a folder that is not in use and switches to it at the end: if it is stopped, the
+previous environment, or none, remains.
 """
 
 from __future__ import annotations
@@ -51,17 +51,17 @@ from .pythons import probe
 _logger = logging.getLogger(__name__)
 
 NEEDED_GIB = 3
-"""Download and installation with torch for the processor (1.5 GB stay)."""
+"""Disk space for download and installation with torch for the CPU (1.5 GB remain used)."""
 NEEDED_CUDA_GIB = 12
 _TEMPORARY = "tmp"
 _SEE_LOG = "See log.txt in the worker's folder, then press Set Up Worker."
 
-# Settings of pip that would send packages somewhere else than into the environment.
+# Settings of pip that would install packages outside of the environment.
 _IGNORED_VARIABLES = (
     "PIP_USER", "PIP_TARGET", "PIP_PREFIX", "PIP_ROOT", "PIP_REQUIREMENT", "PIP_LOG",
     "PIP_REQUIRE_VIRTUALENV", "PIP_NO_DEPS", "PIP_DRY_RUN",
 )  # fmt: skip
-# What pip says, what it means, and the next step; the first that matches is told.
+# Pattern in pip's output, error message and next step; the first match is reported.
 _FAILURES = (
     (r"No space left|not enough space|quota exceeded", "The disk is full.",
      "Free several GiB, then press Set Up Worker."),
@@ -74,7 +74,7 @@ _FAILURES = (
 
 
 class SetupTask(threading.Thread):
-    """A set-up, or a removal, beside its caller; ``status`` tells how far it is."""
+    """Thread that sets up or removes an environment; ``status`` holds its progress."""
 
     def __init__(self, request: SetupRequest, *, removes: bool = False) -> None:
         super().__init__(daemon=True)
@@ -84,10 +84,10 @@ class SetupTask(threading.Thread):
         self.status = JobStatus("RUNNING", "remove" if removes else "environment")
         self._process: subprocess.Popen[bytes] | None = None
         self._package_count = 0
-        """Packages that pip has named so far."""
+        """Number of packages that pip has named so far."""
 
     def run(self) -> None:
-        """Work until the end, which ``status`` tells as well."""
+        """Run to the end; ``status`` then holds the outcome."""
         try:
             if self.removes:
                 remove(self.request.environment)
@@ -98,7 +98,7 @@ class SetupTask(threading.Thread):
             self._end("CANCELLED" if isinstance(error, Cancelled) else "FAILED", error)
         except OSError as error:
             self._end("FAILED", unwritable_error(error.filename or self.request.root, error))
-        except Exception as error:  # without an end, its user would wait for ever
+        except Exception as error:  # without a final status, the user would wait forever
             _logger.exception("set-up")
             self._end("FAILED", WorkerError(f"{type(error).__name__}: {error}.", _SEE_LOG))
 
@@ -108,13 +108,13 @@ class SetupTask(threading.Thread):
         )
 
     def cancel(self) -> None:
-        """Ask it to stop; it deletes what it has begun."""
+        """Request a stop; unfinished files are deleted."""
         self.is_cancelling = True
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
 
     def _set_up(self) -> None:
-        """Make the environment; one that is there is replaced in the end."""
+        """Create the environment; an existing one is replaced at the end."""
         request, environment = self.request, self.request.environment
         names = [r.name for r in read_requirements(Path(request.requirements))]
         python = probe(request.python)
@@ -150,7 +150,7 @@ class SetupTask(threading.Thread):
             write_json(environment.ready_path, versions)
             register_environment(environment.root)
         finally:
-            with contextlib.suppress(OSError):  # the next set-up deletes what is left
+            with contextlib.suppress(OSError):  # the next set-up deletes the rest
                 _delete_unused(environment)
             lock.unlock()
             if self.is_cancelling and not environment.is_ready():
@@ -158,7 +158,7 @@ class SetupTask(threading.Thread):
                     remove(environment)
 
     def _run_command(self, command: Command, python: str, log: IO[str], expected: int) -> None:
-        """Run a command to its end; ``expected`` packages are all the progress."""
+        """Run a command to its end; the progress is the share of ``expected`` packages named."""
         log.write(f"$ {as_line(command)}\n")
         last: deque[str] = deque(maxlen=40)
         self._process = process = start_process(
@@ -167,7 +167,7 @@ class SetupTask(threading.Thread):
         )
         assert process.stdin is not None
         assert process.stdout is not None
-        if self.is_cancelling:  # before there was a process to tell
+        if self.is_cancelling:  # cancelled before the process started
             process.stdin.close()
         try:
             for raw in process.stdout:
@@ -200,12 +200,12 @@ def _check_disk(root: Path, needed_gib: int) -> None:
 
 
 def start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes]:
-    """Start :func:`main` in a process that leads its own group, with its files in ``temporary``.
+    """Start :func:`main` in a process group of its own, with temporary files in ``temporary``.
 
     Raises
     ------
     WorkerError
-        It does not start.
+        The process does not start.
     """
     inherited = {
         k: v for k, v in child_environment().items() if k.upper() not in _IGNORED_VARIABLES
@@ -226,31 +226,31 @@ def start_process(command: list[str], temporary: Path) -> subprocess.Popen[bytes
 
 
 def main(arguments: list[str]) -> int:
-    """Run a command that is ended when standard input is closed, as by the end of who asked."""
+    """Run a command and kill it when standard input is closed, as when the parent ends."""
     process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL)
 
     def watch() -> None:
         os.read(0, 1)
         process.kill()
         if hasattr(os, "killpg"):
-            os.killpg(0, signal.SIGKILL)  # this process too, with all that it has started
+            os.killpg(0, signal.SIGKILL)  # the whole group, this process included
 
     threading.Thread(target=watch, daemon=True).start()
     return process.wait()
 
 
 def error_from_output(code: int, last: list[str]) -> WrapError:
-    """Return the typed error for what a command said before it failed."""
+    """Return the typed error for the last output lines of a failed command."""
     for pattern, message, hint in _FAILURES:
         match = re.search(pattern, "\n".join(last))
         if match:
             return ResourceError(message.format(*match.groups()), hint)
-    errors = [line for line in last if line.lower().startswith("error")] or last or ["no words"]
+    errors = [line for line in last if line.lower().startswith("error")] or last or ["no output"]
     return WorkerError(f"A command of the set-up ended with code {code}: {errors[-1]}.", _SEE_LOG)
 
 
 def _delete_unused(environment: WorkerEnvironment) -> None:
-    """Delete what belongs to an environment but the folder in use."""
+    """Delete the files of an environment except the folder in use."""
     in_use = environment.folder if environment.is_ready() else None
     if in_use is None:
         environment.ready_path.unlink(missing_ok=True)
@@ -262,14 +262,14 @@ def _delete_unused(environment: WorkerEnvironment) -> None:
 
 
 def remove(environment: WorkerEnvironment) -> None:
-    """Delete an environment that we made, and nothing else.
+    """Delete an environment made by the add-on, and nothing else.
 
     Raises
     ------
     UsageError
-        The folder does not carry our marker, or a set-up is at work in it.
+        The folder has no marker of ours, or a set-up is running in it.
     OSError
-        Something of it cannot be deleted.
+        A file cannot be deleted.
     """
     root = environment.root
     if root.is_symlink() or not environment.is_ours():
@@ -284,5 +284,5 @@ def remove(environment: WorkerEnvironment) -> None:
     _delete_unused(environment)
     for name in ("status.json", "log.txt", "output.txt", "cancel", "lock.json", MARKER):
         (root / name).unlink(missing_ok=True)
-    with contextlib.suppress(OSError):  # something else lies there: it stays
+    with contextlib.suppress(OSError):  # other files in the folder stay
         root.rmdir()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which Pythons this machine has that a worker's environment can be made from."""
+"""Find the Python installations that a worker environment can be created from."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from ..processes.spawn import child_environment
 
 OLDEST = (3, 11)
 NEWEST_WITH_WHEELS = (3, 13)
-"""Of newer ones, some packages have no wheels yet (xatlas): they are listed last."""
+"""Some packages (xatlas) have no wheels for newer versions yet, which are listed last."""
 PROBE_DEADLINE_S = 20.0
 
-# Blender's Python on Windows has the module venv, but not the programs that it copies.
+# Blender's Python on Windows has the module venv, but not the executables that it copies.
 _PROBE = (
     "import os, sys, json, pathlib, importlib.util as u;"
     "has = lambda n: u.find_spec(n) is not None;"
@@ -39,25 +39,25 @@ _BUNDLED_PIP = (
     "sys.path.insert(0, str(w[-1])); sys.argv[0] = 'pip';"
     "runpy.run_module('pip', run_name='__main__')"
 )
-"""Runs the pip that ensurepip carries without installing it anywhere."""
+"""Runs the pip bundled with ensurepip without installing it."""
 _MAC_PATTERNS = (
     "/Library/Frameworks/Python.framework/Versions/3.*/bin/python3",
     "/opt/homebrew/bin/python3.[1-9][0-9]",
     "/usr/local/bin/python3.[1-9][0-9]",
 )
-"""Blender started from the Finder does not have them in its ``PATH``."""
+"""Not in the ``PATH`` of a Blender started from the Finder."""
 
 
 @dataclass(frozen=True)
 class FoundPython:
-    """What an interpreter has said of itself."""
+    """Properties reported by an interpreter."""
 
     path: str
     version: tuple[int, int, int]
     has_venv: bool = True
-    """``venv`` with all that it needs."""
+    """Whether ``venv`` and all that it needs are present."""
     pip: tuple[str, ...] = ("-m", "pip")
-    """Arguments that run a pip with it outside of a venv; empty for none."""
+    """Arguments that run pip outside of a venv; empty if there is none."""
 
     @property
     def version_text(self) -> str:
@@ -66,7 +66,7 @@ class FoundPython:
 
     @property
     def can_install(self) -> bool:
-        """Whether packages can be installed with it in any way."""
+        """Whether packages can be installed with it, in a venv or with pip."""
         return self.has_venv or bool(self.pip)
 
     @property
@@ -76,12 +76,12 @@ class FoundPython:
 
 
 def probe(path: str) -> FoundPython:
-    """Ask an interpreter what it is.
+    """Query the properties of an interpreter.
 
     Raises
     ------
     UsageError
-        It is none, does not answer, is 32-bit or too old.
+        It is not a Python, does not respond, is 32-bit or too old.
     """
     other = "Choose another Python 3.11 to 3.13 (python.org, or your system's packages)."
     if _is_blender(path):
@@ -94,13 +94,13 @@ def probe(path: str) -> FoundPython:
         answers = json.loads(done.stdout.decode("utf-8", "replace"))
         major, minor, micro = (int(n) for n in answers["version"])
     except (OSError, subprocess.TimeoutExpired, ValueError, KeyError, TypeError):
-        raise UsageError(f"{path} is no Python that runs.", other) from None
+        raise UsageError(f"{path} does not run as a Python.", other) from None
     if (major, minor) < OLDEST or not answers["is_64_bit"]:
         wrong = "which is too old" if (major, minor) < OLDEST else "but a 32-bit one"
         raise UsageError(f"{path} is Python {major}.{minor}.{micro}, {wrong}.", other)
     bundled = ("-c", _BUNDLED_PIP) if answers["ensurepip"] else ()
     return FoundPython(
-        # What a venv was made from stays where it is; the venv may be thrown away.
+        # The base interpreter of a venv is permanent; the venv itself may be deleted.
         answers["base"] if Path(answers["base"]).exists() else path,
         (major, minor, micro),
         bool(answers["venv"]),
@@ -109,7 +109,7 @@ def probe(path: str) -> FoundPython:
 
 
 def candidates(own: str = "") -> list[str]:
-    """Return paths that may be a Python, the likely ones first; nothing is started but ``py``."""
+    """Return paths that may be a Python, the likely ones first; starts only ``py``."""
     names = [f"python3.{minor}" for minor in range(11, 15)] + ["python3", "python"]
     found = [shutil.which(name) or "" for name in names]
     if sys.platform == "darwin":
@@ -122,7 +122,7 @@ def candidates(own: str = "") -> list[str]:
                 timeout=PROBE_DEADLINE_S,
             )  # fmt: skip
             found += paths_of_launcher(done.stdout.decode(errors="replace"))
-    # Neither Blender itself nor the program of the Microsoft Store (it opens the shop) is a Python.
+    # Neither Blender nor the Microsoft Store's stub (it opens the shop) is a Python.
     usable = (p for p in [*found, own] if p and "WindowsApps" not in p and not _is_blender(p))
     return list(dict.fromkeys(usable))
 
@@ -132,12 +132,12 @@ def _is_blender(path: str) -> bool:
 
 
 def paths_of_launcher(text: str) -> list[str]:
-    """Return the paths in the words of ``py -0p``: one version and one path a line."""
+    """Return the paths in the output of ``py -0p``: one version and one path per line."""
     return re.findall(r"[A-Za-z]:\\.*\.exe", text)
 
 
 def find_pythons(own: str = "", paths: Iterable[str] | None = None) -> list[FoundPython]:
-    """Return the Pythons that can be used, those with wheels first; takes up to seconds."""
+    """Return the usable Pythons, those with wheels first; takes up to several seconds."""
     found: dict[str, FoundPython] = {}
     for path in candidates(own) if paths is None else paths:
         with contextlib.suppress(UsageError):

@@ -121,8 +121,9 @@ def start_more(scene: bpy.types.Scene, frame: bpy.types.Object, choice: WorkerCh
     folder = job_folder_of(frame)
     _refuse_running(folder)
     earlier = finished_job(JobFolder(folder))
-    more = properties_of(scene).training.more_iterations
-    job = continue_training_job(JobFolder(folder), earlier, more)
+    job = continue_training_job(
+        JobFolder(folder), earlier, properties_of(scene).training.more_iterations
+    )
     job = replace(job, settings=replace(job.settings, threads=choice.threads))
     client = JobClient.start(
         folder, job, python=worker_python(choice.python), keep_running=choice.keep_running

@@ -298,7 +298,7 @@ def test_a_job_tells_its_region_and_world_cameras(tmp_path: Path) -> None:
     (job / "result" / "head" / "mesh.ply").write_bytes(b"")
     with pytest.raises(UsageError, match="auto, head"):
         job_mesh(job, None)
-    with pytest.raises(UsageError, match="no job folder"):
+    with pytest.raises(UsageError, match="not a job folder"):
         job_mesh(tmp_path, None)
 
 

@@ -192,7 +192,7 @@ def test_meshes_and_clouds_are_named(tmp_path: Path) -> None:
 def test_other_formats_are_named_with_the_next_step(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"NGSP")
-    with pytest.raises(DatasetError, match="not read") as caught:
+    with pytest.raises(DatasetError, match="not supported") as caught:
         read_foreign_splat(path)
     assert "uncompressed PLY" in caught.value.hint
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A finished job without a training: Gaussians on a sphere, in stage folders as a worker's."""
+"""Make a finished job without training: Gaussians on a sphere, in stage folders."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mesh from a finished training trains nothing again, whatever became of the photos."""
+"""Meshing a finished training does not train again, even if the photos have changed."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from gaussian_wrapping_addon.core.dataset.loading import load
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs import runner
+from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
 from gaussian_wrapping_addon.core.jobs.stages.training_stage import training_keys
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
@@ -22,6 +23,7 @@ from gaussian_wrapping_addon.core.jobs.store.stage_folder import (
     source_fingerprint,
     stage_key,
 )
+from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import JobSettings
 
 
@@ -54,8 +56,7 @@ def finish(folder: JobFolder, name: str, finished_unix_s: float) -> None:
 
 
 def cameras_of(folder: JobFolder, job: JobFile) -> Stage:
-    overall = runner._Overall(lambda _event: None, lambda: False)
-    return runner._run_cameras(folder, job, overall, 1)
+    return run_cameras(folder, job, Progress(), threads=1)
 
 
 @pytest.fixture(autouse=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A disk that is full at any write: the file is named, what was there stays whole."""
+"""A full disk at any write: the error names the file, and existing files stay intact."""
 
 from __future__ import annotations
 

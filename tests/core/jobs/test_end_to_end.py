@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The whole road on a tiny scene with exact ground truth, through the command line."""
+"""All stages on a tiny scene with exact ground truth, through the command line."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_another_region_and_resolution_needs_no_training(
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((root / "out" / "result" / "report.json").read_text())
     assert not blend.exists(), "a file that shows another result"
-    assert "scene.blend showed the result before this one" in done.stdout
+    assert "scene.blend showed the previous result" in done.stdout
     reused = {s["name"]: s["reused"] for s in report["stages"]}
     assert reused["cameras"]
     assert reused["train"]
@@ -230,7 +230,7 @@ def test_a_region_without_surface_leaves_the_finished_job_as_it_was(
     done = batch("mesh", "--out", str(folder.root), "--region", str(box), "--no-blend")
     assert done.returncode == 3, done.stdout + done.stderr
     assert "nothing" in done.stdout
-    assert "the job and its result are as they were before" in done.stdout
+    assert "the job and its result are unchanged" in done.stdout
     assert (folder.job_path.read_bytes(), sorted(folder.stages.iterdir())) == before
     assert folder.read_status().state == "DONE"
     assert {p: p.read_bytes() for p in folder.result.rglob("*") if p.is_file()} == shown
@@ -336,7 +336,7 @@ def test_a_region_is_estimated_and_meshed_in_tiles_with_help(
         assert done.returncode == 0, done.stdout + done.stderr
         said, _ = helper.communicate(timeout=240)
     assert helper.returncode == 0, said
-    helped = int(re.search(r"(\d+) parts done here", said).group(1)) > 0
+    helped = int(re.search(r"(\d+) parts done by this process", said).group(1)) > 0
     region = json.loads((root / "out" / "result" / "report.json").read_text())["regions"]["tiled"]
     assert region["provenance"]["tiles"] == 3
     assert region["provenance"]["tile_processes"] == 1 + helped

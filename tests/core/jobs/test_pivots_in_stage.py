@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mesh by pivots is estimated before it is made, and refused where memory will not suffice."""
+"""A mesh by pivots is estimated before it is made, and raises if memory is not sufficient."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A splat of another program becomes a closed mesh through the command line, without photos."""
+"""A splat of another program is meshed without photos through the command line."""
 
 from __future__ import annotations
 
@@ -67,4 +67,4 @@ def test_a_permuted_splat_becomes_a_closed_mesh_on_its_surface(tmp_path: Path) -
     truth = SIZE * fibonacci_directions(400) * AXES + MOVE
     _, gap, _ = trimesh.proximity.closest_point(mesh, truth)
     assert np.percentile(gap / SIZE, 95) < 0.08
-    assert "made-up views" in (result / "report.json").read_text()
+    assert "virtual views" in (result / "report.json").read_text()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A cancelled worker whose main thread does not listen ends itself, with its helpers."""
+"""A cancelled worker whose main thread does not respond exits by itself, with its helpers."""
 
 from __future__ import annotations
 

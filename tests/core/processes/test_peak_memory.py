@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is told of memory is this process's own."""
+"""Peak memory is that of the process itself, not of its parent."""
 
 from __future__ import annotations
 

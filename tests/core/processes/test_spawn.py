@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Children are started alike everywhere: own group, nothing inherited, ended with their own."""
+"""Child processes: own process group, no inherited files, ended with their descendants."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The entry of child processes loads the package without help from the environment."""
+"""The entry point of child processes loads the package independent of the environment."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pythons that are refused, commands as they are shown, versions, failures of commands."""
+"""Parts of the set-up: unsuitable Pythons, displayed commands, versions, failed commands."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def fake_python(folder: Path, version: str, name: str = "python3", bits: int = 6
 @pytest.mark.parametrize(
     ("version", "bits", "words"),
     [("[3, 10, 4]", 64, "3.10.4, which is too old"), ("[2, 7, 18]", 64, "too old"),
-     ("[3, 12, 1]", 32, "32-bit"), ("no", 64, "no Python that runs")],
+     ("[3, 12, 1]", 32, "32-bit"), ("no", 64, "does not run as a Python")],
 )  # fmt: skip
 def test_pythons_that_are_refused(tmp_path: Path, version: str, bits: int, words: str) -> None:
     path = fake_python(tmp_path, version, bits=bits)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Set-up without network from tiny wheels: whole, cancelled, replaced, removed, refused."""
+"""Set-up without network from tiny wheels: complete, cancelled, replaced, removed, invalid."""
 
 from __future__ import annotations
 

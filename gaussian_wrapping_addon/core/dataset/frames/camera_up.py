@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which way is up, from cameras alone, also where phones were held upright or upside down."""
+"""Estimate the up direction from cameras that may be rolled by quarter turns."""
 
 from __future__ import annotations
 
@@ -11,38 +11,39 @@ from ...errors import UsageError
 from .normalisation import MEAN_UP, up_direction
 
 MIN_AGREEING_SHARE = 0.7
-"""Share of the cameras that must agree with an up direction: three quarters of hand-held photos
-are held on purpose, and a direction by chance gets at most half (:func:`_quarter_turn_share`)."""
+"""Share of the cameras that must agree with an up direction: about three quarters of hand-held
+photos are level or turned by quarters, and a random direction reaches at most half
+(:func:`_quarter_turn_share`)."""
 UPRIGHT_DEG = 40.0
-"""Roll below which a camera counts as held upright: between level and a quarter turn, 45 degrees
-would be undecided."""
+"""Roll below which a camera counts as upright: below 45 degrees, which is half way between level
+and a quarter turn."""
 QUARTER_DEG = 12.0
-"""Roll off the nearest quarter turn below which a camera counts as held on purpose. Hands are
-within a few degrees; by chance a quarter of all cameras would be."""
+"""Deviation of the roll from a quarter turn below which a camera counts as aligned with it.
+Hand-held cameras are within a few degrees; at random a quarter of all cameras would be."""
 _MIN_PROJECTED_UP = 0.3
-"""A camera that looks along a direction sees nothing of it in its image: below this length of the
-projection (17 degrees) its roll does not count."""
+"""Minimum length of the up direction's projection into the image (17 degrees): the roll of a camera
+that looks along it is undefined."""
 _SAME_DIRECTION_DEG = 30.0
-"""Directions within this angle are the same guess."""
+"""Directions within this angle count as the same candidate."""
 _AMBIGUOUS_SHARE = 0.9
-"""Another direction with this share of the best one's agreement makes the answer a guess."""
+"""Another direction with this share of the best one's agreement makes the result ambiguous."""
 _MIN_PITCH_SINE = 0.05
-"""Mean sine of the cameras' pitch above which they look down (3 degrees)."""
+"""Mean sine of the cameras' pitch beyond which they look down or up (3 degrees)."""
 _MIN_SIGN_MAJORITY = 0.2
 """Majority, as a share of all cameras, that decides between up and down."""
 _MAX_CAMERAS = 32
-"""Cameras whose axes are tried against each other; all of them judge."""
+"""Number of cameras whose axes are combined to candidates; all cameras score them."""
 
 _HINT = "Pick three points on the ground and press Set Ground."
 
 
 def camera_up(rotations: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, str]:
-    """Estimate which way is up from how people hold cameras.
+    """Estimate the up direction from how people hold cameras.
 
-    First as in the scene frame (:func:`~.normalisation.up_direction`). Where too few cameras are
-    upright by that, photos may be turned by quarters (phones whose photos carry no orientation):
-    then the direction wanted is the one by which most cameras have a roll near a whole number of
-    quarter turns. Its sign is that of upright cameras, or else the side from which they look down.
+    First as in the scene frame (:func:`~.normalisation.up_direction`). If too few cameras are
+    upright by that, photos may be rolled by quarter turns (phones whose photos carry no
+    orientation): then up is the direction for which most cameras have a roll near a multiple of a
+    quarter turn. Its sign is that of upright cameras, or else the side from which they look down.
 
     Parameters
     ----------
@@ -55,12 +56,12 @@ def camera_up(rotations: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, s
     -------
     up : (3,) float64, unit length
     rule : str
-        Those of ``up_direction``, or ``"cameras turned by quarters"``.
+        A rule of ``up_direction``, or ``"cameras turned by quarters"``.
 
     Raises
     ------
     UsageError
-        No camera, or they contradict each other.
+        There is no camera, or the cameras contradict each other.
     """
     rotations = np.asarray(rotations, np.float64).reshape(-1, 3, 3)
     centers = np.asarray(centers, np.float64).reshape(-1, 3)
@@ -76,8 +77,8 @@ def camera_up(rotations: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, s
     try:
         return _up_from_quarter_turns(rotations), "cameras turned by quarters"
     except UsageError:
-        # On an arc, the mean of cameras that lie on their sides looks like an up held
-        # carelessly; where quarter turns explain nothing, it was that.
+        # On an arc, the mean of cameras that lie on their sides resembles a loosely held upright
+        # camera; if quarter turns explain nothing, it was the latter.
         if upright:
             return up, rule
         raise
@@ -90,15 +91,18 @@ def _up_from_quarter_turns(rotations: np.ndarray) -> np.ndarray:
     apart = np.abs(candidates @ candidates[best]) < np.cos(np.radians(_SAME_DIRECTION_DEG))
     second_best = float(shares[apart].max()) if apart.any() else 0.0
     if shares[best] < MIN_AGREEING_SHARE:
-        raise UsageError("The cameras were held in too many ways to tell which way is up.", _HINT)
+        raise UsageError("The cameras are rolled too differently to find the up direction.", _HINT)
     if second_best >= _AMBIGUOUS_SHARE * shares[best]:
-        raise UsageError("The cameras leave open which of two ways is up.", _HINT)
+        raise UsageError("The cameras allow two different up directions.", _HINT)
     up = _refined(rotations, candidates[best])
     return up * _sign(rotations, up)
 
 
 def _roll_and_projection(rotations: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (n,) roll in radians of cameras by ``up``, and how much of it each sees."""
+    """Return roll relative to ``up`` in radians and length of its projection into each image.
+
+    Both (n,).
+    """
     across, along = rotations[:, 0] @ up, -(rotations[:, 1] @ up)
     return np.arctan2(across, along), np.hypot(across, along)
 
@@ -109,9 +113,9 @@ def _angle_to_quarter_turn(roll: np.ndarray) -> np.ndarray:
 
 
 def _upright_share(rotations: np.ndarray, up: np.ndarray, limit_deg: float) -> float:
-    """Return the share of cameras rolled by less, of those that see ``up`` in their image.
+    """Return the share of cameras with a smaller roll, among those with a defined roll.
 
-    Looking straight down says nothing against a direction that others agree on, unless most do.
+    Cameras that look straight down do not count against a direction, unless most of them do.
     """
     roll, seen = _roll_and_projection(rotations, up)
     held = (np.abs(roll) < np.radians(limit_deg)) & (seen > _MIN_PROJECTED_UP)
@@ -119,7 +123,7 @@ def _upright_share(rotations: np.ndarray, up: np.ndarray, limit_deg: float) -> f
 
 
 def _quarter_turn_share(rotations: np.ndarray, up: np.ndarray) -> float:
-    """Return the share of all cameras near a quarter turn; those that look along ``up`` are not."""
+    """Return the share of all cameras near a quarter turn, excluding those looking along ``up``."""
     roll, seen = _roll_and_projection(rotations, up)
     return float(
         (
@@ -129,7 +133,7 @@ def _quarter_turn_share(rotations: np.ndarray, up: np.ndarray) -> float:
 
 
 def _candidates(rotations: np.ndarray) -> np.ndarray:
-    """Return (k, 3) unit directions: image axes, and what is level with those of two cameras."""
+    """Return (k, 3) unit directions: image axes, and normals of the image axes of two cameras."""
     step = max(1, -(-len(rotations) // _MAX_CAMERAS))
     subset = rotations[::step, :2, :]  # (c, 2, 3): either axis may be the level one
     found = [*subset.reshape(-1, 3)]
@@ -143,7 +147,7 @@ def _candidates(rotations: np.ndarray) -> np.ndarray:
 
 
 def _refined(rotations: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return the direction most nearly orthogonal to the level axes of the cameras held so."""
+    """Return the direction most nearly orthogonal to the level axes of the aligned cameras."""
     for _ in range(10):
         roll, seen = _roll_and_projection(rotations, up)
         held = (_angle_to_quarter_turn(roll) < np.radians(QUARTER_DEG)) & (seen > _MIN_PROJECTED_UP)
@@ -151,7 +155,7 @@ def _refined(rotations: np.ndarray, up: np.ndarray) -> np.ndarray:
         level = np.where(upright[:, None], rotations[:, 0], rotations[:, 1])[held]  # (m, 3)
         values, axes = np.linalg.eigh(level.T @ level)
         if values[1] < 0.01 * values[2]:
-            return up  # all level axes are parallel: they leave the pitch open
+            return up  # all level axes are parallel: the pitch is undetermined
         up = axes[:, 0] if axes[:, 0] @ up >= 0.0 else -axes[:, 0]
     return up
 
@@ -163,4 +167,4 @@ def _sign(rotations: np.ndarray, up: np.ndarray) -> float:
     pitch = float((rotations[:, 2] @ up).mean())
     if abs(pitch) > _MIN_PITCH_SINE:
         return float(-np.sign(pitch))
-    raise UsageError("The cameras do not tell up from down.", _HINT)
+    raise UsageError("The cameras do not distinguish up from down.", _HINT)

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where the coordinates of an exported file lie: which frame, turned how, without which offset.
+"""Coordinate frame of an exported file: target frame, axes and offset.
 
-Formats have an axis that their readers take for up. Files of formats with Y
-up hold (x, z, -y) of the coordinates that they were made of, as Blender's own exporters do.
+Files of Y-up formats hold (x, z, -y) of the Z-up coordinates, as Blender's own exporters write.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from ...export_formats import EXPORT_FORMATS
 from ..similarity import Similarity
 
 FAR_FROM_ORIGIN = 100.0
-"""Further than this many sizes from the origin, float32 rounding passes 1e-5 of the size."""
+"""Further than this many sizes from the origin, float32 rounding exceeds 1e-5 of the size."""
 
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation from Z up to Y up."""
@@ -29,9 +28,9 @@ class FileFrame:
     format: str
     """A name of :data:`EXPORT_FORMATS`."""
     target_from_scene: Similarity
-    """Leads to the world of the input, or to the scene as placed in Blender."""
+    """Transform to the world of the input, or to the scene as placed in Blender."""
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    """(3,) float64, target frame: what the file's coordinates leave out."""
+    """(3,) float64, target frame: offset subtracted from the file's coordinates."""
 
     @property
     def turn(self) -> np.ndarray:
@@ -39,18 +38,18 @@ class FileFrame:
         return Y_UP if EXPORT_FORMATS[self.format].y_up else np.eye(3)
 
     def local(self, points: np.ndarray) -> np.ndarray:
-        """Return (n, 3) float64 of points in the scene frame: less the offset, not turned."""
+        """Map (n, 3) scene points to the target frame minus the offset, axes not yet turned."""
         return self.target_from_scene.points(points) - self.offset
 
     def file_from_scene(self) -> Similarity:
-        """Return what leads to the coordinates as the file has them."""
+        """Return the transform from the scene frame to the file's coordinates."""
         turned = Similarity(1.0, self.turn, -(self.turn @ self.offset))
         return turned.after(self.target_from_scene)
 
     def to_json(
         self, world_from_scene: Similarity, blender_from_scene: Similarity
     ) -> dict[str, Any]:
-        """Return what a sidecar says of coordinates: every way out of the file, in double."""
+        """Return the entries of a sidecar: all transforms from the file's frame, in float64."""
         scene_from_file = self.file_from_scene().inverse()
         up = "+Y" if EXPORT_FORMATS[self.format].y_up else "+Z"
         return {
@@ -66,7 +65,7 @@ class FileFrame:
 
 
 def file_offset(world: np.ndarray) -> np.ndarray:
-    """Return the (3,) float64 offset that files leave out: 0, or whole units near the centre."""
+    """Return the (3,) float64 offset to subtract: 0, or whole units near the centre."""
     low, high = world.min(axis=0), world.max(axis=0)
     size = float((high - low).max())
     centre = 0.5 * (low + high)

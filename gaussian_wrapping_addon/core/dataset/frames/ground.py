@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ground of a scene from its surface: the main level plane low down, where one is clear."""
+"""Find the ground plane of a scene from its surface."""
 
 from __future__ import annotations
 
@@ -8,34 +8,33 @@ import numpy as np
 from .placement import COINCIDENT, Plane
 
 LEVEL_DEG = 20.0
-"""Faces that lean more than this are not ground: the up direction of cameras is off by a few
-degrees at most where it is off at all."""
+"""Largest tilt of ground faces: the up direction from cameras is off by a few degrees at most."""
 BAND_SHARE = 0.02
-"""Height, as a share of the surface's extent, within which faces lie on one plane."""
+"""Thickness of the plane's inlier band, as a share of the surface's extent."""
 CLEAR_SHARE = 0.4
-"""Share of the level, upward-facing area, without the topmost, that the plane must hold."""
+"""Share of the level, upward-facing area below the top that the plane must contain."""
 LOW_SHARE = 0.4
-"""The plane must lie in this lowest share of the heights: tops of things are level as well."""
+"""The plane must lie in this lowest share of the heights: tops of objects are level as well."""
 _ROUNDS = 4
 
 
 def find_ground_plane(
     centers: np.ndarray, normals: np.ndarray, areas: np.ndarray, up: np.ndarray
 ) -> Plane | None:
-    """Find the level plane that most of the low, upward-facing surface lies on.
+    """Find the level plane that contains most of the low, upward-facing surface.
 
     Parameters
     ----------
     centers, normals : (f, 3) float64
-        Of the faces of a mesh; normals of unit length, outwards.
+        Centres and outward unit normals of a mesh's faces.
     areas : (f,) float64
     up : (3,) float64
-        Unit vector, right within :data:`LEVEL_DEG`.
+        Unit vector, accurate to :data:`LEVEL_DEG`.
 
     Returns
     -------
     Plane or None
-        None where no plane is clear.
+        None if no plane is distinct.
     """
     good = np.isfinite(centers).all(1) & np.isfinite(normals).all(1) & (areas > 0.0)
     centers, normals, areas = centers[good], normals[good], areas[good]
@@ -50,7 +49,7 @@ def find_ground_plane(
         return None
     floor, ceiling = float(heights.min()), float(heights.max())
     limit = floor + LOW_SHARE * (ceiling - floor)
-    level &= heights < ceiling - band  # a region that cuts things off closes them by a level top
+    level &= heights < ceiling - band  # a region closes the objects it cuts with a level top
     if not level.any():
         return None
     points, weights, low = centers[level] - middle, areas[level], heights[level] < limit
@@ -66,7 +65,7 @@ def find_ground_plane(
         spread = points[near] - mean
         values, axes = np.linalg.eigh((spread * weights[near, None]).T @ spread)
         if values[1] <= 1e-4 * values[2]:
-            return None  # a strip: the plane would turn about it
+            return None  # a strip: rotation about it is undetermined
         normal = axes[:, 0] if axes[:, 0] @ up >= 0.0 else -axes[:, 0]
         offset = float(mean @ normal)
     near = np.abs(points @ normal - offset) <= band

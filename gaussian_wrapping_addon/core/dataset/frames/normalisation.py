@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Choose the scene frame: Z up, camera centres' mean at 0, cameras within a fixed radius."""
+"""Compute the scene frame: Z up, mean camera centre at 0, cameras within a fixed radius."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from ..similarity import Similarity
 RADIUS_MARGIN = 1.1
 """The largest camera distance times this becomes ``SCENE_RADIUS`` (docs/method.md, section 1.7)."""
 FAR_CAMERA_FACTOR = 30.0
-"""A camera this many median distances from the median position was solved wrongly."""
+"""A camera further than this many median distances from the median position is an outlier."""
 _COINCIDENT = 1e-12
-"""Share of the coordinates' size below which positions cannot be told apart in float64."""
+"""Share of the coordinates' size below which positions coincide in float64."""
 _MAX_LEVEL_TILT = 0.15
 """Mean |sin| of the angle between level camera axes and the horizon: about 9 degrees."""
 _MIN_SPREAD_RATIO = 0.03
-"""Smallest share of the middle eigenvalue in the largest: directions fan out by 20 degrees."""
+"""Smallest ratio of the middle to the largest eigenvalue: directions fan out by 20 degrees."""
 _MAX_NOISE_RATIO = 0.2
-"""Largest share of the smallest eigenvalue in the middle one: the plane is clear of the noise."""
+"""Largest ratio of the smallest to the middle eigenvalue: the plane is above the noise."""
 _MAX_PLANE_THICKNESS = 0.05
-"""Thickness over width of a camera path that counts as plane."""
+"""Largest thickness over width of a planar camera path."""
 MEAN_UP = "mean camera up"
-"""The rule of :func:`up_direction` where nothing better than the mean was found."""
+"""The rule of :func:`up_direction` that falls back to the mean."""
 _MIN_AGREEMENT_COS = np.cos(np.radians(50.0))
-"""Directions further from the cameras' mean up than this are not the up direction."""
+"""Largest angle between the up direction and the cameras' mean up, as a cosine."""
 
 
 @dataclass(frozen=True)
 class SceneFrame:
-    """The similarity to the scene frame, the cameras to keep, and how up was found."""
+    """The similarity to the scene frame, the cameras to keep, and the rule for up."""
 
     scene_from_world: Similarity
     keep: np.ndarray
-    """(n,) bool; cameras left out stand impossibly far away."""
+    """(n,) bool; outliers far from all other cameras are excluded."""
     up_rule: str
     collinear: bool
     """Whether all camera centres lie on one line."""
@@ -61,13 +61,12 @@ def find_scene_frame(rotations: np.ndarray, centers: np.ndarray) -> SceneFrame:
     Raises
     ------
     DatasetError
-        All cameras stand at one place, or too few are left.
+        All cameras coincide, or too few remain.
     """
     keep = near_cameras(centers)
     if int(keep.sum()) < MIN_IMAGES:
         raise DatasetError(
-            f"Only {int(keep.sum())} cameras stand within reach of each other; "
-            f"{MIN_IMAGES} are needed.",
+            f"Only {int(keep.sum())} cameras are near each other; {MIN_IMAGES} are needed.",
             "Solve the cameras again.",
         )
     kept = centers[keep]
@@ -95,7 +94,7 @@ def find_scene_frame(rotations: np.ndarray, centers: np.ndarray) -> SceneFrame:
 
 
 def near_cameras(centers: np.ndarray) -> np.ndarray:
-    """Tell which of the (n, 3) camera centres stand within reach of the others, (n,) bool."""
+    """Return (n,) bool: which of the (n, 3) camera centres are not outliers."""
     finite = np.isfinite(centers).all(1)
     if not finite.any():
         return finite
@@ -108,12 +107,12 @@ def near_cameras(centers: np.ndarray) -> np.ndarray:
 
 
 def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, str]:
-    """Estimate which way is up from how people hold cameras.
+    """Estimate the up direction from how people hold cameras.
 
-    The mean of the cameras' own up axes gives the sign and a first guess, which a constant pitch
-    over part of a circle tilts. Level cameras have horizontal x axes whatever their pitch, so
-    the direction most nearly orthogonal to all of these is preferred; then the normal of a plane
-    camera path. Both only count where they are well determined and agree with the first guess.
+    The mean of the cameras' up axes gives the sign and a first guess, which is tilted by a constant
+    pitch over part of a circle. Level cameras have horizontal x axes at any pitch, so the direction
+    most nearly orthogonal to all of these is preferred; then the normal of a planar camera path.
+    Both are used only if they are well determined and agree with the first guess.
 
     Parameters
     ----------
@@ -149,20 +148,20 @@ def up_direction(rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray
 
 
 def _robust_mean(directions: np.ndarray) -> np.ndarray:
-    """Return the unit vector with the least sum of distances to (n, 3) unit vectors."""
+    """Return the geometric median direction of (n, 3) unit vectors."""
     best = directions.mean(0)
     for _ in range(30):
         gaps = np.linalg.norm(directions - best, axis=1)
         weights = 1.0 / np.maximum(gaps, 1e-3)
         best = (weights[:, None] * directions).sum(0) / weights.sum()
     length = np.linalg.norm(best)
-    if length < 1e-6:  # the cameras look every way: any direction is as good
+    if length < 1e-6:  # directions cancel out: any direction is as good
         return directions[0] / np.linalg.norm(directions[0])
     return best / length
 
 
 def _least_aligned(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the direction most nearly orthogonal to (n, 3) vectors, and the eigenvalues upwards.
+    """Return the direction most nearly orthogonal to (n, 3) vectors, and ascending eigenvalues.
 
     Cauchy weights on the sine of the angle keep a few rolled cameras from tilting the result.
     """

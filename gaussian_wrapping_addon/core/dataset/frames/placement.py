@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Steps that place a scene: true scale, ground at z = 0 with up along +Z, origin.
+"""Place a scene: set its scale, level the ground at z = 0 with +Z up, set the origin.
 
-Each step is a similarity that is applied after the placement so far. None of them ever scales
-axes differently, and each can be made again: a step from points that are placed already is the
-identity.
+Each step is a similarity applied after the present placement. Scaling is always uniform, and steps
+are idempotent: a step from points that are placed already is the identity.
 """
 
 from __future__ import annotations
@@ -17,17 +16,17 @@ from ...errors import UsageError
 from ..similarity import Similarity
 
 COINCIDENT = 1e-6
-"""Distance over size of the coordinates below which two points are one: Blender's coordinates
-are single precision, so that such a distance holds hardly one digit."""
+"""Distance over size of the coordinates below which two points coincide: in Blender's single
+precision such a distance has hardly one significant digit."""
 COLLINEAR = 0.01
-"""Second over first extent below which points count as lying on one line: the plane through them
-would turn freely about it within the error of picking."""
+"""Second over first extent below which points count as collinear: within the picking error, the
+plane through them could rotate freely about the line."""
 SMALLEST_SCALE, LARGEST_SCALE = 1e-9, 1e9
-"""Bounds of a placement's scale. Beyond them single precision coordinates lose the scene, and a
-distance was mistyped."""
+"""Bounds of a placement's scale. Beyond them single precision is not sufficient, and the distance
+was mistyped."""
 SIMILAR = 1e-4
-"""Share by which the axes of a matrix may differ in length, and be off a right angle: object
-matrices are single precision, and a hierarchy adds up a few roundings."""
+"""Relative tolerance of a matrix's axis lengths and right angles: object matrices are single
+precision, and a hierarchy accumulates a few rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -41,20 +40,20 @@ class Plane:
 
 
 def scale_step(points: np.ndarray, length: float) -> Similarity:
-    """Scale about the origin so that two points stand ``length`` apart.
+    """Scale about the origin so that two points are ``length`` apart.
 
-    About the origin, so that a ground at z = 0 and a chosen origin stay.
+    A ground at z = 0 and a chosen origin stay where they are.
 
     Parameters
     ----------
     points : (2, 3) float64
     length : float
-        True distance, in the unit that the placement leads to.
+        True distance, in the unit of the placed scene.
 
     Raises
     ------
     UsageError
-        There are not two points, they lie in one place, or the length is no positive number.
+        There are not exactly two points, they coincide, or the length is not positive.
     """
     points = _finite(points)
     if len(points) != 2:
@@ -62,21 +61,21 @@ def scale_step(points: np.ndarray, length: float) -> Similarity:
             f"{_count(len(points))} picked.", "Pick two points whose distance you know."
         )
     if not (math.isfinite(length) and length > 0.0):
-        raise UsageError(f"{length:g} is no distance.", "Type a length greater than zero.")
+        raise UsageError(f"{length:g} is not a distance.", "Enter a length greater than zero.")
     distance = float(np.linalg.norm(points[1] - points[0]))
     if distance <= COINCIDENT * float(np.abs(points).max()):
-        raise UsageError("The two points lie in one place.", "Pick two points that are far apart.")
+        raise UsageError("The two points coincide.", "Pick two points that are far apart.")
     return Similarity(length / distance)
 
 
 def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
-    """Return the plane through three points, or the nearest one to more.
+    """Return the plane through three points, or the least-squares plane of more.
 
     Parameters
     ----------
     points : (n, 3) float64
     above : (k, 3) float64
-        What stands above the plane, such as camera centres. With none, or with as many below as
+        Points above the plane, such as camera centres. Without any, or with as many below as
         above, up is the side nearer to +Z.
 
     Raises
@@ -93,7 +92,7 @@ def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
     offsets = points - center
     _, extents, axes = np.linalg.svd(offsets, full_matrices=False)  # (3,), (3, 3)
     if extents[0] <= COINCIDENT * float(np.abs(points).max()):
-        raise UsageError("The points lie in one place.", "Pick three points that are far apart.")
+        raise UsageError("The points coincide.", "Pick three points that are far apart.")
     if extents[1] <= COLLINEAR * extents[0]:
         raise UsageError(
             "The points lie on one line.", "Pick a third point well to the side of the line."
@@ -106,7 +105,7 @@ def plane_through(points: np.ndarray, above: np.ndarray) -> Plane:
 
 
 def ground_step(plane: Plane) -> Similarity:
-    """Turn the plane's normal to +Z by the shortest way and lay the plane on z = 0.
+    """Rotate the plane's normal to +Z by the smallest angle and move the plane to z = 0.
 
     The plane's point keeps its x and y.
     """
@@ -121,10 +120,10 @@ def origin_step(point: np.ndarray) -> Similarity:
 
 
 def turn_to_z(direction: np.ndarray) -> np.ndarray:
-    """Return the (3, 3) rotation of least angle that turns a unit vector to +Z."""
+    """Return the (3, 3) rotation of smallest angle that maps a unit vector to +Z."""
     if direction[2] >= 0.0:
         return _least_turn(direction)
-    # Near -Z the axis is not determined: a half turn about X first, which is one of the shortest.
+    # Near -Z the axis is undetermined: a half turn about X first is one of the smallest.
     half_turn = np.diag([1.0, -1.0, -1.0])
     return _least_turn(half_turn @ direction) @ half_turn
 
@@ -137,18 +136,18 @@ def _least_turn(direction: np.ndarray) -> np.ndarray:
 
 
 def similarity_of_matrix(matrix: np.ndarray, name: str) -> Similarity:
-    """Return the similarity that a (4, 4) matrix is.
+    """Convert a (4, 4) matrix to a similarity.
 
     Parameters
     ----------
     matrix : (4, 4) float64
     name : str
-        Of the object, for the message.
+        Name of the object, for the message.
 
     Raises
     ------
     UsageError
-        The matrix is not finite, has no size, mirrors, or scales its axes differently.
+        The matrix is not finite, is singular, mirrors, or scales its axes differently.
     """
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]
@@ -165,7 +164,7 @@ def similarity_of_matrix(matrix: np.ndarray, name: str) -> Similarity:
 
 
 def check_scale(placement: Similarity) -> None:
-    """Refuse a placement whose scale single precision cannot carry.
+    """Raise if the scale of a placement is too small or large for single precision.
 
     Raises
     ------
@@ -174,7 +173,7 @@ def check_scale(placement: Similarity) -> None:
     """
     if not SMALLEST_SCALE <= placement.scale <= LARGEST_SCALE:
         raise UsageError(
-            f"The scene would be scaled by {placement.scale:.3g}.", "Check the distance typed."
+            f"The scene would be scaled by {placement.scale:.3g}.", "Check the distance entered."
         )
 
 

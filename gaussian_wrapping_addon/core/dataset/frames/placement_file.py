@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``placement.json`` of a result: the transform of Blender's parent empty, in double precision."""
+"""Read and write ``placement.json``: the transform of Blender's parent empty in float64."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from .placement import check_scale
 FILE_NAME = "placement.json"
 VERSION = 1
 _ORTHONORMAL = 1e-9
-"""What products of a few float64 rotations may be off by."""
+"""Tolerance for products of a few float64 rotations."""
 
 
 def write_placement(
     path: Path, blender_from_scene: Similarity, world_from_scene: Similarity
 ) -> None:
-    """Write a placement with the scene frame that it is for.
+    """Write a placement together with its scene frame.
 
     Raises
     ------
@@ -48,13 +48,13 @@ def read_placement(path: Path, world_from_scene: Similarity) -> Similarity | Non
     ----------
     path : Path
     world_from_scene : Similarity
-        Of the result that the placement is wanted for.
+        Scene frame of the result that the placement applies to.
 
     Returns
     -------
     Similarity or None
-        None where the file was written for another scene frame (the cameras were solved again),
-        by which its lengths and directions mean something else.
+        None if the file was written for another scene frame (the cameras were solved again), in
+        which its lengths and directions differ.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def read_placement(path: Path, world_from_scene: Similarity) -> Similarity | Non
             raise ValueError("a number is not finite")
         gram = placement.rotation @ placement.rotation.T
         if np.abs(gram - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(placement.rotation) < 0:
-            raise ValueError("the rotation is none")
+            raise ValueError("not a rotation")
         check_scale(placement)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, UsageError) as error:
         raise ParseError(path, "whole file", f"not a placement ({error}).", hint) from None

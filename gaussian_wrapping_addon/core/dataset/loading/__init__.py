@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From an input path to a scene: check, solve, undistort, mask, choose the start points.
+"""Load an input as a scene: check, solve poses, undistort, mask, choose start points.
 
 In: a path. Out: a :class:`~..scene.Scene` in its own frame.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Quick findings about an input before any long work: needs numpy only, solves nothing."""
+"""Check an input quickly before any long work: needs numpy only, solves no poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Severity = Literal["error", "warning", "fact"]
 _MAX_UNREADABLE_SHARE = 0.2
 _MIN_GOOD_SIDE_PX = 200
 _SHORT_NAMES = {"photos": "cameras to be solved", SPLAT: "splat without photos"}
-"""What is said of kinds whose name is no heading."""
+"""Headings of kinds whose name is unsuitable."""
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,16 @@ class Finding:
     message: str
     hint: str = ""
     short: str = ""
-    """What a heading says of it: joined, the short words of all findings name the input."""
+    """Part of a heading: joined, the short texts of all findings describe the input."""
 
 
 def check_input(source: Path) -> list[Finding]:
-    """Look at an input without decoding photos or solving cameras.
+    """Check an input without decoding photos or solving cameras.
 
     Returns
     -------
     list of Finding
-        An ``"error"`` means that loading would be refused.
+        An ``"error"`` means that loading would fail.
     """
     findings: list[Finding] = []
     try:
@@ -129,15 +129,17 @@ def _check_poses(kind: SourceKind, findings: list[Finding]) -> None:
     frame = find_scene_frame(rotations, -np.einsum("nji,nj->ni", rotations, translations))
     far = int((~frame.keep).sum())
     if far:
-        findings.append(Finding("warning", f"{far} cameras stand far away from all others."))
+        findings.append(Finding("warning", f"{far} cameras are far away from all others."))
     if frame.collinear:
-        findings.append(Finding("warning", "All cameras stand on one line; depth will be weak."))
+        findings.append(
+            Finding("warning", "All cameras lie on one line; depth will be inaccurate.")
+        )
 
 
 def _check_files(
     kind: SourceKind, photos: list[Path], names: list[str], findings: list[Finding]
 ) -> None:
-    """Check headers: readable, large enough, enough of them."""
+    """Check that headers are readable, and that photos are large enough and sufficiently many."""
     bad: list[DatasetError] = []
     sizes: Counter[str] = Counter()
     small = unknown = 0
@@ -178,7 +180,7 @@ def _check_files(
         )
     listed = ", ".join(f"{count} of {size}" for size, count in sizes.most_common(3))
     message = f"{good} photos: {listed or 'sizes not known yet'}."
-    # Before the kind: "80 photos, COLMAP model".
+    # In front of the kind: "80 photos, COLMAP model".
     findings.insert(0, Finding("fact", message, short=f"{good} photos"))
     masked = sum(find_mask(kind.mask_roots, name) is not None for name in names)
     if masked:

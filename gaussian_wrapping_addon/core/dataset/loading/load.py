@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From an input path to a :class:`~..scene.Scene`: poses, photos, frame, start points."""
+"""Load an input path as a :class:`~..scene.Scene`: poses, photos, frame, start points."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def load_scene(
     ----------
     source : Path
         Folder of photos, COLMAP project (``images/`` and ``sparse/0``), ``transforms.json`` or a
-        folder that holds it. Nothing is written there.
+        folder that contains it. Nothing is written there.
     work_folder : Path
         Undistorted photos, masks and the solved cameras are written here.
     progress : Progress
@@ -53,12 +53,12 @@ def load_scene(
     Returns
     -------
     Scene
-        In the scene frame; ``warnings`` and ``facts`` tell what was read, left out and solved.
+        In the scene frame; ``warnings`` and ``facts`` list what was read, left out and solved.
 
     Raises
     ------
     DatasetError, ParseError
-        The input cannot be used; names what and where.
+        The input cannot be used; names the problem and its location.
     """
     source = Path(source).resolve()
     work_folder = Path(work_folder).resolve()
@@ -137,7 +137,7 @@ def _solve(
 def _frame(
     views: list[PreparedView], warnings: list[ReportWarning]
 ) -> tuple[list[PreparedView], Similarity, dict[str, Any]]:
-    """Choose the scene frame and leave out cameras that stand impossibly far away."""
+    """Compute the scene frame and remove outlier cameras far from all others."""
     rotations = np.array([view.cam_from_world[:, :3] for view in views])  # (n, 3, 3)
     translations = np.array([view.cam_from_world[:, 3] for view in views])  # (n, 3)
     centers = -np.einsum("nji,nj->ni", rotations, translations)
@@ -145,7 +145,7 @@ def _frame(
     far = [view.name for view, keep in zip(views, frame.keep, strict=True) if not keep]
     if far:
         text = (
-            f"{len(far)} cameras stand far away from all others and were left out: "
+            f"{len(far)} cameras are far away from all others and were left out: "
             f"{', '.join(far[:3])}."
         )
         warnings.append(
@@ -155,7 +155,7 @@ def _frame(
         warnings.append(
             ReportWarning(
                 "cameras-on-a-line",
-                "All cameras stand on one line; depth and the up direction are weak.",
+                "All cameras lie on one line; depth and the up direction are inaccurate.",
                 "Take photos from other heights and directions too.",
             )
         )
@@ -173,11 +173,11 @@ def _camera(view: PreparedView) -> Camera:
 def _points(
     model: SourceModel, scene_from_world: Similarity, warnings: list[ReportWarning]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bring the input's sparse points to the scene frame and drop impossible ones."""
+    """Transform the input's sparse points to the scene frame and drop outliers."""
     with np.errstate(over="ignore", invalid="ignore"):
         points = scene_from_world.points(model.points.reshape(-1, 3))
         near = np.linalg.norm(points, axis=1) <= POINT_REACH
     if not near.all():
-        text = f"{int((~near).sum())} sparse points lie impossibly far; left out."
+        text = f"{int((~near).sum())} sparse points are impossibly far away and were left out."
         warnings.append(ReportWarning("points-far-away", text, LEFT_OUT_HINT))
     return points[near], model.point_colors[near]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cameras for a splat that comes without photos: around its middle, looking at it."""
+"""Place virtual cameras around a splat that comes without photos."""
 
 from __future__ import annotations
 
@@ -18,52 +18,52 @@ PHOTO_SIDE_PX = 800
 FIELD_OF_VIEW_DEG = 50.0
 
 FAR_VIEWS, NEAR_VIEWS = 28, 20
-"""The far views hold the whole, the near ones its middle at more pixels."""
+"""Far views show the whole splat, near views its middle at higher resolution."""
 
 FAR_MARGIN = 1.05
 NEAR_DISTANCE = 1.7
-"""Distance of the near views in radii; the far ones stand where the sphere fits their frame."""
+"""Distance of the near views in radii; from the far views the sphere fits the image."""
 
 MIN_OPACITY = 0.1
-"""Fainter Gaussians tell nothing about where the splat is."""
+"""Gaussians of lower opacity are ignored when measuring the extent."""
 
 WHOLE_SHARE, MIDDLE_SHARE = 0.98, 0.5
 SURROUNDINGS_RATIO = 3.0
-"""Where the radius of :data:`WHOLE_SHARE` is more than this many times that of
-:data:`MIDDLE_SHARE`, the splat has surroundings, and this bounds what the cameras stand around."""
+"""If the radius of :data:`WHOLE_SHARE` is more than this many times that of :data:`MIDDLE_SHARE`,
+the splat has surroundings, and this ratio limits the radius that the cameras cover."""
 
 NO_PHOTOS_WARNING = (
-    "A splat without photos is wrapped from made-up views around its middle: surroundings and "
-    "rooms seen from inside are not covered, and errors of the splat stay."
+    "A splat without photos is wrapped from virtual views around its middle: surroundings and "
+    "rooms seen from inside are not covered, and errors of the splat remain."
 )
-NO_PHOTOS_HINT = "Where its photos exist, give them as the input and the splat as the start."
+NO_PHOTOS_HINT = "If its photos exist, give them as the input and the splat as the start."
 
 
 @dataclass(frozen=True)
 class SplatExtent:
-    """Where a splat is, frame of the file."""
+    """Centre and radius of a splat, frame of the file."""
 
     center: np.ndarray
     """(3,) float64."""
     radius: float
     has_surroundings: bool
-    """Whether much of it lies farther away than ``radius``."""
+    """Whether a substantial part lies beyond ``radius``."""
 
 
 def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
-    """Return the robust middle and radius of the opaque Gaussians.
+    """Return the robust centre and radius of the opaque Gaussians.
 
     Parameters
     ----------
     means : (n, 3)
         Finite.
     opacities : (n,)
-        Effective, in [0, 1]; the weight of each.
+        Effective opacities in [0, 1], used as weights.
 
     Raises
     ------
     DatasetError
-        Everything is transparent, or lies at one place.
+        All Gaussians are transparent or coincide.
     """
     opaque = opacities >= MIN_OPACITY
     if not opaque.any():
@@ -80,7 +80,7 @@ def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
     middle = _quantile(distance, weights, MIDDLE_SHARE)
     whole = _quantile(distance, weights, WHOLE_SHARE)
     if not whole > 0.0:
-        raise DatasetError("All Gaussians of the splat lie at one place.", "Export it again.")
+        raise DatasetError("All Gaussians of the splat coincide.", "Export it again.")
     has_surroundings = middle > 0.0 and whole > SURROUNDINGS_RATIO * middle
     radius = SURROUNDINGS_RATIO * middle if has_surroundings else whole
     return SplatExtent(center + first, float(radius), bool(has_surroundings))
@@ -93,7 +93,7 @@ def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
 
 
 def cameras_on_spheres(extent: SplatExtent) -> list[Camera]:
-    """Return cameras on two spheres around a splat that look at its middle, frame of the file."""
+    """Return cameras on two spheres around a splat that look at its centre, frame of the file."""
     half = math.radians(0.5 * FIELD_OF_VIEW_DEG)
     focal_px = 0.5 * PHOTO_SIDE_PX / math.tan(half)
     far = FAR_MARGIN / math.sin(half)
@@ -117,7 +117,7 @@ def cameras_on_spheres(extent: SplatExtent) -> list[Camera]:
 
 
 def _look_at(eye: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """(3, 4) ``cam_from_world`` with Z up; no direction of the lattice is a pole."""
+    """Return (3, 4) ``cam_from_world`` with Z up; no direction of the lattice is a pole."""
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
@@ -125,7 +125,7 @@ def _look_at(eye: np.ndarray, forward: np.ndarray) -> np.ndarray:
 
 
 def scene_frame(cameras: list[Camera]) -> Similarity:
-    """Return ``scene_from_world``: the axes stay the file's, only place and size change."""
+    """Return ``scene_from_world``: translation and scale only, keeping the file's axes."""
     centers = np.stack([camera.center for camera in cameras])
     mean = centers[0] + (centers - centers[0]).mean(axis=0)
     reach = float(np.linalg.norm(centers - mean, axis=1).max())

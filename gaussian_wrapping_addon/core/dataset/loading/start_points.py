@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Start points where the input has none: triangulated from the photos, else random."""
+"""Make start points for inputs without any: triangulated from the photos, else random."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..poses.pose_solver import triangulate_points
 _logger = logging.getLogger(__name__)
 
 MIN_POINTS = 100
-"""Fewer points than this are too few to start from."""
+"""Smallest number of points to start from."""
 RANDOM_POINTS = 20_000
 _ROUNDS = 40
 _MIN_SEEN = 2
@@ -40,8 +40,8 @@ def make_start_points(
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Return points (n, 3) float64 and colours (n, 3) uint8 in the scene frame, and their origin.
 
-    Triangulation keeps the poses of the input. Where it finds too little (no texture, poses that
-    do not fit), points are drawn at random where cameras look, and ``warnings`` says so.
+    Triangulation keeps the poses of the input. If it finds too few points (no texture, inaccurate
+    poses), points are drawn at random in view of the cameras, and a warning is added.
     """
     try:
         points, colors = triangulate_points(
@@ -64,7 +64,7 @@ def make_start_points(
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the (3,) point nearest to all optical axes (least squares, lightly held at 0)."""
+    """Return the (3,) point nearest to all optical axes (least squares, regularised towards 0)."""
     total, right = 1e-3 * np.eye(3), np.zeros(3)
     for camera in cameras:
         across = np.eye(3) - np.outer(camera.forward, camera.forward)
@@ -78,8 +78,8 @@ def random_points(
 ) -> np.ndarray:
     """Draw (count, 3) points around the point that the cameras look at.
 
-    Points are uniform in a ball that reaches to the middle of the cameras' distances and are kept
-    where at least two cameras see them.
+    Points are uniform in a ball whose radius follows the cameras' median distance; those seen by
+    at least two cameras are kept.
     """
     rng = np.random.default_rng(seed)
     focus = focus_point(cameras)
@@ -100,7 +100,7 @@ def random_points(
 
 
 def count_observing_views(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """Count, for (n, 3) points, the cameras whose image they fall into: (n,) int."""
+    """Count the cameras whose image contains each of (n, 3) points, (n,) int."""
     seen = np.zeros(len(points), np.int64)
     for camera in cameras:
         pixels, depth = camera.project(points)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Turn a distorted lens into a pinhole camera: the new intrinsics and where to sample the photo.
+"""Undistort photos: pinhole intrinsics of a lens model and the sampling map into the photo.
 
-Lens formulas are pycolmap's (its number-crunching only; the parameters are checked before, see
-:meth:`~..readers.source_model.LensCamera.problem`). The pinhole image shows the largest
+Lens formulas are pycolmap's; the parameters are validated before, see
+:meth:`~..readers.source_model.LensCamera.problem`. The pinhole image shows the largest
 axis-parallel rectangle, in normalised coordinates, that the photo fills without a black border.
 """
 
@@ -17,13 +17,13 @@ from ...errors import DatasetError
 from ..readers.source_model import LensCamera
 
 _MAX_SLOPE = math.tan(math.radians(65.0))
-"""Views wider than 130 degrees are cut: a plane image would waste its pixels on the rim."""
+"""Fields of view are limited to 130 degrees: a planar image would waste its pixels on the rim."""
 _MAX_GROWTH = 1.5
-"""The pinhole image is at most this many times larger a side than the photo."""
+"""Largest ratio of the pinhole image's side to the photo's."""
 _BORDER_SAMPLES = 200
 _CHUNK_PIXELS = 1 << 20
 _ROUND_TRIP_PX = 0.1
-"""A border pixel whose ray does not lead back within this lies beyond the lens model's range."""
+"""A border pixel whose unprojection and projection differ by more is outside the model's range."""
 
 
 def pinhole_of(camera: LensCamera) -> LensCamera:
@@ -50,7 +50,7 @@ def pinhole_of(camera: LensCamera) -> LensCamera:
 
 
 def sampling_map(camera: LensCamera, pinhole: LensCamera) -> np.ndarray:
-    """Return where each pixel of the pinhole image lies in the photo.
+    """Return the photo coordinates of each pixel of the pinhole image.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def _native(camera: LensCamera) -> Any:
 
 
 def _central_focal(camera: LensCamera) -> tuple[float, float]:
-    """Return pixels per unit slope at the optical axis: the pinhole's resolution there."""
+    """Return pixels per unit slope at the optical axis, the focal lengths of the pinhole."""
     step = 1e-4
     rays = np.array([[step, 0, 1], [-step, 0, 1], [0, step, 1], [0, -step, 1]], np.float64)
     pixels = _native(camera).img_from_cam(rays)
@@ -99,7 +99,7 @@ def _inner_rectangle(camera: LensCamera) -> tuple[float, float, float, float]:
     width, height = camera.width, camera.height
     along_x = np.linspace(0.0, width, _BORDER_SAMPLES)
     along_y = np.linspace(0.0, height, _BORDER_SAMPLES)
-    # The photo's border from pixel centre to pixel centre plus half a pixel is its whole area.
+    # Pixel coordinates 0 and width (height) are the outer borders of the photo's area.
     left = _slopes(camera, np.stack([np.zeros_like(along_y), along_y], 1))[:, 0].max()
     right = _slopes(camera, np.stack([np.full_like(along_y, width), along_y], 1))[:, 0].min()
     top = _slopes(camera, np.stack([along_x, np.zeros_like(along_x)], 1))[:, 1].max()
@@ -134,6 +134,6 @@ def _slopes(camera: LensCamera, pixels: np.ndarray) -> np.ndarray:
 def _unusable(camera: LensCamera) -> DatasetError:
     return DatasetError(
         f"The distortion of a {camera.model} camera ({camera.width} x {camera.height}) cannot be "
-        "removed: its parameters fold the picture.",
+        "removed: its parameters map several rays to one pixel.",
         "Solve the cameras again.",
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From posed photos to pinhole views: find, decode, bring upright, undistort, mask."""
+"""Prepare posed photos as pinhole views: find, decode, orient, undistort, mask."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from .undistort import pinhole_of, sampling_map
 
 MIN_PHOTO_SIDE_PX = 16
 _SMALLEST_MASKED_SHARE = 1e-4
-"""A mask that leaves less than this share of the pixels leaves nothing to learn from."""
+"""Smallest share of unmasked pixels; photos with less are not used."""
 
 
 @dataclass(frozen=True)
 class PreparedView:
-    """A photo that matches its pinhole camera, pose still in the world frame."""
+    """A photo that matches its pinhole camera; the pose is in the world frame."""
 
     name: str
     pinhole: LensCamera
@@ -52,7 +52,7 @@ class PreparedView:
 
 @dataclass
 class _Notes:
-    """What happened to single photos, for counted warnings."""
+    """Problems of single photos, collected for warnings with counts."""
 
     missing: list[str] = field(default_factory=list)
     bad: list[str] = field(default_factory=list)
@@ -73,10 +73,10 @@ def prepare_views(
     *,
     threads: int = 0,
 ) -> tuple[list[PreparedView], list[ReportWarning], dict[str, int]]:
-    """Make every posed photo a pinhole view; photos that fit already are used where they lie.
+    """Convert every posed photo to a pinhole view; photos that fit already are used in place.
 
-    Written files: ``work_folder/images/*.jpg`` (undistorted, or brought upright and to 8 bits) and
-    ``work_folder/masks/*.png``.
+    Written files: ``work_folder/images/*.jpg`` (undistorted, or oriented and converted to 8 bits)
+    and ``work_folder/masks/*.png``.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def prepare_views(
     Raises
     ------
     DatasetError
-        No photo found, more than a fifth undecodable, or sizes that do not match the cameras.
+        No photo was found, more than a fifth cannot be decoded, or sizes do not match the cameras.
     """
     threads = threads or default_threads()
     notes = _Notes()
@@ -141,7 +141,7 @@ def _prepare(
     maps: _MapCache,
     notes: _Notes,
 ) -> PreparedView | None:
-    """Prepare one photo; ``None`` where it cannot be used, which ``notes`` then says."""
+    """Prepare one photo; ``None`` if it cannot be used, which is recorded in ``notes``."""
     try:
         header = photo_header(path)
         if min(header.width, header.height) < MIN_PHOTO_SIDE_PX:
@@ -155,7 +155,7 @@ def _prepare(
         with notes.lock:
             notes.bad.append(f"{path.name} decodes to another size than its header says.")
         return None
-    # COLMAP reads pixels as they are stored; other programs turn them by EXIF first.
+    # COLMAP reads pixels as stored; other programs apply the EXIF orientation first.
     prefers_stored = model.kind == "COLMAP model"
     lens, upright, rescaled = fit_lens(posed, header, path.name, prefers_stored=prefers_stored)
     color, alpha = photo.color, photo.alpha
@@ -189,7 +189,7 @@ def _prepare(
 
 
 def _is_plain(photo: DecodedPhoto, header: PhotoHeader) -> bool:
-    """Whether the file as it lies shows the prepared pixels to every program."""
+    """Whether every program reads the prepared pixels from the original file."""
     return photo.plain and header.orientation == 1
 
 
@@ -201,16 +201,16 @@ def fit_lens(
     Returns
     -------
     lens : LensCamera
-        Of exactly the photo's size.
+        Intrinsics for exactly the photo's size.
     upright : bool
         Whether the EXIF orientation has to be applied.
     rescaled : bool
-        Whether the photo is a scaled copy of what the input describes.
+        Whether the photo is a scaled copy of the one described by the input.
 
     Raises
     ------
     DatasetError
-        The photo has other proportions than its camera.
+        The photo's aspect ratio differs from its camera's.
     """
     stored, upright = (header.width, header.height), header.upright_size
     if posed.lens is None:
@@ -238,7 +238,7 @@ def fit_lens(
 
 
 def _same_proportions(size: tuple[int, int], lens: LensCamera) -> bool:
-    """Whether ``size`` is the camera's size times one factor, up to rounding to whole pixels."""
+    """Whether ``size`` is the camera's size times a factor, up to rounding to whole pixels."""
     tolerance = lens.width + lens.height
     return abs(size[0] * lens.height - size[1] * lens.width) < tolerance
 
@@ -295,7 +295,7 @@ def _resized_mask(mask: np.ndarray, shape: tuple[int, ...], path: Path) -> np.nd
 
 
 class _MapCache:
-    """Sampling maps of the last lenses; photos of one lens share one."""
+    """Cache of sampling maps, shared by photos of the same lens."""
 
     _MAX_MAPS = 2
 
@@ -304,7 +304,7 @@ class _MapCache:
         self._maps: dict[LensCamera, np.ndarray] = {}
 
     def get(self, lens: LensCamera, pinhole: LensCamera) -> np.ndarray:
-        # The lock is held while computing: two threads would compute the same map.
+        # Hold the lock while computing: two threads would compute the same map otherwise.
         with self._lock:
             if lens not in self._maps:
                 while len(self._maps) >= self._MAX_MAPS:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a photo's EXIF says about the lens: which photos share it, and its focal length."""
+"""Read lens identity and focal length from a photo's EXIF."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _PLANE_X, _PLANE_UNIT, _PIXELS_X = 0xA20E, 0xA210, 0xA002
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _PLAUSIBLE = (0.2, 30.0)
-"""Focal length over the photo's long side; anything else is a wrong entry."""
+"""Plausible range of the focal length over the photo's long side."""
 
 
 @dataclass(frozen=True)
 class LensExif:
-    """Identity of the lens setting and its focal length in pixels, where it is known."""
+    """Identity of the lens setting and its focal length in pixels, if known."""
 
     key: tuple[str, ...]
     focal_px: float | None
@@ -42,7 +42,7 @@ def read_lens_exif(path: Path, width: int, height: int) -> LensExif:
     longest = max(width, height)
     focal_px = 0.0
     if focal_35:
-        # The 35 mm equivalent keeps the diagonal's field of view (CIPA DCG-001).
+        # The 35 mm equivalent preserves the diagonal field of view (CIPA DCG-001).
         focal_px = focal_35 * math.hypot(width, height) / _DIAGONAL_35MM
     elif focal_mm:
         unit_mm = _UNIT_MM.get(int(_positive(tags.get(_PLANE_UNIT)) or 2), 25.4)

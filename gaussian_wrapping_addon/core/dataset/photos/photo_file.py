@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 JPEG_QUALITY = 97
-"""For photos that we write: no visible loss, a fifth of a PNG's size."""
+"""Of written photos: no visible loss, a fifth of a PNG's size."""
 
 MASK_THRESHOLD = 128
 """Mask pixels darker than this are ignored."""
@@ -32,9 +32,9 @@ class DecodedPhoto:
     color: np.ndarray
     """(h, w, 3) uint8."""
     alpha: np.ndarray | None
-    """(h, w) uint8, where the file has transparency."""
+    """(h, w) uint8, if the file has transparency."""
     plain: bool
-    """Whether every other program shows these very pixels: 8-bit, RGB or grey, no rotation."""
+    """Whether every program reads exactly these pixels: 8-bit, RGB or grey, no rotation."""
 
 
 def photo_header(path: Path) -> PhotoHeader:
@@ -70,7 +70,7 @@ def read_photo(path: Path, *, upright: bool = True) -> DecodedPhoto:
 
 
 def read_mask(path: Path, *, upright: bool = True) -> np.ndarray:
-    """Decode a mask to (h, w) uint8; where only the alpha varies, the alpha is the mask.
+    """Decode a mask to (h, w) uint8; if only the alpha varies, it is the mask.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def read_mask(path: Path, *, upright: bool = True) -> np.ndarray:
 
 
 def apply_orientation(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Turn and mirror stored pixels (h, w, ...) upright, by the EXIF rule 1 to 8."""
+    """Rotate and mirror stored pixels (h, w, ...) upright by the EXIF orientation, 1 to 8."""
     if orientation in (5, 6, 7, 8):
         pixels = pixels.swapaxes(0, 1)
     if orientation in (2, 3, 6, 7):
@@ -142,7 +142,7 @@ def _to_arrays(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _grey_to_eight_bits(values: np.ndarray) -> np.ndarray:
-    """Bring 16-bit, 32-bit or float grey to 8 bits: full range of 16 bits, else of the values."""
+    """Scale 16-bit, 32-bit or float grey to 8 bits: full range of 16 bits, else of the values."""
     if values.dtype.kind == "f":
         values = np.nan_to_num(np.asarray(values, np.float64))
         top = 1.0 if values.max() <= 1.0 else 255.0

@@ -24,7 +24,7 @@ _MAX_DEPTH = 8
 
 
 def list_photos(root: Path) -> list[Path]:
-    """List photo files under ``root``, sorted by name; folders of masks and hidden ones are left.
+    """List photo files under ``root``, sorted by name, without masks and hidden folders.
 
     Links to files are followed, links to folders are not (they could form a loop).
 
@@ -58,7 +58,7 @@ def list_photos(root: Path) -> list[Path]:
 
 
 def count_raw_photos(root: Path) -> int:
-    """Count the files of cameras and phones under ``root`` that must be developed first."""
+    """Count the camera RAW and HEIC files under ``root``, which must be converted first."""
     return sum(
         PurePosixPath(name).suffix.lower() in RAW_SUFFIXES
         for _, _, names in os.walk(root)
@@ -88,7 +88,7 @@ class PhotoIndex:
     Parameters
     ----------
     roots : list of Path
-        Names are tried under each of them as they are, then by looser rules under the first.
+        Names are looked up exactly under each of them, then by looser rules under the first.
     """
 
     def __init__(self, roots: list[Path]) -> None:
@@ -106,7 +106,7 @@ class PhotoIndex:
         return table
 
     def find(self, name: str) -> Match | None:
-        """Return the photo of ``name``; looser rules only where they leave one candidate."""
+        """Return the photo of ``name``; looser rules apply only if they give one candidate."""
         for root in self.roots:
             path = resolve_inside(root, name)
             if path is not None and path.is_file():
@@ -125,7 +125,7 @@ class PhotoIndex:
 
 
 def _keys(name: str) -> list[tuple[str, str]]:
-    """Return what a name is compared by, strictest first."""
+    """Return the keys by which a name is matched, strictest first."""
     folded = unicodedata.normalize("NFC", name).casefold()
     stem = str(PurePosixPath(folded).with_suffix("")) if PurePosixPath(folded).name else folded
     return [

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Size and EXIF orientation of a photo from its first bytes, without decoding it.
+"""Read size and EXIF orientation of a photo from its header, without decoding it.
 
 JPEG and PNG are parsed here, so that a Python with numpy alone (Blender's) can check an input;
-other formats are asked of Pillow where it is installed.
+other formats are read by Pillow if it is installed.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def _read_png(stream: IO[bytes]) -> PhotoHeader:
 
 
 def _exif_orientation(body: bytes) -> int:
-    """Find the orientation in a TIFF block; anything odd counts as "as stored"."""
+    """Return the orientation in a TIFF block; 1 ("as stored") if it is missing or invalid."""
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(body[:4])
     if order is None:
         return 1

@@ -22,9 +22,9 @@ class PhotoStore:
     """Photos, masks and matching cameras of a scene's views, read on demand and cached.
 
     The base level (divisor 1) is the photo with its long side limited to ``max_image_px``;
-    divisor d averages d x d base pixels, cutting off what is left at the right and lower border,
+    divisor d averages d x d base pixels and crops incomplete blocks at the right and lower border,
     so that the camera of a level is exactly the base camera with intrinsics divided by d.
-    Safe to use from several threads.
+    Thread-safe.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class PhotoStore:
     max_image_px : int
         Long side of the base level, pixels.
     memory_bytes : int
-        Bound of the cache; one photo is kept even where it alone is larger.
+        Limit of the cache; one photo is kept even if it alone is larger.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class PhotoStore:
         Raises
         ------
         DatasetError
-            The file was changed or removed since the scene was made.
+            The file was changed or removed after the scene was made.
         """
         return self._cached(("photo", index, divisor), lambda: self._make_photo(index, divisor))
 
@@ -95,7 +95,7 @@ class PhotoStore:
             return _average(self.photo(index), divisor)
         view, base = self._views[index], self._base[index]
         self._check_size(view.photo_path, view.camera)
-        # The scene's photos show the right pixels as stored: none relies on an EXIF rotation.
+        # Photos of a scene are stored upright: none relies on an EXIF rotation.
         color = read_photo(view.photo_path, upright=False).color
         if (base.width, base.height) == (view.camera.width, view.camera.height):
             return color
@@ -139,7 +139,7 @@ class PhotoStore:
             if key in self._cache:
                 self._cache.move_to_end(key)
                 return self._cache[key]
-        made = make()  # outside the lock: decoding takes long, and levels ask for the base
+        made = make()  # outside the lock: decoding is slow, and levels call for the base
         made.setflags(write=False)
         with self._lock:
             if key not in self._cache:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which photos are matched with which."""
+"""Choose the pairs of photos to match."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _MAX_VIEW_ANGLE_COS = np.cos(np.radians(60.0))
 def pairs_by_order(count: int) -> list[tuple[int, int]]:
     """Return pairs (i < j) of ``count`` photos sorted by name.
 
-    Small sets: all. Large sets: neighbours in the order, neighbours at growing powers of two, and
-    all pairs among evenly chosen keyframes, which close loops.
+    Small sets: all pairs. Large sets: sequential neighbours, neighbours at powers of two, and all
+    pairs of evenly spaced keyframes for loop closure.
     """
     if count <= EXHAUSTIVE_LIMIT:
         return [(i, j) for i in range(count) for j in range(i + 1, count)]
@@ -31,7 +31,7 @@ def pairs_by_order(count: int) -> list[tuple[int, int]]:
 
 
 def pairs_by_pose(centers: np.ndarray, forwards: np.ndarray) -> list[tuple[int, int]]:
-    """Return pairs (i < j) of posed photos that are near each other and look the same way.
+    """Return pairs (i < j) of posed photos with similar positions and viewing directions.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Solve camera poses from photos, or start points from posed photos, in a helper process.
+"""Solve camera poses, or triangulate points of posed photos, in a helper process.
 
-The photos are decoded here, brought upright, limited in size and written under plain names; the
-native solver sees only these files. Its result is a COLMAP model read by our own reader.
+The photos are decoded here, oriented, limited in size and written under plain names; the native
+solver reads only these files. Its result is a COLMAP model read by our own reader.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from ..readers.source_model import PosedPhoto, SourceModel
 from .match_pairs import pairs_by_order, pairs_by_pose
 
 MAX_SIFT_PX = 1600
-"""Long side of the photos that features are searched in."""
+"""Long side of the photos that features are extracted from."""
 MAX_UNREADABLE_SHARE = 0.2
-"""More undecodable photos than this refuse the data set."""
+"""Largest share of photos that cannot be decoded; with more, loading fails."""
 _HELPER = "dataset.poses.pose_solver_helper"
 _MEMORY_SHARE = 0.9
 _MIN_MEMORY_BYTES = 8 << 30
-"""The limit counts reserved addresses too; below this the solver's threads may not even start."""
+"""The limit includes reserved address space; below this the solver's threads may not start."""
 
 
 @dataclass(frozen=True)
 class _SolverPhoto:
-    """One photo as the solver sees it."""
+    """One photo as passed to the solver."""
 
     name: str
     """Name under ``images/`` of the task folder."""
@@ -83,14 +83,14 @@ def solve_poses(
     Returns
     -------
     SourceModel
-        Photos that could not be placed are left out, with a counted warning. World is the
-        solver's own frame. The same for the same seed with one thread; with more, the native
-        matcher has been seen to differ once in about 60 runs.
+        Photos that could not be registered are left out, with a warning. World is the solver's own
+        frame. Reproducible for the same seed with one thread; with more, the native matcher
+        differed once in about 60 runs.
 
     Raises
     ------
     DatasetError
-        Too few photos decode, or fewer than ``MIN_IMAGES`` can be placed.
+        Too few photos can be decoded, or fewer than ``MIN_IMAGES`` can be registered.
     """
     folder = _fresh_folder(work_folder)
     prepared: list[_SolverPhoto] = []
@@ -144,7 +144,7 @@ def _with_source_names(
     bad: list[str],
     offered: int,
 ) -> SourceModel:
-    """Give the solved photos their own names and full-size intrinsics."""
+    """Restore original names and full-size intrinsics of the solved photos."""
     of_name = {p.name: (p, name) for p, name in zip(prepared, names, strict=True)}
     photos: list[PosedPhoto] = []
     for posed in model.photos:
@@ -195,7 +195,7 @@ def triangulate_points(
     seed: int = 0,
     threads: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangulate features of photos whose pinhole cameras are known and stay fixed.
+    """Triangulate features of photos with known, fixed pinhole cameras.
 
     Returns
     -------
@@ -247,7 +247,7 @@ def check_unreadable_share(bad: Sequence[str], offered: int) -> None:
 def _write_solver_photo(
     folder: Path, index: int, decoded: DecodedPhoto, source: Path | None, mask: Path | None
 ) -> _SolverPhoto:
-    """Write one upright photo of limited size; ``source`` is asked for its lens."""
+    """Write one upright photo of limited size; the lens is read from the EXIF of ``source``."""
     from PIL import Image
 
     full_height, full_width = decoded.color.shape[:2]
@@ -290,6 +290,6 @@ def _save_model(folder: Path, work_folder: Path) -> None:
 
 
 def _memory_limit_bytes() -> int | None:
-    """Return a share of the machine's memory, or ``None`` where it is not known."""
+    """Return a share of the machine's memory, or ``None`` if unknown."""
     total = total_memory_bytes()
     return max(int(_MEMORY_SHARE * total), _MIN_MEMORY_BYTES) if total else None

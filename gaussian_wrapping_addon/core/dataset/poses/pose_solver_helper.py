@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Helper process of :mod:`.pose_solver`: features, matching, mapping or triangulation (pycolmap).
+"""Helper process of :mod:`.pose_solver`: feature extraction, matching, mapping, triangulation.
 
 Reads ``task.json``, ``images/`` and ``masks/`` of its folder, writes ``model/`` (COLMAP binary).
 """
@@ -16,22 +16,22 @@ from ...files import read_json
 from ...processes.helper_process import emit
 
 DEFAULT_FOCAL_FACTORS = (1.2, 0.85, 1.7, 2.5)
-"""Focal lengths over the long side that are tried where EXIF gives none, the commonest first."""
+"""Focal lengths over the long side to try if EXIF gives none, the most common first."""
 _MIN_REGISTERED_SHARE = 0.8
-"""Share of placed photos at which no other focal length is tried."""
+"""Share of registered photos at which no other focal length is tried."""
 _LENIENT_REGISTERED_SHARE = 0.5
-"""Share of placed photos below which weaker evidence is accepted for a first pair and for poses."""
+"""Share of registered photos below which thresholds for the first pair and poses are relaxed."""
 _MAX_FEATURES = 8192
 _MAX_FEATURES_POSED = 4096
 _MATCHING_BLOCKS = 3
 _MATCHING_BLOCK_PAIRS = 1500
-"""Every block builds the search index of each of its photos anew: few, large blocks are quick."""
+"""Every block rebuilds the search index of each of its photos: few, large blocks are faster."""
 
 _EXTRACT_END, _MATCH_END = 0.5, 0.85
 
 
 def main(folder: Path) -> None:
-    """Do the task of ``folder``."""
+    """Run the task of ``folder``."""
     import pycolmap
 
     pycolmap.logging.minloglevel = 1
@@ -112,7 +112,7 @@ def _extract(
     done = 0
     for camera_id, names in names_of_camera.items():
         reader.existing_camera_id = camera_id
-        # Entered in order first: extraction would number the photos as its threads finish.
+        # Import in order first: extraction would number the photos as its threads finish.
         pycolmap.import_images(
             database,
             folder / "images",
@@ -205,7 +205,7 @@ def _map(folder: Path, database: Path, task: dict[str, Any], total: int, *, leni
     found = pycolmap.incremental_mapping(
         database, folder / "images", output, options, next_image_callback=next_photo
     )
-    # Ties go to the model found first, whatever the order of the dictionary.
+    # Of equally large models, take the first, independent of the dictionary's order.
     ordered = [found[key] for key in sorted(found)]
     return max(ordered, key=lambda model: model.num_reg_images(), default=None)
 
@@ -241,7 +241,7 @@ def _triangulate(folder: Path, task: dict[str, Any]) -> None:
             posed.add_image_with_trivial_frame(image, pose)
     emit(fraction=_MATCH_END, message="triangulating points")
     options = _mapping_options(task["seed"])
-    # Poses must stay what the input says: bundle adjustment may move points only.
+    # Keep the poses of the input: bundle adjustment may move points only.
     solved = pycolmap.triangulate_points(
         posed, database, folder / "images", folder, clear_points=True, options=options
     )

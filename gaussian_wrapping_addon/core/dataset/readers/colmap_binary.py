@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Bounded reader of COLMAP's binary files: every count is checked against the bytes left.
 
-The common reader of the ecosystem loops for ever on a file cut inside a name and accepts NaN,
-so the format is read here, straight from its description.
+The commonly used reader loops forever on a file truncated inside a name and accepts NaN, so the
+format is read here, following its specification.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _POINT2D_BYTES = 24
 _POINT_BYTES = 51
 _TRACK_BYTES = 8
 _LONGEST_NAME_BYTES = 64 * 1024
-"""Names are judged later; beyond this the file is no model."""
+"""Names are validated later; with a longer one the file is not a model."""
 
 EQUIRECTANGULAR = 17
 
 
 @dataclass(frozen=True)
 class RawImage:
-    """One image record, not yet judged: values may be NaN, the name may be unsafe."""
+    """One image record before validation: values may be NaN, the name may be unsafe."""
 
     image_id: int
     quaternion: np.ndarray
@@ -61,7 +61,7 @@ class RawPoints:
 
 
 class _Cursor:
-    """A position in a file's bytes that never passes the end."""
+    """A bounds-checked read position in a file's bytes."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -88,7 +88,7 @@ class _Cursor:
         return values
 
     def count(self, record_bytes: int, most: int, what: str) -> int:
-        """Read a 64-bit count and refuse one that the rest of the file cannot hold."""
+        """Read a 64-bit count; raise if the rest of the file cannot hold as many records."""
         (number,) = self.take(_COUNT, f"the number of {what}")
         if number > self.left // record_bytes:
             self.at -= _COUNT.size
@@ -155,7 +155,7 @@ def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]
 def add_camera(
     cameras: dict[int, LensCamera], camera_id: int, camera: LensCamera, path: Path, place: str
 ) -> None:
-    """Put a camera into ``cameras``, or raise :class:`ParseError` saying what is wrong with it."""
+    """Add a camera to ``cameras``; raise :class:`ParseError` if it is invalid."""
     problem = camera.problem()
     if problem:
         raise ParseError(path, place, f"{problem}.", "Solve the cameras again.")
@@ -165,7 +165,7 @@ def add_camera(
 
 
 def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
-    """Read ``images.bin``; the 2D points are passed over.
+    """Read ``images.bin``; the 2D points are skipped.
 
     Raises
     ------
@@ -195,7 +195,7 @@ def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
 
 
 def read_points(path: Path) -> tuple[RawPoints, list[ReportWarning]]:
-    """Read ``points3D.bin``; tracks are passed over, their lengths kept.
+    """Read ``points3D.bin``; tracks are skipped, their lengths kept.
 
     Raises
     ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Find and read a COLMAP model: choose the submodel, judge every image, keep what is usable."""
+"""Find and read a COLMAP model: choose the submodel, validate images, keep usable ones."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class ModelFiles:
 def find_models(source: Path) -> list[ModelFiles]:
     """List the models under ``source``: in ``sparse/0..``, ``sparse`` and ``source`` itself.
 
-    Binary files come before text files of the same folder; the layouts are searched in this order
-    and the first that holds a model ends the search.
+    Binary files are preferred to text files of the same folder; the layouts are searched in this
+    order, up to the first that holds a model.
     """
     for layout in _LAYOUTS:
         root = source / layout
@@ -70,15 +70,15 @@ def read_colmap(source: Path) -> SourceModel:
     Raises
     ------
     DatasetError
-        No model, or no usable image in it.
+        There is no model, or it has no usable image.
     ParseError
-        A file is cut or broken, with the byte or line.
+        A file is truncated or broken; names the byte or line.
     """
     models = find_models(source)
     if not models:
         raise DatasetError(
             f"{source.name} holds no COLMAP model.",
-            "Wanted: cameras, images and points3D (.bin or .txt) in sparse/0, sparse or here.",
+            "Expected: cameras, images and points3D (.bin or .txt) in sparse/0, sparse or here.",
         )
     warnings: list[ReportWarning] = []
     chosen = models[0]
@@ -113,7 +113,7 @@ def read_colmap(source: Path) -> SourceModel:
 def _largest(
     models: list[ModelFiles], warnings: list[ReportWarning]
 ) -> tuple[ModelFiles, list[int]]:
-    """Return the model with most images; a broken one counts as empty unless all are broken."""
+    """Return the model with most images; broken ones count as empty unless all are broken."""
     counts, failure = [], None
     for model in models:
         try:
@@ -193,7 +193,7 @@ def _usable_photos(
     cameras: dict[int, LensCamera],
     warnings: list[ReportWarning],
 ) -> list[PosedPhoto]:
-    """Keep images with a safe name, a known camera and a finite pose; say what was left out."""
+    """Keep images with a safe name, a known camera and a finite pose; warn about the others."""
     photos: list[PosedPhoto] = []
     dropped: dict[str, list[str]] = {}
     seen_ids: set[int] = set()

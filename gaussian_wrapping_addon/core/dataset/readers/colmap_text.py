@@ -30,7 +30,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         number = 0
         while raw := stream.readline(limits.MAX_LINE_BYTES * 64 + 1):
             number += 1
-            # The second line of an image lists its 2D points and may honestly be long.
+            # The second line of an image lists its 2D points and can be very long.
             if len(raw) > limits.MAX_LINE_BYTES * 64:
                 raise ParseError(path, f"line {number}", "the line is too long.", _AGAIN)
             if number == 1 and raw.startswith(b"\xef\xbb\xbf"):
@@ -96,7 +96,7 @@ def read_cameras(path: Path) -> tuple[dict[int, LensCamera], list[ReportWarning]
 
 
 def read_images(path: Path) -> tuple[list[RawImage], list[ReportWarning]]:
-    """Read ``images.txt``: two lines an image, of which the second may be empty.
+    """Read ``images.txt``: two lines per image, of which the second may be empty.
 
     Where a second line was left out, the next line is not a list of 2D points (triples of
     numbers); such a file is read with a warning instead of losing every second image.

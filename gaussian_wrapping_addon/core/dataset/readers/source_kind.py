@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tell what kind of input a path is, where its photos lie, and read its poses if it has any."""
+"""Detect the kind of an input, locate its photos, and read its poses if it has any."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ _WANTED = (
 
 
 SPLAT = "splat"
-"""Kind of a 3D Gaussian splat as an input of its own, without photos."""
+"""Kind of an input that is a 3D Gaussian splat without photos."""
 
 
 @dataclass(frozen=True)
 class SourceKind:
-    """What an input is."""
+    """Kind and location of an input."""
 
     kind: str
     """``"COLMAP model"``, ``"transforms.json"``, ``"photos"`` or ``"splat"``."""
     folder: Path
     """Folder that names in the input are relative to."""
     transforms: Path | None
-    """The transforms file, also where a COLMAP model is preferred to it."""
+    """The transforms file, also if a COLMAP model is preferred to it."""
 
     @property
     def photo_roots(self) -> list[Path]:
         """Folders that photo names may be relative to, in order of preference."""
         roots = [photo_root(self.folder), self.folder]
-        # The model folder itself was given: photos lie beside "sparse".
+        # The input is the model folder itself: photos are beside "sparse".
         if self.folder.name == "sparse":
             roots.append(photo_root(self.folder.parent))
         elif self.folder.parent.name == "sparse":
@@ -58,7 +58,7 @@ class SourceKind:
 
 
 def source_kind(source: Path) -> SourceKind:
-    """Detect the kind of input; a COLMAP model wins over transforms.json, both over photos.
+    """Detect the kind of input; prefers a COLMAP model to transforms.json, both to photos.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def read_poses(kind: SourceKind) -> SourceModel:
     ParseError, DatasetError
     """
     if kind.kind == SPLAT:
-        raise DatasetError("A splat holds no cameras.", "Give the input that it was trained on.")
+        raise DatasetError("A splat contains no cameras.", "Give the input that it was trained on.")
     if kind.kind == "COLMAP model":
         return read_colmap(kind.folder)
     assert kind.transforms is not None

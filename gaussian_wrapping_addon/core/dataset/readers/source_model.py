@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Posed photos as an input states them: lens models, poses, sparse points, before any photo."""
+"""Posed photos as described by an input: lens models, poses and sparse points."""
 
 from __future__ import annotations
 
@@ -148,17 +148,17 @@ class PosedPhoto:
 
     name: str
     lens: LensCamera | None
-    """``None`` until the photo's own size completes the intrinsics (``angle_x`` is then set)."""
+    """``None`` if the photo's size is needed to complete the intrinsics (``angle_x`` is set)."""
     cam_from_world: np.ndarray
     """(3, 4) float64, COLMAP axes (x right, y down, z forward)."""
     mask_name: str | None = None
     angle_x: float | None = None
-    """Horizontal field of view in radians, where the input gives nothing else."""
+    """Horizontal field of view in radians, if the input gives nothing else."""
 
 
 @dataclass(frozen=True)
 class SourceModel:
-    """Everything an input says about cameras and points, world frame, float64."""
+    """Cameras and points of an input, world frame, float64."""
 
     kind: str
     """``"COLMAP model"``, ``"transforms.json"`` or ``"photos"``."""

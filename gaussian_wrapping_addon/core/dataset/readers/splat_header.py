@@ -54,7 +54,7 @@ class SplatHeader:
 
 
 def is_splat_path(path: Path) -> bool:
-    """Tell by its suffix whether a file may be a splat; refuse formats that are not read.
+    """Tell by its suffix whether a file may be a splat; raise for unsupported splat formats.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def is_splat_path(path: Path) -> bool:
     suffix = path.suffix.lower()
     if suffix in OTHER_FORMATS:
         raise DatasetError(
-            f"{path.name} is a splat in the format {OTHER_FORMATS[suffix]}, which is not read.",
+            f"{path.name} is a splat in {OTHER_FORMATS[suffix]} format, which is not supported.",
             _UNPACK,
         )
     return suffix == ".ply"
@@ -76,15 +76,15 @@ def read_splat_header(path: Path) -> SplatHeader:
     Raises
     ------
     ParseError
-        Not a splat: names what is missing and what is expected; compressed variants are named.
+        The file is not a splat (names the missing property), or a compressed variant.
     DatasetError
-        By its suffix another splat format.
+        The suffix is that of another splat format.
     """
     is_splat_path(path)
     ply = read_ply_header(path, EXPECTED)
     elements = {element.name: element for element in ply.elements}
     if "chunk" in elements or any("packed" in n for e in ply.elements for n in e.names):
-        raise ParseError(path, "header", "a compressed splat PLY, which is not read.", _UNPACK)
+        raise ParseError(path, "header", "a compressed splat PLY is not supported.", _UNPACK)
     if "vertex" not in elements:
         raise ParseError(path, "header", "the element vertex is missing.", EXPECTED)
     if ply.elements[0].name != "vertex":
@@ -122,7 +122,7 @@ def _degree(path: Path, names: set[str]) -> int:
 
 
 def _described(elements: Container[str], names: set[str]) -> str:
-    """Say in a word what a PLY without Gaussians is."""
+    """Describe a PLY without Gaussians."""
     if "face" in elements:
         return "a mesh"
     return "a point cloud" if {"x", "y", "z"} <= names else "another PLY"

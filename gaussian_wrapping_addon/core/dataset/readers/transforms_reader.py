@@ -55,7 +55,7 @@ def read_transforms(path: Path) -> SourceModel:
     Raises
     ------
     ParseError
-        Names the entry, such as ``frames[3].transform_matrix``.
+        An entry is invalid; names it, such as ``frames[3].transform_matrix``.
     DatasetError
         No usable frame.
     """
@@ -173,7 +173,7 @@ def _pose(path: Path, place: str, value: Any) -> tuple[np.ndarray, bool]:
 def _intrinsics(
     path: Path, place: str, values: dict[str, Any]
 ) -> tuple[LensCamera | None, float | None]:
-    """Return the lens, or ``None`` and the angle where the photo's size has to complete it."""
+    """Return the lens, or ``None`` and the angle if the photo's size is needed to complete it."""
 
     def number(key: str) -> float | None:
         return _number(path, place, values, key)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Questions answered in the worker's Python: estimate, evaluate, export, doctor."""
+"""Commands that run in the worker's Python: estimate, evaluate, export, work on tiles, doctor."""

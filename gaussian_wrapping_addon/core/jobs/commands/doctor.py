@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Findings about an environment: can this Python run a worker, and what is missing."""
+"""Diagnose a Python environment: whether it can run a worker, and what is missing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REQUIRED = {
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One line of the doctor: ``good`` tells whether it stands in the way of a job."""
+    """One finding; ``good`` is false if it prevents jobs from running."""
 
     subject: str
     good: bool
@@ -42,7 +42,7 @@ class Diagnosis:
 
 
 def diagnose(folder: str = ".") -> list[Diagnosis]:
-    """Examine the interpreter that runs this."""
+    """Diagnose the running interpreter."""
     found = [
         Diagnosis(
             "Python",
@@ -67,7 +67,7 @@ def diagnose(folder: str = ".") -> list[Diagnosis]:
 
 
 def _packages() -> list[Diagnosis]:
-    """Compare every pinned package with the list, and import it."""
+    """Import every pinned package and compare its version with the list."""
     modules = {package: module for module, package in REQUIRED.items()}
     found = []
     for requirement in read_requirements(requirements_file()):
@@ -80,13 +80,13 @@ def _packages() -> list[Diagnosis]:
             found.append(Diagnosis(name, False, f"cannot be imported: {error}", hint))
             continue
         good = requirement.allows(version)
-        wanted = "" if good else f", but {requirement.versions} is wanted"
+        wanted = "" if good else f", but {requirement.versions} is required"
         found.append(Diagnosis(name, good, f"{version}{_build(module)}{wanted}", hint))
     return found
 
 
 def _build(module: Any) -> str:
-    """Return for which device torch was built; nothing for other packages."""
+    """Return the device that torch was built for; empty for other packages."""
     if getattr(module, "__name__", "") != "torch":
         return ""
     cuda = getattr(module.version, "cuda", None)
@@ -96,7 +96,7 @@ def _build(module: Any) -> str:
 def _device() -> Diagnosis:
     try:
         import torch
-    except Exception:  # the line of torch says what it is
+    except Exception:  # reported by the finding about torch
         return Diagnosis("Device", False, "torch is missing", "Press Set Up Worker.")
     if torch.cuda.is_available():
         return Diagnosis(
@@ -118,7 +118,7 @@ def _memory() -> Diagnosis:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the findings about this interpreter to stdout, one JSON object a line."""
+    """Write the findings about this interpreter to stdout, one JSON object per line."""
     findings = diagnose(arguments[0] if arguments else ".")
     for finding in findings:
         emit(**asdict(finding))
@@ -126,12 +126,12 @@ def main(arguments: list[str]) -> int:
 
 
 def diagnose_worker(python: str) -> list[Diagnosis]:
-    """Examine another interpreter, in a child process.
+    """Diagnose another interpreter, in a child process.
 
     Raises
     ------
     WorkerError
-        The interpreter does not start or gives no answer.
+        The interpreter does not start or reports nothing.
     """
     try:
         command = child_command("jobs.commands.doctor", python=python)
@@ -150,14 +150,14 @@ def diagnose_worker(python: str) -> list[Diagnosis]:
     if not findings:
         error_lines = error_output.strip().splitlines()
         raise WorkerError(
-            f"{python} gave no answer: {error_lines[-1] if error_lines else 'no output'}.",
+            f"{python} reported nothing: {error_lines[-1] if error_lines else 'no output'}.",
             "Press Set Up Worker, or choose a Python 3.11 or newer with the worker's packages.",
         )
     return findings
 
 
 def find_and_diagnose(preference: str = "") -> list[Diagnosis]:
-    """Examine the interpreter that jobs would use; where there is none, say what to do."""
+    """Diagnose the interpreter that jobs would use; without one, return the next step."""
     from ..client import worker_python
 
     try:

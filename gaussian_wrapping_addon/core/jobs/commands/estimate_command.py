@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``estimate`` of the command line: what a training will take, told by the worker's Python.
+"""The ``estimate`` command in the worker's Python: time, memory and disk of a training.
 
-Speaks as :mod:`~.evaluate_command` does: one JSON object a line on stdout.
+Writes one JSON object per line to stdout, in the protocol of :mod:`~.evaluate_command`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _estimate(job: JobFile) -> list[str | ReportWarning]:
 
 
 def input_facts(source: Path) -> SceneFacts:
-    """Return the facts of an input, read from headers and poses alone.
+    """Return number and size of an input's photos and points, from headers and poses alone.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def input_facts(source: Path) -> SceneFacts:
         try:
             sizes.append(photo_header(path).upright_size)
         except DatasetError:
-            continue  # loading leaves it out, or refuses, with words
+            continue  # loading leaves it out with a warning, or raises
     if not sizes:
         raise DatasetError(
             f"{source} holds no photo that can be read.", "See what batch.py check finds."

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``estimate-mesh`` of the command line: what a region's mesh will take, from a finished training.
+"""The ``estimate-mesh`` command in the worker's Python: triangles, time and memory of a mesh.
 
-Runs in the worker's Python. Speaks as :mod:`~.evaluate_command` does: one JSON object a line on
-stdout.
+Needs a finished training. Writes one JSON object per line to stdout, in the protocol of
+:mod:`~.evaluate_command`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..store.stage_folder import read_done
 from .worker_call import run_command
 
 MAX_VIEWS = 24
-"""Photos whose cameras look for the surface: more cover little more of it."""
+"""Maximum number of cameras that sample the surface: more cover little more of it."""
 MAX_DEPTH_SAMPLES = 60_000
 
 
@@ -34,7 +34,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _newest_stage(stages: Path, name: str) -> Path:
-    """Return the stage that was finished last."""
+    """Return the folder of the stage that was finished last."""
     done = [(values["finished_unix_s"], path) for path in sorted(stages.glob(f"{name}-*"))
             if (values := read_done(path)) is not None]  # fmt: skip
     if not done:
@@ -68,7 +68,7 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
         region = automatic_region(scene) if automatic else whole_region(scene, arrays)
     cameras = scene.cameras[:: max(1, -(-len(scene.cameras) // MAX_VIEWS))]
     edge_length = meshing.edge_length / scene.world_from_scene.scale
-    notes = checked_request(edge_length, meshing.points, region).notes  # refuses before any work
+    notes = checked_request(edge_length, meshing.points, region).notes  # raises before any work
     depth_samples = sample_depth_maps(
         gaussians, cameras, lambda points: region.contains(points, 0.0), Progress(),
         most=MAX_DEPTH_SAMPLES, threads=threads,

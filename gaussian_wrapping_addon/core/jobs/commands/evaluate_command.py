@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``evaluate`` of the command line: judges a mesh or a job in the worker's Python.
+"""The ``evaluate`` command: score a mesh or a job in the worker's Python.
 
-The caller's side needs neither scipy nor libigl; the child reports on stdout, one JSON object a
-line: ``{"message"}`` while it works, ``{"line"}`` for the table, ``{"warning", "code"}``,
+The parent process needs neither scipy nor libigl. The child writes one JSON object per line to
+stdout: ``{"message"}`` for progress, ``{"line"}`` for the table, ``{"warning", "code"}``, and
 ``{"error", "hint"}`` at the end.
 """
 
@@ -49,7 +49,7 @@ def run_in_worker(
     module: str = "jobs.commands.evaluate_command",
     what: str = "evaluation",
 ) -> int:
-    """Start the child, show what it says, and return its exit code.
+    """Run a command in a child process, log its output, and return its exit code.
 
     Parameters
     ----------
@@ -59,12 +59,12 @@ def run_in_worker(
     python : str
         The worker's interpreter.
     module, what : str
-        The child's module, and what errors call it: others speak the same way.
+        The child's module, and its name in errors; all commands use the same protocol.
 
     Raises
     ------
     WorkerError
-        It does not start, or ends without a word.
+        It does not start, or ends without reporting an error.
     """
     text = json.dumps(request, allow_nan=False)
     with tempfile.TemporaryFile() as error_file:
@@ -93,13 +93,13 @@ def run_in_worker(
             reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
             raise WorkerError(
                 f"The {what} {reason}: {error_lines[-1] if error_lines else 'no output'}.",
-                "See whether batch.py doctor finds something.",
+                "Run batch.py doctor to check the worker's Python.",
             )
         return code
 
 
 def _log_line(raw: bytes) -> bool:
-    """Log one line of the child; tell whether it was its error."""
+    """Log one line of the child; tell whether it was an error."""
     try:
         values = json.loads(raw)
     except ValueError:
@@ -139,7 +139,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _check_output(out: Path) -> None:
-    """Refuse a file that cannot be written: before the work, not after it."""
+    """Raise before the work starts if the output file cannot be written."""
     if out.is_dir():
         raise UsageError(f"{out} is a folder.", "Give a file for the figures.")
     if not (out.parent.is_dir() and os.access(out.parent, os.W_OK)):
@@ -173,7 +173,10 @@ def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
         cameras = job_cameras(source)
     else:
         if given["region"]:
-            raise UsageError(f"{source.name} has no regions.", "Leave --region, or give a job.")
+            raise UsageError(
+                f"{source.name} is a mesh file and has no regions.",
+                "Omit --region, or give a job folder.",
+            )
         path = source
     if given["cameras"]:
         cameras_path = Path(given["cameras"])
@@ -209,20 +212,21 @@ def job_mesh(folder: Path, region: str | None) -> Path:
     Raises
     ------
     UsageError
-        The folder is no job; it has several regions and none was named, or lacks the one named.
+        The folder is not a job; it has several regions and none was named, or not the one named.
     DatasetError
         The job has no results.
     """
     if not (folder / MARKER).exists():
         raise UsageError(
-            f"{folder.name} is no job folder.", "Give the folder of --out, or a mesh file."
+            f"{folder.name} is not a job folder.", "Give the folder of --out, or a mesh file."
         )
     found = {path.parent.name: path for path in sorted(folder.glob("result/*/mesh.ply"))}
     if not found:
         raise DatasetError(f"The job {folder.name} has no mesh yet.", "Resume it first.")
     if region is None and len(found) > 1:
         raise UsageError(
-            f"The job {folder.name} has the regions {', '.join(found)}.", "Say which: --region."
+            f"The job {folder.name} has the regions {', '.join(found)}.",
+            "Choose one with --region.",
         )
     if region is not None and region not in found:
         raise UsageError(
@@ -239,7 +243,7 @@ def job_cameras(folder: Path) -> list[Camera]:
     DatasetError
         The job has no results yet.
     ParseError
-        The file is not what a job writes.
+        The file is not in the format that jobs write.
     """
     from ...dataset.camera import Camera
     from ...dataset.similarity import Similarity

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``export`` of the command line: results as GLB, OBJ, PLY and splat, each with its sidecar.
+"""The ``export`` command in the worker's Python: GLB, OBJ, PLY and splat files with sidecars.
 
-Runs in the worker's Python and needs no Blender (USD and FBX do: ``ops/export/export_objects.py``).
-Speaks as :mod:`~.evaluate_command` does: one JSON object a line on stdout.
+Needs no Blender (USD and FBX do: ``ops/export/export_objects.py``). Writes one JSON object per
+line to stdout, in the protocol of :mod:`~.evaluate_command`.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ SPLAT_NAME = f"{SPLAT_STEM}.ply"
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """What is to be written of a result."""
+    """The files to export from a result."""
 
     result: Path
     """The result folder."""
     out: Path
-    """Made where it is missing; files of the same names are replaced."""
+    """Output folder, created if missing; files of the same names are replaced."""
     formats: tuple[str, ...]
     """Among :data:`WORKER_FORMATS`."""
     placed: bool = False
-    """Whether coordinates are those of the scene as placed in Blender, else the input's world."""
+    """Whether coordinates are as placed in Blender, else in the world frame of the input."""
     regions: tuple[str, ...] = ()
-    """Names; none for all."""
+    """Names of regions; empty for all."""
     levels: bool = False
-    """Whether levels of detail are written too."""
+    """Whether levels of detail are exported too."""
     shading: str = "auto"
-    """Of GLB: lit, unlit, or lit where there is a normal map or occlusion."""
+    """Of GLB: lit, unlit, or auto: lit if there is a normal or occlusion map."""
 
 
 @dataclass(frozen=True)
@@ -65,23 +65,23 @@ class StoredMesh:
     faces: np.ndarray  # (f, 3) int32
     corner_uvs: np.ndarray  # (f, 3, 2) float32
     stem: str
-    """Name of its files, without their endings."""
+    """Name of its files without suffix."""
     face_atlas: np.ndarray | None = None  # (f,) uint8, None where there is one atlas
 
     def maps(self, name: str) -> list[Path]:
-        """Return the files of a map, one for each atlas; none where the mesh has no such map."""
+        """Return the files of a map, one for each atlas; empty if the mesh has no such map."""
         atlases = 1 if self.face_atlas is None else int(self.face_atlas.max()) + 1
         paths = [self.folder / atlas_file(name, number) for number in range(atlases)]
         return paths if paths[0].is_file() else []
 
 
 def result_of(folder: Path) -> Path:
-    """Return the result folder of a job folder, or of itself.
+    """Return the result folder of a job folder or of a result folder.
 
     Raises
     ------
     UsageError
-        The folder is no job's.
+        The folder is neither.
     DatasetError
         The job has no result yet.
     """
@@ -99,7 +99,7 @@ def frames_of(result: Path) -> tuple[Similarity, Similarity]:
     Raises
     ------
     ParseError
-        ``scene.json`` or ``placement.json`` does not hold one.
+        ``scene.json`` or ``placement.json`` holds no valid transform.
     """
     path = result / "scene.json"
     try:
@@ -116,14 +116,14 @@ def frames_of(result: Path) -> tuple[Similarity, Similarity]:
 
 
 def export_files(request: ExportRequest) -> Iterator[Path]:
-    """Write every file of a request; yield each, whole, its sidecar beside it.
+    """Write every file of a request; yield each once it and its sidecar are complete.
 
     Raises
     ------
     UsageError
         An unknown format, shading or region.
     DatasetError, ParseError
-        The result is not whole.
+        The result is incomplete.
     MeshingError
         A mesh or a Gaussian is not finite; nothing of it is written.
     ResourceError
@@ -135,7 +135,7 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
         given = getattr(request, name)
         wrong = sorted({*([given] if isinstance(given, str) else given)} - set(known))
         if wrong:
-            raise UsageError(f"{wrong[0]!r} is not written here.", f"Use {', '.join(known)}.")
+            raise UsageError(f"{wrong[0]!r} cannot be exported.", f"Use {', '.join(known)}.")
     frames = frames_of(request.result)
     if "splat" in request.formats:
         _splat_of(request.result)  # before anything is written
@@ -170,7 +170,7 @@ def _meshes(request: ExportRequest) -> Iterator[StoredMesh]:
 
 
 def _levels(folder: Path) -> Iterator[tuple[int, Path]]:
-    """Give the number and the folder of each level that a region has."""
+    """Yield number and folder of each level of detail of a region."""
     level, level_folder = 0, folder
     while (level_folder / "mesh.npz").is_file():
         yield level, level_folder
@@ -218,7 +218,7 @@ def _write_mesh(
     target_from_scene = blender_from_scene if request.placed else world_from_scene
     frame = FileFrame(format, target_from_scene)
     if not request.placed and not EXPORT_FORMATS[format].doubles:
-        # That of the finest level, so that all levels lie over each other.
+        # Use the offset of the finest level, so that all levels align.
         finest = mesh
         if mesh.level:
             finest = _read_mesh(mesh.region, 0, mesh.folder.parent, mesh.stem)
@@ -273,7 +273,7 @@ def _write_mesh(
 
 
 def _image(path: Path) -> Image:
-    """Read an RGB image, so that nothing broken is handed on."""
+    """Read an RGB image; raises if it is broken."""
     from PIL import Image
 
     try:
@@ -285,7 +285,7 @@ def _image(path: Path) -> Image:
 
 
 def _png(path: Path) -> bytes:
-    """Return the bytes of an image that can be read."""
+    """Return the bytes of an image file after checking that it can be read."""
     _image(path)
     return path.read_bytes()
 

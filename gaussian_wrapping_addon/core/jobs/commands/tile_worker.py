@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""``work-tiles`` of the command line: helps a job that meshes a region in tiles.
+"""The ``work-tiles`` command: mesh tiles of a running job in a further process.
 
-Runs in the worker's Python, on this machine or on another one that sees the same job folder. Speaks
-as :mod:`~.evaluate_command` does: one JSON object a line on stdout.
+Runs in the worker's Python, on this machine or on another one that shares the job folder. Writes
+one JSON object per line to stdout, in the protocol of :mod:`~.evaluate_command`.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ def main(arguments: list[str]) -> int:
         request = json.loads(arguments[0])
         folder = JobFolder(Path(request["out"]))
         done = work_on_tiles(folder, int(request["threads"]), float(request["wait_s"]))
-        return [f"{done} parts done here"]
+        return [f"{done} parts done by this process"]
 
     return run_command(work)
 
 
 def work_on_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
-    """Work on every open tile list of a job; return how many parts were done here.
+    """Work on every unfinished tile list of a job; return the number of tasks completed here.
 
     Parameters
     ----------
     wait_s : float
-        How long to wait for a list, at most.
+        Longest time to wait for a list.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def work_on_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
         There is no job, or no list to work on.
     """
     if not folder.is_job():
-        raise UsageError(f"{folder.root} is no job folder.", "Give the --out of a job.")
+        raise UsageError(f"{folder.root} is not a job folder.", "Give the --out of a job.")
     until_s = time.monotonic() + wait_s
     progress = Progress("mesh", None, folder.cancel_path.exists)
     while not (lists := unfinished_tile_lists(folder)):
@@ -65,7 +65,7 @@ def work_on_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
                 folder.stages, path, progress, done, threads=threads or default_threads()
             )
         except (WrapError, OSError):
-            # The job has joined the tiles and removed their files while we looked.
+            # The job may have joined the tiles and removed their files meanwhile.
             if path in unfinished_tile_lists(folder):
                 raise
     return len(done)

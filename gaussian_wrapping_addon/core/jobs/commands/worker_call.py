@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A question of the command line, answered by the worker's Python: lines, or an error.
+"""Run a command of the command line in the worker's Python and report lines or an error.
 
-Speaks one JSON object a line on stdout, as :mod:`.evaluate_command` reads them.
+Writes one JSON object per line to stdout, which :mod:`.evaluate_command` reads.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ def run_command(
 ) -> int:
     """Emit the lines and warnings of ``work`` as they come, or its error; return the exit code.
 
-    The process ends when the one that asked does.
+    The process ends when its parent does.
     """
-    # Not the caller's own id: where Python is started through a launcher, that is the parent.
+    # getppid() instead of the caller's id: a launcher of Python may stand in between.
     threading.Thread(target=exit_with_parent, args=(os.getppid(),), daemon=True).start()
     try:
         for line in work():
@@ -50,7 +50,7 @@ def run_command(
     except ImportError as error:
         emit(
             error=f"The worker's Python lacks a package: {error}.",
-            hint="pip install -r requirements-worker.txt there.",
+            hint="Press Set Up Worker, or run pip install -r requirements-worker.txt with it.",
         )
         return EXIT_OTHER
     except OSError as error:
@@ -64,7 +64,7 @@ def run_command(
 
 
 def exit_with_parent(parent: int) -> None:
-    """End this process when the one that asked has gone: nobody waits for the answer."""
+    """End this process when its parent has ended: nothing reads the output any more."""
     while os.getppid() == parent:
         time.sleep(PARENT_POLL_S)
     os._exit(EXIT_CANCELLED)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The last stage: gather results of all regions into ``result/`` and write the report."""
+"""Export stage: gather the results of all regions in ``result/`` and write the report."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..store.stage_folder import Stage
 from .scene_summary import write_scene_summary
 
 REPORTS = ("report.json", "report.md")
-"""They tell of all the other files."""
+"""Replaced last, since they describe all other files."""
 
 
 def export_results(
@@ -35,13 +35,13 @@ def export_results(
 ) -> None:
     """Fill ``result/``; regions of earlier jobs in the same folder stay.
 
-    All of it changes at the end: where anything fails before, it is as it was.
+    Files are replaced together at the end: after a failure the result is unchanged.
 
     Parameters
     ----------
     regions : list of (name, mesh stage, texture stage)
     summary : dict
-        What the runner measured of the whole job.
+        Measurements of the whole job, from the runner.
     """
     from ...dataset.scene_file import load_saved_scene
     from ...gaussians.gaussian_file import load_gaussians
@@ -66,11 +66,11 @@ def export_results(
             write_json(target / "figures.json", _json_values(figures))
         shutil.copy2(regions[0][2].folder / "preview.png", new / "preview.png")
         progress.update(0.9, "writing the report")
-        # A region may have the name of this folder, of this job or of an earlier one.
+        # A region of this job or of an earlier one may have the name of this folder.
         if (folder.result / REPORT_FOLDER).is_dir() and not (new / REPORT_FOLDER).exists():
             shutil.copytree(folder.result / REPORT_FOLDER, new / REPORT_FOLDER)
         _training_pictures(trained, new / REPORT_FOLDER)
-        # Regions of an earlier training stay on disk; this report is about this training.
+        # Regions of an earlier training stay on disk; the report covers this training only.
         known = {**_figures_in(folder.result), **_figures_in(new)}
         of_training = {n: f for n, f in sorted(known.items()) if f.get("training") == trained.key}
         report = _json_values({**summary, **_job_report(cameras, trained, regions)})
@@ -119,10 +119,10 @@ def _in_world_units(
 
 
 def _training_pictures(trained: Stage, folder: Path) -> None:
-    """Bring the pictures of the training there; those of an earlier training go."""
+    """Copy the training's pictures into ``folder``, replacing those of an earlier training."""
     from ...evaluation.report.pictures import write_learning_curve
 
-    # Only these files: others are not ours, or of a region of this name.
+    # Only these files: others may belong to a region with the name of this folder.
     folder.mkdir(exist_ok=True)
     for old in (*folder.glob("held-out-*.jpg"), folder / CURVE):
         old.unlink(missing_ok=True)
@@ -134,5 +134,5 @@ def _training_pictures(trained: Stage, folder: Path) -> None:
 
 
 def _json_values(values: Any) -> Any:
-    """Return the values as JSON would read them back: no tuples, and nothing that is not finite."""
+    """Return the values as read back from JSON: lists for tuples, finite numbers only."""
     return json.loads(json.dumps(finite_json(values)))

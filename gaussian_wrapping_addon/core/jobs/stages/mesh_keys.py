@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Keys and folder names of the stages that mesh a job's regions."""
+"""Keys and folder names of a job's mesh stages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def mesh_key(job: JobFile, request: str, name: str, trained_key: str) -> str:
 
 
 def mesh_stages(folder: JobFolder, job: JobFile) -> set[str]:
-    """Return the names of the mesh stages that the job has, or would have, in a folder."""
+    """Return the names of the job's mesh stages in a folder, existing or not."""
     finished = [p for p in folder.stages.glob("train-*") if read_done(p) is not None]
     trained = [path.name.partition("-")[2] for path in finished]
     names = {r: region_name(r, job.region_bodies.get(r)) for r in job.settings.regions}

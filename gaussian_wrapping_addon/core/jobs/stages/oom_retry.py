@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A training that runs out of memory is tried again one step smaller, and says so."""
+"""Retry a training with reduced settings after it runs out of memory."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _logger = logging.getLogger(__name__)
 MAX_RETRIES = 2
 GAUSSIANS_FACTOR = 0.6
 IMAGE_FACTOR = 0.75
-"""A step leaves 0.6 of the Gaussians and 0.56 of the pixels: about half of the memory that grows
-with them."""
+"""Each retry keeps 0.6 of the Gaussians and 0.56 of the pixels: about half of the memory that
+grows with them."""
 
 MIN_GAUSSIANS = 1000
 MIN_IMAGE_PX = 96
@@ -34,19 +34,19 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Trained(Generic[Result]):
-    """A result with the settings that it was trained with in the end."""
+    """A result with the settings it was finally trained with."""
 
     result: Result
     settings: TrainingSettings
     warnings: tuple[ReportWarning, ...]
-    """One for each step down."""
+    """One for each retry."""
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Tell whether an error means that memory did not suffice.
+    """Tell whether an error means that memory ran out.
 
-    A :class:`ResourceError` out of a training is a limit of the renderer: too many pairs of
-    Gaussian and tile, or a GPU that is full.
+    A :class:`ResourceError` raised by training is a limit of the renderer: too many intersections
+    of Gaussians and tiles, or a full GPU.
     """
     if isinstance(error, (MemoryError, ResourceError)):
         return True
@@ -57,7 +57,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def reduced_settings(settings: TrainingSettings) -> TrainingSettings | None:
-    """Return the settings one step smaller; ``None`` where they are as small as is useful."""
+    """Return settings with fewer Gaussians and smaller images; ``None`` at the lower bounds."""
     gaussians = max(MIN_GAUSSIANS, round(GAUSSIANS_FACTOR * settings.max_gaussians))
     side_px = max(MIN_IMAGE_PX, round(IMAGE_FACTOR * settings.max_image_px))
     gaussians = min(gaussians, settings.max_gaussians)
@@ -73,25 +73,26 @@ def train_with_oom_retry(
     folder: Path,
     discard_checkpoints: Callable[[], None],
 ) -> Trained[Result]:
-    """Train; after running out of memory, train again one step smaller, at most twice.
+    """Train; after running out of memory, train again with reduced settings, at most twice.
 
-    The steps are kept in the folder, so that a run that was stopped goes on as small as it was.
+    The retries are recorded in the folder, so that an interrupted run resumes with the same
+    settings.
 
     Parameters
     ----------
     train : callable
-        Given settings, trains from the start or the last checkpoint.
+        Takes the settings; trains from the start or the last checkpoint.
     settings : TrainingSettings
-        What was asked for.
+        The requested settings.
     folder : Path
         Of the training stage.
-    forget : callable
-        Removes what a larger training left behind (its checkpoints fit no other settings).
+    discard_checkpoints : callable
+        Removes the checkpoints of the failed attempt, which fit no other settings.
 
     Raises
     ------
     ResourceError
-        The smallest try also ran out of memory. Whatever else ``train`` raises is passed on.
+        The last retry also ran out of memory. Other exceptions of ``train`` propagate.
     """
     reasons = _read_retries(folder)
     for _ in reasons:
@@ -102,7 +103,7 @@ def train_with_oom_retry(
             warnings = tuple(ReportWarning("memory-step-down", reason) for reason in reasons)
             return Trained(result, settings, warnings)
         except (MemoryError, ResourceError, RuntimeError) as error:
-            # Words only: the error itself would keep the memory of the failed training.
+            # Keep only the text: the exception would hold the memory of the failed training.
             if not is_out_of_memory(error):
                 raise
             reduced = reduced_settings(settings)
@@ -142,7 +143,7 @@ def _read_retries(folder: Path) -> list[str]:
 
 
 def killed_hint(settings: TrainingSettings) -> str:
-    """Return the next step after the system has ended a worker, probably for its memory."""
+    """Return the hint for a training worker that the system killed, probably for its memory."""
     reduced = reduced_settings(settings)
     number = settings.max_gaussians if reduced is None else reduced.max_gaussians
     return (
@@ -152,7 +153,7 @@ def killed_hint(settings: TrainingSettings) -> str:
 
 
 def killed_mesh_hint(meshing: MeshingSettings, *, kept: bool) -> str:
-    """Return the same for a worker that was meshing or texturing: no training would help it.
+    """Return the hint for a killed worker that was meshing or texturing.
 
     Parameters
     ----------

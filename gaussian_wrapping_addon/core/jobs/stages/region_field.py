@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The vacancy that a region is meshed from: masks and unseen space as the job says."""
+"""Build the vacancy field of a region with the job's masks and handling of unseen space."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _logger = logging.getLogger(__name__)
 def requested_region(
     request: str, body: Any, scene: Scene, arrays: GaussianArrays
 ) -> tuple[Region, Region]:
-    """Return the region that a job asks for, in the scene's frame and in the world's.
+    """Return the requested region in the scene frame and in the world frame.
 
-    That of a file stays in the world's frame as it was read: taken through the scene's and back,
-    its last digits would change each time.
+    The world-frame region of a file is returned as read: transforming it to the scene frame and
+    back would change its last digits each time.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def region_field(
     threads: int,
     device: str = "cpu",
 ) -> VacancyField:
-    """Return the field in and around a region; it knows nothing beyond the mesher's halo.
+    """Return the field in and around a region, limited to the mesher's halo.
 
     Parameters
     ----------
@@ -66,8 +66,8 @@ def region_field(
     meshing : MeshingSettings
         ``unseen`` is read.
     device : str
-        Where the Gaussians were trained, as torch names it. On a GPU the field runs there too;
-        where its kernels cannot, it runs on the processor, and the log says why.
+        Torch device that the Gaussians were trained on. On a GPU the field is evaluated there too;
+        if its kernels cannot run, it is evaluated on the CPU and the log says why.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def region_field(
 
 
 def field_figures(field: VacancyField) -> dict[str, Any]:
-    """Return what the report tells of a field that was used: how much no camera saw."""
+    """Return the report's figures of a field: device, evaluations, and share that is unseen."""
     return {
         "field_device": field.device,
         "unseen": field.unseen,

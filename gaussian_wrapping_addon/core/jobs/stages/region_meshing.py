@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A region's mesh in its stage folder: whole or in tiles, as asked for or as memory allows."""
+"""Mesh a region in its stage folder, whole or in tiles, as requested or as memory allows."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 _logger = logging.getLogger(__name__)
 
 TILES_FOLDER = "tiles"
-"""In the stage's folder, while the tiles are worked on."""
+"""Subfolder of the stage's folder while tiles are being meshed."""
 
 CLAIMS_FOLDER = "claims"
 
 MAX_SPACING_SAMPLES = 5_000
-"""Depth samples at which it is looked up what the photos resolve, about."""
+"""Approximate number of depth samples at which the resolution of the photos is evaluated."""
 
 
 def mesh_in_stage(
@@ -69,7 +69,7 @@ def mesh_in_stage(
     Raises
     ------
     ResourceError
-        It cannot fit into memory.
+        The mesh does not fit into memory.
     MeshingError
         The region holds no surface.
     """
@@ -154,7 +154,7 @@ def estimate_region_mesh(
     edge_length_scene: float,
     depth_samples: DepthSamples,
 ) -> MeshEstimate:
-    """Estimate the mesh of a region from where the cameras see its surface."""
+    """Estimate the mesh of a region from the depth samples of its surface."""
     from ...meshing.cost.mesh_estimate import (
         box_counting_area,
         estimate_mesh,
@@ -177,7 +177,7 @@ def estimate_region_mesh(
 
 
 def free_bytes(folder: Path, threads: int) -> int:
-    """Return how much memory a mesh may take here, 0 where the system does not tell."""
+    """Return how much memory a mesh may use on this machine; 0 if unknown."""
     from ...training.cost.training_estimate import MEMORY_SHARE_LEFT, this_machine
 
     return int(MEMORY_SHARE_LEFT * this_machine(folder, threads).memory_bytes)
@@ -198,16 +198,16 @@ def mesh_tiled_in_stage(
     depth_samples: DepthSamples | None,
     origin: dict[str, Any],
 ) -> SurfaceMesh:
-    """Mesh a region tile by tile, alone or with other processes that join in.
+    """Mesh a region tile by tile, alone or together with other processes.
 
-    Finished tiles of an interrupted run are used.
+    Finished tiles of an interrupted run are re-used.
 
     Parameters
     ----------
     tiles : int
         0 makes as many as the request needs.
     origin : dict
-        With which other processes make the same field (:func:`tiles_origin`).
+        From which other processes rebuild the same field (:func:`tiles_origin`).
     """
     from ...meshing.tiles.store import (
         LIST_NAME,
@@ -242,28 +242,28 @@ def mesh_tiled_in_stage(
 
 
 def tiles_origin(cameras: Path, training: Path, settings: JobSettings) -> dict[str, Any]:
-    """Return with which another process makes the same field, as JSON values."""
+    """Return the inputs from which another process rebuilds the same field, as JSON values."""
     return {"cameras": cameras.name, "training": training.name, "settings": to_json(settings)}
 
 
 def remove_tiles(stage_folder: Path) -> None:
-    """Remove the files of the tiles once the mesh is saved."""
+    """Remove the tile files once the mesh is saved."""
     folder = stage_folder / TILES_FOLDER
     if not folder.is_dir():
         return
     aside = stage_folder / f"{TILES_FOLDER}-joined"
     try:
-        os.replace(folder, aside)  # at once: nobody finds half a list
+        os.replace(folder, aside)  # atomic: no process finds a partly deleted list
     except OSError:
         aside = folder
     shutil.rmtree(aside, ignore_errors=True)
 
 
 def unfinished_tile_lists(folder: JobFolder) -> list[Path]:
-    """Return the folders of the tile lists that the job in a folder is not done with.
+    """Return the folders of the unfinished tile lists of the job in a folder.
 
-    Lists of jobs before it, which nobody will join, do not count. Whether its worker is alive does
-    not matter: from another machine that cannot be seen.
+    Lists of earlier jobs, which nothing will join, do not count. The job's worker need not be
+    alive: another machine could not tell.
     """
     from ...meshing.tiles.store import LIST_NAME
 
@@ -278,12 +278,12 @@ def unfinished_tile_lists(folder: JobFolder) -> list[Path]:
 def work_on_tile_list(
     stages: Path, folder: Path, progress: Progress, done_here: list[str], *, threads: int
 ) -> None:
-    """Work on a tile list from a process of its own; note the names of the parts it did.
+    """Work on a tile list in a separate process; append the names of completed tasks.
 
     Raises
     ------
     ParseError, DatasetError
-        What the list names is not in the job folder.
+        A stage named by the list is not in the job folder.
     """
     from ...dataset.scene_file import load_saved_scene
     from ...field.vector_field import VectorField

@@ -10,7 +10,7 @@ from ..store.stage_folder import Stage
 
 
 def write_scene_summary(path: Path, cameras: Stage) -> None:
-    """Write ``result/scene.json``: what Blender needs of the scene (docs/architecture.md)."""
+    """Write ``result/scene.json``, the cameras and frame for Blender (docs/architecture.md)."""
     from ...dataset.scene_file import load_saved_scene
     from ...tolerances import SCENE_RADIUS
 

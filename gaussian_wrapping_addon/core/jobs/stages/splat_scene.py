@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A splat without photos as a scene: cameras made up around it, photos rendered from it."""
+"""Make a scene of a splat without photos: place virtual cameras around it and render them."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from ...report_warning import ReportWarning
 from ..store.job_file import JobFile
 
 MAX_START_POINTS = 30_000
-"""So many middles of opaque Gaussians stand for the sparse points of a reconstruction."""
+"""Centres of at most this many opaque Gaussians serve as sparse points."""
 
 MIN_START_OPACITY = 0.5
-"""Opacity of the Gaussians that do."""
+"""Minimum opacity of Gaussians that serve as sparse points."""
 
 
 def start_splat_of(job: JobFile) -> Path | None:
-    """Return the splat that a job's training starts from: the one asked for, or the input."""
+    """Return the splat that a job's training starts from: the setting, or the input itself."""
     if job.settings.start_splat:
         return Path(job.settings.start_splat)
     source = Path(job.source)
@@ -38,19 +38,19 @@ def start_splat_of(job: JobFile) -> Path | None:
 
 
 def is_splat(source: Path) -> bool:
-    """Tell whether an input is a splat of its own."""
+    """Tell whether an input is a splat file."""
     return source.is_file() and is_splat_path(source)
 
 
 def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads: int = 0) -> Scene:
-    """Render a splat from made-up cameras into ``folder/images`` and return the scene.
+    """Render a splat from virtual cameras into ``folder/images`` and return the scene.
 
     The scene frame keeps the axes of the file. The background is black, as in training.
 
     Raises
     ------
     ParseError, DatasetError
-        The file is not a splat, or shows nothing.
+        The file is not a splat, or has no visible Gaussian.
     """
     import torch
 

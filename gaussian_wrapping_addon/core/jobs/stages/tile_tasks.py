@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The parts of a tiled mesh as tasks that any number of processes share."""
+"""Tasks of a tiled mesh, which any number of processes can share."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The stage that trains: estimate first, go on from a shorter training, smaller where it must."""
+"""Training stage: estimate cost, continue a shorter training, retry when out of memory."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _logger = logging.getLogger(__name__)
 
 
 def start_fingerprint(path: str) -> list[Any]:
-    """Return what a training's key says of the file that it starts from; empty for none.
+    """Return path, size and time of the start splat for the stage key; empty for none.
 
     Raises
     ------
     DatasetError
-        The file is not there.
+        The file does not exist.
     """
     if not path:
         return []
@@ -76,14 +76,14 @@ def run_training(
     version: int,
     threads: int,
 ) -> Stage:
-    """Train, or re-use what is trained.
+    """Train, or re-use a finished training.
 
     Raises
     ------
     UsageError
-        The job is to train more, and there is nothing to go on from.
+        The job continues a training, and there is no training to continue.
     ResourceError
-        The disk is too full, or memory does not suffice even for a smaller training.
+        The disk is too full, or memory does not suffice even with reduced settings.
     """
     key, base_key = training_keys(version, cameras.key, job)
     extra = job.settings.training.extra_iterations
@@ -154,7 +154,7 @@ def _train(
 
 
 def _inside_regions(job: JobFile, scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return what tells the points of the job's regions, where these count more; scene frame."""
+    """Return the test whether points lie in the job's weighted regions, scene frame, if any."""
     from ...regions.region import parse_region
 
     focus = job.settings.training.focus
@@ -178,9 +178,9 @@ def _inside_regions(job: JobFile, scene: Scene) -> Callable[[np.ndarray], np.nda
 def _estimate(
     scene: Scene, job: JobFile, stage_folder: Path, progress: Progress, threads: int
 ) -> tuple[dict[str, Any], list[ReportWarning]]:
-    """Tell what the training will take; refuse where the disk is too full.
+    """Estimate the training's cost; raise if the disk is too full.
 
-    The renderer is compiled meanwhile where that was never done here.
+    Compiles the renderer first if that was never done on this machine.
     """
     from ...training.cost.machine_speed import machine_speed, renderer_is_compiled
     from ...training.cost.training_estimate import (

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ``scene.blend`` of a result: set aside where it shows another result than the one beside it.
+"""Rename the ``scene.blend`` of a result when it no longer matches the result.
 
-It is written outside of the worker, which has no Blender, and only where it is asked for.
+It is written outside of the worker, which has no Blender, and only on request.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ _logger = logging.getLogger("gaussian_wrapping")
 
 NAME = "scene.blend"
 EARLIER = "scene.blend1"
-"""As Blender calls the version before: it may hold what a person has added."""
+"""Blender's name for the previous version, which may hold a user's additions."""
 
 
 def result_state(result: Path) -> dict[str, bytes]:
-    """Return what tells one result from another: the figures of each region, by its name."""
+    """Return the content of each region's figures file, by region: it identifies a result."""
     return {path.parent.name: path.read_bytes() for path in sorted(result.glob("*/figures.json"))}
 
 
 def back_up_stale_blend(result: Path, before: dict[str, bytes]) -> bool:
-    """Rename ``scene.blend`` where the result has changed; tell whether it was.
+    """Rename ``scene.blend`` if the result has changed; tell whether it was renamed.
 
     Parameters
     ----------
     before : dict
-        From :func:`result_state`, when the file was up to date.
+        :func:`result_state` from when the file was up to date.
     """
     blend = result / NAME
     if not blend.is_file() or result_state(result) == before:
         return False
     os.replace(blend, result / EARLIER)
-    _logger.info("%s showed the result before this one: it is %s now", NAME, EARLIER)
+    _logger.info("%s showed the previous result and was renamed to %s", NAME, EARLIER)
     return True

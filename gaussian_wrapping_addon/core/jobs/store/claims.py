@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Claims on pieces of work in a shared folder: who does what, without a server.
+"""Distribute tasks over processes by claim files in a shared folder, without a server.
 
-A claim is a file that only one process can create. Its time is refreshed while the process works.
-Of a process that has ended on this machine, or that has not refreshed it for a while on another
-one, the claim is taken over. Where two take over at once, or a process comes back from a long
-sleep, a piece is done twice; that costs time and nothing else, as both get the same result and
-results appear whole.
+A claim is a file that only one process can create; its modification time is refreshed while the
+process works. A claim is taken over when its process has ended (same machine) or has stopped
+refreshing it (another machine). When two processes take over at once, or one resumes after a long
+sleep, a task is done twice. That only costs time: both compute the same result, and results are
+written atomically.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ _logger = logging.getLogger(__name__)
 
 REFRESH_S = 5.0
 STALE_S = 60.0
-"""A claim of another machine that was not refreshed for so long is dead. Measured by the own clock
-from the first look, as clocks of machines differ."""
+"""A claim of another machine that was not refreshed for this long is stale. Measured by the local
+clock since the claim was first seen, as clocks of machines differ."""
 POLL_S = 1.0
 
 _WORKER = "worker"
-"""Ending of an empty file for each process that has done a part."""
+"""Suffix of an empty file for each process that has completed a task."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A piece of work."""
+    """A unit of work."""
 
     name: str
-    """Of its claim's file."""
+    """Name of its claim file."""
     done: Callable[[], bool]
     ready: Callable[[], bool]
-    """Whether what it needs is there."""
+    """Whether its inputs exist."""
     run: Callable[[Progress], None]
 
 
@@ -67,16 +67,16 @@ class Claims:
         return self._folder / f"{name}.json"
 
     def record_worker(self) -> None:
-        """Say that this process has done a part."""
+        """Record that this process has completed a task."""
         (self._folder / f"{self._worker}.{_WORKER}").touch()
 
     def worker_count(self) -> int:
-        """Return how many processes have done a part; one that was started anew counts again."""
+        """Count the processes that have completed a task; a restarted process counts again."""
         return sum(1 for _ in self._folder.glob(f"*.{_WORKER}"))
 
     @contextmanager
     def held(self, name: str) -> Iterator[bool]:
-        """Hold a claim for the duration of a block; false where another process has it."""
+        """Hold a claim during a ``with`` block; yields false if another process holds it."""
         if not (self._create(name) or (self._drop_stale(name) and self._create(name))):
             yield False
             return
@@ -110,16 +110,16 @@ class Claims:
             try:
                 os.utime(self.path(name))
             except OSError:
-                _logger.warning("the claim on %s has gone", name)
+                _logger.warning("the claim on %s has disappeared", name)
                 return
 
     def _drop_stale(self, name: str) -> bool:
-        """Remove a dead process's claim; false where its owner seems alive."""
+        """Remove the claim of a dead process; return false if its owner seems alive."""
         path = self.path(name)
         try:
             time_ns = path.stat().st_mtime_ns
         except FileNotFoundError:
-            return True  # given back just now
+            return True  # released just now
         owner = self._owner(path)
         here = owner.get("place") == host_and_pid_namespace()
         if here and process_alive(int(owner["pid"]), int(owner["started"])):
@@ -134,7 +134,7 @@ class Claims:
         _logger.warning("taking over %s from process %s", name, owner.get("pid", "unknown"))
         aside = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.stale")
         try:
-            os.rename(path, aside)  # of several only one succeeds
+            os.rename(path, aside)  # only one of several processes succeeds
         except FileNotFoundError:
             return False
         aside.unlink(missing_ok=True)
@@ -142,7 +142,7 @@ class Claims:
 
     @staticmethod
     def _owner(path: Path) -> dict[str, Any]:
-        """Return what a claim says; nothing where it is being written, or was broken off."""
+        """Return the content of a claim; empty while it is being written or if it is cut off."""
         try:
             values = read_json(path)
             return {**values, "pid": int(values["pid"]), "started": int(values["started"])}
@@ -151,7 +151,7 @@ class Claims:
 
 
 def host_and_pid_namespace() -> str:
-    """Return a text that processes share only where they know each other's process ids."""
+    """Return a text that is equal only for processes that see each other's process ids."""
     parts = [platform.node()]
     for read in (
         lambda: Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
@@ -160,7 +160,7 @@ def host_and_pid_namespace() -> str:
         try:
             parts.append(read())
         except (OSError, AttributeError):
-            continue  # the name alone, where the system is not Linux
+            continue  # outside Linux: the host name alone
     return " ".join(parts)
 
 
@@ -171,19 +171,19 @@ def run_tasks(
     poll_s: float = POLL_S,
     done_here: list[str] | None = None,
 ) -> int:
-    """Do what nobody else does until all tasks are done; return how many this process did.
+    """Run unclaimed tasks until all are done; return how many this process completed.
 
-    Waits where the rest is in other hands, and takes over what they drop.
+    Waits while other processes hold the remaining tasks, and takes over stale claims.
 
     Parameters
     ----------
     done_here : list of str, optional
-        Gets the names of what this process has done, also where it ends with an error.
+        Receives the names of the tasks completed here, also if the call ends with an error.
 
     Raises
     ------
     WrapError
-        Of a task that failed here, or the request to stop.
+        A task failed here, or a stop was requested.
     """
     completed = [] if done_here is None else done_here
     while True:
@@ -197,7 +197,7 @@ def run_tasks(
             if not task.ready():
                 continue
             with claims.held(task.name) as free:
-                if not free or task.done():  # done between our look and our claim
+                if not free or task.done():  # done before the claim was taken
                     continue
                 task.run(progress.span(finished / len(tasks), (finished + 1) / len(tasks)))
                 completed.append(task.name)

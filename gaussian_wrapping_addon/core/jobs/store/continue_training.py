@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training a finished job further: its last checkpoint starts a longer training."""
+"""Continue the training of a finished job from its last checkpoint."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from .stage_folder import read_done
 _logger = logging.getLogger(__name__)
 
 _CHECKPOINT = re.compile(r"checkpoint-(\d{1,9})\.json")
-_INSTEAD = "Train anew instead: wrap with as many --iterations as you want in all."
+_INSTEAD = "Train anew instead: run wrap with the total number of --iterations."
 
 
 def continue_training_job(folder: JobFolder, job: JobFile, iterations: int) -> JobFile:
-    """Return the job that trains so many iterations more than ``job``, then meshes again.
+    """Return the job that trains ``job`` for more iterations, then meshes again.
 
     Raises
     ------
     UsageError
         The number is not positive.
     DatasetError
-        The folder holds no finished training, or no checkpoint that training could go on from.
+        The folder holds no finished training, or no checkpoint to continue from.
     """
     if iterations < 1:
         raise UsageError(f"--iterations {iterations} adds nothing.", "Give a positive number.")
@@ -39,7 +39,7 @@ def continue_training_job(folder: JobFolder, job: JobFile, iterations: int) -> J
         raise no_finished_training(folder.root)
     if not any(checkpoints(path) for path in finished):
         raise DatasetError(
-            f"The training in {folder.root} has kept no checkpoint to go on from.", _INSTEAD
+            f"The training in {folder.root} has no checkpoint to continue from.", _INSTEAD
         )
     training = job.settings.training
     longer = replace(training, extra_iterations=training.extra_iterations + iterations)
@@ -54,21 +54,18 @@ def checkpoints(folder: Path) -> list[Path]:
 
 
 def lineage(base_key: str, extra_iterations: int) -> dict[str, Any]:
-    """Return what a finished training's ``done.json`` says for longer ones to find it.
+    """Return the entry of ``done.json`` by which longer trainings find a finished one.
 
     Parameters
     ----------
     base_key : str
-        Hash of all that the stage's key depends on, but for the extra iterations.
+        Hash of everything that the stage's key depends on except the extra iterations.
     """
     return {"base": base_key, "extra_iterations": extra_iterations}
 
 
 def shorter_training(stages: Path, base_key: str, extra_iterations: int) -> Path | None:
-    """Return the longest finished training that this one continues, ``None`` without any.
-
-    Only trainings that have a checkpoint count.
-    """
+    """Return the longest finished training with a checkpoint that this one can continue, if any."""
     best: tuple[int, str, Path] | None = None
     for folder in stages.glob("train-*"):
         values = (read_done(folder) or {}).get("lineage")
@@ -82,23 +79,23 @@ def shorter_training(stages: Path, base_key: str, extra_iterations: int) -> Path
 
 
 def link_checkpoints(source: Path, target: Path, others: tuple[str, ...] = ()) -> None:
-    """Put the checkpoints of a finished stage into a new one, as hard links where that works.
+    """Link the checkpoints of a finished stage into a new one; copy them if links are unsupported.
 
-    Files of a stage are replaced, never written into, so that a link cannot change its origin.
+    Files of a stage are replaced, never modified, so that a link cannot change its source.
 
     Parameters
     ----------
     others : tuple of str
-        More files to bring, where they are there.
+        Further files to link, if they exist.
     """
     for path in reversed(checkpoints(source)):
-        # The JSON file last: without it, the arrays count for nothing.
+        # The JSON file last: without it, the arrays are ignored.
         for one in (path.with_suffix(".npz"), path):
             _link(one, target / one.name)
     for name in others:
         if (source / name).is_file():
             _link(source / name, target / name)
-    _logger.info("training goes on from %s", source.name)
+    _logger.info("training continues from %s", source.name)
 
 
 def _link(source: Path, target: Path) -> None:
@@ -110,12 +107,12 @@ def _link(source: Path, target: Path) -> None:
 
 
 def no_finished_training(root: Path) -> DatasetError:
-    """Return the error of what needs a finished training, whichever command it is."""
+    """Return the error of a command that needs a finished training."""
     return DatasetError(f"{root} holds no finished training.", "Run wrap, or resume it, first.")
 
 
 def nothing_to_continue(folder: JobFolder) -> DatasetError:
-    """Return the error of a ``more`` whose job has no training that fits it."""
+    """Return the error of a ``more`` job without a matching training."""
     return DatasetError(
         f"No finished training in {folder.root} fits this job's photos and settings and has a "
         "checkpoint.",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The job: what is asked for, the same for button, command line and bug report."""
+"""The job file: command, input, settings and regions, the same for button and command line."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ COMMANDS = ("wrap", "mesh", "more")
 
 @dataclass(frozen=True)
 class JobFile:
-    """One job. Region files are read when the job is made, so that a resume needs none of them."""
+    """One job. It contains the region files, so that resuming does not need them."""
 
     command: str
     source: str
     """Absolute path of the input: a folder or a transforms.json."""
     settings: JobSettings
     region_bodies: dict[str, Any] = field(default_factory=dict)
-    """Content of each region file, by the string that names it in ``settings.regions``."""
+    """Content of each region file, keyed by its entry in ``settings.regions``."""
     edge_lengths: dict[str, float] = field(default_factory=dict)
-    """Edge length, world units, of each region that has its own, by the same string. It decides
-    there in place of ``settings.meshing``'s edge length or number of points."""
+    """Edge length, world units, of each region that has its own, by the same key. It replaces
+    ``settings.meshing``'s edge length or number of points."""
 
     def meshing_of(self, request: str) -> MeshingSettings:
-        """Return how a region of ``settings.regions`` is meshed."""
+        """Return the meshing settings of a region of ``settings.regions``."""
         meshing = self.settings.meshing
         if request not in self.edge_lengths:
             return meshing
@@ -43,7 +43,7 @@ class JobFile:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        # Jobs without lengths of their own are written as before there were any.
+        # Omitted if empty: job files stay as they were before this entry existed.
         own = {"edge_lengths": self.edge_lengths} if self.edge_lengths else {}
         return {
             **own,
@@ -91,14 +91,14 @@ def make_job(
     Parameters
     ----------
     edge_lengths : mapping, optional
-        Edge lengths, world units, of regions that have their own, by their string in
+        Edge lengths, world units, of regions that have their own, keyed by their entry in
         ``settings.regions``.
 
     Raises
     ------
     UsageError, DatasetError
         A setting is out of range; the source or a region file is missing or unreadable; two
-        regions have one name.
+        regions have the same name.
     """
     settings = settings.validated()
     own = _checked_lengths(dict(edge_lengths or {}), settings.regions)
@@ -138,7 +138,7 @@ def make_job(
 
 
 def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:
-    """Return edge lengths of single regions, or refuse them."""
+    """Return validated edge lengths of single regions."""
     if not isinstance(values, dict) or not set(values) <= set(regions):
         raise UsageError("edge_lengths must name regions of the job.", "Start the job again.")
     for name, value in values.items():
@@ -149,21 +149,21 @@ def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:
 
 
 def reject_region_conflicts(result: Path, job: JobFile) -> None:
-    """Refuse a job of which a region would replace the result of another region.
+    """Raise if a region of a job would overwrite the result of a different region.
 
     A region of the same name is the same region, meshed again.
 
     Parameters
     ----------
     result : Path
-        The result folder of the job, which may be missing.
+        The result folder of the job; need not exist.
 
     Raises
     ------
     UsageError
-        Names both: two regions of the job, or one of it and one that was meshed before.
+        Two regions of the job, or one of it and one meshed before, conflict; names both.
     ParseError
-        A region in the job file is broken.
+        A region in the job file is invalid.
     """
     region_names(job.settings.regions, job.region_bodies)
     folders = {
@@ -174,19 +174,19 @@ def reject_region_conflicts(result: Path, job: JobFile) -> None:
 
 
 def reject_folder_conflicts(result: Path, folders: dict[str, str]) -> None:
-    """Refuse regions whose folder in a result is that of a region with another name.
+    """Raise if a region's result folder belongs to a region with another name.
 
     A region of the same name is the same region, meshed again.
 
     Parameters
     ----------
     folders : dict
-        For the name of each region, as its file gives it, that of its folder.
+        Folder name by region name, as the region's file gives it.
 
     Raises
     ------
     UsageError
-        Names both.
+        Two regions conflict; names both.
     """
     there = {path.parent.name: path for path in sorted(result.glob("*/region.json"))}
     for wanted, name in folders.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The job folder: where everything of a job lies, its status, its lock, its cancel request.
+"""The job folder: its layout, status file, lock and cancel request.
 
 Layout: ``job.json``, ``status.json``, ``log.txt``, ``lock.json``, ``cancel`` (a file asks to
 stop), ``stages/<name>-<hash>/`` (``done.json`` last), ``result/``.
@@ -32,43 +32,43 @@ class JobStatus:
     """For people only."""
     seconds_left: float | None = None
     error: str = ""
-    """Why it failed; of a job that was put back, why it could not be meshed again."""
+    """Why the job failed; after a rollback, why it could not be meshed again."""
     hint: str = ""
     exit_code: int | None = None
     pid: int = 0
     pid_started: int = 0
-    """Start time of the process in the system's own ticks: tells a re-used pid."""
+    """Start time of the process in system ticks: detects a re-used pid."""
     heartbeat_s: float = 0.0
-    """Unix time of the last sign of life."""
+    """Unix time of the last heartbeat."""
     result: str = ""
     """Absolute path of the result folder, once there is one."""
     figures: dict[str, float] = field(default_factory=dict)
-    """Live figures of the stage at work, such as ``iteration``, ``gaussians`` and ``psnr``."""
+    """Live figures of the running stage, such as ``iteration``, ``gaussians`` and ``psnr``."""
     phase: str = ""
-    """For programs: what is special about the moment, such as ``progress.COMPILING``."""
+    """For programs: a special phase of the stage, such as ``progress.COMPILING``."""
     put_back: bool = False
-    """This is the finished job from before a mesh that has failed."""
+    """Whether the job was rolled back to its finished state after a failed mesh."""
 
     @property
     def active(self) -> bool:
-        """Whether a worker is (or should be) at work."""
+        """Whether a worker is (or should be) running."""
         return self.state in ACTIVE_STATES
 
     @classmethod
     def from_json(cls, values: Any) -> JobStatus:
-        """Build from JSON values, ignoring entries of other versions.
+        """Build from JSON values, ignoring unknown entries.
 
         Raises
         ------
         TypeError, ValueError
-            An entry is not of its kind: the file is not ours, or is being written.
+            An entry has the wrong type: the file is not ours, or is being written.
         """
         given = dict(values)
         known = {f.name: given[f.name] for f in fields(cls) if f.name in given}
         for name, value in known.items():
             if not _is_kind(name, value):
                 raise TypeError(f"{name} is {type(value).__name__}")
-        # Version 0.1.0 told of a job that was put back by its error alone.
+        # Version 0.1.0 marked a rolled-back job only by its error.
         old = known.get("state") == "DONE" and bool(known.get("error"))
         return cls(**{"put_back": old, **known})
 
@@ -80,7 +80,7 @@ _MAY_BE_NONE = ("seconds_left", "exit_code")
 
 
 def _is_kind(name: str, value: Any) -> bool:
-    """Tell whether a value can be the field of this name of a status."""
+    """Tell whether a value has the type of a status field."""
     if value is None:
         return name in _MAY_BE_NONE
     if isinstance(value, bool) or name in _FLAGS:
@@ -95,19 +95,19 @@ def _is_kind(name: str, value: Any) -> bool:
 
 
 def process_start_ticks(pid: int) -> int:
-    """Return the start time of a process in system ticks; 0 where the system does not tell."""
+    """Return the start time of a process in system ticks; 0 if unknown."""
     if not sys.platform.startswith("linux"):
         return 0
     try:
         text = Path(f"/proc/{pid}/stat").read_text()
     except OSError:
         return 0
-    # The command name, in parentheses, may hold spaces; field 22 is the start time.
+    # The command name, in parentheses, may contain spaces; field 22 is the start time.
     return int(text.rsplit(")", 1)[1].split()[19])
 
 
 def process_alive(pid: int, started: int) -> bool:
-    """Tell whether the process that began at ``started`` still runs (a zombie does not)."""
+    """Tell whether the process started at ``started`` still runs (a zombie does not)."""
     if pid <= 0:
         return False
     if sys.platform.startswith("linux"):
@@ -144,7 +144,7 @@ def _alive_windows(pid: int) -> bool:
 
 @dataclass(frozen=True)
 class JobFolder:
-    """Paths of one job folder and the small files in it."""
+    """Paths of a job folder; access to its status and lock."""
 
     root: Path
 
@@ -165,12 +165,12 @@ class JobFolder:
 
     @property
     def cancel_path(self) -> Path:
-        """A file of this name asks the worker to stop."""
+        """``cancel``; the worker stops if it exists."""
         return self.root / "cancel"
 
     @property
     def lock_path(self) -> Path:
-        """Names the process that works here."""
+        """``lock.json``; names the process that holds the folder."""
         return self.root / "lock.json"
 
     @property
@@ -184,7 +184,7 @@ class JobFolder:
         return self.root / "result"
 
     def create(self) -> None:
-        """Make the folder, or accept an existing job folder or an empty folder.
+        """Create the folder, or accept an existing job folder or an empty folder.
 
         Raises
         ------
@@ -214,14 +214,14 @@ class JobFolder:
         """Return the status; a running job whose process is gone is reported as LOST."""
         status = self._read_file()
         if self._gone(status):
-            # The worker may have written its last words and ended between our two looks.
+            # The worker may have written its final status and ended after the first read.
             status = self._read_file()
         if not self._gone(status):
             return status
         return replace(
             status,
             state="LOST",
-            error="The worker process has ended without a word.",
+            error="The worker process ended without reporting an error.",
             hint="Resume the job; it continues from the last checkpoint.",
         )
 
@@ -243,26 +243,26 @@ class JobFolder:
         except OSError as error:
             if error.errno not in DISK_FULL_ERRNOS or status.active:
                 raise
-            # The last words of a worker that has met a full disk.
+            # The final status of a worker on a full disk: overwrite in place.
             overwrite_json(self.status_path, asdict(status))
 
     def lock(self) -> None:
-        """Take the folder for this process.
+        """Lock the folder for this process.
 
-        The lock of a dead process, or one that is broken, is taken over: locks of living ones
-        appear whole.
+        The lock of a dead process, or an unreadable one, is taken over: a lock of a living process
+        is written atomically.
 
         Raises
         ------
         UsageError
-            Another process is at work here.
+            Another process holds the folder.
         """
         mine = {"pid": os.getpid(), "started": process_start_ticks(os.getpid())}
         owner = self._lock_owner()
         if owner == (mine["pid"], mine["started"]):
             return
         self._drop_stale_lock()
-        # A hard link to a finished file appears whole or not at all, and for one process only.
+        # A hard link to a complete file is atomic and succeeds for one process only.
         ready = self.lock_path.with_name(f"lock.{os.getpid()}.json")
         write_json(ready, mine)
         try:
@@ -274,7 +274,7 @@ class JobFolder:
                 "Wait for it, cancel it, or choose another folder.",
             ) from None
         except OSError:
-            # A file system without hard links (exFAT): the best there is.
+            # A file system without hard links (exFAT): renaming is the best available.
             os.replace(ready, self.lock_path)
         finally:
             ready.unlink(missing_ok=True)
@@ -294,7 +294,7 @@ class JobFolder:
             return
         try:
             if aside.read_bytes() != content:
-                # Another process has taken it over between our looks: its lock goes back.
+                # Another process has taken the lock over meanwhile: restore it.
                 os.link(aside, self.lock_path)
         except FileExistsError:
             pass
@@ -311,10 +311,10 @@ class JobFolder:
             return None
 
     def locked(self) -> bool:
-        """Whether a living process works here."""
+        """Whether a living process holds the folder."""
         owner = self._lock_owner()
         return owner is not None and process_alive(*owner)
 
     def unlock(self) -> None:
-        """Give the folder free."""
+        """Release the folder."""
         self.lock_path.unlink(missing_ok=True)

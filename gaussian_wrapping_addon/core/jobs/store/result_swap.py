@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A new result takes the place of the earlier one at its end, or not at all.
+"""Replace a job's result all at once, or not at all.
 
-What is written lies in a folder inside of the result folder until all of it is there: on the same
-disk, so that taking its place is renaming alone. No region has a name with a dot.
+A new result is written to a subfolder of the result folder until it is complete: on the same disk,
+so that replacing takes renames only. Region names contain no dot.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from pathlib import Path
 _logger = logging.getLogger(__name__)
 
 NEW = ".new"
-"""In the result folder, while a result is being written."""
+"""Subfolder of the result folder in which a new result is written."""
 EARLIER = ".earlier"
-"""In the result folder, for the moment of the change: what the new result replaces."""
+"""Subfolder of the result folder that holds the replaced files during the swap."""
 
 
 @contextmanager
 def new_result(result: Path, last: tuple[str, ...] = ()) -> Iterator[Path]:
-    """Give an empty folder for the new result; put its content in place when the block ends.
+    """Yield an empty folder for the new result; move its content into place when the block ends.
 
-    Each entry of the folder replaces that of its name in ``result``; others there stay. Where the
-    block, or taking the place, ends with an error, the result is as it was before.
+    Each entry of the folder replaces the one of its name in ``result``; others stay. If the block
+    or the swap raises, the result is unchanged.
 
     Parameters
     ----------
     result : Path
-        The result folder; made where there is none.
+        The result folder; created if missing.
     last : tuple of str
-        Entries that tell of the others: they change after them.
+        Entries that describe the others and are replaced after them.
 
     Raises
     ------
@@ -58,10 +58,10 @@ def new_result(result: Path, last: tuple[str, ...] = ()) -> Iterator[Path]:
 
 
 def recover(result: Path) -> None:
-    """Bring back what a change that was cut off has set aside, and remove what it had begun."""
+    """Undo an interrupted swap: restore the earlier files and remove the new ones."""
     earlier = result / EARLIER
     if earlier.is_dir():
-        _logger.warning("an earlier export was cut off; its result is brought back")
+        _logger.warning("an earlier export was interrupted; the previous result is restored")
         for path in sorted(earlier.iterdir()):
             _remove(result / path.name)
             os.replace(path, result / path.name)
@@ -90,7 +90,7 @@ def _swap(new: Path, result: Path, last: tuple[str, ...]) -> None:
             os.replace(target, source)
         earlier.rmdir()
         raise
-    # In place: what cannot be removed now has another name, so that it is not brought back.
+    # Swap complete: rename the old files before deleting, so that recover() ignores leftovers.
     old = result / f"{NEW}{EARLIER}"
     _remove(old)
     os.replace(earlier, old)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a job folder held before it was meshed again: a mesh that fails leaves it as it was.
+"""Roll a job folder back to its finished job when meshing it again fails.
 
-A file beside ``job.json`` keeps the finished job while ``mesh`` works. It goes when that is done;
-where ``mesh`` fails, job and status are those of the finished job again, and what it has begun is
-removed. One that was stopped can be resumed, as any job.
+A file beside ``job.json`` keeps the finished job while ``mesh`` runs, and is removed when that is
+done. If ``mesh`` fails, job and status of the finished job are restored and the stages it began
+are removed. A cancelled ``mesh`` can be resumed, as any job.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ NAME = "job-finished.json"
 
 
 def save_rollback(folder: JobFolder, job: JobFile) -> None:
-    """Keep what a folder holds before ``job`` is written there.
+    """Save the state of a folder before ``job`` is written there.
 
-    Of several meshes without an end in between, the job before the first is kept: where the last
-    one fails, what the others have begun goes as well. Commands that train change the result
-    itself: nothing is kept.
+    Of several meshes in a row that did not finish, the state before the first is kept: if the last
+    one fails, the stages begun by the others are removed as well. Commands that train change the
+    result itself: nothing is saved.
     """
     path = folder.root / NAME
     if job.command != "mesh":
@@ -39,18 +39,18 @@ def save_rollback(folder: JobFolder, job: JobFile) -> None:
         return
     status = folder.read_status()
     if status.state != "DONE":
-        return  # what is kept already, its list of stages too, is of the time before all of them
+        return  # an earlier rollback file, with its list of stages, stays valid
     try:
         finished = read_job(folder.job_path)
     except (UsageError, ParseError):
         path.unlink(missing_ok=True)
-        return  # nothing that could be put back
+        return  # nothing to restore
     saved = {"job": finished.to_json(), "status": asdict(_without_error(status))}
     write_json(path, {**saved, "stages": sorted(p.name for p in folder.stages.iterdir())})
 
 
 def finished_job(folder: JobFolder) -> JobFile:
-    """Return the job that a folder's result is of: not a mesh that has not come to its end.
+    """Return the job that produced a folder's result, not one whose mesh is unfinished.
 
     Raises
     ------
@@ -64,14 +64,14 @@ def finished_job(folder: JobFolder) -> JobFile:
 
 
 def discard_rollback(folder: JobFolder) -> None:
-    """Take the job at hand for the finished one."""
+    """Delete the saved state: the current job is the finished one."""
     (folder.root / NAME).unlink(missing_ok=True)
 
 
 def roll_back(folder: JobFolder) -> JobStatus | None:
-    """Make a folder what it was before a mesh that has failed; return its status then.
+    """Restore a folder to its state before a failed mesh; return its status at that time.
 
-    ``None`` where there was no finished job, or another command has failed.
+    Returns ``None`` if there was no finished job, or if another command failed.
     """
     saved = _read(folder.root / NAME)
     if saved is None:
@@ -89,8 +89,8 @@ def roll_back(folder: JobFolder) -> JobStatus | None:
         recover(folder.result)
     write_job(folder.job_path, job)
     discard_rollback(folder)
-    _logger.info("the job is again as it was before this mesh")
-    # The folder may be a copy, whose status names the place of the other one.
+    _logger.info("the job was restored to its state before this mesh")
+    # The folder may be a copy whose status names the original's path.
     return replace(status, result=str(folder.result) if status.result else "")
 
 

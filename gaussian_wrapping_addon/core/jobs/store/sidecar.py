@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The JSON beside an exported file: where its coordinates lie, and what it was made of.
+"""Write the JSON sidecar of an exported file: its coordinate frame and how it was made.
 
-Exports are given away, so that names stand in it and no path of this machine.
+Exports are shared with others, so that it holds names and no paths of this machine.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MANIFEST = "blender_manifest.toml"
 
 
 def sidecar_path(path: Path) -> Path:
-    """Return where the sidecar of an exported file lies: ``auto.glb`` has ``auto.glb.json``."""
+    """Return the path of an exported file's sidecar, such as ``auto.glb.json`` of ``auto.glb``."""
     return path.with_name(path.name + ".json")
 
 
@@ -54,13 +54,13 @@ def write_sidecar(
     path : Path
         The exported file.
     frame : FileFrame
-        Of its coordinates.
+        Frame of its coordinates.
     placed : bool
         Whether the target of ``frame`` is the scene as placed, else the world of the input.
     result : Path
-        The result folder of the job; what is missing there is left out.
+        The result folder of the job; entries missing there are left out.
     contents : dict
-        What the file holds: region, level, shading, number of vertices and faces, textures.
+        Content of the file: region, level, shading, number of vertices and faces, textures.
     """
     values = {
         "version": VERSION,
@@ -77,7 +77,7 @@ def write_sidecar(
 
 
 def _source(result: Path, region: Any) -> dict[str, Any]:
-    """Return the job and the region's file, as far as they are there."""
+    """Return the job and the region's file, as far as they exist."""
     out: dict[str, Any] = {"job": None, "region_body": None, "training": None}
     try:
         job_path, region_path = result.parent / "job.json", result / str(region) / "region.json"
@@ -96,8 +96,8 @@ def _source(result: Path, region: Any) -> dict[str, Any]:
         if region is not None and figures_path.is_file():
             out["training"] = read_json(figures_path).get("training")
     except WrapError as error:
-        # The mesh is sound all the same: a sidecar that says less is better than no export.
-        _logger.warning("the sidecar says less: %s", error)
+        # The mesh is valid all the same: an incomplete sidecar is better than no export.
+        _logger.warning("the sidecar is incomplete: %s", error)
     return out
 
 
@@ -118,7 +118,7 @@ def _versions() -> dict[str, str | None]:
 
 @functools.cache
 def add_on_version() -> str:
-    """Return the version of the manifest; ``"unknown"`` where there is none beside the package."""
+    """Return the version in the manifest; ``"unknown"`` if there is none beside the package."""
     for folder in (_PACKAGE, _PACKAGE.parent):
         path = folder / _MANIFEST
         if path.is_file():
@@ -128,7 +128,7 @@ def add_on_version() -> str:
 
 @functools.cache
 def code_fingerprint() -> str:
-    """Return 12 hexadecimal digits that change with any file of the code."""
+    """Return a hash of all code files, 12 hexadecimal digits."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Stages: a folder named by the hash of its inputs, finished when ``done.json`` lies in it."""
+"""Stages: folders named by the hash of their inputs, finished once ``done.json`` exists."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .job_folder import MARKER
 
 _logger = logging.getLogger(__name__)
 
-# Bump a number when a stage's code changes its result, so that old stage folders are not re-used.
+# Increase a number when a stage's code changes its result: old stage folders are not re-used then.
 STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 9, "texture": 11}
 
 HASH_CHARACTERS = 12
@@ -38,12 +38,12 @@ class Stage:
     """Hash of everything that the stage's result depends on."""
     folder: Path
     done: dict[str, Any]
-    """Content of ``done.json``: what was measured."""
+    """Content of ``done.json``: the stage's measurements."""
     reused: bool
 
 
 def stage_key(*parts: Any) -> str:
-    """Hash JSON values (and keys of earlier stages) into the name of a stage."""
+    """Hash JSON values (and keys of earlier stages) into the key of a stage."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:HASH_CHARACTERS]
 
@@ -51,7 +51,7 @@ def stage_key(*parts: Any) -> str:
 def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
     """List the files of an input with size and modification time, for :func:`stage_key`.
 
-    Photos are not read: size and time tell a change, as in other build systems.
+    Photos are not read: size and time detect a change, as in build systems.
     """
     if source.is_file() and source.suffix.lower() == ".ply":
         state = source.stat()
@@ -90,19 +90,19 @@ def run_stage(
     progress: Progress,
     work: Callable[[Path, Progress], dict[str, Any]],
 ) -> Stage:
-    """Run a stage, or re-use it when its folder is finished.
+    """Run a stage, or re-use its finished folder.
 
     Parameters
     ----------
     stages : Path
         Folder of all stages.
     name, key : str
-        Together the folder's name.
+        Together they form the folder's name.
     progress : Progress
-        Span of the stage.
+        Progress of the stage.
     work : callable
-        Does the work in the folder; returns what goes into ``done.json``. A folder left by an
-        interrupted run is given as it is, so that training finds its checkpoints.
+        Works in the folder; returns the content of ``done.json``. The folder of an interrupted
+        run is passed as it is, so that training finds its checkpoints.
     """
     folder = stages / f"{name}-{key}"
     done = read_done(folder)
@@ -115,7 +115,7 @@ def run_stage(
     progress.update(0.0, f"{name}: starting")
     done = work(folder, progress)
     seconds = _seconds_so_far(folder) + time.monotonic() - begun_s
-    # Of this process and this run alone, not of helpers.
+    # Of this process in this run only, without helpers.
     processor_s = time.process_time() - begun_processor_s
     done = {
         **done,
@@ -129,7 +129,7 @@ def run_stage(
 
 
 def record_interrupted_time(stages: Path, name: str, key: str, seconds: float) -> None:
-    """Add the time of an interrupted run to the stage, so that reports count it."""
+    """Record the time of an interrupted run, so that reports include it."""
     folder = stages / f"{name}-{key}"
     if folder.is_dir() and read_done(folder) is None:
         write_json(folder / "spent.json", {"seconds": _seconds_so_far(folder) + seconds})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Up from cameras held level, pitched, by quarter turns, upside down; and where nobody can tell."""
+"""Up direction of cameras that are level, pitched, rolled, upside down, or ambiguous."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The main level plane of a surface: found exactly where it is clear, None where it is not."""
+"""The ground plane of a surface: exact where it is distinct, None where it is not."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scale, ground and origin: exact where the answer is known, refused where there is none."""
+"""Steps of the placement: exact results for known cases, errors for degenerate input."""
 
 from __future__ import annotations
 
@@ -69,13 +69,13 @@ def test_scale_step_gives_the_length_and_keeps_the_origin(size: float, length: f
         ([[0, 0, 0]], 1.0, "One point is picked"),
         (NOTHING, 1.0, "No point"),
         ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], 1.0, "3 are picked"),
-        ([[0, 0, 0], [0, 0, 0]], 1.0, "one place"),
-        ([[1, 2, 3], [1, 2, 3]], 1.0, "one place"),
-        ([[1e5, 0, 0], [1e5 + 1e-3, 0, 0]], 1.0, "one place"),
-        ([[0, 0, 0], [1, 0, 0]], 0.0, "no distance"),
-        ([[0, 0, 0], [1, 0, 0]], -2.0, "no distance"),
-        ([[0, 0, 0], [1, 0, 0]], np.inf, "no distance"),
-        ([[0, 0, 0], [1, 0, 0]], np.nan, "no distance"),
+        ([[0, 0, 0], [0, 0, 0]], 1.0, "coincide"),
+        ([[1, 2, 3], [1, 2, 3]], 1.0, "coincide"),
+        ([[1e5, 0, 0], [1e5 + 1e-3, 0, 0]], 1.0, "coincide"),
+        ([[0, 0, 0], [1, 0, 0]], 0.0, "not a distance"),
+        ([[0, 0, 0], [1, 0, 0]], -2.0, "not a distance"),
+        ([[0, 0, 0], [1, 0, 0]], np.inf, "not a distance"),
+        ([[0, 0, 0], [1, 0, 0]], np.nan, "not a distance"),
         ([[0, 0, 0], [np.nan, 0, 0]], 1.0, "not finite"),
     ],
 )
@@ -122,8 +122,8 @@ def test_the_side_of_a_plane_without_cameras_is_the_one_nearer_to_z() -> None:
         ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], "one line"),
         ([[0, 0, 0], [1, 1, 1], [2, 2, 2.001]], "one line"),
         ([[0, 0, 0], [0, 0, 0], [5, 0, 0]], "one line"),
-        ([[3, 0, 0]] * 3, "one place"),
-        ([[0, 0, 0]] * 3, "one place"),
+        ([[3, 0, 0]] * 3, "coincide"),
+        ([[0, 0, 0]] * 3, "coincide"),
         ([[0, 0, 0], [1, 0, 0], [0, np.inf, 0]], "not finite"),
     ],
 )

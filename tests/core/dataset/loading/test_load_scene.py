@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Loading whole inputs: every kind, every repair, every refusal."""
+"""Loading complete inputs: every kind, every repair, every error."""
 
 from __future__ import annotations
 
@@ -275,9 +275,9 @@ def test_one_wild_camera_and_wild_points_are_left_out(tmp_path: Path) -> None:
     assert [c.name for c in scene.cameras] == [f"p{i:02d}.png" for i in (0, 1, 3, 4, 5)]
     assert len(scene.points) == 119
     text = " ".join(w.text for w in scene.warnings)
-    assert "1 cameras stand far away" in text
-    assert "1 sparse points lie impossibly far" in text
-    assert any("1 cameras stand far away" in f.message for f in check_input(tmp_path / "set"))
+    assert "1 cameras are far away" in text
+    assert "1 sparse points are impossibly far" in text
+    assert any("1 cameras are far away" in f.message for f in check_input(tmp_path / "set"))
 
 
 def _folder_with(folder: Path, count: int, *, model: bool) -> Path:
@@ -379,7 +379,7 @@ def test_broken_scene_files_are_refused(tmp_path: Path) -> None:
         load_saved_scene(work)
     (work / "scene.json").write_text(text)
     (source / "images" / "p02.png").unlink()
-    with pytest.raises(DatasetError, match=r"p02\.png is no longer there"):
+    with pytest.raises(DatasetError, match=r"p02\.png no longer exists"):
         load_saved_scene(work)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cameras made up around a splat, and what the check says of a splat as an input."""
+"""Virtual cameras around a splat, and the check of a splat as an input."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_surroundings_do_not_push_the_cameras_out() -> None:
 def test_transparent_and_collapsed_splats_are_refused() -> None:
     with pytest.raises(DatasetError, match="transparent"):
         splat_extent(fibonacci_directions(50), np.zeros(50))
-    with pytest.raises(DatasetError, match="one place"):
+    with pytest.raises(DatasetError, match="coincide"):
         splat_extent(np.ones((50, 3)), np.ones(50))
 
 
@@ -98,7 +98,7 @@ def test_the_check_names_formats_that_are_not_read(tmp_path: Path, suffix: str) 
     path.write_bytes(b"x")
     (finding,) = check_input(path)
     assert finding.severity == "error"
-    assert "not read" in finding.message
+    assert "not supported" in finding.message
 
 
 def test_the_check_refuses_a_point_cloud(tmp_path: Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""COLMAP models: the convention, every cut, every lie a file can tell."""
+"""COLMAP models: conventions, truncation at every byte, and invalid content."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the command ``estimate`` reads of an input before anything is made of it."""
+"""The facts that the command ``estimate`` reads from an input."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Exports of a result: coordinates lead back to the world, and bad data writes nothing."""
+"""Exports of a result: coordinates map back to the world, and invalid data writes no file."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def test_what_is_not_finite_is_refused_and_nothing_is_written(tmp_path: Path) ->
 def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
     result = write_result(tmp_path / "job")
     good = ExportRequest(result, tmp_path / "out", ("glb",))
-    with pytest.raises(UsageError, match="'fbx' is not written here"):
+    with pytest.raises(UsageError, match="'fbx' cannot be exported"):
         exported(replace(good, formats=("glb", "fbx")))
     with pytest.raises(UsageError, match="shiny"):
         exported(replace(good, shading="shiny"))

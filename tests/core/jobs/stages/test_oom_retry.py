@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A training that runs out of memory comes back smaller, says so, and stays so when resumed."""
+"""Retries after running out of memory: reduced settings, a warning, the same when resumed."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The field that regions are meshed from: photo masks, unseen space, bounds with the halo."""
+"""The vacancy field of a region: photo masks, unseen space, bounds with the halo."""
 
 from __future__ import annotations
 

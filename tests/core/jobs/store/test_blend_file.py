@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""No ``scene.blend`` stays beside a result that it does not show."""
+"""A ``scene.blend`` is renamed when the result beside it changes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Several processes share the parts of a mesh; what a dead one held is taken over."""
+"""Several processes share the tasks of a mesh and take over those of a dead process."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training more finds the right checkpoints, and refuses with words where there are none."""
+"""Continuing a training finds the right checkpoints and raises if there are none."""
 
 from __future__ import annotations
 

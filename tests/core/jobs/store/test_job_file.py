@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Job files: round trip, and refusal of what is not one."""
+"""Job files: round trip and validation."""
 
 from __future__ import annotations
 

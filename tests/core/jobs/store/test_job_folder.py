@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Job folders: ownership, locks, states of processes that are gone."""
+"""Job folders: ownership, locks, states of processes that have ended."""
 
 from __future__ import annotations
 

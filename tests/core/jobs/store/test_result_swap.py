@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""An export that fails anywhere leaves the earlier result as it was, byte for byte."""
+"""An export that fails at any point leaves the earlier result unchanged, byte for byte."""
 
 from __future__ import annotations
 

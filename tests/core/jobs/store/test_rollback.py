@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mesh that fails leaves a finished job as it was; what comes after knows nothing of it."""
+"""A failed mesh rolls a finished job back; later commands see no trace of it."""
 
 from __future__ import annotations
 

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Cameras stage: load the input as a scene, or re-use the cameras of a finished training."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from ...progress import Progress
+from ..store.job_file import JobFile
+from ..store.job_folder import JobFolder
+from ..store.stage_folder import (
+    STAGE_VERSIONS,
+    Stage,
+    read_done,
+    run_stage,
+    source_fingerprint,
+    stage_key,
+)
+from .training_stage import training_keys
+
+_logger = logging.getLogger(__name__)
+
+
+def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads: int) -> Stage:
+    """Load the scene, or re-use a finished cameras stage.
+
+    ``mesh`` uses the cameras of the finished training even if the photos have changed since.
+
+    Raises
+    ------
+    DatasetError, ParseError
+        The input cannot be used.
+    """
+    from ...dataset.loading.load import load_scene
+    from ...dataset.scene_file import save_scene
+    from .splat_scene import is_splat, make_splat_scene
+
+    source = Path(job.source)
+    key = stage_key(
+        STAGE_VERSIONS["cameras"], job.source, source_fingerprint(source), job.settings.seed
+    )
+    if job.command == "mesh" and read_done(folder.stages / f"cameras-{key}") is None:
+        earlier = _cameras_of_finished_training(folder, job)
+        if earlier is not None:
+            _logger.warning(
+                "%s has changed since the training, or its files have new dates: the mesh is of "
+                "the training as it is. To train anew, run wrap.", source,
+            )  # fmt: skip
+            return earlier
+
+    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        if is_splat(source):
+            scene = make_splat_scene(source, stage_folder, progress, threads=threads)
+        else:
+            scene = load_scene(
+                source, stage_folder, progress, seed=job.settings.seed, threads=threads
+            )
+        save_scene(scene, stage_folder)
+        return {
+            "views": len(scene.views),
+            "points": len(scene.points),
+            "warnings": [warning.to_json() for warning in scene.warnings],
+            "facts": scene.facts,
+        }
+
+    return run_stage(folder.stages, "cameras", key, progress, work)
+
+
+def _cameras_of_finished_training(folder: JobFolder, job: JobFile) -> Stage | None:
+    """Return the newest finished cameras stage with a finished training of this job."""
+    found: list[tuple[float, int, Stage]] = []
+    for path in sorted(folder.stages.glob("cameras-*")):
+        done, key = read_done(path), path.name.removeprefix("cameras-")
+        train_key, _ = training_keys(STAGE_VERSIONS["train"], key, job)
+        trained = read_done(folder.stages / f"train-{train_key}")
+        if done is not None and trained is not None:
+            stage = Stage("cameras", key, path, done, True)
+            found.append((trained["finished_unix_s"], len(found), stage))
+    return max(found)[2] if found else None

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Mesh stage: mesh a region of a finished training and clean the mesh up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ...errors import MeshingError
+from ...progress import Progress
+from ..store.job_file import JobFile
+from ..store.job_folder import JobFolder
+from ..store.stage_folder import Stage, run_stage
+from .mesh_keys import mesh_key
+
+DENSE_MESH = "dense.npz"
+"""In a mesh stage: the mesh before decimation, if it was decimated; texture maps use it."""
+
+
+def run_mesh(
+    folder: JobFolder,
+    job: JobFile,
+    request: str,
+    name: str,
+    cameras: Stage,
+    trained: Stage,
+    progress: Progress,
+    *,
+    threads: int,
+) -> Stage:
+    """Mesh a region, or re-use its finished mesh stage.
+
+    Parameters
+    ----------
+    request : str
+        The region's entry in the job's settings.
+    name : str
+        Name of the region's folder.
+
+    Raises
+    ------
+    MeshingError, ResourceError
+        The region holds no surface, or its mesh does not fit into memory.
+    """
+    meshing = job.meshing_of(request)
+    body = job.region_bodies.get(request)
+    key = mesh_key(job, request, name, trained.key)
+
+    def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
+        import numpy as np
+
+        from ...dataset.scene_file import load_saved_scene
+        from ...field.depth_samples import sample_depth_maps
+        from ...field.vector_field import VectorField
+        from ...gaussians.gaussian_file import load_gaussians
+        from ...mesh.mesh_file import save_mesh
+        from ...meshing.checks.manifold_check import validate_manifold
+        from ...meshing.checks.mesh_statistics import mesh_statistics
+        from ...meshing.cleanup.clean_up import clean_up
+        from ...meshing.cleanup.open_boundary import without_caps
+        from ...regions.region import write_region
+        from .region_field import field_figures, region_field, requested_region
+        from .region_meshing import (
+            mesh_by_pivots_in_stage,
+            mesh_in_stage,
+            remove_tiles,
+            tiles_origin,
+        )
+
+        scene = load_saved_scene(cameras.folder)
+        gaussians = load_gaussians(trained.folder / "gaussians.npz")
+        arrays = gaussians.arrays()
+        region, world_region = requested_region(request, body, scene, arrays)
+        vacancy = region_field(
+            scene, arrays, region, job.settings.training, meshing, threads=threads,
+            device=str(gaussians.means.device),
+        )  # fmt: skip
+        depth_samples = sample_depth_maps(
+            gaussians, scene.cameras, lambda points: region.contains(points, 0.0),
+            progress.span(0.0, 0.15), threads=threads,
+        )  # fmt: skip
+        if meshing.method == "pivots":
+            mesh, expected = mesh_by_pivots_in_stage(
+                stage_folder, vacancy, arrays, scene.cameras, region, meshing,
+                progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
+                depth_samples=depth_samples,
+            )  # fmt: skip
+        else:
+            mesh, expected = mesh_in_stage(
+                stage_folder, vacancy, VectorField(arrays, threads=threads), arrays, scene.cameras,
+                region, meshing, progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
+                edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
+                depth_samples=depth_samples,
+                origin=tiles_origin(cameras.folder, trained.folder, job.settings),
+            )  # fmt: skip
+        mesh, dense = clean_up(mesh, region, meshing, vacancy, progress.span(0.9, 0.97))
+        open_at = region if meshing.boundary == "open" else None
+        if open_at is not None:
+            mesh = without_caps(mesh, open_at, meshing.min_component_share)
+            if dense is not None:
+                dense = without_caps(dense, open_at, meshing.min_component_share)
+        mesh.provenance.update(field_figures(vacancy))
+        if not np.isfinite(mesh.vertices).all():
+            raise MeshingError(
+                "The mesh has vertices that are not finite.",
+                "Send the job folder's log.txt with a bug report.",
+            )
+        save_mesh(stage_folder / "mesh.npz", mesh)
+        if dense is not None:
+            save_mesh(stage_folder / DENSE_MESH, dense)
+        remove_tiles(stage_folder)
+        write_region(stage_folder / "region.json", world_region)
+        progress.update(0.97, "measuring the mesh")
+        return {
+            "statistics": mesh_statistics(mesh).to_json(),
+            "check": validate_manifold(mesh.vertices, mesh.faces, open_at).to_json(),
+            "provenance": mesh.provenance,
+            "edge_length_world": meshing.edge_length,
+            "estimate": expected,
+        }
+
+    return run_stage(folder.stages, f"mesh-{name}", key, progress, work)
