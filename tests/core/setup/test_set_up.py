@@ -150,7 +150,11 @@ def test_ctrl_c_cancels_the_command(request_: SetupRequest) -> None:
     batch = Path(install.__file__).parents[2] / "batch.py"
     options = ["--find-links", request_.find_links, "--requirements", request_.requirements]
     command = [sys.executable, str(batch), "set-up-worker", "--to", request_.root, *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True,
+        # Started in the background of a shell, the tests themselves ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
     end_s = time.monotonic() + 30
     while not request_.environment.folder.exists():
         assert time.monotonic() < end_s
