@@ -11,7 +11,7 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.training.losses.multi_view import _Pair
+from gaussian_wrapping_addon.core.training.losses.multi_view import _ViewPair
 from tests.core.render.scenes import look_at
 
 NORMAL = np.array([0.0, 0.0, 1.0])
@@ -60,10 +60,10 @@ def moved(view: PlaneView, **images: np.ndarray) -> PlaneView:
     return dataclasses.replace(view, **images)
 
 
-def pair_of(view: PlaneView, pixels: np.ndarray, threads: int = 1) -> _Pair:
+def pair_of(view: PlaneView, pixels: np.ndarray, threads: int = 1) -> _ViewPair:
     """Return what the terms make of the exact view."""
     reference, other = camera_pair()
-    return _Pair(view, reference, other, pixels, 0.2, threads)  # type: ignore[arg-type]
+    return _ViewPair(view, reference, other, pixels, 0.2, threads)  # type: ignore[arg-type]
 
 
 def grey_of(photo: np.ndarray) -> np.ndarray:

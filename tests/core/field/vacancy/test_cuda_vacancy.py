@@ -384,5 +384,5 @@ def test_a_full_gpu_is_a_typed_error(emulator_library: Path) -> None:
         kernels=Full(emulator_library), device_cache_bytes=0,
     )  # fmt: skip
     for ask in (field.vacancy, field.is_empty, lambda points: field.transmittance(points, 0)):
-        with pytest.raises(ResourceError, match="vacancy of 1 Gaussians: 2 GiB asked"):
+        with pytest.raises(ResourceError, match="vacancy field of 1 Gaussians: 2 GiB asked"):
             ask(np.zeros((5, 3)))
