@@ -12,10 +12,8 @@ prepare:
 demo: prepare
 	$(PY) gaussian_wrapping_addon/batch.py wrap examples/bananas --out demo_out --preset draft
 
-# The tests in a real Blender run alone: they measure how long Blender stands still.
 test: lint blenders
-	$(PY) -m pytest $(PARALLEL) -m "not gui"
-	$(PY) -m pytest -m gui
+	$(PY) -m pytest $(PARALLEL)
 
 quick: lint
 	$(PY) -m pytest $(PARALLEL) -q -m "not slow and not gui"
