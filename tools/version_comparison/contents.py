@@ -60,6 +60,7 @@ LEFT_OUT_ENTRIES = (
     LeftOut(r"(^|\.)free_memory_bytes$", "memory that was free"),
     LeftOut(r"(^|\.)pid(_started)?$", "process number"),
     LeftOut(r"^machine\.", "the machine"),
+    LeftOut(r"^made_with\.code$", "fingerprint of the source code"),
     LeftOut(r"(^|\.)estimate\.speed$", "speed of the machine"),
     LeftOut(r"(^|\.)(evidence|note|lpips_note|unwrap_fallback_reason)$", "wording"),
     LeftOut(
