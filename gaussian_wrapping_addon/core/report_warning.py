@@ -27,6 +27,27 @@ class ReportWarning:
         return asdict(self)
 
 
+# Version 0.1.0 stored texts alone, and told what to do by these marks in them.
+_HINTS_0_1_0 = (
+    ("could not be placed", "Take more photos with more overlap there, or remove blurred ones."),
+    ("cannot be read", "Save these photos again as JPEG or PNG."),
+    ("start points", "Photos with more texture help, or a COLMAP model with its points."),
+    ("points3D", "Export the COLMAP model together with its points."),
+    ("held out for measuring", "Take more photos, from all around."),
+    ("numbers were not finite", "If the figures below are poor, train again with another seed."),
+    ("stand far away", "Check the poses of these cameras."),
+    ("stand on one line", "Take photos from other heights and directions too."),
+    ("models:", "Take photos that connect the parts, so that one model holds them all."),
+    ("left out", "Check whether these are needed; if so, export the input again."),
+    ("levels of detail were made", "Ask for fewer with --lods, or for a mesh with more faces."),
+    ("ply_file_path", "Put the file where transforms.json says it is."),
+)
+
+
+def _hint_of_0_1_0(text: str) -> str:
+    return next((hint for mark, hint in _HINTS_0_1_0 if mark in text), "")
+
+
 def read_warnings(values: Any) -> tuple[ReportWarning, ...]:
     """Return the warnings of a JSON list; invalid entries are skipped.
 
@@ -38,7 +59,7 @@ def read_warnings(values: Any) -> tuple[ReportWarning, ...]:
     found = []
     for value in values if isinstance(values, list) else []:
         if isinstance(value, str):
-            found.append(ReportWarning("", value))
+            found.append(ReportWarning("", value, _hint_of_0_1_0(value)))
         elif isinstance(value, dict) and isinstance(value.get("text"), str):
             code, hint = (value.get(key) for key in ("code", "hint"))
             found.append(

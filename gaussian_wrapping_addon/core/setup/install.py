@@ -136,6 +136,7 @@ class SetupTask(threading.Thread):
             write_json(environment.marker_path, marker)
         lock = JobFolder(environment.root)
         lock.lock()
+        replaced = environment.folder if environment.is_ready() else None
         try:
             _delete_unused(environment)
             (environment.root / _TEMPORARY).mkdir()
@@ -151,7 +152,8 @@ class SetupTask(threading.Thread):
             register_environment(environment.root)
         finally:
             with contextlib.suppress(OSError):  # the next set-up deletes the rest
-                _delete_unused(environment)
+                # Jobs that run may still load packages from the replaced environment.
+                _delete_unused(environment, keep=replaced)
             lock.unlock()
             if self.is_cancelling and not environment.is_ready():
                 with contextlib.suppress(OSError):
@@ -249,15 +251,15 @@ def error_from_output(code: int, last: list[str]) -> WrapError:
     return WorkerError(f"A command of the set-up ended with code {code}: {errors[-1]}.", _SEE_LOG)
 
 
-def _delete_unused(environment: WorkerEnvironment) -> None:
-    """Delete the files of an environment except the folder in use."""
+def _delete_unused(environment: WorkerEnvironment, keep: Path | None = None) -> None:
+    """Delete the files of an environment except the folder in use and ``keep``."""
     in_use = environment.folder if environment.is_ready() else None
     if in_use is None:
         environment.ready_path.unlink(missing_ok=True)
     for folder in (environment.root / name for name in (*FOLDERS, _TEMPORARY)):
         if folder.is_symlink():
             folder.unlink()
-        elif folder.exists() and folder != in_use:
+        elif folder.exists() and folder not in (in_use, keep):
             shutil.rmtree(folder)
 
 

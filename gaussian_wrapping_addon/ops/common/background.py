@@ -70,7 +70,8 @@ class Task(Generic[Result]):
             self._results.append(self._call())
         except Exception as failure:  # delivered, or raised by result()
             self._failure = failure
-        self._ended.set()
+        finally:
+            self._ended.set()
 
     def finished(self, wait_s: float = 0.0) -> bool:
         """Return whether the call has ended, waiting up to ``wait_s`` seconds."""

@@ -8,6 +8,7 @@ Nothing here waits: Pythons are searched, set-ups and removals run in the backgr
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import time
@@ -30,6 +31,8 @@ from ..common.background import Lane
 from ..common.redrawing import redraw
 from . import worker_check
 from .preferred_worker import worker_choice
+
+_logger = logging.getLogger(__name__)
 
 READY_FOR_S = 2.0
 """Lifetime of a cached result of :func:`worker_problem`."""
@@ -94,7 +97,17 @@ def search_pythons() -> None:
     if not state.has_searched:
         state.has_searched = True
         own = sys.executable
-        _searches.submit(lambda: (cuda_present(), find_pythons(own)), _keep_search)
+        _searches.submit(
+            lambda: (cuda_present(), find_pythons(own)), _keep_search, failed=_search_failed
+        )
+    if not state.is_busy and state.task is not None and state.task.status.active:
+        state.is_busy = True  # it went on while the add-on was disabled
+        background.watch(tick)
+
+
+def _search_failed(error: Exception) -> None:
+    _logger.error("The search for Python installations failed.", exc_info=error)
+    _keep_search((False, []))
 
 
 def _keep_search(found: tuple[bool, list[FoundPython]]) -> None:

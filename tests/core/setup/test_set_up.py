@@ -110,7 +110,7 @@ def test_a_whole_life(request_: SetupRequest, monkeypatch: pytest.MonkeyPatch) -
     write_wheel(Path(request_.find_links), "gwgamma", "2.0")
     assert finish(request_).state == "DONE"
     assert environment.folder.name == "env-2"
-    assert not (environment.root / "env").exists()
+    assert (environment.root / "env").exists(), "a job that runs may still load packages from it"
     assert imported(request_, "gwgamma") == "2.0"
     assert job_client.worker_python() == environment.worker() != worker
 
@@ -239,8 +239,11 @@ def test_one_that_0_1_0_made_is_used_and_replaced(quick: SetupRequest, kind: str
     assert interpreter_of(environment.worker()) == expected
     assert finish(quick).state == "DONE"
     assert environment.is_ready()
-    assert not old.exists()
     assert imported(quick, "gwbeta") == "0.9"
+    assert old.exists(), "a job that runs may still load packages from it"
+    assert finish(quick).state == "DONE"
+    assert environment.is_ready()
+    assert not (environment.root / "packages").exists(), "the next set-up deletes it"
 
 
 def test_a_marker_from_elsewhere_names_no_other_folder(tmp_path: Path) -> None:

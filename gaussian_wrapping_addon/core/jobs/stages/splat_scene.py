@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...dataset.loading.splat_cameras import (
+    NO_PHOTOS_HINT,
     NO_PHOTOS_WARNING,
     cameras_on_spheres,
     scene_frame,
@@ -85,7 +86,7 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
     chosen = np.nonzero((opacities >= MIN_START_OPACITY) & near)[0]
     chosen = chosen[:: max(1, -(-len(chosen) // MAX_START_POINTS))]
     colors = np.clip(0.5 + SH_C0 * world.sh[chosen, 0].numpy(), 0.0, 1.0)  # (m, 3)
-    warnings = [*splat.warnings, ReportWarning("without-photos", NO_PHOTOS_WARNING)]
+    warnings = [*splat.warnings, ReportWarning("without-photos", NO_PHOTOS_WARNING, NO_PHOTOS_HINT)]
     if extent.has_surroundings:
         text = "The splat reaches far beyond its middle; only the middle is covered by the views."
         warnings.append(ReportWarning("surroundings-not-covered", text))

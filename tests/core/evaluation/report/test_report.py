@@ -126,7 +126,7 @@ def test_every_warning_is_listed_with_stage_and_next_step(tmp_path: Path) -> Non
         assert line == f"warning ({warning['stage']}): {warning['text']}"
 
 
-def test_texts_of_version_0_1_0_are_read_without_a_hint(tmp_path: Path) -> None:
+def test_texts_of_version_0_1_0_are_read_with_their_hints(tmp_path: Path) -> None:
     """``report.json`` and ``done.json`` held plain texts then; old stages are used again."""
     summary, region = full_summary(), full_region()
     whole = write(tmp_path, copy.deepcopy(summary), {REGION: copy.deepcopy(region)})[0]
@@ -135,10 +135,11 @@ def test_texts_of_version_0_1_0_are_read_without_a_hint(tmp_path: Path) -> None:
     region["provenance"]["notes"] = [n["text"] for n in region["provenance"]["notes"]]
     report, text = write(tmp_path, summary, {REGION: region})
     stated = "2 of 16 photos could not be placed and are not used: a|b.jpg, c.jpg."
-    assert report["warnings"][0] == {"stage": "cameras", "code": "", "text": stated, "hint": ""}
+    hint = "Take more photos with more overlap there, or remove blurred ones."
+    assert report["warnings"][0] == {"stage": "cameras", "code": "", "text": stated, "hint": hint}
     assert [w["text"] for w in report["warnings"]] == [w["text"] for w in whole["warnings"]]
     line = next(x for x in text.splitlines() if escaped(stated) in x and x.startswith("- "))
-    assert "Next step" not in line
+    assert escaped(hint) in line
 
 
 def test_warnings_of_stages_are_written_as_they_were_made(tmp_path: Path) -> None:
