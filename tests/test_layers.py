@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The plan of docs/architecture.md: folders in order, imports that run down, no circles."""
+"""The map of docs/architecture.md: imports of the same or earlier folders only, no circles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "gaussian_wrapping_addon"
 CORE = PACKAGE / "core"
 
-# From the bottom to the top: a file imports its own folder and those before it, never one after it.
+# A file imports its own folder and folders listed earlier in FOLDERS, never later ones.
 FOLDERS = (
     "core",
     "core/settings", "core/ply", "core/kernels", "core/processes", "core/imaging",
@@ -42,7 +42,7 @@ FOLDERS = (
     "command_line/options", "command_line", "",
 )  # fmt: skip
 
-# What a part may not reach although it stands below: part -> parts.
+# What a part may not import although it is listed earlier: part -> parts.
 KEPT_APART = {
     "field": {"training"}, "meshing": {"training"}, "texture": {"training"},
     "evaluation": {"training"},
@@ -106,7 +106,7 @@ def folder_of(module: str) -> str:
 
 
 def upward(package: Path, order: Iterable[str]) -> list[str]:
-    """Return the imports that run up, and those of or from folders that have no place."""
+    """Return the imports of later folders, and those of or from folders that have no place."""
     place = {folder: k for k, folder in enumerate(order)}
     wrong = []
     for path in python_files(package):

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Data sets: cameras, the scene with its views and points, and readers of inputs.
 
-The modules here are the data classes; the folders read inputs and make a scene of them.
+In: photos, camera poses, point clouds. Out: a :class:`.scene.Scene`. The modules here are the data
+classes and the file of a scene; the folders read inputs and make a scene of them.
 """

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Initial Gaussians: from sparse points, and along camera rays if these are few."""
+"""Initial Gaussians: from sparse points, and along camera rays if these are few.
+
+The start from an existing splat is in ``core/training/initialisation/``.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussians and a camera in, images and gradients out.
+"""Rendering of oriented Gaussians, forward and backward.
 
-``render.py`` is for autograd, ``view_renderer.py`` for the trainer; the folders hold the steps.
+In: Gaussians and a camera. Out: images and gradients. ``render.py`` is for autograd,
+``view_renderer.py`` for the trainer; the folders hold the steps.
 """
