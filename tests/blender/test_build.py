@@ -116,18 +116,18 @@ preferences = bpy.context.preferences.addons[name].preferences
 preferences.threads = 3
 preferences.worker_python = {python!r}
 assert "gaussian_wrapping_addon" not in sys.modules
-workers = sys.modules[name + ".ops.preferred_worker"]
+workers = sys.modules[name + ".ops.worker.preferred_worker"]
 choice = workers.worker_choice(bpy.context)
 assert (choice.threads, choice.python) == (3, {python!r}), choice
 import time
 scene = bpy.context.scene
 scene.gwrap.source = {photos!r}
 assert bpy.ops.gwrap.wrap_scene() == {{"FINISHED"}}
-timer = sys.modules[name + ".ops.job_timer"]
+timer = sys.modules[name + ".ops.jobs.job_timer"]
 end_s = time.monotonic() + 60
 while timer.poll_jobs() and time.monotonic() < end_s:
     time.sleep(0.1)
-watched = sys.modules[name + ".ops.watched_jobs"]
+watched = sys.modules[name + ".ops.jobs.watched_jobs"]
 status = watched.status_of(scene.gwrap.job_folder)
 print("STATUS", status.state, status.error)
 known = Path(bpy.utils.extension_path_user(name)) / "known_jobs.json"

@@ -242,7 +242,7 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(UsageError, match="Degree 4"):
         select_harmonics(sphere_gaussians(), views, [], 4)
     wrong = [dataclasses.replace(views[0], photo=views[0].photo[1:]), *views[1:]]
-    with pytest.raises(UsageError, match="one size"):
+    with pytest.raises(UsageError, match="same size"):
         select_harmonics(sphere_gaussians(), wrong, [], 1, threads=1)
 
 
