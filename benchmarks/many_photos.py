@@ -138,8 +138,8 @@ _NOTE = (
 )
 
 _PURPOSE = (
-    f"The same scene from {PHOTOS} photos of {WIDTH_PX} x {HEIGHT_PX} pixels and from every second of "
-    "them; preset Draft, exact cameras, everything else as the program decides. Pruning by "
+    f"The same scene from {PHOTOS} photos of {WIDTH_PX} x {HEIGHT_PX} pixels and from every second "
+    "of them; preset Draft, exact cameras, everything else as the program decides. Pruning by "
     "contribution must not remove what only some of many photos show."
 )
 
