@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 from ... import tolerances
-from ..simd.raster_math import FRONT_SIGMAS
+from ..simd.raster_math import FLOAT32_MAX, FRONT_SIGMAS
 
 PARTS = (
     "common.cu",
@@ -35,6 +35,7 @@ KERNELS = (
     "backward_tiles_absolute",
     "backward_tiles_depth_absolute",
     "sum_pairs",
+    "finish_params",
     "locate_points",
     "transmittance_tiles",
 )
@@ -85,6 +86,7 @@ _DOUBLE = {
     "FINITE_Z_MAX": tolerances.FINITE_Z_MAX,
     "FINITE_SIGMA_Z": tolerances.FINITE_SIGMA_Z,
     "FINITE_COLOR": tolerances.FINITE_COLOR,
+    "FLOAT32_MAX": FLOAT32_MAX,
     # As in projection_backward.py.
     "GRADIENT_MAX": 1e38,
     "BASIS_MAX": 3.0,
