@@ -105,35 +105,6 @@ def reference_depth_at(
     return positions.new_zeros(len(positions)).index_put((seen,), _depth(rays, options))
 
 
-def reference_transmittance_at(
-    gaussians: OrientedGaussians,
-    camera: Camera,
-    positions: Tensor,
-    depths: Tensor,
-    options: RenderOptions,
-) -> Tensor:
-    """Return the transmittance of the contributors of :func:`render_reference` up to z-depths.
-
-    Parameters
-    ----------
-    gaussians, camera, positions, options
-        As for :func:`reference_depth_at`.
-    depths : (m,) tensor
-        Scene units, >= 0; differentiable.
-
-    Returns
-    -------
-    (m,) tensor
-        In [0, 1]; 0 off the image.
-    """
-    rays, seen = _evaluate_rays_at(gaussians, camera, positions, options)
-    before = (rays.peak - depths[seen][:, None]).clamp_min(0.0)  # (k, n)
-    density = torch.exp(rays.log_alpha - 0.5 * rays.sharpness * before * before)
-    density = torch.where(rays.contributes, density.clamp_max(tolerances.ALPHA_MAX), 0.0)
-    transmittance = torch.prod(1.0 - density, dim=1)
-    return positions.new_zeros(len(positions)).index_put((seen,), transmittance)
-
-
 def _evaluate_rays_at(
     gaussians: OrientedGaussians, camera: Camera, positions: Tensor, options: RenderOptions
 ) -> tuple[_RayEvaluation, Tensor]:
