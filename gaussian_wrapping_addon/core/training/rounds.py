@@ -143,9 +143,13 @@ class Rounds:
                 )
                 stopped = not evidence.pays
         weights = self._region_weights(state)
-        densify_and_prune(
+        change = densify_and_prune(
             state.adam, state.statistics, 0 if stopped else limit, state.random, weights
         )
+        _logger.debug(
+            "iteration %d: cloned %d, split %d, pruned %d Gaussians",
+            state.iteration, change.cloned, change.split, change.pruned,
+        )  # fmt: skip
 
     def _prune(self, state: TrainingState) -> None:
         found = contributions(
