@@ -89,6 +89,8 @@ def reference_depth_at(
 ) -> Tensor:
     """Return the depth of :func:`render_reference` at any positions of the image.
 
+    The definition of :func:`~..query.depth_query.solve_depths`; only tests compare with it.
+
     Parameters
     ----------
     gaussians, camera, options
