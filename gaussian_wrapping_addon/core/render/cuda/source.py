@@ -62,7 +62,7 @@ _SINGLE = {
     "NEGLIGIBLE": 30.0,
     "FALL_END": 22.4,
     "SOLVER_STEP_SIGMAS": 5e-4,
-    "SOLVER_LEVEL_MARGIN": 3e-7,
+    "SOLVER_LEVEL_MARGIN": 3e-7,  # as in isosurface_steps.py
     "SOLVER_BRACKET_SHARE": 1.25e-7,
     "SOLVER_LEAST_SHARE": 1.25e-7,
     "SOLVER_POLISH_SIGMAS": 3e-3,

@@ -40,7 +40,8 @@ class NeighbourLimits:
 
 
 FIXED_LIMITS = NeighbourLimits(max_distance=0.3 * tolerances.SCENE_RADIUS, min_overlap=0.0)
-"""The limits of docs/method.md, section 3.4, tuned on captures of hundreds of photos."""
+"""The limits that those above replace (docs/method.md, section 3.4, departures), tuned on captures
+of hundreds of photos."""
 
 
 def find_neighbours(
