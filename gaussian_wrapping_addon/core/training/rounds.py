@@ -142,7 +142,7 @@ class Rounds:
             evidence = state.error_history.growth_evidence()
             state.model_selection = state.model_selection.with_decision(evidence.decision(setting))
             stopped = setting == "auto" and not evidence.pays
-        densify_and_prune(
+        change = densify_and_prune(
             state.adam,
             state.statistics,
             0 if stopped else limit,
@@ -151,6 +151,10 @@ class Rounds:
             least_score=self.settings.densify_score,
             min_opacity=self.settings.min_opacity,
         )
+        _logger.debug(
+            "iteration %d: cloned %d, split %d, pruned %d Gaussians",
+            state.iteration, change.cloned, change.split, change.pruned,
+        )  # fmt: skip
 
     def _prune(self, state: TrainingState) -> None:
         """Remove the Gaussians that no training view needs."""

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -29,8 +28,6 @@ from ...settings import TrainingSettings
 from ..cancellation import cancellable
 from ..density.orientation import orient
 from .splat_transform import transform_gaussians, with_degree
-
-_logger = logging.getLogger(__name__)
 
 ITERATIONS_SHARE = 0.3
 """Share of the preset's iterations: positions and colours exist, shapes and orientations do not."""

@@ -325,7 +325,7 @@ def _other_gradients(
 ) -> tuple[VisibleGradients, np.ndarray, int]:
     """Return gradients on the Gaussians (m', ...) and positions (m, 2), and Gaussians dropped."""
     grad_params = np.zeros_like(view.screen.params)
-    by_positions, _ = add_query_gradients(view, depths, by_found, grad_params)
+    by_positions = add_query_gradients(view, depths, by_found, grad_params)
     # All values are finite if the sum of their absolute values is.
     with np.errstate(all="ignore"):
         sizes = np.abs(grad_params[:, :_GEOMETRY_COLUMNS]).sum(1)  # (n,)

@@ -16,8 +16,7 @@ import numpy as np
 
 from ...kernels.compiled import inline, kernel
 
-CAMERA_VALUES = 6
-"""fx, fy, cx, cy, width, height."""
+# Cameras are (6,): fx, fy, cx, cy, width, height.
 
 HALF_PATCH = 3
 """A patch has ``2 * 3 + 1`` samples per side ..."""

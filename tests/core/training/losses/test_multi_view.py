@@ -14,7 +14,6 @@ from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.query.depth_query import query_depth
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRenderer
@@ -27,6 +26,7 @@ from gaussian_wrapping_addon.core.training.losses.multi_view import (
 from gaussian_wrapping_addon.core.training.losses.multi_view_kernels import SAMPLES
 from gaussian_wrapping_addon.core.training.losses.pixel_choice import choose_pixels, grey_image
 from gaussian_wrapping_addon.core.training.optimizer.gradient_sums import merge_gradients
+from tests.core.render.query_autograd import query_depth
 from tests.core.training.plane_scene import camera_pair, plane_gaussians, plane_photo
 
 REFERENCE, OTHER = camera_pair()
