@@ -73,18 +73,20 @@ def normal_product(
     weights = np.empty(8, np.float32)
     basis = np.empty(9, np.float32)
     wide = np.empty(8, np.float32)
-    mixed = np.empty(27, np.float32)
-    own = np.empty((8, 27), np.float32)
-    total = np.empty((8, 27), np.float32)
+    # One colour after the other, so that the inner loops run over neighbouring numbers.
+    factors = np.empty(72, np.float32)
+    own = np.empty((3, 72), np.float32)
+    total = np.empty((3, 72), np.float32)
     near = np.empty((8, 3), np.float32)
     near_total = np.empty((8, 3), np.float32)
     quarter = np.float32(0.25)
     for c in range(begin, end):
         for k in range(8):
             vertex = coarse_corners[c, k]
-            for j in range(27):
-                own[k, j] = coarse[vertex, j]
-                total[k, j] = np.float32(0.0)
+            for h in range(9):
+                for j in range(3):
+                    own[j, 9 * k + h] = coarse[vertex, 3 * h + j]
+                    total[j, 9 * k + h] = np.float32(0.0)
         for f in range(coarse_starts[c], coarse_starts[c + 1]):
             for k in range(8):
                 vertex = fine_corners[f, k]
@@ -101,31 +103,25 @@ def normal_product(
                     wide,
                 )
                 _harmonics(directions[s, 0], directions[s, 1], directions[s, 2], basis)
-                for j in range(27):
-                    mixed[j] = np.float32(0.0)
                 for k in range(8):
-                    w = wide[k]
-                    for j in range(27):
-                        mixed[j] += w * own[k, j]
+                    for h in range(9):
+                        factors[9 * k + h] = wide[k] * basis[h]
                 red = -share * colors[s, 0]
                 green = -share * colors[s, 1]
                 blue = -share * colors[s, 2]
+                for q in range(72):
+                    red += factors[q] * own[0, q]
+                    green += factors[q] * own[1, q]
+                    blue += factors[q] * own[2, q]
                 for k in range(8):
                     red += weights[k] * near[k, 0]
                     green += weights[k] * near[k, 1]
                     blue += weights[k] * near[k, 2]
-                for h in range(9):
-                    red += basis[h] * mixed[3 * h]
-                    green += basis[h] * mixed[3 * h + 1]
-                    blue += basis[h] * mixed[3 * h + 2]
-                for h in range(9):
-                    mixed[3 * h] = basis[h] * red
-                    mixed[3 * h + 1] = basis[h] * green
-                    mixed[3 * h + 2] = basis[h] * blue
+                for q in range(72):
+                    total[0, q] += factors[q] * red
+                    total[1, q] += factors[q] * green
+                    total[2, q] += factors[q] * blue
                 for k in range(8):
-                    w = wide[k]
-                    for j in range(27):
-                        total[k, j] += w * mixed[j]
                     near_total[k, 0] += weights[k] * red
                     near_total[k, 1] += weights[k] * green
                     near_total[k, 2] += weights[k] * blue
@@ -133,8 +129,9 @@ def normal_product(
                 for j in range(3):
                     fine_sums[f, k, j] = near_total[k, j]
         for k in range(8):
-            for j in range(27):
-                coarse_sums[c, k, j] = total[k, j]
+            for h in range(9):
+                for j in range(3):
+                    coarse_sums[c, k, 3 * h + j] = total[j, 9 * k + h]
 
 
 @kernel(fast=True)

@@ -38,7 +38,7 @@ class MeshBasedSettings:
     """How the field is trained and what is compared."""
 
     max_samples: int = 3_000_000
-    """Training pixels of the mesh that are used, drawn evenly; fewer if there are fewer."""
+    """Training pixels that are used, of each photo at most an equal share, drawn evenly."""
     seed: int = 0
     """Of the draw."""
     outline_margin: float = 0.02
@@ -285,30 +285,28 @@ def _draw(
     progress: Progress,
 ) -> tuple[Samples | None, int]:
     """Return samples of the surface and the number of pixels that they were drawn from."""
-    depths, candidates = [], []
+    quota = -(-settings.max_samples // len(training))
+    generator = np.random.default_rng(settings.seed)
+    points, directions, footprints, colors = [], [], [], []
+    total = 0
     for number, view in enumerate(training):
         progress.update(number / len(training), "finding the surface in the training photos")
         depth = surface.depth(view.camera)
         use = np.isfinite(depth)
         if view.counted is not None:
             use &= view.counted
-        depths.append(depth)
-        candidates.append(np.flatnonzero(use).astype(np.int32))
-    total = sum(map(len, candidates))
-    if total == 0:
-        return None, 0
-    share = min(1.0, settings.max_samples / total)
-    generator = np.random.default_rng(settings.seed)
-    points, directions, footprints, colors = [], [], [], []
-    for view, depth, every in zip(training, depths, candidates, strict=True):
-        count = min(len(every), max(1, round(share * len(every)))) if len(every) else 0
-        chosen = every if count == len(every) else generator.choice(every, count, replace=False)
+        chosen = np.flatnonzero(use)
+        total += len(chosen)
+        if len(chosen) > quota:
+            chosen = np.sort(generator.choice(chosen, quota, replace=False))
         found = _rays(depth, view.camera, chosen)
         points.append(found[0])
         directions.append(found[1])
         focal = float(np.sqrt(view.camera.fx * view.camera.fy))
         footprints.append((depth.reshape(-1)[chosen] / focal).astype(np.float32))
         colors.append(_target(view).reshape(-1, 3)[chosen])
+    if total == 0:
+        return None, 0
     joined = (np.concatenate(parts) for parts in (points, directions, footprints, colors))
     return Samples(*joined), total
 
