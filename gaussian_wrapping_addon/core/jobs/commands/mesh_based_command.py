@@ -143,11 +143,11 @@ def table(values: dict[str, Any]) -> list[str]:
         value = values.get(name)
         return "not measured" if value is None else f"{value:.{digits}f}{unit}"
 
+    tested, trained = len(values["views"]), values["training_views"]
+    figures = f"PSNR {shown('psnr', 2, ' dB')}, SSIM {shown('ssim', 4)}, LPIPS {shown('lpips', 4)}"
     lines = [
-        f"mesh-based rendering over {len(values['views'])} test photos, field trained on "
-        f"{values['training_views']} others",
-        f"PSNR {shown('psnr', 2, ' dB')}, SSIM {shown('ssim', 4)}, LPIPS {shown('lpips', 4)} "
-        "(pixels that no face covers are black)",
+        f"mesh-based rendering: {tested} test photos, colour field trained on {trained} others",
+        f"{figures} (pixels that no face covers are black)",
         f"PSNR of covered pixels {shown('covered_psnr', 2, ' dB')}",
     ]
     uncovered = values.get("uncovered")
