@@ -15,5 +15,6 @@ MESH_METHODS = ("pam", "pivots")
 PIVOT_COUNTS = (2, 3, 9)
 BOUNDARIES = ("closed", "open")
 UNSEEN = ("empty", "occupied")
+FIELD_CAMERAS = ("training", "all")
 MAX_LODS = 8
 TEXTURE_SOURCES = ("photos", "gaussians")

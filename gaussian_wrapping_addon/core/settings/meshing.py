@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from ..limits import MAX_TILES
 from .checks import Choices, Condition, Range
-from .choices import BOUNDARIES, MESH_METHODS, PIVOT_COUNTS, SPACINGS, UNSEEN
+from .choices import BOUNDARIES, FIELD_CAMERAS, MESH_METHODS, PIVOT_COUNTS, SPACINGS, UNSEEN
 from .declaration import Item, Option, PanelProperty, setting
 
 
@@ -179,6 +179,30 @@ class MeshingSettings:
             items=(
                 Item("empty", "Empty", "Space that no camera sees is empty"),
                 Item("occupied", "Occupied", "It is solid: closes the backs of objects"),
+            ),
+        ),
+    )
+    cameras: str = setting(
+        "training",
+        help="Cameras that the mesh is made from. training: those that were trained on, as the "
+        "method has it; all: those of held-out and of wholly masked photos as well.",
+        check=Choices(FIELD_CAMERAS),
+        option=Option(
+            "--mesh-cameras",
+            help="cameras that the mesh is made from: those trained on (default), or all, held-out "
+            "ones too",
+        ),
+        panel=PanelProperty(
+            "Cameras",
+            "Cameras that the mesh is made from",
+            name="mesh_cameras",
+            items=(
+                Item(
+                    "training",
+                    "Training",
+                    "Those that were trained on; held-out photos only measure",
+                ),
+                Item("all", "All", "Held-out photos carve the mesh, too"),
             ),
         ),
     )

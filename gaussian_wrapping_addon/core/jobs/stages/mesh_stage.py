@@ -76,19 +76,20 @@ def run_mesh(
             device=str(gaussians.means.device),
         )  # fmt: skip
         depth_samples = sample_depth_maps(
-            gaussians, scene.cameras, lambda points: region.contains(points, 0.0),
+            gaussians, vacancy.cameras, lambda points: region.contains(points, 0.0),
             progress.span(0.0, 0.15), threads=threads,
         )  # fmt: skip
         if meshing.method == "pivots":
             mesh, expected = mesh_by_pivots_in_stage(
-                stage_folder, vacancy, arrays, scene.cameras, region, meshing,
+                stage_folder, vacancy, arrays, vacancy.cameras, region, meshing,
                 progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
                 depth_samples=depth_samples,
             )  # fmt: skip
         else:
             mesh, expected = mesh_in_stage(
-                stage_folder, vacancy, VectorField(arrays, threads=threads), arrays, scene.cameras,
-                region, meshing, progress.span(0.15, 0.9), seed=job.settings.seed, threads=threads,
+                stage_folder, vacancy, VectorField(arrays, threads=threads), arrays,
+                vacancy.cameras, region, meshing, progress.span(0.15, 0.9),
+                seed=job.settings.seed, threads=threads,
                 edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
                 depth_samples=depth_samples,
                 origin=tiles_origin(cameras.folder, trained.folder, job.settings),
@@ -99,7 +100,7 @@ def run_mesh(
             mesh = without_caps(mesh, open_at, meshing.min_component_share)
             if dense is not None:
                 dense = without_caps(dense, open_at, meshing.min_component_share)
-        mesh.provenance.update(field_figures(vacancy))
+        mesh.provenance.update(field_figures(vacancy), cameras=meshing.cameras)
         if not np.isfinite(mesh.vertices).all():
             raise MeshingError(
                 "The mesh has vertices that are not finite.",
