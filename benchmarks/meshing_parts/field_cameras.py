@@ -21,7 +21,7 @@ from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
 from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.kernels.parallel import default_threads
 from gaussian_wrapping_addon.core.machine import processor_name
-from gaussian_wrapping_addon.core.settings.choices import FIELD_CAMERAS
+from gaussian_wrapping_addon.core.settings import FIELD_CAMERAS
 
 from ..scenes import ensure_scene
 from ..speed_error.plan import THRESHOLD_SHARES, Run, Variant
