@@ -53,7 +53,8 @@ MOST_MODULES = 12
 
 # Blender's own process has only the standard library and numpy: what it loads may import no more.
 BLENDER_SIDE = (
-    "core.jobs.client", "core.jobs.commands.evaluate_command", "core.jobs.store.job_file",
+    "core.jobs.client", "core.jobs.commands.run_in_worker",
+    "core.jobs.commands.evaluate_command", "core.jobs.store.job_file",
     "core.dataset.loading.check", "core.settings", "core.setup.install",
     "core.processes.worker_environment", "core.regions.box", "core.regions.region_file",
     "core.names",

@@ -2,7 +2,7 @@
 """The ``estimate-mesh`` command in the worker's Python: triangles, time and memory of a mesh.
 
 Needs a finished training. Writes one JSON object per line to stdout, in the protocol of
-:mod:`~.evaluate_command`.
+:mod:`~.run_in_worker`.
 """
 
 from __future__ import annotations
