@@ -15,6 +15,7 @@ from ...report_warning import LEFT_OUT_HINT, ReportWarning
 from ...tolerances import SCENE_RADIUS
 from ..camera import Camera
 from ..frames.normalisation import find_scene_frame
+from ..frames.scene_grid import POINT_STEP, snapped, snapped_camera
 from ..photos.photo_finder import list_photos, photo_root
 from ..poses.pose_solver import solve_poses
 from ..readers.source_kind import SourceKind, read_poses, source_kind
@@ -84,7 +85,7 @@ def load_scene(
     check_photo_count(len(views))
     views, scene_from_world, frame_facts = _frame(views, warnings)
     facts.update(frame_facts)
-    cameras = [_camera(view).moved(scene_from_world) for view in views]
+    cameras = [snapped_camera(_camera(view).moved(scene_from_world)) for view in views]
     points, colors = _points(model, scene_from_world, warnings)
     if len(points) < MIN_POINTS:
         points, colors, facts["start_points"] = make_start_points(
@@ -173,9 +174,9 @@ def _camera(view: PreparedView) -> Camera:
 def _points(
     model: SourceModel, scene_from_world: Similarity, warnings: list[ReportWarning]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Transform the input's sparse points to the scene frame and drop outliers."""
+    """Transform the input's sparse points to the scene frame's grid and drop outliers."""
     with np.errstate(over="ignore", invalid="ignore"):
-        points = scene_from_world.points(model.points.reshape(-1, 3))
+        points = snapped(scene_from_world.points(model.points.reshape(-1, 3)), POINT_STEP)
         near = np.linalg.norm(points, axis=1) <= POINT_REACH
     if not near.all():
         text = f"{int((~near).sum())} sparse points are impossibly far away and were left out."
