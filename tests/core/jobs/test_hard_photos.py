@@ -63,9 +63,8 @@ class Case:
             width, height = self.sizes[index % len(self.sizes)]
             cx = width / 2 if self.cx_px is None else self.cx_px
             name = f"{index:03d}{self.suffix}"
-            cameras.append(
-                (index + 1, "PINHOLE", width, height, [self.focal_px, self.focal_px, cx, height / 2])
-            )  # fmt: skip
+            lens = [self.focal_px, self.focal_px, cx, height / 2]
+            cameras.append((index + 1, "PINHOLE", width, height, lens))
             quaternion = quaternion_from_rotation(pose[:, :3])
             records.append(ImageRecord(index + 1, quaternion, pose[:, 3], index + 1, name))
             rays = np.ones((height, width, 3))
