@@ -33,7 +33,7 @@ FOLDERS = (
     "core/texture/atlas", "core/texture/unwrap", "core/texture/bake", "core/texture/cost",
     "core/texture/files", "core/texture/detail", "core/texture",
     "core/evaluation/surface", "core/evaluation/alignment", "core/evaluation/layouts",
-    "core/evaluation/views", "core/evaluation/report", "core/evaluation",
+    "core/evaluation/color_field", "core/evaluation/views", "core/evaluation/report", "core/evaluation",
     "core/jobs/store", "core/jobs/stages", "core/jobs", "core/jobs/commands", "core/setup",
     "ops/common", "ops/cameras", "ops/regions", "ops/placement", "ops/results", "ops/export",
     "ops/worker", "ops/jobs", "ops/training", "ops/dataset", "ops/meshing", "ops",
