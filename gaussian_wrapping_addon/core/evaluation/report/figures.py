@@ -36,6 +36,8 @@ _UNITS = {
     "utilisation": "of 1",
     "coverage": "of 1",
     "covered": "of 1",
+    "uncovered": "of 1",
+    "whole_psnr": "dB",
     "exposure_spread": "of 1, standard deviation",
     "brightness_spread_within_photos": "of 1, standard deviation",
     "stretch_mean": "1 is even",
