@@ -12,20 +12,17 @@ from ...errors import DatasetError
 from ...limits import MIN_IMAGES
 from ...progress import Progress
 from ...report_warning import LEFT_OUT_HINT, ReportWarning
-from ...tolerances import SCENE_RADIUS
+from ...tolerances import POINT_REACH, SCENE_RADIUS
 from ..camera import Camera
 from ..frames.normalisation import find_scene_frame
 from ..photos.photo_finder import list_photos, photo_root
 from ..poses.pose_solver import solve_poses
 from ..readers.source_kind import SourceKind, read_poses, source_kind
 from ..readers.source_model import SourceModel
-from ..scene import Scene, View
+from ..scene import Scene, View, usable_points
 from ..similarity import Similarity
 from .start_points import MIN_POINTS, make_start_points
 from .views import PreparedView, prepare_views
-
-POINT_REACH = 100.0 * SCENE_RADIUS
-"""Sparse points further than this from the cameras are triangulation errors."""
 
 
 def load_scene(
@@ -173,11 +170,14 @@ def _camera(view: PreparedView) -> Camera:
 def _points(
     model: SourceModel, scene_from_world: Similarity, warnings: list[ReportWarning]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Transform the input's sparse points to the scene frame and drop outliers."""
+    """Transform the input's sparse points to the scene frame; leave out and count unusable ones."""
     with np.errstate(over="ignore", invalid="ignore"):
         points = scene_from_world.points(model.points.reshape(-1, 3))
-        near = np.linalg.norm(points, axis=1) <= POINT_REACH
+    near = usable_points(points)
     if not near.all():
-        text = f"{int((~near).sum())} sparse points are impossibly far away and were left out."
+        text = (
+            f"{int((~near).sum())} of {len(near)} sparse points were left out: they are not finite "
+            f"or farther away than {POINT_REACH / SCENE_RADIUS:.0f} scene radii."
+        )
         warnings.append(ReportWarning("points-far-away", text, LEFT_OUT_HINT))
     return points[near], model.point_colors[near]
