@@ -38,10 +38,11 @@ def job(tmp_path: Path) -> JobFolder:
     return JobFolder(tmp_path / "copy" / "job")
 
 
-def batch(job: JobFolder, *arguments: str) -> str:
+def batch(job: JobFolder, *arguments: str, timeout_s: float = 240.0) -> str:
     done = subprocess.run(
         [sys.executable, str(ROOT / "gaussian_wrapping_addon" / "batch.py"), *arguments],
-        cwd=job.root.parent, capture_output=True, text=True, check=False, timeout=240,
+        cwd=job.root.parent, capture_output=True, text=True, check=False,
+        timeout=timeout_s,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -89,7 +90,7 @@ def test_its_files_are_exported(job: JobFolder, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_resume_makes_anew_what_is_computed_otherwise_since(job: JobFolder) -> None:
     before = contents(job.stages)
-    batch(job, "resume", "job", "--no-blend")
+    batch(job, "resume", "job", "--no-blend", timeout_s=540.0)
     assert set(reused(job).values()) == {False}
     assert contents(job.stages).items() >= before.items()
     after = report(job)
