@@ -24,6 +24,7 @@ from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene, sa
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, ParseError
 from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS
 from tests.core.dataset.model_writers import (
     HEIGHT,
     WIDTH,
@@ -274,14 +275,19 @@ def test_one_wild_camera_and_wild_points_are_left_out(tmp_path: Path) -> None:
     pose = look_at_pose(np.array([1e6, 0.0, 0.0]), np.zeros(3))
     model.images[2].translation = pose[:, 3]
     model.points[5] = ([1e9, 0.0, 0.0], *model.points[5][1:])
+    model.points[6] = ([0.0, 2e3, 0.0], *model.points[6][1:])  # far, and a point like others
     write_binary(model, tmp_path / "set" / "sparse")
     write_photos(model, tmp_path / "set" / "images")
     scene = load(tmp_path / "set")
     assert [c.name for c in scene.cameras] == [f"p{i:02d}.png" for i in (0, 1, 3, 4, 5)]
     assert len(scene.points) == 119
+    far = scene.world_from_scene.points(scene.points)[5]
+    assert far == pytest.approx([0.0, 2e3, 0.0], abs=1e-6)
+    assert np.linalg.norm(scene.points[5]) > 100 * SCENE_RADIUS
     text = " ".join(w.text for w in scene.warnings)
     assert "1 cameras are far away" in text
-    assert "1 sparse points are impossibly far" in text
+    assert "1 of " in text
+    assert "farther away than 10000 scene radii" in text
     assert any("1 cameras are far away" in f.message for f in check_input(tmp_path / "set"))
 
 
