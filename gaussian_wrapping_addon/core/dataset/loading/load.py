@@ -29,8 +29,8 @@ from .views import PreparedView, prepare_views
 _ONE_PLACE_REACH = 100.0 * SCENE_RADIUS
 """Points farther than this are far away for the distances between the cameras."""
 _MIN_NEAR_SHARE = 0.1
-"""Where fewer of the sparse points are nearer, it is not the points that are far: the cameras hardly
-moved."""
+"""Where fewer of the sparse points are nearer, it is not the points that are far: the cameras
+hardly moved."""
 
 
 def load_scene(
