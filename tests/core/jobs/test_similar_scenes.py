@@ -7,7 +7,6 @@ Bit for bit in the scene frame; in world coordinates to the digits that a file h
 from __future__ import annotations
 
 import json
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -115,7 +114,6 @@ def test_scenes_are_loaded_with_the_same_bits(
 @pytest.fixture(scope="module")
 def meshed(inputs: dict[str, BallScene]) -> dict[str, Path]:
     """Train and mesh the scene at every similarity, in this process; return the results."""
-    logging.getLogger("gaussian_wrapping_addon").setLevel(logging.ERROR)
     results = {}
     for name, scene in inputs.items():
         box = scene.folder.parent / "ball.json"
