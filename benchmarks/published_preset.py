@@ -57,8 +57,8 @@ _PROTOCOL = (
 )
 
 _NOTE = (
-    "PSNR of eight test views that no run was given. F1 over the whole true surface at shares of the "
-    "crop volume's diagonal; thin recall on parts thinner than 1.5 % of it; normals: mean absolute "
+    "PSNR of eight test views that no run was given. F1 over the whole true surface at shares of "
+    "the crop volume's diagonal; thin recall on parts thinner than 1.5 % of it; normals: mean absolute "
     "cosine between corresponding normals."
 )
 
@@ -83,10 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _cells(of: dict[str, Any]) -> tuple[str | float | int | None, ...]:
     """Return one row of the table."""
-    iterations = of["iterations"]
-    per_iteration = (
-        None if of["train_processor_s"] is None else of["train_processor_s"] / iterations
-    )
+    iterations, spent_s = of["iterations"], of["train_processor_s"]
     published = preset("paper").training.iterations
     return (
         LABELS[of["run"]],
