@@ -58,8 +58,8 @@ _PROTOCOL = (
 
 _NOTE = (
     "PSNR of eight test views that no run was given. F1 over the whole true surface at shares of "
-    "the crop volume's diagonal; thin recall on parts thinner than 1.5 % of it; normals: mean absolute "
-    "cosine between corresponding normals."
+    "the crop volume's diagonal; thin recall on parts thinner than 1.5 % of it; normals: mean "
+    "absolute cosine between corresponding normals."
 )
 
 
