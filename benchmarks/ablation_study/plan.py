@@ -17,7 +17,7 @@ SEEDS = (0, 1, 2)
 PRESET = "draft"
 
 FIXED = (
-    "--iterations", "1000", "--max-gaussians", "30000", "--max-image-px", "640", "--holdout", "0",
+    "--iterations", "1000", "--max-gaussians", "20000", "--max-image-px", "640", "--holdout", "0",
     "--harmonics", "off", "--exposure", "off", "--growth", "on", "--full-size", "on",
     "--spacing", "uniform", "--points", "12000", "--texture-size", "64",
 )  # fmt: skip
