@@ -13,21 +13,22 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from gaussian_wrapping_addon.core.errors import WorkerError
 from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.machine import processor_name
 
 from ..scenes import ensure_scene
-from ..speed_error.runs import BATCH, LAST_LINES, ROOT
+from ..speed_error.runs import BATCH, LAST_LINES, ROOT, Settings
+from ..speed_error.runs import warm_up as run_warm_up
 from ..tables import versions
 from .case import Case
 from .record import Record, code_of_tree, record_path, write_record
 
 _logger = logging.getLogger("benchmarks")
 
-STAGES = ("cameras", "train", "mesh", "texture", "export")
+STAGES = ("cameras", "train", "mesh", "texture")
 KEPT_RUNS = ROOT / ".cache" / "studies"
 """Folders of runs, with Gaussians and meshes: not committed, and not needed for a document."""
 
@@ -39,12 +40,19 @@ _SURFACE = (
 DIGITS = 6
 
 
+class Maker(Protocol):
+    """Makes one run and writes its record."""
+
+    def __call__(self, case: Case, *, threads: int, kept: Path = KEPT_RUNS) -> Record: ...
+
+
 def carry_out(
     cases: Sequence[Case],
     *,
     threads: int,
     again: bool = False,
     runs: int = 0,
+    maker: Maker | None = None,
     kept: Path = KEPT_RUNS,
 ) -> int:
     """Make the runs that have no record yet, in their order; return how many failed.
@@ -57,6 +65,8 @@ def carry_out(
         Make runs that have a record, too.
     runs : int
         Make no more runs than this; 0: there is no limit.
+    maker : callable, optional
+        Makes one run and writes its record; :func:`make` by default.
     kept : Path
         Folder of the runs themselves.
     """
@@ -67,18 +77,34 @@ def carry_out(
         if runs and made == runs:
             break
         made += 1
+        warm_up(case, threads, kept)
         try:
-            record = make(case, threads=threads, kept=kept)
+            record = (maker or make)(case, threads=threads, kept=kept)
         except WorkerError as error:
             failed += 1
             _logger.error("%s failed: %s", case.identity, error)
             continue
         _logger.info(
             "%d/%d %s: %.0f processor s, F1 %s", number + 1, len(cases), case.identity,
-            record.processor_s["command"],
+            record.spent_s,
             " ".join(f"{value:.3f}" for value in record.scores["surface"]["uniform"]["f1"]),
         )  # fmt: skip
     return failed
+
+
+def warm_up(case: Case, threads: int, kept: Path) -> None:
+    """Compile all kernels in a job of a minute, once for each version of the code."""
+    stamp = kept / f"warm-{code_of_tree().name.replace(', ', '-')}"
+    if stamp.is_file():
+        return
+    everything = ("--multi-view", "on", "--wrapping", "on", "--harmonics", "on", "--exposure", "on")
+    run_warm_up(_scene(case), Settings(kept, threads, False), everything)
+    stamp.touch()
+
+
+def _scene(case: Case) -> Path:
+    photos = case.photos
+    return ensure_scene(case.scene, photos=photos.count, width=photos.width, height=photos.height)
 
 
 def make(case: Case, *, threads: int, kept: Path = KEPT_RUNS) -> Record:
@@ -89,8 +115,7 @@ def make(case: Case, *, threads: int, kept: Path = KEPT_RUNS) -> Record:
     WorkerError
         With the last lines of the job's output.
     """
-    photos = case.photos
-    scene = ensure_scene(case.scene, photos=photos.count, width=photos.width, height=photos.height)
+    scene = _scene(case)
     folder = run_folder(case, kept)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -111,7 +136,7 @@ def make(case: Case, *, threads: int, kept: Path = KEPT_RUNS) -> Record:
     words += ["--export", "ply", "--no-blend", "--threads", str(threads)]
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     code = code_of_tree()
-    wall_s, processor_s = _child([sys.executable, str(BATCH), *words], f"See {job}.")
+    wall_s = _child([sys.executable, str(BATCH), *words], f"See {job}.")
     scores_file = folder / "scores.json"
     _judge(scene, job, folder, scores_file, threads)
     report = read_json(job / "result" / "report.json")
@@ -128,7 +153,7 @@ def make(case: Case, *, threads: int, kept: Path = KEPT_RUNS) -> Record:
         date=datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes"),
         load_before=load,
         wall_s=round(wall_s, 1),
-        processor_s={**stages, "command": round(processor_s, 1)},
+        processor_s=stages,
         memory_gib=round(max(peaks.values()) / 2**30, 2) if peaks else None,
         mesh={
             "vertices": statistics["vertices"],
@@ -150,17 +175,21 @@ def run_folder(case: Case, kept: Path = KEPT_RUNS) -> Path:
 
 def kept_scores(scores: dict[str, Any]) -> dict[str, Any]:
     """Return what a record keeps of the scores, lengths as shares of the diagonal."""
-    diagonal = scores["diagonal"]
-    surface = {}
-    for protocol in ("uniform", "scan"):
-        found = {name: scores["surface"][protocol][name] for name in _SURFACE}
-        for name in ("accuracy_median", "chamfer_mean"):
-            found[name] = None if found[name] is None else found[name] / diagonal
-        surface[protocol] = found
     texture = {name: scores["texture"].get(name) for name in ("psnr", "ssim", "coverage")}
-    kept = {"surface": surface, "texture": texture}
+    kept = {"surface": kept_surface(scores["surface"], scores["diagonal"]), "texture": texture}
     kept |= {name: scores[name] for name in ("gaussians", "depth", "vacancy") if name in scores}
     return dict(_rounded(kept))
+
+
+def kept_surface(surface: dict[str, Any], diagonal: float) -> dict[str, Any]:
+    """Return what a record keeps of the scores of a surface, by protocol."""
+    found: dict[str, Any] = {}
+    for protocol in ("uniform", "scan"):
+        found[protocol] = {name: surface[protocol][name] for name in _SURFACE}
+        for name in ("accuracy_median", "chamfer_mean"):
+            length = found[protocol][name]
+            found[protocol][name] = None if length is None else length / diagonal
+    return dict(_rounded(found))
 
 
 def _rounded(values: Any) -> Any:
@@ -186,24 +215,14 @@ def _judge(scene: Path, job: Path, folder: Path, path: Path, threads: int) -> No
     )  # fmt: skip
 
 
-def _child(command: list[str], hint: str) -> tuple[float, float]:
-    """Run a command; return its seconds on the clock and of all processors."""
-    begun_s, used_s = time.monotonic(), children_s()
+def _child(command: list[str], hint: str) -> float:
+    """Run a command; return its seconds on the clock."""
+    begun_s = time.monotonic()
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     if done.returncode != 0:
         words = "\n".join((done.stdout + done.stderr).splitlines()[-LAST_LINES:])
         raise WorkerError(f"A run failed with exit code {done.returncode}: {words}", hint)
-    return time.monotonic() - begun_s, children_s() - used_s
-
-
-def children_s() -> float:
-    """Return the processor seconds of all ended children; NaN where unknown."""
-    try:
-        import resource
-    except ImportError:
-        return math.nan
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
+    return time.monotonic() - begun_s
 
 
 def _processor_s(report: dict[str, Any], stage: str) -> float | None:

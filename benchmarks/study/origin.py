@@ -28,7 +28,7 @@ def made_by(command: str, records: Sequence[Record], planned: Sequence[Case]) ->
     dates = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
     machines = "; ".join(dict.fromkeys(f"{r.machine}, {_threads(r)}" for r in records))
     versions = "; ".join(dict.fromkeys(r.versions for r in records))
-    used_s = math.fsum(r.processor_s["command"] for r in records)
+    used_s = math.fsum(r.spent_s for r in records)
     loads = [r.load_before for r in records if r.load_before is not None]
     load = f" Load average before a run: {min(loads):.1f} to {max(loads):.1f}." if loads else ""
     done = {r.case.identity for r in records}

@@ -58,7 +58,7 @@ class Record:
     wall_s: float
     """Of the whole command, on the clock: other programs may have run beside it."""
     processor_s: dict[str, float]
-    """By stage, and ``command``: all of the command, with starting Python and writing files."""
+    """By stage, of all threads: as the job measures them, without starting Python."""
     memory_gib: float | None
     mesh: dict[str, Any]
     """``vertices``, ``faces``, ``closed``, ``components``."""
@@ -83,6 +83,11 @@ class Record:
     def f1(self, index: int, protocol: str = "uniform") -> float:
         """Return F1 at a threshold."""
         return float(self.scores["surface"][protocol]["f1"][index])
+
+    @property
+    def spent_s(self) -> float:
+        """Processor seconds of all its stages; NaN where one is not known."""
+        return self.processor(*self.processor_s)
 
     def processor(self, *stages: str) -> float:
         """Return the processor seconds of some stages together; NaN where one is not known."""
