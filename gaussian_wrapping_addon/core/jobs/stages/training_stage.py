@@ -111,10 +111,11 @@ def _train(
 ) -> dict[str, Any]:
     from ...dataset.photos.photo_store import PhotoStore
     from ...dataset.scene_file import load_saved_scene
+    from ...dataset.view_split import held_out_views
     from ...evaluation.report.pictures import write_held_out
     from ...gaussians.gaussian_file import save_gaussians
     from ...training.checkpoint import remove_checkpoints
-    from ...training.trainer import held_out_views, train
+    from ...training.trainer import train
     from .splat_scene import start_splat_of
 
     scene = load_saved_scene(cameras.folder)
