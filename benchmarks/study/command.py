@@ -13,6 +13,7 @@ from gaussian_wrapping_addon.core.errors import UsageError
 from ..speed_error.runs import ROOT
 from .case import Case, named
 from .making import Maker, carry_out, make
+from .mesh_based import fill_in
 from .record import Record, read_records
 
 _logger = logging.getLogger("benchmarks")
@@ -50,6 +51,10 @@ def run_study(
         "--only", nargs="+", default=[], metavar="WORD",
         help="make runs of these scenes, names and seeds (seed0) only",
     )  # fmt: skip
+    parser.add_argument(
+        "--mbr", action="store_true",
+        help="make no run: mesh-based rendering of the kept meshes whose record lacks it",
+    )  # fmt: skip
     parser.add_argument("--document", action="store_true", help="make no run, write the document")
     if draw is not None:
         parser.add_argument(
@@ -64,7 +69,9 @@ def run_study(
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     logging.getLogger("PIL").setLevel(logging.WARNING)
     failed = 0
-    if not options.document:
+    if options.mbr:
+        failed = fill_in(chosen, threads=options.threads, runs=options.runs, again=options.again)
+    elif not options.document:
         failed = carry_out(
             chosen, threads=options.threads, again=options.again, runs=options.runs, maker=maker
         )

@@ -178,7 +178,7 @@ def kept_scores(scores: dict[str, Any]) -> dict[str, Any]:
     texture = {name: scores["texture"].get(name) for name in ("psnr", "ssim", "coverage")}
     kept = {"surface": kept_surface(scores["surface"], scores["diagonal"]), "texture": texture}
     kept |= {name: scores[name] for name in ("gaussians", "depth", "vacancy") if name in scores}
-    return dict(_rounded(kept))
+    return dict(rounded(kept))
 
 
 def kept_surface(surface: dict[str, Any], diagonal: float) -> dict[str, Any]:
@@ -189,15 +189,15 @@ def kept_surface(surface: dict[str, Any], diagonal: float) -> dict[str, Any]:
         for name in ("accuracy_median", "chamfer_mean"):
             length = found[protocol][name]
             found[protocol][name] = None if length is None else length / diagonal
-    return dict(_rounded(found))
+    return dict(rounded(found))
 
 
-def _rounded(values: Any) -> Any:
+def rounded(values: Any) -> Any:
     """Return values with :data:`DIGITS` significant digits: no figure is known better."""
     if isinstance(values, dict):
-        return {name: _rounded(value) for name, value in values.items()}
+        return {name: rounded(value) for name, value in values.items()}
     if isinstance(values, (list, tuple)):
-        return [_rounded(value) for value in values]
+        return [rounded(value) for value in values]
     if isinstance(values, float) and math.isfinite(values):
         return float(f"{values:.{DIGITS}g}")
     return values

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from benchmarks.speed_error.plan import Photos
-from benchmarks.study import command, making, record
+from benchmarks.study import command, making, mesh_based, record
 from benchmarks.study.case import Case, named, options
 from benchmarks.study.making import carry_out, kept_scores
 from benchmarks.study.origin import made_by
@@ -233,3 +233,39 @@ def test_lengths_are_kept_as_shares_of_the_diagonal() -> None:
     assert kept["texture"] == {"psnr": 24.1235, "ssim": None, "coverage": None}
     assert kept["gaussians"] == {"count": 7}
     assert "depth" not in kept
+
+
+def test_mesh_based_rendering_is_filled_into_records_of_kept_meshes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, kept = tmp_path / "records", tmp_path / "kept"
+    known = invented(PLAN[0], mbr={"psnr": 20.0})
+    for made in (known, invented(PLAN[1]), invented(PLAN[2])):
+        write_record(made, root)
+    for case in PLAN[:2]:
+        (making.run_folder(case, kept) / "mesh").mkdir(parents=True)  # of the third none is kept
+    asked: list[list[str]] = []
+
+    def judged(module: str, arguments: list[str], path: Path, settings: Any) -> dict[str, Any]:
+        asked.append([module, *arguments])
+        return {"psnr": 21.123456789, "uncovered": 0.25, "views": [1, 2], "settings": {}}
+
+    monkeypatch.setattr(mesh_based, "judged_by", judged)
+    monkeypatch.setattr(mesh_based, "ensure_scene", lambda name, **_: tmp_path / name)
+    assert mesh_based.fill_in(PLAN, threads=1, kept=kept, root=root) == 0
+    folder = making.run_folder(PLAN[1], kept)
+    assert [a[0] for a in asked] == ["mesh_based"]
+    assert {str(folder / "mesh"), str(folder / "out")} < set(asked[0])
+    found = read_records(PLAN, root)
+    assert found[PLAN[0].identity] == known
+    assert found[PLAN[2].identity].mbr is None
+    filled = found[PLAN[1].identity]
+    assert filled.mbr is not None
+    assert (filled.mbr["psnr"], filled.mbr["uncovered"]) == (21.1235, 0.25)
+    assert "views" not in filled.mbr
+    assert dataclasses.replace(filled, mbr=None) == invented(PLAN[1])
+    # Nothing is left to do but what is asked for again.
+    mesh_based.fill_in(PLAN, threads=1, kept=kept, root=root)
+    assert len(asked) == 1
+    mesh_based.fill_in(PLAN, threads=1, again=True, runs=1, kept=kept, root=root)
+    assert len(asked) == 2
