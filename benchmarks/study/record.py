@@ -57,8 +57,9 @@ class Record:
     load_before: float | None
     wall_s: float
     """Of the whole command, on the clock: other programs may have run beside it."""
-    processor_s: dict[str, float]
-    """By stage, of all threads: as the job measures them, without starting Python."""
+    processor_s: dict[str, float | None]
+    """By stage, of all threads: as the job measures them, without starting Python; ``None`` where
+    the system does not tell."""
     memory_gib: float | None
     mesh: dict[str, Any]
     """``vertices``, ``faces``, ``closed``, ``components``."""
@@ -91,7 +92,8 @@ class Record:
 
     def processor(self, *stages: str) -> float:
         """Return the processor seconds of some stages together; NaN where one is not known."""
-        return math.fsum(self.processor_s.get(stage, math.nan) for stage in stages)
+        known = (self.processor_s.get(stage) for stage in stages)
+        return math.fsum(math.nan if seconds is None else seconds for seconds in known)
 
 
 def record_path(case: Case, root: Path = RECORDS) -> Path:

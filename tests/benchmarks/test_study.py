@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import statistics
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,16 @@ def test_records_come_back_as_they_were(tmp_path: Path) -> None:
         assert path == tmp_path / "trial" / f"{made.case.identity}.json"
         assert read_record(path) == made
         assert path.stat().st_size < 4096
+
+
+def test_processor_seconds_that_are_not_known_are_no_number() -> None:
+    made = invented(PLAN[0])
+    assert made.processor("train", "mesh") == 80.0
+    assert made.spent_s == 90.0
+    made.processor_s["mesh"] = None
+    assert math.isnan(made.processor("train", "mesh"))
+    assert math.isnan(made.processor("nothing"))
+    assert made.processor("train") == 60.0
 
 
 def test_a_record_holds_no_figure_that_json_lacks(tmp_path: Path) -> None:
