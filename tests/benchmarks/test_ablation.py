@@ -26,6 +26,7 @@ from benchmarks.ablation_study.plan import (
     Cell,
     plan,
 )
+from benchmarks.ablation_study.plots import write_plot
 from benchmarks.ablation_study.tables import (
     PARTS,
     cell_table,
@@ -193,4 +194,15 @@ def test_the_page_of_few_runs_says_so(tmp_path: Path) -> None:
         assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {len(table.header) + 1}
     words = [t.text for t in ElementTree.parse(tmp_path / document.PLOT).getroot().iter()]
     assert "wheel" in words
-    assert "spot" not in words
+    assert not {"spot", "single runs"} & set(words)
+
+
+def test_the_plot_joins_means_and_shows_every_run(tmp_path: Path) -> None:
+    write_plot(measured(("wheel", "spot")), tmp_path / "p.svg")
+    root = ElementTree.parse(tmp_path / "p.svg").getroot()
+    words = Counter(text.text for text in root.iter("{http://www.w3.org/2000/svg}text"))
+    assert (words["wheel"], words["spot"], words["single runs"]) == (1, 1, 2)
+    assert words["with multi-view terms"] == words["without multi-view terms"] == 2
+    assert words["+ clones"] == 4
+    dots = len(list(root.iter("{http://www.w3.org/2000/svg}circle")))
+    assert dots == 2 * (6 + 6 * len(SEEDS) + 3)  # means, runs, legend

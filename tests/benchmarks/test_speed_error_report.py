@@ -154,7 +154,8 @@ def test_thin_parts_and_open_meshes_are_shown_as_they_are() -> None:
 def test_a_further_mesh_costs_its_training_too() -> None:
     records = all_records()
     further = records[mesher_case("spot", "draft", NINE).identity]
-    further.processor_s.update(train=float("nan"), mesh=7.0)  # its own job trained nothing
+    further.processor_s.clear()
+    further.processor_s.update(mesh=7.0, texture=2.0)  # its own job trained nothing
     assert spent_s(further, records) == 1.0 + 60.0 + 7.0
     assert spent_s(records[preset_case("spot", "draft").identity], records) == 81.0
     assert spent_s(records[alpha_case("spot").identity], records) == 0.25
