@@ -189,7 +189,7 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
     }  # fmt: skip
     for name in ("preset", "meshing.min_component_share", "training.holdout_every"):
         assert name in known
-    assert option_of("training.lambda_dssim") == ""
+    assert option_of("training.focus") == ""
 
 
 @pytest.mark.parametrize(

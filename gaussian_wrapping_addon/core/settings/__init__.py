@@ -24,10 +24,10 @@ from .choices import (
 )
 from .declaration import Declaration, declarations, with_values
 from .job import JobSettings, declared, preset
-from .json_values import from_json, to_json
+from .json_values import from_json, key_values, to_json
 from .meshing import MeshingSettings
 from .texture import TextureSettings
-from .training import MODEL_SELECTION, RESULT_INDEPENDENT, TrainingSettings
+from .training import MODEL_SELECTION, TrainingSettings
 
 __all__ = [
     "BOUNDARIES",
@@ -41,7 +41,6 @@ __all__ = [
     "PIVOT_COUNTS",
     "PIVOT_SAMPLES",
     "PRESETS",
-    "RESULT_INDEPENDENT",
     "SELECTION_MODES",
     "SPACINGS",
     "SWITCH",
@@ -55,6 +54,7 @@ __all__ = [
     "declarations",
     "declared",
     "from_json",
+    "key_values",
     "preset",
     "to_json",
     "with_values",

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-PRESETS = ("draft", "standard", "fine")
+PRESETS = ("draft", "standard", "fine", "paper")
 SELECTION_MODES = ("auto", "on", "off")
 """Of an optional part of the model; ``"auto"`` selects it by evidence in the photos."""
 SWITCH = ("off", "on")

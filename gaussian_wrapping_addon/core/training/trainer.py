@@ -33,7 +33,7 @@ from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import Correction, LiveView, evenly_spaced, measure_held_out
-from .losses.neighbours import find_neighbours
+from .losses.neighbours import NeighbourLimits, find_neighbours
 from .result import HeldOutMetrics, TrainingResult
 from .rounds import Inside, Rounds
 from .schedule import SMALLEST_SIDE_PX, Schedule
@@ -153,7 +153,8 @@ class _Trainer:
             raise DatasetError("No photo is left to train on.", "Add photos or check the masks.")
         sizes = [photos.camera(i, 1) for i in self.views]
         side_px = max(max(c.width, c.height) for c in sizes)
-        found = find_neighbours(sizes, points=scene.points)
+        limits = NeighbourLimits.of_settings(settings)
+        found = find_neighbours(sizes, limits, points=scene.points)
         numbers = np.array(self.views)
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)
@@ -316,10 +317,15 @@ class _Trainer:
                     "harmonics", settings.harmonics, f"degree {degree}", evidence, measured=False
                 )
             )
-        if settings.wrapping == "off":
-            evidence = "Not measured: decided by the settings."
+        evidence = "Not measured: decided by the settings."
+        if settings.wrapping != "auto":
+            word = settings.wrapping
             model_selection = model_selection.with_decision(
-                Decision("wrapping", "off", "off", evidence, measured=False)
+                Decision("wrapping", word, word, evidence, measured=False)
+            )
+        if settings.growth == "off":
+            model_selection = model_selection.with_decision(
+                Decision("growth", "off", "off", evidence, measured=False)
             )
         state.model_selection = model_selection
 
