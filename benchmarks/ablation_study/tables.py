@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from ..speed_error.tables import AT, SHARES, Row, table_of
 from ..study.case import Case, options
 from ..study.figures import (
+    MBR_NOTE,
     f1_fine,
     f1_middle,
     f1_seen,
@@ -97,7 +98,7 @@ def cell_table(records: Records) -> Table:
         "cameras see, where at least 1 % of the samples are thin. Normal error: one less the mean "
         "size of the cosine between normals of counterparts, both directions. Test views: PSNR of "
         "the Gaussians at eight views that training was never given, whole photo."
-        + (" MBR: PSNR of mesh-based rendering." if _knows_mbr(measured) else ""),
+        + (f" {MBR_NOTE}" if _knows_mbr(measured) else ""),
     )
 
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 
 from ..study.figures import (
+    MBR_NOTE,
     f1_fine,
     f1_middle,
     f1_seen,
@@ -78,7 +79,7 @@ def preset_table(records: Records) -> Table:
         "counterparts, both directions.",
         "Test views: PSNR of the Gaussians at eight views that the job was never given, whole "
         "photo. Textured mesh: PSNR on the pixels that show the true surface; a hole is an error "
-        "there." + (" MBR: PSNR of mesh-based rendering." if knows_mbr else ""),
+        "there." + (f" {MBR_NOTE}" if knows_mbr else ""),
         "Alpha shape: of the sparse points that training starts from, with the best alpha of six "
         "by the truth; its time is that of the triangulation alone. What is not above it was not "
         "worth training for.",

@@ -6,6 +6,11 @@ from __future__ import annotations
 from ..speed_error.tables import MIDDLE, thin_recall
 from .record import Record
 
+MBR_NOTE = (
+    "MBR: PSNR of mesh-based rendering (docs/method.md, section 9.3), photos cut out along the true "
+    "outline."
+)
+
 
 def f1_middle(record: Record) -> float:
     """F1 at 0.5 % of the diagonal, whole surface."""
