@@ -7,8 +7,8 @@ from ..speed_error.tables import MIDDLE, thin_recall
 from .record import Record
 
 MBR_NOTE = (
-    "MBR: PSNR of mesh-based rendering (docs/method.md, section 9.3), photos cut out along the true "
-    "outline."
+    "MBR: PSNR of mesh-based rendering (docs/method.md, section 9.3), photos cut out along the "
+    "true outline."
 )
 
 
