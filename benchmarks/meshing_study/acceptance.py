@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
 from ..meshing_parts.spacing import vertex_ratio
 from ..speed_error.tables import Row, table_of
 from ..tables import Table
-from ..training_study.acceptance import Check
 from .carry_out import Made, Outcome
 from .plan import (
     ADAPTIVE,
@@ -29,6 +29,17 @@ VACANCY_S, LARGE_S, LARGE_GB = 12.0, 120.0, 3.0
 TOPOLOGY_SCENES = ("torus", "spot", "fence", "wheel")
 OTHER_LARGE_SHARE = 0.8
 """Vertices that a mesh of "200k" has to have at least, of those."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """One target and what was measured."""
+
+    what: str
+    target: str
+    figure: str
+    met: bool | None
+    """``None``: shown for comparison, without a target."""
 
 
 def checks(outcome: Outcome) -> list[Check]:

@@ -17,8 +17,7 @@ from gaussian_wrapping_addon.core.errors import WorkerError
 from gaussian_wrapping_addon.core.files import read_json, write_json
 
 from ..scenes import ensure_scene
-from ..speed_error.runs import Settings, code_state, judged_by, measured, run_wrap
-from ..training_study.carry_out import first_line
+from ..speed_error.runs import Settings, code_state, first_line, judged_by, measured, run_wrap
 from .one_mesh import MEASURED, MESH
 from .plan import UNIFORM, VACANCY, Method, Plan, Subject
 

@@ -10,9 +10,8 @@ from typing import Any
 from gaussian_wrapping_addon.core.files import write_bytes
 from gaussian_wrapping_addon.core.machine import processor_name
 
-from ..speed_error.document import reading
+from ..speed_error.tables import missing_table
 from ..tables import versions
-from ..training_study.tables import missing_table
 from .acceptance import acceptance_table
 from .carry_out import Outcome
 from .figures import SHOWN, write_plots
@@ -111,3 +110,15 @@ def _open3d() -> str:
         return metadata.version("open3d")
     except metadata.PackageNotFoundError:
         return "is not installed"
+
+
+def reading(path: Path, date: str) -> list[str]:
+    """Return the hand-written reading; its first line is the date of the figures that it reads."""
+    if not path.is_file():
+        return []
+    written, _, text = path.read_text(encoding="utf-8").partition("\n")
+    stale = (
+        [] if written.strip() == date else [f"*Written for the figures of {written.strip()}.*", ""]
+    )
+    heading, _, rest = text.strip().partition("\n")
+    return [heading, "", *stale, rest.strip(), ""]

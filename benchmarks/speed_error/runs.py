@@ -171,3 +171,10 @@ def judged_by(module: str, arguments: list[str], path: Path, settings: Settings)
             words = "\n".join((done.stdout + done.stderr).splitlines()[-LAST_LINES:])
             raise WorkerError(f"{module} {' '.join(arguments)} failed: {words}")
     return dict(read_json(path))
+
+
+def first_line(text: str) -> str:
+    """Return the line of a job's output that names the error, or the last one."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    named = [line for line in lines if "error" in line.lower()]
+    return (named or lines or ["no words"])[-1]
