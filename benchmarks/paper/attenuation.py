@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The field under the earlier attenuation against the vacancy: ``python -m benchmarks.paper.attenuation``.
+"""The field under the earlier attenuation against the vacancy.
 
-Two trainings of the wheel, the method's and a plain one whose losses know neither definition of
-depth, each with both fields: slices, meshes marched on the same tetrahedra, scores, and how far the
-level lies from the true surface. Writes a record, two pictures, and the page.
+``python -m benchmarks.paper.attenuation``. Two trainings of the wheel, the method's and a plain one
+whose losses know neither definition of depth, each with both fields: slices, meshes marched on the
+same tetrahedra, scores, and how far the level lies from the true surface. Writes a record, three
+pictures, and the page.
 """
 
 from __future__ import annotations

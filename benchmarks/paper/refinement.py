@@ -71,7 +71,7 @@ def steps_of(
     surface, as many as the mesh is to have points; the mesher itself projects more and thins them,
     so its own points begin anew at the step "points, thinned".
     """
-    arrays, region, cameras = trained.gaussians.arrays(), trained.region, trained.scene.cameras
+    arrays, region = trained.gaussians.arrays(), trained.region
     vectors = VectorField(arrays, threads=threads)
     rng = np.random.default_rng(0)
     request = checked_request(0.0, settings.points, region)

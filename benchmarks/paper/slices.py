@@ -47,11 +47,10 @@ class Plane:
 
 
 def spoke_planes(points: np.ndarray, radii: tuple[float, float], half: float) -> list[Plane]:
-    """Return planes across spokes of the wheel, from samples (n, 3) on thin parts, alone ones first.
+    """Return planes across spokes of the wheel, from samples (n, 3) on thin parts.
 
-    The wheel's axis is y. Places between two radii are in the order of how nearly their samples
-    within :data:`_RUN` lie along one line: where other spokes are near, they do not. The middle of
-    a plane lies on its spoke's axis.
+    The wheel's axis is y. Solitary places come first: those whose samples within :data:`_RUN` lie
+    most nearly along one line. The middle of a plane lies on its spoke's axis.
     """
     radius = np.hypot(points[:, 0], points[:, 2])
     rng = np.random.default_rng(0)
