@@ -138,14 +138,6 @@ class KernelVariant:
         ]
 
 
-def kernel_variant(
-    gaussians: OrientedGaussians, width: int, height: int, lanes: int
-) -> KernelVariant:
-    """Return the kernels on one view of any Gaussians, one thread."""
-    workload = Workload(len(gaussians), width, height)
-    return KernelVariant(RawArrays.from_gaussians(gaussians), workload, lanes, 1, RenderBuffers())
-
-
 def _projection_parts(
     raw: RawArrays, variant: KernelVariant
 ) -> list[tuple[str, Callable[[], object]]]:

@@ -87,6 +87,13 @@ def test_clean_up_options_become_meshing_settings(command: str) -> None:
     )
     assert meshing("--edge-length", "0.5") == MeshingSettings(edge_length=0.5)
     assert meshing("--boundary", "open") == MeshingSettings(boundary="open")
+    assert meshing("--method", "pivots", "--pivots", "9", "--pivot-box", "gof") == MeshingSettings(
+        method="pivots", pivots=9, pivot_box="gof"
+    )
+    assert meshing("--method", "pivots", "--pivot-samples", "none") == MeshingSettings(
+        method="pivots", pivot_samples="none"
+    )
+    assert meshing("--mesh-cameras", "all") == MeshingSettings(cameras="all")
     assert meshing("--unseen", "occupied") == MeshingSettings(unseen="occupied")
     assert meshing("--faces", "5000") == MeshingSettings(target_faces=5000)
     assert meshing("--smooth", "3") == MeshingSettings(smooth_steps=3)
@@ -102,6 +109,9 @@ def test_clean_up_options_become_meshing_settings(command: str) -> None:
         (("--method", "pivots", "--tiles", "4"), ("--tiles 4", "--method pivots")),
         (("--pivots", "9"), ("--pivots 9", "--method pam")),
         (("--method", "pam", "--pivots", "2"), ("--pivots 2", "--method pam")),
+        (("--pivot-box", "gof"), ("--pivot-box gof", "--method pam")),
+        (("--pivot-samples", "none"), ("--pivot-samples none", "--method pam")),
+        (("--method", "pivots", "--pivot-box", "gof"), ("--pivot-box gof", "--pivots 9")),
     ],
 )
 @pytest.mark.parametrize("command", ["wrap photos", "mesh", "estimate-mesh"])
@@ -179,7 +189,7 @@ def test_every_setting_that_an_option_gives_is_called_by_that_option() -> None:
     }  # fmt: skip
     for name in ("preset", "meshing.min_component_share", "training.holdout_every"):
         assert name in known
-    assert option_of("training.lambda_dssim") == ""
+    assert option_of("training.focus") == ""
 
 
 @pytest.mark.parametrize(

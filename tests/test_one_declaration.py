@@ -45,7 +45,7 @@ def test_a_new_setting_needs_its_declaration_only(tmp_path: Path, group: str) ->
     assert found["refused"] == "--fake-number is out of range. Give from 1 to 9."
     assert (found["stored"], found["read"]) == (7, 7)
     (row,) = found["table"]
-    for cell in ("`--fake-number N`", "Fake Number", "3 / 3 / 5", "from 1 to 9", "bananas"):
+    for cell in ("`--fake-number N`", "Fake Number", "3 / 3 / 5 / 3", "from 1 to 9", "bananas"):
         assert f"{cell} |" in row
     assert found["outdated"], "the test of the table would fail until it is written again"
 
@@ -73,7 +73,7 @@ def test_declarations_agree_with_themselves(entry: Declaration) -> None:
     assert entry.help.endswith(".")
     if entry.option is not None:
         assert entry.option.name.startswith("--")
-        assert entry.scope in ("training", "method", "region", "more")
+        assert entry.scope in ("training", "constants", "method", "region", "more")
 
 
 @pytest.mark.parametrize("entry", WITH_PANEL, ids=path_of)

@@ -14,7 +14,7 @@ from gaussian_wrapping_addon.core.regions.automatic_region import automatic_regi
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 from gaussian_wrapping_addon.core.regions.region import read_region
 
-from ..speed_error.score import stage_folder
+from ..speed_error.score import mesh_scene, stage_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +22,7 @@ class Trained:
     """What a mesh is made of; scene frame."""
 
     scene: Scene
+    """With the views only whose cameras the job's meshes are made from."""
     gaussians: OrientedGaussians
     region: Region
 
@@ -35,4 +36,4 @@ def open_trained(scene_folder: Path, job: Path) -> Trained:
         region = read_region(path).transformed(scene.world_from_scene.inverse())
     else:
         region = automatic_region(scene)
-    return Trained(scene, gaussians, region)
+    return Trained(mesh_scene(job, scene), gaussians, region)

@@ -10,7 +10,4 @@ from __future__ import annotations
 from .cache import ALL_KINDS, ensure_scene
 from .catalogue import KINDS, SceneKind
 
-SCENES = tuple(ALL_KINDS)
-"""Names of all scenes."""
-
-__all__ = ["ALL_KINDS", "KINDS", "SCENES", "SceneKind", "ensure_scene"]
+__all__ = ["ALL_KINDS", "KINDS", "SceneKind", "ensure_scene"]

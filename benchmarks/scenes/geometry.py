@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -88,22 +88,6 @@ def joined(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Return the volume enclosed by a closed mesh, > 0 where faces are seen from outside."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
-
-
-def open_edges(faces: np.ndarray) -> int:
-    """Return the number of edges that are not met once in each direction."""
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)  # (3f, 2)
-    count: dict[tuple[int, int], int] = {}
-    for a, b in edges.tolist():
-        key = (min(a, b), max(a, b))
-        count[key] = count.get(key, 0) + (1 if a < b else -1)
-    return sum(1 for value in count.values() if value)
-
-
 def box(
     name: str, low: Sequence[float], high: Sequence[float], material: str, turn_degrees: float = 0.0
 ) -> Part:
@@ -170,8 +154,3 @@ def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
         )
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     return vertices, triangles.astype(np.int32)
-
-
-def moved(part: Part, scale: float, offset: Sequence[float]) -> Part:
-    """Return the part scaled about 0, then shifted."""
-    return replace(part, vertices=part.vertices * scale + np.array(offset, np.float64))

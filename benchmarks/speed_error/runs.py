@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import math
 import os
 import shutil
@@ -18,8 +17,6 @@ from gaussian_wrapping_addon.core.errors import WorkerError
 from gaussian_wrapping_addon.core.files import read_json, write_json
 
 from .plan import Run, Variant
-
-_logger = logging.getLogger(__name__)
 
 ROOT = Path(__file__).resolve().parents[2]
 BATCH = ROOT / "gaussian_wrapping_addon" / "batch.py"

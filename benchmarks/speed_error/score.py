@@ -11,6 +11,7 @@ scene were never given to the job.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +21,7 @@ import numpy as np
 from PIL import Image
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
@@ -37,6 +39,8 @@ from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.imaging.lpips import lpips_if_ready
 from gaussian_wrapping_addon.core.imaging.view_metrics import score_images
+from gaussian_wrapping_addon.core.jobs.stages.region_field import field_views
+from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import AtlasMaps, TexturedMesh
@@ -129,7 +133,8 @@ def judge(mesh: Path, scene_folder: Path, job: Path, threads: int, stages: bool)
     }
     if stages:
         gaussians = load_gaussians(stage_folder(job, "train") / "gaussians.npz")
-        scores |= judge_stages(gaussians, scene, truth, views, masks, thresholds, threads)
+        seen = mesh_scene(job, scene)
+        scores |= judge_stages(gaussians, seen, truth, views, masks, thresholds, threads)
     return scores
 
 
@@ -219,6 +224,14 @@ def read_textured(folder: Path) -> TexturedMesh:
         with Image.open(folder / atlas_file("albedo", number)) as image:
             maps.append(AtlasMaps(np.asarray(image.convert("RGB"))))
     return TexturedMesh.of(mesh, uvs, owner, maps, {})
+
+
+def mesh_scene(job: Path, scene: Scene) -> Scene:
+    """Return the scene with the views only whose cameras the job's meshes are made from."""
+    settings = read_job(job / "job.json").settings
+    photos = PhotoStore(scene, settings.training.max_image_px)
+    views = field_views(scene, photos, settings.training.holdout_every, settings.meshing.cameras)
+    return dataclasses.replace(scene, views=tuple(scene.views[index] for index in views))
 
 
 def stage_folder(job: Path, name: str) -> Path:

@@ -86,19 +86,11 @@ def steps_between_texels(textured: TexturedMesh, texels_apart: int) -> float:
     evened with anything. Of a thing of one colour that photos show in different brightness, this is
     how visible the borders are where the leading view changes.
     """
-    return float(np.percentile(_steps(textured, texels_apart), 99.9))
+    return float(np.percentile(all_steps(textured, texels_apart), 99.9))
 
 
-def mean_of_largest_steps(textured: TexturedMesh, texels_apart: int, share: float) -> float:
-    """Return the mean of the largest of these differences, a share of them all.
-
-    A percentile of a texture of one colour is a whole number of its 255 steps; this is finer.
-    """
-    steps = np.sort(_steps(textured, texels_apart))
-    return float(steps[-max(1, int(share * len(steps))) :].mean())
-
-
-def _steps(textured: TexturedMesh, texels_apart: int) -> np.ndarray:
+def all_steps(textured: TexturedMesh, texels_apart: int) -> np.ndarray:
+    """Return the grey differences of all pairs of such texels so far apart."""
     size = len(textured.albedo)
     assert textured.views is not None
     good = raster_atlas(textured.corner_uvs, size, 2).inside & (textured.views >= 2)

@@ -25,7 +25,6 @@ F1_LOST, PSNR_LOST_DB, TIME_SAVED = 0.01, 0.2, 0.3
 
 FOX, SURFACE, SWITCH, DECISION = "fox", "surface", "wrapping", "decisions"
 """Parts, beside :data:`.plan.NEEDS`."""
-PARTS = (FOX, SURFACE, SWITCH, NEEDS, DECISION)
 
 
 def acceptance_plan() -> Plan:

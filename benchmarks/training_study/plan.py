@@ -8,7 +8,6 @@ import dataclasses
 from ..speed_error.plan import PRESETS, Photos, Run
 
 ABLATION, PRESET, NEEDS, REAL = "ablation", "presets", "needs", "real"
-PARTS = (ABLATION, PRESET, NEEDS, REAL)
 
 _FIXED = ("--harmonics", "off", "--exposure", "off")
 """What no row of the ablation varies."""

@@ -79,9 +79,9 @@ def pivot_table(pivots: dict[str, dict[str, Any]]) -> Table:
         rows,
         "Marching tetrahedra on the Delaunay edges of the pivots, of one training with all losses: "
         "centre and one point outside along the orientation, or centre and the corners of the "
-        "3-sigma box. Judged as extracted, without removing small parts. The add-on samples its "
-        "mesh from the surface of two pivots and of points that its cameras see, which are left "
-        "out here.",
+        "3-sigma box on the normal. Judged as extracted, without removing small parts. The add-on "
+        "samples its mesh from the surface of two pivots and of points that its cameras see, which "
+        "are left out here.",
     )
 
 

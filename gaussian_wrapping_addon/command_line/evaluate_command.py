@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command ``evaluate``: score a mesh or a job against a ground truth."""
+"""The command ``evaluate``: score a mesh or a job against a ground truth or photos."""
 
 from __future__ import annotations
 
@@ -7,17 +7,40 @@ import math
 from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
 
+from ..core.errors import UsageError
 from .common import Commands, add_threads
+
+MIN_IMAGE_PX = 64
+"""Smaller photos hold no surface to speak of."""
 
 
 def add_evaluate(commands: Commands) -> None:
     """Add ``evaluate``."""
-    parser = commands.add_parser("evaluate", help="score a mesh or a job against a ground truth")
+    parser = commands.add_parser(
+        "evaluate", help="score a mesh or a job against a ground truth or photos"
+    )
     parser.add_argument(
         "mesh", type=Path, metavar="MESH_OR_JOB", help="PLY, OBJ, GLB, STL or OFF; or a job folder"
     )
     parser.add_argument(
-        "--truth", type=Path, required=True, metavar="PATH", help="mesh, cloud, scene or data set"
+        "--metric",
+        choices=("surface", "mbr"),
+        default="surface",
+        help="surface: distances to a true surface; mbr: mesh-based rendering, a colour field "
+        "trained on the mesh and compared with photos that were held out",
+    )
+    parser.add_argument(
+        "--truth", type=Path, metavar="PATH", help="mesh, cloud, scene or data set (surface)"
+    )
+    parser.add_argument(
+        "--test",
+        type=Path,
+        metavar="PATH",
+        help="test photos with cameras: COLMAP, transforms, or a folder with cameras.json and "
+        "images (mbr; default: the photos that the job held out)",
+    )
+    parser.add_argument(
+        "--max-image-px", type=int, metavar="N", help="long side of the photos compared (mbr)"
     )
     parser.add_argument(
         "--layout",
@@ -27,7 +50,9 @@ def add_evaluate(commands: Commands) -> None:
     )
     parser.add_argument("--scan", type=int, help="number of the DTU scan")
     parser.add_argument("--region", help="region of the job, if it has several")
-    parser.add_argument("--cameras", type=Path, help="cameras of a mesh file: COLMAP, transforms")
+    parser.add_argument(
+        "--cameras", type=Path, help="cameras, and photos, of a mesh file: COLMAP, transforms, job"
+    )
     parser.add_argument(
         "--thresholds", type=_floats, help="shares of the truth's diagonal, comma separated"
     )
@@ -66,10 +91,17 @@ def _evaluate(options: Namespace) -> int:
     from ..core.settings import JobSettings
 
     JobSettings(seed=options.seed, threads=options.threads).validated()
+    if options.max_image_px is not None and options.max_image_px < MIN_IMAGE_PX:
+        raise UsageError(
+            f"--max-image-px {options.max_image_px} is too small.", f"Give at least {MIN_IMAGE_PX}."
+        )
     protocols = options.protocols
     request = {
         "mesh": str(options.mesh),
-        "truth": str(options.truth),
+        "metric": options.metric,
+        "truth": None if options.truth is None else str(options.truth),
+        "test": None if options.test is None else str(options.test),
+        "max_image_px": options.max_image_px,
         "layout": options.layout,
         "scan": options.scan,
         "region": options.region,

@@ -3,13 +3,10 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from typing import Any
 
 import bpy
-
-_logger = logging.getLogger(__name__)
 
 NAME = "gwrap"
 

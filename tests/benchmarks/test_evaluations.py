@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from benchmarks.evaluations import count_evaluations, reached_rows
-from benchmarks.kernel_speed import agreement, kernel_variant, runs_of
+from benchmarks.kernel_results import Workload
+from benchmarks.kernel_speed import KernelVariant, agreement, runs_of
 from benchmarks.workload import surface_gaussians, view
 from benchmarks.yardstick.build import NO_COMPILER, compilers, host_instruction_sets, yardsticks
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.raster.blend import Images, ScreenView
+from gaussian_wrapping_addon.core.render.raster.blend import Images, RenderBuffers, ScreenView
 from gaussian_wrapping_addon.core.render.render import project_view
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
@@ -25,6 +27,14 @@ def prepared(count: int, width: int, height: int, lanes: int) -> ScreenView:
     raw = RawArrays.from_gaussians(surface_gaussians(count))
     with runs_of(lanes):
         return project_view(raw, view(width, height), RenderOptions(threads=1))
+
+
+def kernel_variant(
+    gaussians: OrientedGaussians, width: int, height: int, lanes: int
+) -> KernelVariant:
+    """Return the kernels on one view of any Gaussians, one thread."""
+    workload = Workload(len(gaussians), width, height)
+    return KernelVariant(RawArrays.from_gaussians(gaussians), workload, lanes, 1, RenderBuffers())
 
 
 def count_by_pixels(screen: ScreenView) -> tuple[int, int, np.ndarray]:

@@ -22,7 +22,7 @@ from PIL import Image
 from benchmarks.scenes.build import BuildSize, build_scene
 from benchmarks.scenes.cache import ALL_KINDS, deciding_sources, kind_named
 from benchmarks.scenes.catalogue import KINDS, scene_content, scene_kind
-from benchmarks.scenes.geometry import joined, open_edges, signed_volume
+from benchmarks.scenes.geometry import joined
 from benchmarks.scenes.ground_truth import truth_samples
 from benchmarks.scenes.looking_in import CUP_INSIDE, build_cup_inside, cup_inside_content
 from benchmarks.scenes.rendering import Light, render_photos
@@ -77,6 +77,22 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         base = root / kind.derived_from if kind.derived_from else None
         _apart(build_scene, kind, SIZE, root / name, base)
     return {path.name: path for path in root.iterdir()}
+
+
+def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Return the volume enclosed by a closed mesh, > 0 where faces are seen from outside."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def open_edges(faces: np.ndarray) -> int:
+    """Return the number of edges that are not met once in each direction."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)  # (3f, 2)
+    count: dict[tuple[int, int], int] = {}
+    for a, b in edges.tolist():
+        key = (min(a, b), max(a, b))
+        count[key] = count.get(key, 0) + (1 if a < b else -1)
+    return sum(1 for value in count.values() if value)
 
 
 @pytest.mark.parametrize("name", THINGS)

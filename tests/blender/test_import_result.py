@@ -17,10 +17,10 @@ from mathutils import Vector
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, WrapError
 from gaussian_wrapping_addon.ops.cameras.camera_objects import look_through
 from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.regions.region_objects import region_from_object
 from gaussian_wrapping_addon.ops.results.blend_writer import export_usd, write_blend
 from gaussian_wrapping_addon.ops.results.materials import set_shading, shading_of, texture_of
 from gaussian_wrapping_addon.ops.results.scene_objects import import_result
+from tests.blender.region_shapes import region_from_object
 from tests.blender.synthetic_result import (
     BOX_SCENE,
     CAMERAS,

@@ -217,6 +217,8 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     properties.edge_length = 0.1
     properties.decimate, properties.target_faces, properties.smooth_steps = True, 1234, 2
     properties.method, properties.pivots = "PIVOTS", "9"
+    properties.pivot_box, properties.pivot_samples = "GOF", "NONE"
+    properties.mesh_cameras = "ALL"
     properties.boundary, properties.unseen = "OPEN", "OCCUPIED"
     properties.spacing = "UNIFORM"
     properties.normal_map, properties.ambient_occlusion, properties.lods = "OFF", True, 3
@@ -232,6 +234,8 @@ def test_mesh_region_sends_world_coordinates_and_adds_a_mesh(photos: Path, worke
     assert (job.settings.meshing.target_faces, job.settings.meshing.smooth_steps) == (1234, 2)
     meshing = job.settings.meshing
     assert (meshing.method, meshing.pivots) == ("pivots", 9)
+    assert (meshing.pivot_box, meshing.pivot_samples) == ("gof", "none")
+    assert meshing.cameras == "all"
     assert meshing.spacing == "uniform"
     texture = job.settings.texture
     assert (texture.normal_map, texture.ambient_occlusion, texture.lods) == ("off", "on", 3)

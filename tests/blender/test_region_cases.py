@@ -19,7 +19,6 @@ from gaussian_wrapping_addon.ops.regions.region_hull import MOST_CANDIDATES, con
 from gaussian_wrapping_addon.ops.regions.region_objects import (
     is_convex,
     local_hull,
-    region_from_object,
 )
 from tests.blender.job_play import (
     play_to,
@@ -28,6 +27,7 @@ from tests.blender.job_play import (
     status_of,
     write_fake_python,
 )
+from tests.blender.region_shapes import region_from_object
 from tests.blender.synthetic_result import WORLD_FROM_SCENE
 
 pytestmark = pytest.mark.usefixtures("ended_workers")

@@ -15,8 +15,9 @@ from gaussian_wrapping_addon.core.errors import ParseError, UsageError, WrapErro
 from gaussian_wrapping_addon.core.regions.box import CUBE_CORNERS, CUBE_TRIANGLES
 from gaussian_wrapping_addon.core.regions.region_file import parse_region_file, region_to_json
 from gaussian_wrapping_addon.ops.common import tags
-from gaussian_wrapping_addon.ops.regions.region_objects import create_region, region_from_object
+from gaussian_wrapping_addon.ops.regions.region_objects import create_region
 from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, import_result
+from tests.blender.region_shapes import region_from_object
 from tests.blender.synthetic_result import WORLD_FROM_SCENE, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")

@@ -20,12 +20,12 @@ from gaussian_wrapping_addon.ops.common import known_jobs, tags
 from gaussian_wrapping_addon.ops.placement import placement
 from gaussian_wrapping_addon.ops.regions.region_objects import (
     matrix_of,
-    region_from_object,
     transformed,
 )
 from gaussian_wrapping_addon.ops.regions.region_resolution import own_lengths
 from gaussian_wrapping_addon.ops.results.blend_writer import export_usd, write_blend
 from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, import_result
+from tests.blender.region_shapes import region_from_object
 from tests.blender.synthetic_result import (
     WORLD_FROM_SCENE,
     rotation_about,

@@ -198,7 +198,9 @@ def test_the_picture_follows_the_file_and_survives_bad_ones(tmp_path: Path) -> N
     path = write_picture(tmp_path)
     assert not refreshed(key, live_preview.EVERY_S - 0.1), "not yet time"
     assert refreshed(key, 10.0)
-    assert live_preview.path_of(key) == str(path)
+    stamp = live_preview._shown[key].stamp
+    assert stamp is not None
+    assert stamp[0] == str(path)
     assert len(live_preview.icons_of(key)) == 2, "photo and rendering"
     names = live_preview._shown[key].names
     left, right = (live_preview._pictures[name] for name in names)

@@ -26,7 +26,7 @@ def test_presets_are_valid_and_survive_json(name: str) -> None:
 
 
 def test_presets_grow() -> None:
-    draft, standard, fine = (preset(n).training for n in PRESETS)
+    draft, standard, fine = (preset(n).training for n in ("draft", "standard", "fine"))
     for name in ("iterations", "max_gaussians", "max_image_px"):
         assert getattr(draft, name) < getattr(standard, name) < getattr(fine, name)
 

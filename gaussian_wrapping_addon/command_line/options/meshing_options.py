@@ -20,6 +20,10 @@ _IGNORED_BY_PIVOTS: dict[str, tuple[Any, ...]] = {
 number of 0, and tiles that pivots do not use anyway."""
 
 
+_ONLY_BY_PIVOTS = ("pivots", "pivot_box", "pivot_samples")
+"""Settings that only the method pivots reads."""
+
+
 def add_method_options(parser: ArgumentParser) -> None:
     """Add the meshing method and resolution."""
     add_options(parser, "method")
@@ -47,11 +51,19 @@ def method_settings(options: Namespace) -> dict[str, Any]:
                     "is that of the Gaussians and which makes the mesh in one piece.",
                     f"Omit one of the two; --method pam uses {option}.",
                 )
-    elif "pivots" in given:
-        raise UsageError(
-            f"--pivots {given['pivots']} has no effect with --method {method}.",
-            "Add --method pivots, or omit --pivots.",
-        )
+        if "pivot_box" in given and given.get("pivots", MeshingSettings().pivots) != 9:
+            raise UsageError(
+                f"--pivot-box {given['pivot_box']} has no effect without --pivots 9.",
+                "Add --pivots 9, or omit --pivot-box.",
+            )
+    else:
+        for name in _ONLY_BY_PIVOTS:
+            if name in given:
+                option = option_of(f"meshing.{name}")
+                raise UsageError(
+                    f"{option} {given[name]} has no effect with --method {method}.",
+                    f"Add --method pivots, or omit {option}.",
+                )
     return {
         entry.name: given.get(entry.name, entry.default) for entry in declared_options("method")
     }

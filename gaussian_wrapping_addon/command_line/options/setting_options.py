@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from typing import Any
 
 from ...core.settings import Declaration, JobSettings, declarations
@@ -19,8 +19,8 @@ def declared_options(scope: Scope) -> tuple[Declaration, ...]:
     )
 
 
-def add_options(parser: ArgumentParser, scope: Scope) -> None:
-    """Add the options of a scope. Options that are not given are ``None``."""
+def add_options(parser: Any, scope: Scope) -> None:
+    """Add the options of a scope to a parser or group. Options that are not given are ``None``."""
     exclusive: dict[str, Any] = {}
     for entry in declared_options(scope):
         assert entry.option is not None

@@ -22,6 +22,12 @@ def add_training_options(parser: ArgumentParser) -> None:
         help=f"model selection: sets {names}, each of which overrides this option; "
         "auto: selected from the photos; all: on; none: off",
     )
+    constants = parser.add_argument_group(
+        "constants of the method",
+        "weights, schedule and limits of the training, a share where no unit is named; --preset "
+        "paper sets all of them to the published values",
+    )
+    add_options(constants, "constants")
 
 
 def training_settings(options: Namespace) -> JobSettings:
@@ -29,7 +35,7 @@ def training_settings(options: Namespace) -> JobSettings:
 
     Ranges are checked when the job is made.
     """
-    values = given_settings(options, "training")
+    values = given_settings(options, "training") | given_settings(options, "constants")
     if options.needs is not None:
         selected = {
             f"training.{name}": _SELECTION_VALUES[options.needs] for name in MODEL_SELECTION

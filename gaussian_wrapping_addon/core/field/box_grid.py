@@ -18,7 +18,8 @@ EMPTY_KEY = -1
 @inline
 def cell_key(ix: int, iy: int, iz: int) -> int:
     """Pack three cell coordinates, each modulo 2^21, into 63 bits."""
-    return ((ix & 2097151) << 42) | ((iy & 2097151) << 21) | (iz & 2097151)
+    packed = ((ix & COORDINATE_MASK) << 42) | ((iy & COORDINATE_MASK) << 21)
+    return packed | (iz & COORDINATE_MASK)
 
 
 @inline

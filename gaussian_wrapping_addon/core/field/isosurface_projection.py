@@ -29,7 +29,7 @@ MAX_HALVINGS = 1
 MAX_NEWTON_STEPS = 3
 """Where Newton does not converge quickly, V differs from the slope (it does not depend on the
 camera), and a search for a bracket is faster: with four halvings and unlimited steps more points
-ran out of rounds. The exact gradient of the arg-max camera saves 3 % of the evaluations and takes
+ran out of rounds. The exact gradient of the arg-max camera saved 3 % of the evaluations and took
 longer than that to compute."""
 MAX_STEP_SIGMAS = 1.0
 MAX_INWARD_MARCH = 8
@@ -67,8 +67,6 @@ class ProjectionResult:
     """(n,) float32 ``|vacancy - 0.5|`` there."""
     camera: np.ndarray
     """(n,) int32: the camera that sees the point best, or -1."""
-    vacancy_rounds: int
-    """Batches of vacancy evaluations."""
     vacancy_evaluations: int
     """Total number of points evaluated."""
 
@@ -159,7 +157,7 @@ def project_to_isosurface(
             fresh = vector_field.evaluate(search.x[accepted])
             search.V[accepted], search.outward[accepted] = fresh.V, fresh.outward
     progress.update(1.0, "Projected points onto the surface")
-    return search.result(rounds, evaluations)
+    return search.result(evaluations)
 
 
 class _Search:
@@ -213,7 +211,7 @@ class _Search:
         # Unseen points have no vacancy; without Gaussians there is no length scale.
         self.rows = np.flatnonzero(seen & ~done & (self.sigma > 0.0))
 
-    def result(self, rounds: int, evaluations: int) -> ProjectionResult:
+    def result(self, evaluations: int) -> ProjectionResult:
         """Return the best position of every point."""
         residual = np.abs(self.best_v - tolerances.ISO_LEVEL)
         close = (self.status == ProjectionStatus.DROPPED) & (residual <= self.tolerance)
@@ -227,7 +225,6 @@ class _Search:
             self.status,
             residual.astype(np.float32),
             self.best_camera,
-            rounds,
             evaluations,
         )
 

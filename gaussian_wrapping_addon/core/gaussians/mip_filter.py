@@ -12,12 +12,13 @@ from .. import tolerances
 from ..dataset.camera import Camera
 from ..kernels.compiled import kernel
 from ..kernels.parallel import default_threads, even_bounds, run_chunks
+from ..settings import TrainingSettings
 
-FILTER_VARIANCE_PX = 0.05
-"""Variance of the filter in squared pixels of the closest camera. The usual 0.2 (docs/method.md,
-section 1.5) was found to reduce the opacity of thin parts: a Gaussian as narrow as 0.4 pixels in
-two directions keeps 44 % of it, and spokes of three pixels stay half transparent; with this value
-it keeps 76 %."""
+FILTER_VARIANCE_PX = TrainingSettings.filter_variance
+"""Default variance of the filter in squared pixels of the closest camera, 0.05. The usual 0.2
+(docs/method.md, section 1.5) was found to reduce the opacity of thin parts: a Gaussian as narrow as
+0.4 pixels in two directions keeps 44 % of it, and spokes of three pixels stay half transparent;
+with this value it keeps 76 %."""
 
 IMAGE_MARGIN = 0.15
 """Share by which the image is enlarged on each side in the visibility test of Gaussians."""
@@ -45,12 +46,13 @@ def mip_filter(
     means: np.ndarray,
     cameras: Sequence[Camera],
     *,
+    variance_px: float = FILTER_VARIANCE_PX,
     near_z: float = tolerances.NEAR_Z,
     threads: int = 0,
 ) -> np.ndarray:
     """Return the filter's standard deviation of each Gaussian (docs/method.md, section 1.5).
 
-    ``f = z_min / focal_max * sqrt(FILTER_VARIANCE_PX)``, with ``z_min`` the smallest z-depth over
+    ``f = z_min / focal_max * sqrt(variance_px)``, with ``z_min`` the smallest z-depth over
     the cameras whose image, enlarged by 15 % on each side, contains the mean.
 
     Parameters
@@ -59,6 +61,8 @@ def mip_filter(
         Scene units.
     cameras : sequence of Camera
         Training cameras at the training resolution, scene frame.
+    variance_px : float
+        Variance of the filter, squared pixels of the closest camera.
     near_z : float
         Smaller z-depths are ignored, scene units.
 
@@ -81,7 +85,7 @@ def mip_filter(
     seen = np.isfinite(depth)
     depth[~seen] = depth[seen].max() if seen.any() else near_z
     focal_px = max(max(camera.fx, camera.fy) for camera in cameras)
-    return depth / focal_px * math.sqrt(FILTER_VARIANCE_PX)
+    return depth / focal_px * math.sqrt(variance_px)
 
 
 def _pack(camera: Camera) -> list[float]:

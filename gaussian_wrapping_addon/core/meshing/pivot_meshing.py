@@ -26,8 +26,8 @@ from ..regions.convex_region import Region
 from ..report_warning import ReportWarning
 from ..settings import MeshingSettings
 from .cleanup.degenerate import remove_degenerate
-from .points.candidate_surface import no_surface_error, pivot_cloud
-from .points.pivots import PIVOTS
+from .points.candidate_surface import no_surface_error, pivot_cloud, pivots_alone
+from .points.pivots import pivot_rule
 from .points.spacing import footprints
 from .tetrahedra.boundary_faces import tetrahedron_neighbours
 from .tetrahedra.delaunay import bounding_points, delaunay
@@ -73,10 +73,11 @@ def mesh_by_pivots(
     region : Region
         Scene frame.
     settings : MeshingSettings
-        ``pivots`` (per Gaussian) and ``min_component_share`` are used. An edge length or a number
-        of points does not apply; the provenance notes that.
+        ``pivots`` (per Gaussian), ``pivot_box``, ``pivot_samples`` and ``min_component_share`` are
+        used. An edge length or a number of points does not apply; the provenance notes that.
     depth_samples : DepthSamples, optional
-        Depth-map samples of the isosurface in the region (:mod:`.depth_samples`).
+        Depth-map samples of the isosurface in the region (:mod:`.depth_samples`); not used with
+        ``pivot_samples = "none"``.
 
     Returns
     -------
@@ -90,9 +91,12 @@ def mesh_by_pivots(
     """
     if len(cameras) == 0:
         raise MeshingError("The scene has no cameras.", "Check the scene.")
-    cloud = pivot_cloud(
-        arrays, region, vacancy.is_empty, seed, depth_samples, pivots_of=PIVOTS[settings.pivots]
-    )
+    rule = pivot_rule(settings.pivots, settings.pivot_box)
+    if settings.pivot_samples == "none":
+        depth_samples = None
+        cloud = pivots_alone(arrays, region, rule)
+    else:
+        cloud = pivot_cloud(arrays, region, vacancy.is_empty, seed, depth_samples, pivots_of=rule)
     points = np.concatenate([cloud.points, bounding_points(cloud.points, seed)])
     tetrahedra = delaunay(points, seed=seed, progress=progress.span(0.0, 0.3))
     cut = cut_to_region(points, tetrahedra, region)
@@ -116,6 +120,8 @@ def mesh_by_pivots(
         "method": "marching tetrahedra on pivots",
         "region": region.name,
         "pivots_each": settings.pivots,
+        "pivot_box": settings.pivot_box if settings.pivots == 9 else "",
+        "pivot_samples": settings.pivot_samples,
         "gaussians_in_region": cloud.gaussians,
         "pivots": len(cloud.points),
         "sightings": 0 if depth_samples is None else len(depth_samples),

@@ -8,10 +8,13 @@ Standard library only, so that Blender can load it.
 from .choices import (
     BOUNDARIES,
     CORRELATIONS,
+    FIELD_CAMERAS,
     MASK_MODES,
     MAX_LODS,
     MESH_METHODS,
+    PIVOT_BOXES,
     PIVOT_COUNTS,
+    PIVOT_SAMPLES,
     PRESETS,
     SELECTION_MODES,
     SPACINGS,
@@ -21,21 +24,23 @@ from .choices import (
 )
 from .declaration import Declaration, declarations, with_values
 from .job import JobSettings, declared, preset
-from .json_values import from_json, to_json
+from .json_values import from_json, key_values, to_json
 from .meshing import MeshingSettings
 from .texture import TextureSettings
-from .training import MODEL_SELECTION, RESULT_INDEPENDENT, TrainingSettings
+from .training import MODEL_SELECTION, TrainingSettings
 
 __all__ = [
     "BOUNDARIES",
     "CORRELATIONS",
+    "FIELD_CAMERAS",
     "MASK_MODES",
     "MAX_LODS",
     "MESH_METHODS",
     "MODEL_SELECTION",
+    "PIVOT_BOXES",
     "PIVOT_COUNTS",
+    "PIVOT_SAMPLES",
     "PRESETS",
-    "RESULT_INDEPENDENT",
     "SELECTION_MODES",
     "SPACINGS",
     "SWITCH",
@@ -49,6 +54,7 @@ __all__ = [
     "declarations",
     "declared",
     "from_json",
+    "key_values",
     "preset",
     "to_json",
     "with_values",

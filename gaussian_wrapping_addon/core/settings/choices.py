@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-PRESETS = ("draft", "standard", "fine")
+PRESETS = ("draft", "standard", "fine", "paper")
 SELECTION_MODES = ("auto", "on", "off")
 """Of an optional part of the model; ``"auto"`` selects it by evidence in the photos."""
 SWITCH = ("off", "on")
@@ -13,7 +13,10 @@ CORRELATIONS = ("signed", "squared")
 SPACINGS = ("adaptive", "uniform")
 MESH_METHODS = ("pam", "pivots")
 PIVOT_COUNTS = (2, 3, 9)
+PIVOT_BOXES = ("normal", "gof")
+PIVOT_SAMPLES = ("depth", "none")
 BOUNDARIES = ("closed", "open")
 UNSEEN = ("empty", "occupied")
+FIELD_CAMERAS = ("training", "all")
 MAX_LODS = 8
 TEXTURE_SOURCES = ("photos", "gaussians")

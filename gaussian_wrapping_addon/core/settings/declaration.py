@@ -27,9 +27,10 @@ from .choices import SWITCH
 
 _KEY = "setting"
 
-Scope = Literal["training", "method", "region", "more"]
-"""Groups of options on the command line: training; meshing method and resolution (all that an
-estimate needs); other options of regions; the command ``more`` (continue a training)."""
+Scope = Literal["training", "constants", "method", "region", "more"]
+"""Groups of options on the command line: training; constants of the training method; meshing method
+and resolution (all that an estimate needs); other options of regions; the command ``more``
+(continue a training)."""
 
 Owner = Literal["scene", "training", "preferences"]
 """Owner of a property in Blender: ``Scene.gwrap``, ``Scene.gwrap.training``, or the add-on."""
@@ -136,6 +137,9 @@ class Declaration:
     """Whether it selects a part of the model: ``--needs`` sets all of these."""
     affects_result: bool = True
     """Whether the result depends on it; if not, stage keys exclude it."""
+    since: str = ""
+    """Version that added it; empty: 0.1.0. Stage keys exclude a later setting at its default, so
+    that results of earlier versions stay valid."""
     path: str = ""
     """Dotted, within the job's settings, such as ``"training.iterations"``."""
     kind: Any = None
@@ -219,10 +223,20 @@ def setting(
     panel: PanelProperty | None = None,
     model_selection: bool = False,
     affects_result: bool = True,
+    since: str = "",
 ) -> Any:
     """Declare a setting as a field of a settings class; see :class:`Declaration`."""
     declared = Declaration(
-        default, help, check, unit, presets or {}, option, panel, model_selection, affects_result
+        default,
+        help,
+        check,
+        unit,
+        presets or {},
+        option,
+        panel,
+        model_selection,
+        affects_result,
+        since,
     )
     return field(default=default, metadata={_KEY: declared})
 

@@ -55,6 +55,12 @@ class JobSettings:
                     "Fine",
                     "Larger images and more Gaussians; needs several times as long",
                 ),
+                Item(
+                    "paper",
+                    "Paper",
+                    "The published settings: 30,000 iterations on whole photos, nothing decided "
+                    "automatically; many hours to days on a processor",
+                ),
             ),
             panel_name="train",
             expand=True,
@@ -133,7 +139,7 @@ class JobSettings:
 
 
 def preset(name: str, **overrides: Any) -> JobSettings:
-    """Return the settings of ``"draft"``, ``"standard"`` or ``"fine"``.
+    """Return the settings of ``"draft"``, ``"standard"``, ``"fine"`` or ``"paper"``.
 
     Raises
     ------

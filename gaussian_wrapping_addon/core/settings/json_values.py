@@ -5,14 +5,30 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from typing import Any
+from typing import Any, cast
 
 from ..errors import UsageError
+from .declaration import declarations, value_at
 
 
 def to_json(settings: Any) -> dict[str, Any]:
     """Convert a settings dataclass to plain JSON values."""
     return dataclasses.asdict(settings)
+
+
+def key_values(settings: Any) -> dict[str, Any]:
+    """Return the JSON values that decide about the result of a stage, for its key.
+
+    Settings without influence on the result are left out, and settings that 0.1.0 did not have
+    where they have their default: results of earlier versions stay valid.
+    """
+    left_out = {
+        entry.path
+        for entry in declarations(cast(type, type(settings)))
+        if not entry.affects_result
+        or (entry.since and value_at(settings, entry.path) == entry.default)
+    }
+    return {name: value for name, value in to_json(settings).items() if name not in left_out}
 
 
 def from_json(kind: type, values: Any, location: str = "settings") -> Any:

@@ -8,7 +8,16 @@ from dataclasses import dataclass
 
 from ..limits import MAX_TILES
 from .checks import Choices, Condition, Range
-from .choices import BOUNDARIES, MESH_METHODS, PIVOT_COUNTS, SPACINGS, UNSEEN
+from .choices import (
+    BOUNDARIES,
+    FIELD_CAMERAS,
+    MESH_METHODS,
+    PIVOT_BOXES,
+    PIVOT_COUNTS,
+    PIVOT_SAMPLES,
+    SPACINGS,
+    UNSEEN,
+)
 from .declaration import Item, Option, PanelProperty, setting
 
 
@@ -146,6 +155,49 @@ class MeshingSettings:
             shown_if=("method", "PIVOTS"),
         ),
     )
+    pivot_box: str = setting(
+        "normal",
+        help="Box of nine pivots. normal: along the normal and two directions across it, as in the "
+        "paper; gof: along the Gaussian's own axes, as in Gaussian Opacity Fields.",
+        check=Choices(PIVOT_BOXES),
+        option=Option(
+            "--pivot-box",
+            help="box of --pivots 9: along the normal (default), or the Gaussian's own axes (gof)",
+            scope="method",
+        ),
+        panel=PanelProperty(
+            "Pivot Box",
+            "Box of nine pivots",
+            items=(
+                Item("normal", "Normal", "Along the normal and two directions across it"),
+                Item("gof", "GOF", "Along the Gaussian's own axes, as in Gaussian Opacity Fields"),
+            ),
+            order=41,
+            shown_if=("method", "PIVOTS"),
+        ),
+    )
+    pivot_samples: str = setting(
+        "depth",
+        help="Points that the method pivots triangulates besides the pivots. depth: points of the "
+        "cameras' depth maps, and some throughout the region; none: the pivots alone, of faint "
+        "Gaussians too, as in the paper.",
+        check=Choices(PIVOT_SAMPLES),
+        option=Option(
+            "--pivot-samples",
+            help="points besides the pivots of --method pivots: of depth maps (default), or none",
+            scope="method",
+        ),
+        panel=PanelProperty(
+            "Pivot Samples",
+            "Points that are triangulated besides the pivots",
+            items=(
+                Item("depth", "Depth Maps", "Points that the cameras see: keeps thin parts"),
+                Item("none", "None", "The pivots alone: the mesh of the paper"),
+            ),
+            order=42,
+            shown_if=("method", "PIVOTS"),
+        ),
+    )
     boundary: str = setting(
         "closed",
         help="Mesh where the region cuts the solid. closed: faces on the region's planes close it; "
@@ -179,6 +231,30 @@ class MeshingSettings:
             items=(
                 Item("empty", "Empty", "Space that no camera sees is empty"),
                 Item("occupied", "Occupied", "It is solid: closes the backs of objects"),
+            ),
+        ),
+    )
+    cameras: str = setting(
+        "training",
+        help="Cameras that the mesh is made from. training: those that were trained on, as the "
+        "method has it; all: those of held-out and of wholly masked photos as well.",
+        check=Choices(FIELD_CAMERAS),
+        option=Option(
+            "--mesh-cameras",
+            help="cameras that the mesh is made from: those trained on (default), or all, held-out "
+            "ones too",
+        ),
+        panel=PanelProperty(
+            "Cameras",
+            "Cameras that the mesh is made from",
+            name="mesh_cameras",
+            items=(
+                Item(
+                    "training",
+                    "Training",
+                    "Those that were trained on; held-out photos only measure",
+                ),
+                Item("all", "All", "Held-out photos carve the mesh, too"),
             ),
         ),
     )

@@ -6,8 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from .checks import Choices, Range
-from .choices import CORRELATIONS, MASK_MODES, SELECTION_MODES
+from .choices import MASK_MODES, SELECTION_MODES
 from .declaration import Item, Option, PanelProperty, declarations, setting
+from .method import MethodSettings
 
 _COUNT = Range(1, 10**6)
 _SECONDS = Range(0.0, words="a number of seconds, 0 or more")
@@ -19,7 +20,7 @@ def _selection(automatic: str, on: str, off: str) -> tuple[Item, ...]:
 
 
 @dataclass(frozen=True)
-class TrainingSettings:
+class TrainingSettings(MethodSettings):
     """How the Gaussians are trained. Milestones are fractions of ``iterations``."""
 
     iterations: int = setting(
@@ -27,7 +28,7 @@ class TrainingSettings:
         help="Training iterations.",
         check=_COUNT,
         unit="iterations",
-        presets={"draft": 1500, "fine": 4000},
+        presets={"draft": 1500, "fine": 4000, "paper": 30_000},
         option=Option("--iterations", "N", "training iterations instead of the preset's"),
         panel=PanelProperty(
             "Iterations",
@@ -47,7 +48,7 @@ class TrainingSettings:
         help="Largest number of Gaussians.",
         check=Range(100, 20_000_000),
         unit="Gaussians",
-        presets={"draft": 40_000, "fine": 120_000},
+        presets={"draft": 40_000, "fine": 120_000, "paper": 6_000_000},
         option=Option("--max-gaussians", "N", "cap of Gaussians instead of the preset's"),
         panel=PanelProperty(
             "Gaussians, Max",
@@ -61,7 +62,7 @@ class TrainingSettings:
         help="Long side of the finest training image.",
         check=Range(32, 16384),
         unit="pixels",
-        presets={"draft": 480, "fine": 1024},
+        presets={"draft": 480, "fine": 1024, "paper": 1600},
         option=Option("--max-image-px", "N", "training image size instead of the preset's"),
         panel=PanelProperty(
             "Photo Size, Max",
@@ -70,18 +71,12 @@ class TrainingSettings:
             preset_if_zero=True, soft_high=4096, step=100, subtype="PIXEL",
         ),
     )  # fmt: skip
-    pixels_per_iteration: int = setting(
-        80_000,
-        help="An iteration trains on a window of a photo with at most about this many pixels.",
-        check=Range(1000, 10**9),
-        unit="pixels",
-    )
     sh_degree: int = setting(
         2,
         help="Highest degree of the spherical harmonics; `harmonics` selects how much of it is "
         "used.",
         check=Range(0, 3),
-        presets={"draft": 1, "fine": 3},
+        presets={"draft": 1, "fine": 3, "paper": 3},
         option=Option("--sh-degree", "0..3", "highest degree of the spherical harmonics"),
     )
     holdout_every: int = setting(
@@ -91,42 +86,11 @@ class TrainingSettings:
         unit="photos",
         option=Option("--holdout", "N", "hold out each n-th photo for measuring; 0 holds out none"),
     )
-    lambda_dssim: float = setting(0.2, help="Weight of the D-SSIM term of the colour loss.")
-    lambda_depth_normal: float = setting(0.05, help="Weight of the depth-normal loss.")
-    lambda_normal: float = setting(0.03, help="Weight of the normal loss.")
-    lambda_photometric: float = setting(
-        0.15,
-        help="Weight of the multi-view photometric loss, a quarter of the method's: with its 0.6, "
-        "runs with a tenth of its iterations lose detail.",
-    )
-    lambda_geometric: float = setting(0.02, help="Weight of the multi-view geometric loss.")
-    correlation: str = setting(
-        "signed",
-        help="Correlation of two patches: signed, or squared, where -1 is as good as 1.",
-        check=Choices(CORRELATIONS),
-    )
-    multi_view_until: float = setting(
-        0.75,
-        help="End of the multi-view terms. What noise in the photos has displaced can settle after "
-        "it.",
-        unit="share of iterations",
-    )
-    multi_view_pixels: int = setting(
-        4000,
-        help="Pixels of an iteration at which the multi-view terms are evaluated.",
-        check=_COUNT,
-        unit="pixels",
-    )
-    multi_view_every: int = setting(
-        1,
-        help="The multi-view terms are evaluated in every n-th iteration, with n times the weight.",
-        check=Range(1, 1000),
-        unit="iterations",
-    )
     harmonics: str = setting(
         "auto",
         help="View-dependent colour. auto: only degrees that lower the error of held-out photos; "
         "on: all of them; off: degree 0.",
+        presets={"paper": "on"},
         check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option("--harmonics", help="colour that depends on the direction"),
@@ -143,6 +107,7 @@ class TrainingSettings:
     exposure: str = setting(
         "auto",
         help="Gain and offset per photo.",
+        presets={"paper": "off"},
         check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option("--exposure", help="gain and offset per photo"),
@@ -159,6 +124,7 @@ class TrainingSettings:
     multi_view: str = setting(
         "auto",
         help="Loss terms that compare neighbouring photos.",
+        presets={"paper": "on"},
         check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option("--multi-view", help="terms that compare neighbouring photos"),
@@ -175,6 +141,7 @@ class TrainingSettings:
     wrapping: str = setting(
         "auto",
         help="Orientation of the Gaussians, its loss, and clones of opposite orientation.",
+        presets={"paper": "on"},
         check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option("--wrapping", help="orientation, and clones of opposite orientation"),
@@ -193,6 +160,7 @@ class TrainingSettings:
         help="Densification. auto: it stops where more Gaussians gain little, and Gaussians that "
         "contribute little are kept small (`overlap_price`) and pruned (`prune_share`); on: only "
         "the cap stops it; off: none are added.",
+        presets={"paper": "on"},
         check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option(
@@ -212,6 +180,7 @@ class TrainingSettings:
         "auto",
         help="Training image size. auto: photos that show nothing finer than half their size are "
         "trained on at half size; on: always full size; off: half size.",
+        presets={"paper": "on"},
         check=Choices(SELECTION_MODES),
         model_selection=True,
         option=Option(
@@ -268,46 +237,6 @@ class TrainingSettings:
             ),
         ),
     )
-    depth_from: float = setting(
-        7 / 30,
-        help="Start of the depth-normal loss and the multi-view terms.",
-        unit="share of iterations",
-    )
-    densify_from: float = setting(
-        0.5 / 30, help="Start of densification.", unit="share of iterations"
-    )
-    densify_until: float = setting(0.5, help="End of densification.", unit="share of iterations")
-    densify_every: int = setting(100, help="Interval of densification.", unit="iterations")
-    overlap_price: float = setting(
-        2e-5,
-        help="Footprint regulariser: cost, in the unit of the loss, of one more Gaussian over "
-        "every pixel.",
-        check=Range(0.0, 1.0),
-    )
-    prune_share: float = setting(
-        0.005,
-        help="Gaussians that together contribute less than this share of all blending weights are "
-        "pruned at intervals; 0 prunes none.",
-        check=Range(0.0, 0.5, below_high=True),
-        unit="share",
-    )
-    orient_from: float = setting(
-        20 / 30, help="Start of the orientation loss.", unit="share of iterations"
-    )
-    wrap_rounds: int = setting(
-        3,
-        help="Rounds in which clones of opposite orientation are added; 0 trains the orientation "
-        "alone.",
-        check=Range(0, 20),
-        presets={"draft": 2, "fine": 4},
-        unit="rounds",
-        option=Option("--wrap-rounds", "N", "rounds of clones; 0 trains the orientation alone"),
-    )
-    wrap_from: float = setting(22 / 30, help="First round of clones.", unit="share of iterations")
-    wrap_until: float = setting(26 / 30, help="Last round of clones.", unit="share of iterations")
-    wrap_share: float = setting(
-        0.05, help="Share of the Gaussians that a round may clone.", unit="share"
-    )
     checkpoint_every_s: float = setting(
         60.0,
         help="Time between two checkpoints.",
@@ -331,6 +260,3 @@ class TrainingSettings:
 
 MODEL_SELECTION = tuple(d.name for d in declarations(TrainingSettings) if d.model_selection)
 """Settings of the model selection; ``"auto"`` decides from the photos."""
-
-RESULT_INDEPENDENT = tuple(d.name for d in declarations(TrainingSettings) if not d.affects_result)
-"""Settings that the result does not depend on."""

@@ -21,8 +21,6 @@ from .pythons import FoundPython
 
 CPU = "cpu"
 CUDA = "cuda"
-INDEX = "index"
-"""The default of pip's own index, for users of a mirror."""
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
 

@@ -18,7 +18,7 @@ Item = TypeVar("Item")
 def cancellable(items: Iterable[Item], progress: Progress) -> Iterator[Item]:
     """Yield the items, checking for cancellation before each one is made.
 
-    A wrapping round renders up to sixty views, which takes longer than the two seconds within
+    A wrapping round renders all training views, which takes longer than the two seconds within
     which a cancelled job stops. A loop that changes the training state only after its last view
     leaves the state unchanged when it ends early.
 

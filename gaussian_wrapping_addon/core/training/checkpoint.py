@@ -16,7 +16,7 @@ import numpy as np
 from ..dataset.scene import Scene
 from ..errors import ParseError, UsageError
 from ..files import read_json, write_bytes, write_json
-from ..settings import RESULT_INDEPENDENT, TrainingSettings, to_json
+from ..settings import TrainingSettings, key_values
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ def fingerprint(
     start : Path, optional
         File of Gaussians that the training starts from; its content is hashed.
     """
-    described = {k: v for k, v in to_json(settings).items() if k not in RESULT_INDEPENDENT}
+    described = key_values(settings)
     described.pop("extra_iterations")  # a longer run starts as the shorter one does
     digest = hashlib.sha256()
     digest.update(repr((VERSION, sorted(described.items()), seed)).encode())

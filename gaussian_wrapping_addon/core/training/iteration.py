@@ -39,6 +39,13 @@ _MAX_WINDOWS = 1 << 12
 """Upper bound of the windows per photo; combines view and window into one history index."""
 
 
+def is_oriented(schedule: Schedule, state: TrainingState) -> bool:
+    """Tell whether the orientation is trained now: from its start on, unless wrapping is off."""
+    wrapping = state.model_selection.get("wrapping")
+    off = wrapping is not None and wrapping.chosen == "off"
+    return not off and schedule.is_oriented(state.iteration)
+
+
 class NotFinite(Exception):  # noqa: N818 - asks for a restart, caught in trainer.py
     """A loss is not finite."""
 
@@ -95,6 +102,7 @@ class Stepper:
         """
         iteration, schedule, adam = state.iteration, self.schedule, state.adam
         sample = self._draw_sample(state)
+        oriented = is_oriented(schedule, state)
         gathers, uses_depth = schedule.gathers_statistics(iteration), schedule.uses_depth(iteration)
         options = RenderOptions(
             depth=uses_depth, sh_degree=state.degree, threads=self.threads, screen_gradients=gathers
@@ -112,7 +120,7 @@ class Stepper:
                 sample.camera,
                 sample.mask,
                 lambda_depth_normal=self.settings.lambda_depth_normal,
-                lambda_normal=self.settings.lambda_normal if schedule.is_oriented(iteration) else 0,
+                lambda_normal=self.settings.lambda_normal if oriented else 0,
                 threads=self.threads,
                 store=self.store,
             )
@@ -143,6 +151,8 @@ class Stepper:
             )
             state.statistics.add(image.statistics, sample.whole.width, sample.whole.height, part)
         rates = schedule.rates(iteration, state.rate_factor)
+        if not oriented:
+            rates.pop("orientation", None)
         adam.step_rows(seen, rates, sh_degree=state.degree, threads=self.threads)
         if state.exposure is not None:
             rate = exposure_rate(iteration, self.settings.iterations, len(self.views))

@@ -15,10 +15,10 @@ from ..gaussians.mip_filter import mip_filter
 from ..gaussians.model import OrientedGaussians
 from ..progress import Progress
 from .cancellation import cancellable
-from .density.contribution import contributions, least_contributors, prune_contributors
+from .density.contribution import contributions, needed_by_a_view, prune_contributors
 from .density.density_control import densify_and_prune, reset_opacity
 from .density.wrapping import WrapView, normal_errors, start_orientation, wrap
-from .iteration import Stepper
+from .iteration import Stepper, is_oriented
 from .live_view import divisor_for
 from .schedule import Schedule
 from .selection.harmonics_selection import select_harmonics
@@ -28,11 +28,9 @@ from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
 
-MAX_ROUND_VIEWS = 60
-"""Most views rendered for a round or for the vote on orientations, evenly spread."""
-
-ROUND_DIVISOR = 2
+PRUNE_DIVISOR = 2
 VOTE_DIVISOR = 4
+"""Divisors of the image size at which views are rendered for pruning and for the vote."""
 
 TRIAL_SIDE_PX = 144
 """Long side of the photos on which harmonics are tried: colours vary slowly on the surface."""
@@ -78,7 +76,12 @@ class Rounds:
         if schedule.starts_depth(iteration):
             state.error_history.clear()  # colour errors rise when other terms are added
         if schedule.starts_orientation(iteration):
-            start_orientation(state.adam, self._views(VOTE_DIVISOR), threads=self.threads)
+            start_orientation(
+                state.adam,
+                self._views(VOTE_DIVISOR),
+                first_sign=self.settings.first_sign,
+                threads=self.threads,
+            )
         if self.settings.harmonics == "on":
             state.degree = schedule.sh_degree(iteration)
 
@@ -96,7 +99,9 @@ class Rounds:
         if schedule.prunes(iteration):
             self._prune(state)
             changed = True
-        if schedule.wraps(iteration) and schedule.is_oriented(iteration):
+        if schedule.decides_wrapping(iteration):
+            self._decide_wrapping(state)
+        if schedule.wraps(iteration) and is_oriented(schedule, state):
             changed |= self._wrap(state)
         if changed:
             state.clear_statistics()
@@ -121,62 +126,71 @@ class Rounds:
     def _filter_of(self, state: TrainingState) -> np.ndarray:
         divisor = self.schedule.divisor(min(state.iteration, self.schedule.total - 1))
         cameras = [self.photos.camera(i, divisor) for i in self.views]
-        return mip_filter(state.adam.array("means"), cameras, threads=self.threads)
+        return mip_filter(
+            state.adam.array("means"),
+            cameras,
+            variance_px=self.settings.filter_variance,
+            threads=self.threads,
+        )
 
     def _densify(self, state: TrainingState) -> None:
         """Densify and prune; stop densifying for good once growth no longer pays."""
         setting, limit = self.settings.growth, self.schedule.budget(state.iteration)
         known = state.model_selection.get("growth")
-        if setting != "auto":
-            stopped = setting == "off"
-            if known is None:
-                evidence = state.error_history.growth_evidence()
-                state.model_selection = state.model_selection.with_decision(
-                    evidence.decision(setting)
-                )
-        else:
-            stopped = known is not None and known.chosen == "stopped"
-            if not stopped:
-                evidence = state.error_history.growth_evidence()
-                state.model_selection = state.model_selection.with_decision(
-                    evidence.decision(setting)
-                )
-                stopped = not evidence.pays
-        weights = self._region_weights(state)
-        densify_and_prune(
-            state.adam, state.statistics, 0 if stopped else limit, state.random, weights
+        stopped = setting == "auto" and known is not None and known.chosen == "stopped"
+        if not stopped and (setting == "auto" or known is None):
+            evidence = state.error_history.growth_evidence()
+            state.model_selection = state.model_selection.with_decision(evidence.decision(setting))
+            stopped = setting == "auto" and not evidence.pays
+        change = densify_and_prune(
+            state.adam,
+            state.statistics,
+            0 if stopped else limit,
+            state.random,
+            self._region_weights(state),
+            least_score=self.settings.densify_score,
+            min_opacity=self.settings.min_opacity,
         )
+        _logger.debug(
+            "iteration %d: cloned %d, split %d, pruned %d Gaussians",
+            state.iteration, change.cloned, change.split, change.pruned,
+        )  # fmt: skip
 
     def _prune(self, state: TrainingState) -> None:
-        found = contributions(
+        """Remove the Gaussians that no training view needs."""
+        needed = needed_by_a_view(
             state.adam.gaussians().detached(),
-            self._views(ROUND_DIVISOR),
+            self._views(PRUNE_DIVISOR),
             self.stepper.renderer,
+            self.settings.prune_share,
+            self._region_weights(state),
             threads=self.threads,
         )
-        weights = self._region_weights(state)
-        least = least_contributors(found, self.settings.prune_share, weights)
-        gone = prune_contributors(state.adam, least)
+        gone = prune_contributors(state.adam, needed)
         _logger.info("iteration %d: pruned %d Gaussians", state.iteration, gone)
 
+    def _normal_errors(self, state: TrainingState) -> np.ndarray:
+        views = self._views(self.settings.wrap_divisor)
+        return normal_errors(state.adam.gaussians(), views, threads=self.threads)
+
+    def _decide_wrapping(self, state: TrainingState) -> None:
+        """Decide about wrapping from the photos; if off, undo what was begun to decide it."""
+        shown = contributions(
+            state.adam.gaussians().detached(), self._views(VOTE_DIVISOR), self.stepper.renderer,
+            threads=self.threads,
+        )  # fmt: skip
+        decision = select_wrapping(self._normal_errors(state), shown, self.settings.wrapping)
+        state.model_selection = state.model_selection.with_decision(decision)
+        if decision.chosen == "off" and not self.schedule.refines:
+            # As if it had been off from the start; a splat keeps the orientation it came with.
+            state.adam.array("orientation")[:] = 0.0
+            state.adam.reset_moments("orientation")
+
     def _wrap(self, state: TrainingState) -> bool:
-        """Clone Gaussians with the opposite orientation if selected; return whether it was done."""
-        known = state.model_selection.get("wrapping")
-        if known is not None and known.chosen == "off":
-            return False
-        gaussians = state.adam.gaussians()
-        errors = normal_errors(gaussians, self._views(ROUND_DIVISOR), threads=self.threads)
-        if known is None:
-            shown = contributions(
-                gaussians.detached(), self._views(VOTE_DIVISOR), self.stepper.renderer,
-                threads=self.threads,
-            )  # fmt: skip
-            known = select_wrapping(errors, shown.share, self.settings.wrapping)
-            state.model_selection = state.model_selection.with_decision(known)
-            if known.chosen == "off":
-                return False
-        wrap(state.adam, errors, self.settings.wrap_share, self.settings.max_gaussians)
-        return True
+        """Clone Gaussians with the opposite orientation; return whether there are new ones."""
+        errors = self._normal_errors(state)
+        limit = self.settings.max_gaussians
+        return wrap(state.adam, errors, self.settings.wrap_share, limit) > 0
 
     def _try_harmonics(self, state: TrainingState) -> None:
         """Raise the degree of the harmonics if enough of the surface gains by it.
@@ -227,11 +241,11 @@ class Rounds:
         return np.where(within, self.settings.region_weight, 1.0)
 
     def _views(self, divisor: int) -> Iterator[WrapView]:
-        """Yield at most :data:`MAX_ROUND_VIEWS` training views at reduced size."""
-        count = min(len(self.views), MAX_ROUND_VIEWS)
-        spread = np.linspace(0, len(self.views) - 1, count).round().astype(int)
+        """Yield all training views at reduced size.
+
+        All of them, however many: what only the views left out show would count as unseen.
+        """
         side = self.schedule.long_side_px
         divisor = divisor if side / divisor >= 2 * tolerances.TILE_PX else 1
-        for position in cancellable(spread.tolist(), self.progress):
-            view = self.views[position]
+        for view in cancellable(self.views, self.progress):
             yield WrapView(self.photos.camera(view, divisor), self.photos.mask(view, divisor))

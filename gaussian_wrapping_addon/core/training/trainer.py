@@ -14,6 +14,7 @@ import torch
 
 from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
+from ..dataset.view_split import FEW_PHOTOS, held_out_views, training_views
 from ..errors import Cancelled, DatasetError, WrapError
 from ..gaussians.initialisation import initial_gaussians
 from ..gaussians.model import OrientedGaussians
@@ -32,7 +33,7 @@ from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import Correction, LiveView, evenly_spaced, measure_held_out
-from .losses.neighbours import find_neighbours
+from .losses.neighbours import NeighbourLimits, find_neighbours
 from .result import HeldOutMetrics, TrainingResult
 from .rounds import Inside, Rounds
 from .schedule import SMALLEST_SIDE_PX, Schedule
@@ -42,9 +43,6 @@ from .selection.model_selection import Decision, ModelSelection, decide, select_
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
-
-FEW_PHOTOS = 8
-"""Below this number of photos, only one is held out."""
 
 SNAPSHOT_EVERY = 100
 """Iterations between checks that all values are finite; each one takes a snapshot."""
@@ -61,21 +59,6 @@ TOO_SMALL = "The photos are too small for LPIPS."
 
 RESTART_RATE = 0.5
 """Factor on the learning rates after a restart."""
-
-
-def held_out_views(scene: Scene, every: int) -> list[int]:
-    """Return the held-out views, which are measured and never trained on.
-
-    Every n-th photo sorted by name; only the first with fewer than :data:`FEW_PHOTOS` photos; none
-    if ``every`` is 0 or too few photos would be left.
-    """
-    count = len(scene.views)
-    if every <= 0 or count < 3:
-        return []
-    ranked = sorted(range(count), key=lambda i: (scene.views[i].camera.name, i))
-    if count < FEW_PHOTOS or every == 1:
-        return ranked[:1]
-    return sorted(ranked[::every])
 
 
 def train(
@@ -165,15 +148,13 @@ class _Trainer:
         self.folder, self.seed, self.threads = folder, seed, threads
         self.start_splat, self.inside = start_splat, inside
         self.held_out = held_out_views(scene, settings.holdout_every)
-        kept = set(self.held_out)
-        self.views = [
-            i for i in range(len(scene.views)) if i not in kept and self._has_visible_pixels(i)
-        ]
+        self.views = training_views(scene, self.photos, settings.holdout_every)
         if not self.views:
             raise DatasetError("No photo is left to train on.", "Add photos or check the masks.")
         sizes = [photos.camera(i, 1) for i in self.views]
         side_px = max(max(c.width, c.height) for c in sizes)
-        found = find_neighbours(sizes, points=scene.points)
+        limits = NeighbourLimits.of_settings(settings)
+        found = find_neighbours(sizes, limits, points=scene.points)
         numbers = np.array(self.views)
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)
@@ -181,10 +162,6 @@ class _Trainer:
         self.stepper = Stepper(photos, self.schedule, self.views, self.neighbours, threads)
         self.live_figures: dict[str, float] = {}
         self.live = LiveView(photos, self.held_out, folder, settings, threads)
-
-    def _has_visible_pixels(self, index: int) -> bool:
-        mask = self.photos.mask(index, 1)
-        return mask is None or bool(mask.any())
 
     def _image_size(self, side_px: int) -> tuple[Decision, int]:
         """Decide whether to train at full or half size."""
@@ -340,10 +317,15 @@ class _Trainer:
                     "harmonics", settings.harmonics, f"degree {degree}", evidence, measured=False
                 )
             )
-        if settings.wrapping == "off":
-            evidence = "Not measured: decided by the settings."
+        evidence = "Not measured: decided by the settings."
+        if settings.wrapping != "auto":
+            word = settings.wrapping
             model_selection = model_selection.with_decision(
-                Decision("wrapping", "off", "off", evidence, measured=False)
+                Decision("wrapping", word, word, evidence, measured=False)
+            )
+        if settings.growth == "off":
+            model_selection = model_selection.with_decision(
+                Decision("growth", "off", "off", evidence, measured=False)
             )
         state.model_selection = model_selection
 

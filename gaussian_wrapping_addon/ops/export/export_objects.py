@@ -9,7 +9,6 @@ changed.
 from __future__ import annotations
 
 import contextlib
-import logging
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -32,8 +31,6 @@ from ..placement.placement import placement_of
 from ..regions.region_objects import matrix_of
 from ..results.materials import texture_of
 from .export_materials import MaterialCopies, lend_name, pixels_of
-
-_logger = logging.getLogger(__name__)
 
 _OPERATORS = {
     "glb": "export_scene.gltf",

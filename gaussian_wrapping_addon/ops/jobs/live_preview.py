@@ -65,12 +65,6 @@ def icons_of(folder: str) -> tuple[int, ...]:
     return shown.icons if shown else ()
 
 
-def path_of(folder: str) -> str:
-    """Return the file that the picture of a job folder was read from, or ``""``."""
-    shown = _shown.get(folder)
-    return shown.stamp[0] if shown and shown.stamp else ""
-
-
 def newest_picture(folder: Path) -> Stamp | None:
     """Return the image file of the running training, or None."""
     found = []

@@ -74,8 +74,16 @@ def job_settings(scene: bpy.types.Scene, threads: int) -> JobSettings:
     settings = [declared for declared in settings_of_scene() if declared.group != "meshing"]
     values = chosen_values(properties_of(scene), settings)
     values["start_splat"] = _splat(values["start_splat"])
-    chosen = preset(values.pop("preset"), threads=threads)
-    return with_values(chosen, values)
+    name = values.pop("preset")
+    decided = {
+        declared.path
+        for declared in settings
+        if declared.model_selection
+        and name in declared.presets
+        and values[declared.path] == declared.default
+    }  # Auto leaves it to the preset
+    given = {path: value for path, value in values.items() if path not in decided}
+    return with_values(preset(name, threads=threads), given)
 
 
 def meshing_choices(scene: bpy.types.Scene, world_per_blender: float) -> dict[str, Any]:

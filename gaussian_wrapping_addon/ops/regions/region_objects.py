@@ -133,38 +133,24 @@ def is_convex(thing: bpy.types.Object) -> bool:
     return abs(volume - whole) <= CONVEX_TOLERANCE * whole
 
 
-def region_from_object(thing: bpy.types.Object) -> np.ndarray:
-    """Return the (n, 3) float64 hull vertices of a region object in the world of the input.
+def region_body(thing: bpy.types.Object, name: str = "") -> dict[str, Any]:
+    """Return the bounding-volume JSON of a region object, named as the object by default.
 
-    The way is Blender -> scene frame (the parent empty's matrix) -> world (its
-    ``world_from_scene``); an object outside a result is taken to be in world coordinates.
+    Its hull is in the world of the input. The way is Blender -> scene frame (the parent empty's
+    matrix) -> world (its ``world_from_scene``); an object outside a result is taken to be in world
+    coordinates.
 
     Raises
     ------
     UsageError, MeshingError
         The object cannot be a region, or its frame has lost its coordinates.
     """
-    return _region_in_world(thing)[0]
-
-
-def _region_in_world(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
     frame = tags.frame_of(thing)
     vertices, triangles = hull_in_blender(thing)
     if frame is not None:
         vertices = transformed(scene_from_blender(frame), vertices)
         vertices = tags.world_from_scene(frame).points(vertices)
-    return vertices, triangles
-
-
-def region_body(thing: bpy.types.Object, name: str = "") -> dict[str, Any]:
-    """Return the bounding-volume JSON of a region object, named as the object by default.
-
-    Raises
-    ------
-    UsageError, MeshingError
-        As :func:`region_from_object`.
-    """
-    return region_to_json(name or thing.name, *_region_in_world(thing))
+    return region_to_json(name or thing.name, vertices, triangles)
 
 
 def export_region(thing: bpy.types.Object, path: Path, name: str = "") -> None:

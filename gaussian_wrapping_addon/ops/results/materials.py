@@ -13,7 +13,6 @@ import bpy
 from ...core.texture.files.shading import ROUGHNESS, SPECULAR_LEVEL
 from ..common import tags
 
-SHADINGS = ("LIT", "UNLIT")
 _NORMAL_IMAGE, _NORMAL = "Normal Texture", "Normal Map"
 _IMAGE, _LIT, _UNLIT, _OUTPUT = "Photo Texture", "Lit", "Unlit", "Output"
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,8 +26,6 @@ from .materials import (
     shading_of,
 )
 from .result_files import RegionResult, ResultFiles, read_result
-
-_logger = logging.getLogger(__name__)
 
 FRAME_NAME = "blender_from_scene"
 CAMERAS_NAME = "Photo Cameras"

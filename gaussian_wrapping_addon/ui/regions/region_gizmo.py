@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, field
 from typing import Any, Final, cast
 
@@ -23,8 +22,6 @@ from ...ops.regions.region_box import (
     set_cage_matrix,
     steadied,
 )
-
-_logger = logging.getLogger(__name__)
 
 _POLL_S: Final = 0.05
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core import tolerances
-from gaussian_wrapping_addon.core.field.vacancy.stable_logs import log_gaussian, log_one_minus, odds
+from gaussian_wrapping_addon.core.field.vacancy.stable_logs import log_gaussian, log_one_minus
 from gaussian_wrapping_addon.core.field.vector_field import TAIL, VectorField
 from gaussian_wrapping_addon.core.gaussians.model import GaussianArrays
 from tests.core.field.field_scenes import (
@@ -23,6 +23,12 @@ def whitened(arrays: GaussianArrays, points: np.ndarray) -> tuple[np.ndarray, np
     """Return S^-1 R^T (m, 3, 3) and S^-1 R^T (x - mu) (n, m, 3)."""
     L = arrays.rotations.transpose(0, 2, 1) / arrays.scales[:, :, None]
     return L, np.einsum("mij,nmj->nmi", L, points[:, None] - arrays.means)
+
+
+def odds(log_g: np.ndarray) -> np.ndarray:
+    """Return ``H = G / (1 - G)``, 0 where G underflows."""
+    with np.errstate(over="ignore"):
+        return 1.0 / np.expm1(-np.asarray(log_g, np.float64))
 
 
 def by_definition(arrays: GaussianArrays, points: np.ndarray, tail: float = 1e-300) -> np.ndarray:

@@ -28,7 +28,6 @@ from gaussian_wrapping_addon.core.field.vector_field import VectorField
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.query.depth_query import query_depth
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.gradients import VisibleGradients
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
@@ -42,6 +41,7 @@ from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.field.field_scenes import around_shell, cameras_around, shell_arrays
 from tests.core.meshing.meshing_scenes import ShapeField, cube, gaussians_on, settings, some_cameras
 from tests.core.meshing.meshing_scenes import sphere as sphere_distance
+from tests.core.render.query_autograd import query_depth
 from tests.core.texture.texture_scenes import photograph, ring, scene_of, sphere, sphere_hit, waves
 from tests.core.training.small_scene import sphere_gaussians, sphere_scene
 

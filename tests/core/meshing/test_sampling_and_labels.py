@@ -11,15 +11,10 @@ from scipy.spatial import cKDTree
 
 from gaussian_wrapping_addon.core.mesh.surface_sampling import sample_triangles, thin
 from gaussian_wrapping_addon.core.meshing.points.pivots import (
-    directional_sigma,
-    gaussians_reaching,
-    nine_pivots,
     representative_gaussians,
-    two_pivots,
 )
 from gaussian_wrapping_addon.core.meshing.tetrahedra.classification import regularised
-from tests.core.field.field_scenes import make_arrays, random_arrays
-from tests.core.meshing.meshing_scenes import cube
+from tests.core.field.field_scenes import random_arrays
 
 
 def test_samples_are_uniform_over_triangles() -> None:
@@ -64,49 +59,6 @@ def test_thinning_with_local_radii() -> None:
     left = kept[points[:, 0] < 0.48].sum()
     right = kept[points[:, 0] > 0.52].sum()
     assert 9 < left / right < 20  # areas of the discs differ by 16
-
-
-def test_outer_pivots_lie_three_sigmas_out() -> None:
-    arrays = random_arrays(300, 3)
-    arrays.normals[:50] *= 1e-3  # not oriented
-    index = np.arange(300)
-    pivots = two_pivots(arrays, index)
-    unoriented = int((np.linalg.norm(arrays.normals, axis=1) < 0.05).sum())
-    assert unoriented >= 50
-    assert len(pivots) == 600 + unoriented
-    offset = pivots[300:600] - arrays.means
-    white = np.einsum("nij,ni->nj", arrays.rotations, offset) / arrays.scales
-    assert np.linalg.norm(white, axis=1).min() > 3 - 1e-9
-    oriented = np.linalg.norm(arrays.normals, axis=1) >= 0.05
-    assert ((offset * arrays.normals).sum(1)[oriented] > 0).all()
-    np.testing.assert_allclose(
-        pivots[600:], 2 * arrays.means[~oriented] - pivots[300:600][~oriented]
-    )
-
-
-def test_nine_pivots_are_the_centre_and_the_corners_of_the_box() -> None:
-    arrays = random_arrays(40, 4)
-    index = np.array([7, 3, 30])
-    pivots = nine_pivots(arrays, index)
-    np.testing.assert_array_equal(pivots[:3], arrays.means[index])
-    offset = pivots[3:].reshape(3, 8, 3) - arrays.means[index][:, None]
-    white = np.einsum("nij,nci->ncj", arrays.rotations[index], offset)
-    white /= arrays.scales[index][:, None]
-    np.testing.assert_allclose(np.abs(white), 3.0, rtol=1e-9)
-    assert all(len(np.unique(np.sign(corners), axis=0)) == 8 for corners in white)
-
-
-def test_gaussians_that_reach_a_region() -> None:
-    means = np.array([[0, 0, 0], [1.2, 0, 0], [1.4, 0, 0], [9, 0, 0], [0.5, 0, 0], [0, 0, 1.25]])
-    scales = np.tile([0.1, 0.01, 0.01], (6, 1))
-    alphas = np.array([0.9, 0.9, 0.9, 0.9, 0.003, 0.9])
-    arrays = make_arrays(means, scales, alphas)
-    assert gaussians_reaching(arrays, cube(1.0), 0.0).tolist() == [0, 1]
-    assert gaussians_reaching(arrays, cube(1.0), 0.25).tolist() == [0, 1, 2, 5]
-    np.testing.assert_allclose(
-        directional_sigma(arrays, np.array([0]), np.array([[0.6, 0.8, 0.0]])),
-        np.hypot(0.06, 0.008),
-    )
 
 
 def test_representatives_are_few_and_cover_space() -> None:

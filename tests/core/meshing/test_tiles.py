@@ -17,7 +17,6 @@ from gaussian_wrapping_addon.core.meshing.points.region_caps import no_caps
 from gaussian_wrapping_addon.core.meshing.points.spacing import Spacing
 from gaussian_wrapping_addon.core.meshing.points.surface_points import SurfacePoints
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
-from gaussian_wrapping_addon.core.meshing.tiles import tiled_mesh
 from gaussian_wrapping_addon.core.meshing.tiles.plan import Field, TilePlan
 from gaussian_wrapping_addon.core.meshing.tiles.steiner_points import (
     CLEARANCE_RADII,
@@ -25,7 +24,6 @@ from gaussian_wrapping_addon.core.meshing.tiles.steiner_points import (
 )
 from gaussian_wrapping_addon.core.meshing.tiles.tile_faces import (
     TileFaces,
-    circumradii,
     joined_faces,
     local_tetrahedra,
     tile_faces,
@@ -35,7 +33,6 @@ from gaussian_wrapping_addon.core.meshing.tiles.tile_points import (
     gather,
     pieces_in_box,
 )
-from gaussian_wrapping_addon.core.meshing.tiles.tiled_mesh import mesh_in_tiles
 from gaussian_wrapping_addon.core.meshing.tiles.tiling import Tiling, split_evenly
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.convex_region import Region
@@ -52,6 +49,7 @@ from .meshing_scenes import (
     sphere,
     torus,
 )
+from .tiled_meshing import mesh_in_tiles
 
 SIGMA = 0.02
 PLATE = rounded_box((1.0, 0.9, 0.02), 0.02)
@@ -190,6 +188,14 @@ def points_on_sheet() -> tuple[Region, Tiling, GatheredPoints, TilePlan]:
         (), {},
     )  # fmt: skip
     return region, tiling, gather(plan, [cloud]), plan
+
+
+def circumradii(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Return the circumradii, (m,)."""
+    base = points[tetrahedra[:, 0]]
+    edges = points[tetrahedra[:, 1:]] - base[:, None]  # (m, 3, 3)
+    offsets = np.linalg.solve(2.0 * edges, (edges**2).sum(2)[:, :, None])[:, :, 0]
+    return np.asarray(np.linalg.norm(offsets, axis=1))
 
 
 def test_halo_is_a_small_part_and_no_empty_ball_is_larger_than_stated() -> None:
@@ -382,7 +388,7 @@ def test_region_without_surface_is_told() -> None:
     field = ShapeField(lambda p: np.full(len(p), 1.0), SIGMA)
     arrays = gaussians_on(sphere(), cube(1.3), 100, SIGMA)
     with pytest.raises(MeshingError, match="holds no surface"):
-        tiled_mesh.mesh_in_tiles(
+        mesh_in_tiles(
             field, field, arrays, some_cameras(), cube(1.3), MeshingSettings(points=500),
             Progress(), tiles=2, seed=0, threads=1,
         )  # fmt: skip

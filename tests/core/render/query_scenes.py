@@ -81,10 +81,6 @@ class Oracle:
         density = raw * np.exp(-0.5 * sharpness * ahead * ahead)
         return np.prod(1.0 - np.minimum(density, 0.99), axis=1)
 
-    def transmittance(self, positions: np.ndarray, depths: np.ndarray) -> np.ndarray:
-        """T (p,) at positions of the image."""
-        return self.through(self.cast(positions), depths.astype(np.float64))
-
     def depth(self, positions: np.ndarray, limit: float = 0.45) -> np.ndarray:
         """z-depth (p,); 0 where there is none and off the image."""
         size = np.array([self.camera.width, self.camera.height])

@@ -15,10 +15,10 @@ from hypothesis.extra import numpy as hnp
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
-from gaussian_wrapping_addon.core.render.query.depth_query import query_depth, query_transmittance
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .comparisons import leaves
+from .query_autograd import query_depth
 from .query_scenes import SHAPES, scene
 from .scenes import isotropic, look_at
 
@@ -33,21 +33,14 @@ def test_positions_off_the_image_have_no_answer_and_no_gradient() -> None:
     outside += [[-inf, 5.0], [1e30, -1e30], [nan, inf]]
     leaf = leaves(gaussians, torch.float32)
     at = torch.tensor(inside + outside, requires_grad=True)
-    depths = torch.full((len(at),), 38.0, requires_grad=True)
-    found = [query_depth(leaf, camera, at), query_transmittance(leaf, camera, at, depths)]
-    for answer in found:
-        assert (answer[: len(inside)] > 0).all()
-        assert not answer[len(inside) :].any()
-    (found[0].sum() + found[1].sum()).backward()
-    for grad in (at.grad, depths.grad):
-        assert grad is not None
-        assert torch.isfinite(grad).all()
-        assert grad[: len(inside)].any()
-        assert not grad[len(inside) :].any()
-    deep = torch.tensor([nan, inf, -inf, 38.0])
-    through = query_transmittance(leaf, camera, at.detach()[3].expand(4, 2), deep)
-    assert through[0] == 0.0
-    assert 0.0 < through[1] < through[3] < through[2] <= 1.0
+    found = query_depth(leaf, camera, at)
+    assert (found[: len(inside)] > 0).all()
+    assert not found[len(inside) :].any()
+    found.sum().backward()
+    assert at.grad is not None
+    assert torch.isfinite(at.grad).all()
+    assert at.grad[: len(inside)].any()
+    assert not at.grad[len(inside) :].any()
 
 
 def test_nothing_to_see_and_nothing_asked() -> None:
@@ -60,9 +53,7 @@ def test_nothing_to_see_and_nothing_asked() -> None:
             depth = query_depth(leaf, camera, at)
             assert depth.shape == (count,)
             assert not depth.any()
-            through = query_transmittance(leaf, camera, at, torch.ones(count))
-            assert (through == 1.0).all()
-            (depth.sum() + through.sum()).backward()
+            depth.sum().backward()
             assert leaf.means.grad is not None
             assert not leaf.means.grad.any()
 
@@ -71,18 +62,6 @@ def test_wrong_shapes_are_refused() -> None:
     gaussians, camera = scene("generic")
     with pytest.raises(UsageError, match="shape"):
         query_depth(gaussians, camera, torch.zeros((4, 3)))
-    with pytest.raises(UsageError, match="depths of shape"):
-        query_transmittance(gaussians, camera, torch.zeros((4, 2)), torch.zeros(3))
-
-
-def test_changed_parameters_are_refused_by_backward() -> None:
-    gaussians, camera = scene("generic")
-    leaf = leaves(gaussians, torch.float32)
-    depth = query_depth(leaf, camera, torch.full((3, 2), 20.0))
-    with torch.no_grad():
-        leaf.means.mul_(1.5)
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        depth.sum().backward()
 
 
 def floats(low: float, high: float, shape: tuple[int, ...]) -> st.SearchStrategy[np.ndarray]:
@@ -108,16 +87,13 @@ def test_answers_and_gradients_are_finite(data: st.DataObject) -> None:
     at = torch.from_numpy(data.draw(hnp.arrays(np.float32, (12, 2), elements=anything)))
     # However small a Gaussian is, some position looks at it.
     at[:count] = torch.from_numpy(camera.project(gaussians.means.numpy())[0]).float()
-    deep = torch.from_numpy(data.draw(hnp.arrays(np.float32, (12,), elements=anything)))
     options = RenderOptions(threads=1, depth_valid_transmittance=data.draw(st.floats(0.0, 1.0)))
     leaf = leaves(gaussians, torch.float32)
-    at, deep = at.requires_grad_(), deep.requires_grad_()
+    at = at.requires_grad_()
     depth = query_depth(leaf, camera, at, options)
-    through = query_transmittance(leaf, camera, at, deep, options)
     assert torch.isfinite(depth).all()
     assert (depth >= 0).all()
-    assert ((through >= 0) & (through <= 1)).all()
-    (depth.sum() + through.sum()).backward()
-    for grad in [*(getattr(leaf, field).grad for field in SHAPES), at.grad, deep.grad]:
+    depth.sum().backward()
+    for grad in [*(getattr(leaf, field).grad for field in SHAPES), at.grad]:
         assert grad is not None
         assert torch.isfinite(grad).all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gradients of depth queries against the definition's, in Gaussians, positions and depths."""
+"""Gradients of depth queries against the definition's, in Gaussians and positions."""
 
 from __future__ import annotations
 
@@ -7,33 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.render.projection.projection import (
-    RawArrays,
-    RawGradients,
-    project_backward,
-)
-from gaussian_wrapping_addon.core.render.query.depth_query import (
-    add_query_gradients,
-    query_depth,
-    query_transmittance,
-    query_view,
-    query_view_of,
-    solve_depths,
-)
-from gaussian_wrapping_addon.core.render.raster.blend import (
-    Images,
-    RenderBuffers,
-    blend,
-    blend_backward,
-)
-from gaussian_wrapping_addon.core.render.reference.reference import (
-    reference_depth_at,
-    reference_transmittance_at,
-)
-from gaussian_wrapping_addon.core.render.render import project_view, render
+from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
+from gaussian_wrapping_addon.core.render.query.depth_query import query_view, solve_depths
+from gaussian_wrapping_addon.core.render.reference.reference import reference_depth_at
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .comparisons import leaves, relative_l2
+from .query_autograd import query_depth
 from .query_scenes import EYE, SHAPES, Oracle, random_positions, scene
 from .scenes import look_at
 
@@ -63,28 +43,6 @@ def test_depth_gradients_are_those_of_the_definition(name: str, bound: float) ->
     assert at_one.grad is not None
     assert at_two.grad is not None
     assert relative_l2(at_one.grad, at_two.grad) < bound
-
-
-@pytest.mark.parametrize("name", ["generic", "thin", "opaque"])
-def test_transmittance_gradients_are_those_of_the_definition(name: str) -> None:
-    gaussians, camera = scene(name)
-    positions = torch.from_numpy(random_positions(camera, 1500))
-    random = np.random.default_rng(7)
-    depths = torch.from_numpy(random.uniform(1.0, 4.0, 1500).astype(np.float32))
-    weight = torch.from_numpy(random.normal(size=1500))
-    grads = []
-    for dtype in (torch.float32, torch.float64):
-        leaf = leaves(gaussians, dtype)
-        at = positions.to(dtype).clone().requires_grad_()
-        deep = depths.to(dtype).clone().requires_grad_()
-        if dtype == torch.float32:
-            through = query_transmittance(leaf, camera, at, deep)
-        else:
-            through = reference_transmittance_at(leaf, camera, at, deep, RenderOptions())
-        (through.double() * weight).sum().backward()
-        grads.append([*(getattr(leaf, field).grad for field in SHAPES), at.grad, deep.grad])
-    for fast, exact in zip(*grads, strict=True):
-        assert relative_l2(fast, exact) < 1e-4
 
 
 def test_gradient_on_positions_is_the_slope_of_the_depth() -> None:
@@ -119,41 +77,8 @@ def test_bitwise_the_same_for_any_number_of_threads() -> None:
         leaf, at = leaves(gaussians, torch.float32), positions.clone().requires_grad_()
         options = RenderOptions(threads=threads)
         depth = query_depth(leaf, camera, at, options)
-        through = query_transmittance(leaf, camera, at, torch.full((5000,), 2.3), options)
-        (depth.square().sum() + through.square().sum()).backward()
-        results.append(
-            [depth.detach(), through.detach(), at.grad]
-            + [getattr(leaf, field).grad for field in SHAPES]
-        )
+        depth.square().sum().backward()
+        results.append([depth.detach(), at.grad] + [getattr(leaf, field).grad for field in SHAPES])
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
             assert torch.equal(a, b)
-
-
-def test_one_projection_serves_image_and_query() -> None:
-    gaussians, camera = scene("generic")
-    options = RenderOptions(threads=1)
-    positions = random_positions(camera, 500)
-    weight = np.random.default_rng(3).normal(size=500).astype(np.float32)
-
-    raw = RawArrays.from_gaussians(gaussians)
-    view = project_view(raw, camera, options)
-    images, buffers = Images.allocate(camera, options), RenderBuffers()
-    blend(view, images, buffers)
-    ones = [np.ones_like(images.color), *[np.zeros_like(images.color)] * 2]
-    ones += [np.zeros_like(images.alpha)] * 2
-    grad_params, _, _ = blend_backward(view, images, ones, buffers, absolute=False)
-    shared = query_view_of(view)
-    result = solve_depths(shared, positions)
-    on_positions, _ = add_query_gradients(shared, result, weight, grad_params)
-    total = RawGradients.zeros(raw)
-    project_backward(raw, camera, options, view.screen, grad_params, total)
-
-    leaf, at = leaves(gaussians, torch.float32), torch.from_numpy(positions).requires_grad_()
-    depth = query_depth(leaf, camera, at, options)
-    loss = render(leaf, camera, options).color.sum() + (depth * torch.from_numpy(weight)).sum()
-    loss.backward()
-    np.testing.assert_allclose(result.values, depth.detach().numpy(), rtol=5e-6)
-    assert relative_l2(on_positions, at.grad) < 1e-4
-    for field in SHAPES:
-        assert relative_l2(getattr(total, field), getattr(leaf, field).grad) < 1e-4, field

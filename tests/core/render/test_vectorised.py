@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_wrapping_addon.core.render.query.depth_query import query_depth
 from gaussian_wrapping_addon.core.render.query.depth_query_gradient import query_gradient_range
-from gaussian_wrapping_addon.core.render.query.depth_query_kernels import query_kernel
+from gaussian_wrapping_addon.core.render.query.depth_query_kernels import query_range
 from gaussian_wrapping_addon.core.render.raster import raster_backward, raster_forward
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.simd.raster_math import aligned_zeros, vector_lanes
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 
 from .comparisons import leaves
+from .query_autograd import query_depth
 from .query_scenes import scene
 from .scenes import look_at, random_gaussians
 
@@ -90,7 +90,7 @@ def test_queries_use_packed_arithmetic() -> None:
     gaussians, camera = scene("generic")
     leaf = leaves(gaussians, torch.float32)
     query_depth(leaf, camera, torch.full((1, 2), 20.0)).sum().backward()
-    for kernel, least in ((query_kernel(True), 30), (query_gradient_range, 40)):
+    for kernel, least in ((query_range, 30), (query_gradient_range, 40)):
         packed, single = fused_instructions(kernel)
         assert packed >= least
         assert single < packed

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import Cancelled, MeshingError, UsageError
-from gaussian_wrapping_addon.core.mesh.face_graph import face_graph
+from gaussian_wrapping_addon.core.mesh.face_graph import FaceGraph, face_graph
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.mesh.textured_mesh import TexturedMesh
 from gaussian_wrapping_addon.core.progress import Progress
@@ -22,7 +22,11 @@ from gaussian_wrapping_addon.core.texture.bake.coverage_statistics import Covera
 from gaussian_wrapping_addon.core.texture.bake.fill import surface_positions
 from gaussian_wrapping_addon.core.texture.bake.photo_gains import solve_gains
 from gaussian_wrapping_addon.core.texture.bake.photo_samples import SurfaceArrays, SurfacePoints
-from gaussian_wrapping_addon.core.texture.cost.texture_size import automatic_size, gutter_for
+from gaussian_wrapping_addon.core.texture.cost.texture_size import (
+    gutter_for,
+    plan_textures,
+    required_side,
+)
 from gaussian_wrapping_addon.core.texture.texture_mesh import texture_mesh
 from gaussian_wrapping_addon.core.texture.unwrap.unwrap import Unwrap
 from tests.core.texture.texture_scenes import (
@@ -299,6 +303,10 @@ def test_overexposed_photos_leave_no_grey_on_white(tmp_path: Path) -> None:
     white = (np.abs(normals[:, 2]) < 0.6) & (np.sin(9.0 * positions[:, 2]) > 0.5)
     assert white.sum() > 1000
     assert np.percentile(np.abs(colors[white] - 200.0), 99.0) < 10.0
+
+
+def automatic_size(graph: FaceGraph, photos: FakePhotos, count: int, detail_points: int = 0) -> int:
+    return plan_textures(required_side(graph, photos, count, detail_points), 0, 1)[0]
 
 
 def test_the_automatic_size_follows_the_photos() -> None:

@@ -22,7 +22,7 @@ from gaussian_wrapping_addon.core.settings import TrainingSettings
 from gaussian_wrapping_addon.core.training import iteration, rounds, trainer
 from gaussian_wrapping_addon.core.training.result import TrainingResult
 from gaussian_wrapping_addon.core.training.state import TrainingState
-from gaussian_wrapping_addon.core.training.trainer import held_out_views, train
+from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
 
 SETTINGS = TrainingSettings(
@@ -191,17 +191,6 @@ def test_numbers_that_break_down_are_recovered_once(
     (tmp_path / "again").mkdir()
     with pytest.raises(WrapError, match="twice"):
         train(scene, photos, settings, tmp_path / "again", Progress(), threads=1)
-
-
-def test_held_out_photos_are_every_nth_of_the_sorted_names() -> None:
-    scene, _ = sphere_scene(views=9, size_px=24)
-    assert held_out_views(scene, 8) == [0, 8]
-    assert held_out_views(scene, 4) == [0, 4, 8]
-    backwards = dataclasses.replace(scene, views=scene.views[::-1])
-    assert held_out_views(backwards, 3) == [2, 5, 8]
-    assert held_out_views(scene, 0) == []
-    few = dataclasses.replace(scene, views=scene.views[:5])
-    assert held_out_views(few, 2) == [0]
 
 
 def test_training_more_equals_a_longer_run(tmp_path: Path) -> None:

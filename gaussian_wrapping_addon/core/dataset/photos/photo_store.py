@@ -48,11 +48,6 @@ class PhotoStore:
     def __len__(self) -> int:
         return len(self._views)
 
-    @property
-    def cached_bytes(self) -> int:
-        """Bytes held by the cache now."""
-        return self._cached_bytes
-
     def camera(self, index: int, divisor: int = 1) -> Camera:
         """Return the camera that fits ``photo(index, divisor)`` pixel for pixel."""
         base = self._base[index]

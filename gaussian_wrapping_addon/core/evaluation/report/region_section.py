@@ -176,13 +176,18 @@ def _simplification_rows(provenance: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _tile_rows(provenance: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the number of tiles, and the share of field evaluations that no camera sees."""
+    """Return the number of tiles, the cameras of the field, and what none of them sees."""
     rows = []
     if tiles := measured(provenance.get("tiles")):
         text = plural(int(tiles), "tile")
         if processes := measured(provenance.get("tile_processes")):
             text += f", by {plural(int(processes), 'process', 'processes')}"
         rows.append(("Tiles", text))
+    if cameras := measured(provenance.get("field_cameras")):
+        text = number(cameras)
+        if provenance.get("cameras") == "training":
+            text += ", those that were trained on"
+        rows.append(("Cameras of the mesh", text))
     evaluated = measured(provenance.get("field_evaluations"))
     unseen = measured(provenance.get("unseen_evaluations"))
     if evaluated and unseen is not None:

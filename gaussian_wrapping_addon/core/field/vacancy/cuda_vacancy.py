@@ -97,7 +97,7 @@ class CudaVacancyField(VacancyField):
     values differ by float32 rounding, and by 1/255 of one Gaussian where rounding decides whether
     the ray lies inside the rim of its footprint. Results are the same in every run and do not
     depend on how points are split into calls, except where vacancy exceeds 0.999. The processor
-    prepares the cameras and evaluates :meth:`~.vacancy.VacancyField.log_gradient`.
+    prepares the cameras.
 
     Parameters
     ----------

@@ -1,29 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Numerically stable log alpha, log G, log(1 - G) and G / (1 - G)."""
+"""Numerically stable log G and log(1 - G)."""
 
 from __future__ import annotations
 
 import numpy as np
 
 LOG_HALF = -0.6931471805599453
-
-
-def log_sigmoid(logits: np.ndarray) -> np.ndarray:
-    """Return the log opacity of a logit, ``-softplus(-logit)``.
-
-    Parameters
-    ----------
-    logits : (...) array
-        Opacity logits, any finite value.
-
-    Returns
-    -------
-    (...) float64, < 0
-        Accurate to a few ulp also where the opacity rounds to 1 (docs/method.md, section 5.4).
-    """
-    logits = np.asarray(logits, np.float64)
-    # A single branch would lose digits or overflow on the other side of zero.
-    return np.minimum(logits, 0.0) - np.log1p(np.exp(-np.abs(logits)))
 
 
 def log_gaussian(log_alpha: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -57,20 +39,3 @@ def log_one_minus(log_g: np.ndarray) -> np.ndarray:
         near_zero = np.log1p(-np.exp(log_g))
         near_one = np.log(-np.expm1(log_g))
     return np.where(log_g < LOG_HALF, near_zero, near_one)
-
-
-def odds(log_g: np.ndarray) -> np.ndarray:
-    """Return ``H = G / (1 - G) = 1 / expm1(-log G)``.
-
-    Parameters
-    ----------
-    log_g : (...) array, <= 0
-
-    Returns
-    -------
-    (...) float64, >= 0
-        ``inf`` where ``log_g`` is 0, 0 where G underflows (docs/method.md, section 5.4).
-    """
-    with np.errstate(divide="ignore", over="ignore"):
-        # abs instead of negation: -0.0 would give minus infinity.
-        return 1.0 / np.expm1(np.abs(np.asarray(log_g, np.float64)))

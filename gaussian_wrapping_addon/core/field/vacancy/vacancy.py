@@ -23,7 +23,6 @@ from ...kernels.parallel import (
 from ...machine import total_memory_bytes
 from ...progress import Progress
 from .camera_bins import TILE_PX, CameraBins, VirtualScreen, bin_camera
-from .log_gradient import gradient_from_camera, gradient_table
 from .photo_masks import MaskMode, checked_masks, masked_points
 from .vacancy_kernels import project_points, sort_by_cell, transmittance_of_cells
 
@@ -147,7 +146,6 @@ class VacancyField:
         """Number of those points that no camera sees."""
         self._masks = checked_masks(masks, self.cameras, mask_mode)
         self._mask_mode = mask_mode
-        self._gradient_table: np.ndarray | None = None
         self._screens = [VirtualScreen.of(camera, near_z) for camera in self.cameras]
         self._cache: dict[int, CameraBins | None] = {}
         self._cache_left = default_cache_bytes() if cache_bytes is None else cache_bytes
@@ -223,41 +221,6 @@ class VacancyField:
                 camera_index, points[begin:end], inside, 2.0, best[begin:end], winner[begin:end]
             )
         return np.where(winner >= 0, best, np.float32(np.nan))
-
-    def log_gradient(self, points: np.ndarray, camera: np.ndarray) -> np.ndarray:
-        """Return the gradient of log transmittance at points, each from its own camera.
-
-        With the arg-max camera of :meth:`vacancy` this is the gradient of log vacancy, exact up to
-        rounding in float64 (where the arg-max changes, vacancy has a kink).
-
-        Parameters
-        ----------
-        points : (n, 3) float64
-            Scene frame.
-        camera : (n,) int
-            Camera indices; -1 for none.
-
-        Returns
-        -------
-        (n, 3) float64, 1 / scene units
-            0 where the camera does not see the point.
-        """
-        points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
-        camera = np.asarray(camera)
-        gradient, log_t = np.zeros((len(points), 3)), np.empty(len(points))
-        if self._gradient_table is None:
-            self._gradient_table = gradient_table(self.arrays)
-        order = np.argsort(camera, kind="stable")
-        bounds = np.searchsorted(camera[order], np.arange(len(self.cameras) + 1))
-        for index in range(len(self.cameras)):
-            rows = order[bounds[index] : bounds[index + 1]]
-            bins = self._bins(index) if len(rows) else None
-            if bins is not None:
-                gradient_from_camera(
-                    self._gradient_table, self._screens[index], bins, points, rows, log_t,
-                    gradient, self.threads,
-                )  # fmt: skip
-        return gradient
 
     def evaluation_order(self) -> np.ndarray:
         """Return camera indices, most frequent arg-max first; ties are spread over the list."""

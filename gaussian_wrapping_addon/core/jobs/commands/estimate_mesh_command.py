@@ -17,8 +17,10 @@ from ...names import AUTOMATIC_REGIONS
 from ...progress import Progress
 from ...report_warning import ReportWarning
 from ...settings import MeshingSettings, from_json
+from ..stages.region_field import field_views
 from ..stages.region_meshing import estimate_region_mesh, estimate_region_pivots, free_bytes
 from ..store.continue_training import no_finished_training
+from ..store.job_file import read_job
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import read_done
 from .worker_call import run_command
@@ -43,6 +45,7 @@ def _newest_stage(stages: Path, name: str) -> Path:
 
 
 def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
+    from ...dataset.photos.photo_store import PhotoStore
     from ...dataset.scene_file import load_saved_scene
     from ...field.depth_samples import sample_depth_maps
     from ...field.vacancy.vacancy import VacancyField
@@ -66,11 +69,15 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     else:
         automatic = request["region"] == "auto"
         region = automatic_region(scene) if automatic else whole_region(scene, arrays)
-    cameras = scene.cameras[:: max(1, -(-len(scene.cameras) // MAX_VIEWS))]
+    training = read_job(folder.job_path).settings.training
+    photos = PhotoStore(scene, training.max_image_px)
+    views = field_views(scene, photos, training.holdout_every, meshing.cameras)
+    cameras = [scene.views[index].camera for index in views]
     edge_length = meshing.edge_length / scene.world_from_scene.scale
     notes = checked_request(edge_length, meshing.points, region).notes  # raises before any work
     depth_samples = sample_depth_maps(
-        gaussians, cameras, lambda points: region.contains(points, 0.0), Progress(),
+        gaussians, cameras[:: max(1, -(-len(cameras) // MAX_VIEWS))],
+        lambda points: region.contains(points, 0.0), Progress(),
         most=MAX_DEPTH_SAMPLES, threads=threads,
     )  # fmt: skip
     if len(depth_samples) == 0:
@@ -78,15 +85,13 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
             f"The cameras see no surface in region {region.name!r}.",
             "Draw the region around something that was photographed.",
         )
-    vacancy = VacancyField(arrays, scene.cameras, threads=threads)
+    vacancy = VacancyField(arrays, cameras, threads=threads)
     memory_bytes = free_bytes(folder.root, threads)
     if meshing.method == "pivots":
         by_pivots = estimate_region_pivots(vacancy, arrays, region, meshing, depth_samples)
         by_pivots.refuse(memory_bytes)
         return [*by_pivots.lines()]
-    expected = estimate_region_mesh(
-        vacancy, scene.cameras, region, meshing, edge_length, depth_samples
-    )
+    expected = estimate_region_mesh(vacancy, cameras, region, meshing, edge_length, depth_samples)
     tiled = meshing.tiles != "off" and (meshing.tiles != "auto" or expected.tiles_for(memory_bytes))
     expected.refuse(memory_bytes, tiled=tiled)
     mode = "it would be meshed in tiles" if tiled else "it would be meshed whole"

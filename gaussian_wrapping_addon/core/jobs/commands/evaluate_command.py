@@ -35,7 +35,10 @@ from ..store.job_folder import MARKER, JobFolder
 from .worker_call import run_command
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ...dataset.camera import Camera
+    from ...progress import Progress
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -54,8 +57,9 @@ def run_in_worker(
     Parameters
     ----------
     request : dict
-        ``mesh`` (path of a mesh or a job folder), ``region``, ``cameras``, ``out``, and the
-        entries of :class:`~.command.EvaluationRequest`; plain JSON values.
+        ``mesh`` (path of a mesh or a job folder), ``metric``, ``region``, ``cameras``, ``test``,
+        ``max_image_px``, ``out``, and the entries of :class:`~.command.EvaluationRequest`; plain
+        JSON values.
     python : str
         The worker's interpreter.
     module, what : str
@@ -149,7 +153,6 @@ def _check_output(out: Path) -> None:
 
 def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return the report and its table."""
-    from ...evaluation.command import EvaluationRequest, evaluate_mesh, read_cameras, table
     from ...evaluation.layouts.mesh_input import read_mesh
     from ...kernels.parallel import default_threads
     from ...machine import describe_machine
@@ -157,20 +160,11 @@ def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     from ...progress import Progress, ProgressEvent
 
     begun_s, begun_unix_s = time.monotonic(), time.time()
-
-    def shares(name: str) -> tuple[Any, ...] | None:
-        return None if given[name] is None else tuple(given[name])
-
-    request = EvaluationRequest(
-        Path(given["truth"]), given["layout"], given["scan"], shares("shares"),
-        shares("distances"), given["align"], shares("protocols"), given["samples"], given["seed"],
-        given["threads"] or default_threads(),
-    ).checked()  # fmt: skip
+    threads = given["threads"] or default_threads()
+    _check_metric(given)
     source = Path(given["mesh"])
-    cameras: list[Camera] = []
     if source.is_dir():
         path = job_mesh(source, given["region"])
-        cameras = job_cameras(source)
     else:
         if given["region"]:
             raise UsageError(
@@ -178,6 +172,81 @@ def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
                 "Omit --region, or give a job folder.",
             )
         path = source
+
+    def report_progress(event: ProgressEvent) -> None:
+        emit(fraction=event.fraction, message=event.message)
+
+    progress = Progress("evaluate", report_progress)
+    measure = _against_photos if given["metric"] == "mbr" else _against_truth
+    mesh, result, lines = measure(given, source, lambda: read_mesh(path), threads, progress)
+    report = {
+        "version": 1,
+        "started_unix_s": begun_unix_s,
+        "seconds": time.monotonic() - begun_s,
+        "mesh": {"path": str(path.resolve()), "vertices": len(mesh[0]), "faces": len(mesh[1])},
+        **result,
+        "machine": describe_machine(threads),
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+    return report, [f"{path.name}: {len(mesh[0])} vertices, {len(mesh[1])} faces", *lines]
+
+
+def _check_metric(given: dict[str, Any]) -> None:
+    """Raise if options of one metric are given for the other."""
+    if given["metric"] == "mbr":
+        needless = [
+            f"--{name}"
+            for name in ("truth", "scan", "distances", "align", "protocols", "samples")
+            if given[name] is not None
+        ]
+        needless += ["--thresholds"] * (given["shares"] is not None)
+        if needless:
+            raise UsageError(
+                f"{', '.join(needless)}: --metric mbr compares with photos, not with a true "
+                "surface.",
+                "Omit it, or use --metric surface.",
+            )
+        if not Path(given["mesh"]).is_dir() and given["cameras"] is None:
+            raise UsageError(
+                "--metric mbr needs the photos of the mesh.",
+                "Give them with --cameras: a COLMAP project, a transforms.json or a job.",
+            )
+        return
+    if given["truth"] is None:
+        raise UsageError(
+            "--metric surface needs a ground truth.",
+            "Give it with --truth, or compare with photos: --metric mbr.",
+        )
+    for name in ("test", "max_image_px"):
+        if given[name] is not None:
+            raise UsageError(
+                f"--{name.replace('_', '-')} is for --metric mbr.", "Omit it, or add --metric mbr."
+            )
+
+
+_Mesh = tuple[Any, Any]
+"""Vertices (v, 3) and faces (f, 3), world frame."""
+
+
+def _against_truth(
+    given: dict[str, Any],
+    source: Path,
+    read: Callable[[], _Mesh],
+    threads: int,
+    progress: Progress,
+) -> tuple[_Mesh, dict[str, Any], list[str]]:
+    """Return the mesh, its figures against the ground truth, and their table."""
+    from ...evaluation.command import EvaluationRequest, evaluate_mesh, read_cameras, table
+
+    def shares(name: str) -> tuple[Any, ...] | None:
+        return None if given[name] is None else tuple(given[name])
+
+    request = EvaluationRequest(
+        Path(given["truth"]), given["layout"], given["scan"], shares("shares"),
+        shares("distances"), given["align"], shares("protocols"), given["samples"], given["seed"],
+        threads,
+    ).checked()  # fmt: skip
+    cameras: list[Camera] = job_cameras(source) if source.is_dir() else []
     if given["cameras"]:
         cameras_path = Path(given["cameras"])
         cameras = (
@@ -185,25 +254,34 @@ def _evaluate(given: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
             if (cameras_path / MARKER).exists()
             else read_cameras(cameras_path)
         )
-
-    def report_progress(event: ProgressEvent) -> None:
-        emit(fraction=event.fraction, message=event.message)
-
-    vertices, faces = read_mesh(path)
-    result = evaluate_mesh(vertices, faces, cameras, request, Progress("evaluate", report_progress))
-    report = {
-        "version": 1,
-        "started_unix_s": begun_unix_s,
-        "seconds": time.monotonic() - begun_s,
-        "mesh": {"path": str(path.resolve()), "vertices": len(vertices), "faces": len(faces)},
+    mesh = read()
+    result = evaluate_mesh(*mesh, cameras, request, progress)
+    asked = {
         "truth": str(request.truth.resolve()),
         "cameras": len(cameras),
         "asked": {**asdict(request), "truth": str(request.truth)},
-        **result,
-        "machine": describe_machine(request.threads),
-        "peak_memory_bytes": peak_memory_bytes(),
     }
-    return report, [f"{path.name}: {len(vertices)} vertices, {len(faces)} faces", *table(result)]
+    return mesh, {**asked, **result}, table(result)
+
+
+def _against_photos(
+    given: dict[str, Any],
+    source: Path,
+    read: Callable[[], _Mesh],
+    threads: int,
+    progress: Progress,
+) -> tuple[_Mesh, dict[str, Any], list[str]]:
+    """Return the mesh, its mesh-based rendering, and the figures as lines."""
+    from .mesh_based_command import MeshBasedRequest, evaluate_mesh_based, table
+
+    request = MeshBasedRequest(
+        Path(given["cameras"]) if given["cameras"] else source,
+        None if given["test"] is None else Path(given["test"]),
+        given["max_image_px"], given["seed"], threads,
+    )  # fmt: skip
+    mesh = read()
+    result = evaluate_mesh_based(*mesh, request, progress)
+    return mesh, result, table(result)
 
 
 def job_mesh(folder: Path, region: str | None) -> Path:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from ...settings import to_json
+from ...settings import key_values
 from ..store.job_file import JobFile, region_name
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import STAGE_VERSIONS, read_done, stage_key
@@ -14,7 +14,7 @@ def mesh_key(job: JobFile, request: str, name: str, trained_key: str) -> str:
     body = job.region_bodies.get(request)
     return stage_key(
         STAGE_VERSIONS["mesh"], trained_key, request if body is None else body, name,
-        to_json(job.meshing_of(request)), job.settings.seed,
+        key_values(job.meshing_of(request)), job.settings.seed,
     )  # fmt: skip
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Build the vacancy field of a region with the job's masks and handling of unseen space."""
+"""Build the vacancy field of a region with the job's cameras, masks and unseen space."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...errors import DeviceError
+from ...errors import DatasetError, DeviceError
 from ...names import AUTOMATIC_REGIONS
 
 if TYPE_CHECKING:
+    from ...dataset.photo_source import PhotoSource
     from ...dataset.scene import Scene
     from ...field.vacancy.vacancy import VacancyField
     from ...gaussians.model import GaussianArrays
@@ -45,6 +46,35 @@ def requested_region(
     return world_region.transformed(scene.world_from_scene.inverse()), world_region
 
 
+def field_views(scene: Scene, photos: PhotoSource, holdout_every: int, cameras: str) -> list[int]:
+    """Return the views whose cameras a mesh is made from (docs/method.md, section 5.3).
+
+    Parameters
+    ----------
+    holdout_every : int
+        Setting of the training.
+    cameras : str
+        Setting of the meshing: ``"training"`` leaves out held-out photos and photos that their
+        masks cover; ``"all"`` uses every camera.
+
+    Raises
+    ------
+    DatasetError
+        No camera is left.
+    """
+    from ...dataset.view_split import training_views
+
+    if cameras == "all":
+        return list(range(len(scene.views)))
+    views = training_views(scene, photos, holdout_every)
+    if not views:
+        raise DatasetError(
+            "The masks cover every photo that was trained on.",
+            "Check the masks, or mesh with the cameras of all photos.",
+        )
+    return views
+
+
 def region_field(
     scene: Scene,
     arrays: GaussianArrays,
@@ -62,9 +92,9 @@ def region_field(
     region : Region
         Scene frame.
     training : TrainingSettings
-        ``mask_mode`` and the size of the photos that masks are read at.
+        ``mask_mode``, ``holdout_every`` and the size of the photos that masks are read at.
     meshing : MeshingSettings
-        ``unseen`` is read.
+        ``unseen`` and ``cameras`` are read.
     device : str
         Torch device that the Gaussians were trained on. On a GPU the field is evaluated there too;
         if its kernels cannot run, it is evaluated on the CPU and the log says why.
@@ -72,36 +102,39 @@ def region_field(
     Raises
     ------
     DatasetError
-        A mask does not fit its photo.
+        A mask does not fit its photo, or masks cover every photo that was trained on.
     """
     from ...dataset.photos.photo_store import PhotoStore
     from ...field.vacancy.vacancy import VacancyField
     from ...meshing.points.candidate_surface import halo_bounds
 
     photos = PhotoStore(scene, training.max_image_px)
+    views = field_views(scene, photos, training.holdout_every, meshing.cameras)
+    cameras = [scene.views[index].camera for index in views]
     options: dict[str, Any] = {
         "threads": threads,
         "unseen": meshing.unseen,
         "region_bounds": halo_bounds(region),
-        "masks": [photos.mask(index) for index in range(len(photos))],
+        "masks": [photos.mask(index) for index in views],
         "mask_mode": training.mask_mode,
     }
     if device.startswith("cuda"):
         from ...field.vacancy.cuda_vacancy import CudaVacancyField
 
         try:
-            return CudaVacancyField(arrays, scene.cameras, device=device, **options)
+            return CudaVacancyField(arrays, cameras, device=device, **options)
         except DeviceError as error:
             _logger.warning(
                 "Vacancy is evaluated on the processor, not on the GPU: %s", error.message
             )
-    return VacancyField(arrays, scene.cameras, **options)
+    return VacancyField(arrays, cameras, **options)
 
 
 def field_figures(field: VacancyField) -> dict[str, Any]:
-    """Return the report's figures of a field: device, evaluations, and share that is unseen."""
+    """Return the report's figures of a field: device, cameras, evaluations, what is unseen."""
     return {
         "field_device": field.device,
+        "field_cameras": len(field.cameras),
         "unseen": field.unseen,
         "field_evaluations": field.evaluations,
         "unseen_evaluations": field.unseen_evaluations,

@@ -113,7 +113,7 @@ def mesh_by_pivots_in_stage(
     *,
     seed: int,
     threads: int,
-    depth_samples: DepthSamples,
+    depth_samples: DepthSamples | None,
 ) -> tuple[SurfaceMesh, dict[str, Any]]:
     """Estimate the mesh of a region by pivots, then make it; see :func:`mesh_in_stage`."""
     from ...meshing.pivot_meshing import mesh_by_pivots
@@ -134,15 +134,20 @@ def estimate_region_pivots(
     arrays: GaussianArrays,
     region: Region,
     meshing: MeshingSettings,
-    depth_samples: DepthSamples,
+    depth_samples: DepthSamples | None,
 ) -> PivotEstimate:
-    """Estimate the mesh of a region by pivots from the Gaussians and depth_samples in it."""
+    """Estimate the mesh of a region by pivots from the Gaussians and depth samples in it."""
     from ...meshing.cost.mesh_estimate import evaluation_seconds
     from ...meshing.cost.pivot_estimate import estimate_pivot_mesh
 
+    samples = 0 if depth_samples is None else len(depth_samples)
+    near = (
+        arrays.means[region.contains(arrays.means, 0.0)] if samples == 0 else depth_samples.points
+    )
     return estimate_pivot_mesh(
-        arrays, region, meshing.pivots, len(depth_samples),
-        evaluation_s=evaluation_seconds(vacancy, depth_samples.points),
+        arrays, region, meshing.pivots, samples,
+        box=meshing.pivot_box, alone=meshing.pivot_samples == "none",
+        evaluation_s=evaluation_seconds(vacancy, near),
     )  # fmt: skip
 
 

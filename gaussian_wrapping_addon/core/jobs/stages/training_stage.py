@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import DatasetError
 from ...progress import COMPILING, Progress
 from ...report_warning import ReportWarning
-from ...settings import RESULT_INDEPENDENT, TrainingSettings, to_json
+from ...settings import TrainingSettings, key_values, to_json
 from ..store.continue_training import (
     checkpoints,
     lineage,
@@ -58,8 +58,7 @@ def start_fingerprint(path: str) -> list[Any]:
 
 def training_keys(version: int, cameras_key: str, job: JobFile) -> tuple[str, str]:
     """Return the stage's key, and the key without the extra iterations."""
-    training = to_json(job.settings.training)
-    described = {k: v for k, v in training.items() if k not in RESULT_INDEPENDENT}
+    described = key_values(job.settings.training)
     start = start_fingerprint(job.settings.start_splat)
     parts = (version, cameras_key, job.settings.seed, *([start] if start else []))
     key = stage_key(*parts, described)
@@ -111,10 +110,11 @@ def _train(
 ) -> dict[str, Any]:
     from ...dataset.photos.photo_store import PhotoStore
     from ...dataset.scene_file import load_saved_scene
+    from ...dataset.view_split import held_out_views
     from ...evaluation.report.pictures import write_held_out
     from ...gaussians.gaussian_file import save_gaussians
     from ...training.checkpoint import remove_checkpoints
-    from ...training.trainer import held_out_views, train
+    from ...training.trainer import train
     from .splat_scene import start_splat_of
 
     scene = load_saved_scene(cameras.folder)

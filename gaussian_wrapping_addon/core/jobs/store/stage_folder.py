@@ -21,7 +21,7 @@ from .job_folder import MARKER
 _logger = logging.getLogger(__name__)
 
 # Increase a number when a stage's code changes its result: old stage folders are not re-used then.
-STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 9, "texture": 11}
+STAGE_VERSIONS = {"cameras": 1, "train": 6, "mesh": 10, "texture": 11}
 
 HASH_CHARACTERS = 12
 INPUT_SUFFIXES = (

@@ -14,16 +14,21 @@ from ...errors import ResourceError
 from ...field.depth_samples import MAX_DEPTH_SAMPLES
 from ...gaussians.model import GaussianArrays
 from ...regions.convex_region import Region
-from ..points.candidate_surface import pivots_and_probes
-from ..points.pivots import PIVOTS
+from ..points.candidate_surface import pivots_alone, pivots_and_probes
+from ..points.pivots import pivot_rule
 from .mesh_estimate import BASE_BYTES, FIXED_S, two_digits
 
 TETRAHEDRA_LOW, TETRAHEDRA_HIGH = 5.0, 8.0
 """Per point, after clipping to the region (5.8 to 7.0 for spheres and tori)."""
+TETRAHEDRA_ALONE_HIGH = 20.0
+"""With the pivots alone: nothing lies between the surfaces, so that tetrahedra across the gap are
+long and more of them meet in a point (8.1 to 14.3 for spheres and tori)."""
 
 FACES_LOW, FACES_HIGH = 0.5, 3.0
 """Per pivot of the Gaussians (1.2 with nine pivots, most of which lie off the surface, to 2.4 with
 two; fewer at the region's boundary)."""
+FACES_ALONE_HIGH = 6.0
+"""The same with the pivots alone (up to 3.3: a torus, two pivots)."""
 PAIR_FACES_LOW, PAIR_FACES_HIGH = 3.0, 7.0
 """Per point from depth samples, all next to the surface (5 to 6 on a trained scene)."""
 
@@ -101,7 +106,7 @@ def _span(seconds: float) -> str:
 
 def estimate_pivot_mesh(
     arrays: GaussianArrays, region: Region, pivots: int, depth_samples: int, *,
-    evaluation_s: float = 0.0, seed: int = 0,
+    box: str = "normal", alone: bool = False, evaluation_s: float = 0.0, seed: int = 0,
 ) -> PivotEstimate:  # fmt: skip
     """Estimate the cost of :func:`~..pivot_meshing.mesh_by_pivots`.
 
@@ -113,6 +118,10 @@ def estimate_pivot_mesh(
         Number of pivots per Gaussian.
     depth_samples : int
         Number of depth samples in the region.
+    box : str
+        Of nine pivots, the setting ``pivot_box``.
+    alone : bool
+        Whether nothing is triangulated but the pivots (``pivot_samples = "none"``).
     evaluation_s : float
         Time of one evaluation of vacancy, from :func:`~.mesh_estimate.evaluation_seconds`.
 
@@ -121,22 +130,28 @@ def estimate_pivot_mesh(
     MeshingError
         No Gaussian reaches the region.
     """
-    own = pivots_and_probes(arrays, region, seed, PIVOTS[pivots])
+    rule = pivot_rule(pivots, box)
+    if alone:
+        own, depth_samples = pivots_alone(arrays, region, rule), 0
+        tetrahedra_high, faces_high = TETRAHEDRA_ALONE_HIGH, FACES_ALONE_HIGH
+    else:
+        own = pivots_and_probes(arrays, region, seed, rule)
+        tetrahedra_high, faces_high = TETRAHEDRA_HIGH, FACES_HIGH
     pairs_low = PAIRED_LOW * min(depth_samples, MAX_DEPTH_SAMPLES)
     pairs_high = min(PAIRED_HIGH * depth_samples, 2.0 * MAX_DEPTH_SAMPLES)
     low, high = len(own.points) + pairs_low, len(own.points) + pairs_high
     few = FACES_LOW * len(own.points) + PAIR_FACES_LOW * pairs_low
-    many = FACES_HIGH * len(own.points) + PAIR_FACES_HIGH * pairs_high
+    many = faces_high * len(own.points) + PAIR_FACES_HIGH * pairs_high
     return PivotEstimate(
         own.gaussians,
         int(low),
         int(high),
         int(TETRAHEDRA_LOW * low),
-        int(TETRAHEDRA_HIGH * high),
+        int(tetrahedra_high * high),
         int(few / 2),
         int(many / 2),
         0.5 * FIXED_S + low * (EVALUATIONS_LOW * evaluation_s + POINT_LOW_S),
         2.0 * FIXED_S + high * (EVALUATIONS_HIGH * evaluation_s + POINT_S),
         int(BASE_BYTES / 2 + low * POINT_LOW_BYTES),
-        int(BASE_BYTES + high * POINT_BYTES),
+        int(BASE_BYTES + high * POINT_BYTES * tetrahedra_high / TETRAHEDRA_HIGH),
     )

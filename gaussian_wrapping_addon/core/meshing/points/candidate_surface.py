@@ -6,7 +6,6 @@ See docs/method.md, section 6.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +17,13 @@ from ...progress import Progress
 from ...regions.convex_region import Region
 from ..tetrahedra.delaunay import bounding_points, delaunay
 from ..tetrahedra.marching_tetrahedra import IsEmpty, bisect, marching_tetrahedra
-from .pivots import MAX_PIVOT_GAUSSIANS, gaussians_reaching, representative_gaussians, two_pivots
+from .pivots import (
+    MAX_PIVOT_GAUSSIANS,
+    PivotRule,
+    gaussians_reaching,
+    representative_gaussians,
+    two_pivots,
+)
 
 PROBES = 4096
 """Sample points through the region besides the pivots: a Gaussian as large as the region may have
@@ -116,7 +121,7 @@ def pivot_cloud(
     seed: int,
     depth_samples: DepthSamples | None,
     *,
-    pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray] = two_pivots,
+    pivots_of: PivotRule = two_pivots,
 ) -> PivotCloud:
     """Collect pivots, probes and pairs that bracket the visible surface, in and around a region.
 
@@ -136,7 +141,7 @@ def pivots_and_probes(
     arrays: GaussianArrays,
     region: Region,
     seed: int,
-    pivots_of: Callable[[GaussianArrays, np.ndarray], np.ndarray],
+    pivots_of: PivotRule,
 ) -> PivotCloud:
     """Collect pivots and probes alone, in and around a region, without evaluating the field.
 
@@ -148,12 +153,29 @@ def pivots_and_probes(
     margin = MARGIN_SHARE * region.diagonal
     index = gaussians_reaching(arrays, region, margin)
     if len(index) == 0:
-        raise MeshingError(f"No Gaussian reaches region {region.name!r}.", NO_SURFACE_HINT)
+        raise no_gaussian_error(region)
     chosen = representative_gaussians(arrays, index, MAX_PIVOT_GAUSSIANS)
     pivots = pivots_of(arrays, chosen)
     near = pivots[region.distance(pivots) <= HALO_SHARE * region.diagonal]
     points = np.concatenate([near, _probes(region, margin, seed)])
     return PivotCloud(_in_halo(points, region), len(index), len(chosen))
+
+
+def pivots_alone(arrays: GaussianArrays, region: Region, pivots_of: PivotRule) -> PivotCloud:
+    """Collect the pivots of all Gaussians that reach a region, faint ones too, and nothing else.
+
+    These are the points of the paper (docs/method.md, section 6.1): without samples of depth maps,
+    probes, or a limit on the number of Gaussians. Pivots in the region's halo are kept.
+
+    Raises
+    ------
+    MeshingError
+        No Gaussian reaches the region.
+    """
+    index = gaussians_reaching(arrays, region, MARGIN_SHARE * region.diagonal, faint=True)
+    if len(index) == 0:
+        raise no_gaussian_error(region)
+    return PivotCloud(_in_halo(pivots_of(arrays, index), region), len(index), len(index))
 
 
 def _in_halo(points: np.ndarray, region: Region) -> np.ndarray:
@@ -179,6 +201,11 @@ def _within_halo(is_empty: IsEmpty, region: Region) -> IsEmpty:
         return empty
 
     return inside_only
+
+
+def no_gaussian_error(region: Region) -> MeshingError:
+    """Return the error of a region that no Gaussian reaches."""
+    return MeshingError(f"No Gaussian reaches region {region.name!r}.", NO_SURFACE_HINT)
 
 
 def no_surface_error(region: Region) -> MeshingError:

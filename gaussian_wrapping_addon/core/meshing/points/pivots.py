@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pivots of oriented Gaussians: two, three or nine per Gaussian (docs/method.md, section 6.1)."""
+"""Pivots of oriented Gaussians: two, three or nine each (docs/method.md, section 6.1)."""
 
 from __future__ import annotations
 
@@ -11,21 +11,28 @@ from ... import tolerances
 from ...gaussians.model import GaussianArrays
 from ...regions.convex_region import Region
 
+PivotRule = Callable[[GaussianArrays, np.ndarray], np.ndarray]
+"""Maps Gaussians and (k,) indices of some of them to the (p, 3) float64 pivots of these."""
+
 PIVOT_SIGMAS = 3.0
-"""The outer pivot lies at this many standard deviations along the normal."""
+"""Outer pivots lie at this many standard deviations along a direction."""
+
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 
 MAX_PIVOT_GAUSSIANS = 250_000
 """With more, one Gaussian per cell and direction represents its neighbours, to limit memory."""
 
 
-def gaussians_reaching(arrays: GaussianArrays, region: Region, margin: float) -> np.ndarray:
+def gaussians_reaching(
+    arrays: GaussianArrays, region: Region, margin: float, *, faint: bool = False
+) -> np.ndarray:
     """Return indices of the Gaussians whose 3-sigma ellipsoid is within ``margin`` of the region.
 
-    Gaussians too faint to be rendered (opacity below 1/255) are left out, as are those whose centre
-    is farther away than 1.5 diagonals of the region.
+    Left out are Gaussians too faint to be rendered (opacity below 1/255) unless ``faint``, and
+    those whose centre is farther away than 1.5 diagonals of the region.
     """
     normals, offsets = region.half_spaces
-    good = arrays.log_opacities > np.log(tolerances.ALPHA_MIN)
+    good = (arrays.log_opacities > np.log(tolerances.ALPHA_MIN)) | faint
     good &= np.isfinite(arrays.means).all(1) & np.isfinite(arrays.scales).all(1)
     local = arrays.means - region.center  # (n, 3)
     good &= np.linalg.norm(local, axis=1) < 1.5 * region.diagonal
@@ -69,40 +76,77 @@ def _outer_steps(
     arrays: GaussianArrays, index: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return centres (k, 3), offsets of the outer pivots (k, 3), and whether oriented (k,) bool."""
-    means = arrays.means[index]
+    unit, oriented = _unit_normals(arrays, index)
+    step = PIVOT_SIGMAS * directional_sigma(arrays, index, unit)[:, None] * unit  # (k, 3)
+    return arrays.means[index], step, oriented
+
+
+def _unit_normals(arrays: GaussianArrays, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit normals, the shortest axis where not oriented (k, 3), and whether oriented."""
     normals = arrays.normals[index]
     length = np.linalg.norm(normals, axis=1)
     oriented = length >= tolerances.ORIENTED_MIN_NORM
     rows = np.arange(len(index))
     shortest = arrays.rotations[index][rows, :, arrays.scales[index].argmin(1)]  # (k, 3)
     unit = np.where(oriented[:, None], normals / np.maximum(length, 1e-300)[:, None], shortest)
-    step = PIVOT_SIGMAS * directional_sigma(arrays, index, unit)[:, None] * unit  # (k, 3)
-    return means, step, oriented
+    return unit, oriented
+
+
+def normal_bases(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
+    """Return orthonormal bases of the Gaussians ``index``, (k, 3, 3), columns are directions.
+
+    The first is the unit normal (:func:`_unit_normals`). Gram-Schmidt completes it from the
+    Gaussian's axis that is least aligned with it: a basis that turns with the scene, and is the
+    Gaussian's own where the normal is one of its axes.
+    """
+    first, _ = _unit_normals(arrays, index)
+    rotations = arrays.rotations[index]
+    along = np.einsum("kij,ki->kj", rotations, first)  # (k, 3) cosines
+    axis = rotations[np.arange(len(index)), :, np.abs(along).argmin(1)]  # (k, 3)
+    second = axis - (axis * first).sum(1, keepdims=True) * first
+    second /= np.linalg.norm(second, axis=1, keepdims=True)
+    return np.stack([first, second, np.cross(first, second)], 2)
 
 
 def nine_pivots(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
-    """Return centre and the corners of the 3-sigma box of the Gaussians ``index`` on their axes.
+    """Return centre and the corners of the 3-sigma box of the Gaussians ``index`` on their normal.
 
-    As in Gaussian Opacity Fields; the orientation is not used (docs/method.md, section 6.1).
+    The box is that of :func:`normal_bases`, with the deviation ``sqrt(d^T Sigma d)`` along each
+    direction (docs/method.md, section 6.1).
 
     Returns
     -------
     (9 k, 3) float64
         Centres first, then the corners, Gaussian by Gaussian.
     """
-    means = arrays.means[index]
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
-    local = PIVOT_SIGMAS * signs * arrays.scales[index][:, None, :]  # (k, 8, 3)
-    corners = means[:, None] + np.einsum("kij,kcj->kci", arrays.rotations[index], local)
+    bases = normal_bases(arrays, index)
+    sigmas = [directional_sigma(arrays, index, bases[:, :, axis]) for axis in range(3)]
+    return _box_pivots(arrays.means[index], bases, np.stack(sigmas, 1))
+
+
+def nine_pivots_gof(arrays: GaussianArrays, index: np.ndarray) -> np.ndarray:
+    """Return centre and the corners of the 3-sigma box of the Gaussians ``index`` on their axes.
+
+    As in Gaussian Opacity Fields; the orientation is not used (docs/method.md, section 6.1).
+    Order as in :func:`nine_pivots`.
+    """
+    return _box_pivots(arrays.means[index], arrays.rotations[index], arrays.scales[index])
+
+
+def _box_pivots(means: np.ndarray, bases: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
+    """Return centres (k, 3), then the corners of the boxes of ``sigmas`` (k, 3) on ``bases``."""
+    local = PIVOT_SIGMAS * _CORNERS * sigmas[:, None, :]  # (k, 8, 3)
+    corners = means[:, None] + np.einsum("kij,kcj->kci", bases, local)
     return np.concatenate([means, corners.reshape(-1, 3)])
 
 
-PIVOTS: dict[int, Callable[[GaussianArrays, np.ndarray], np.ndarray]] = {
-    2: two_pivots,
-    3: three_pivots,
-    9: nine_pivots,
-}
+PIVOTS: dict[int, PivotRule] = {2: two_pivots, 3: three_pivots, 9: nine_pivots}
 """Pivot functions by the number of pivots per Gaussian."""
+
+
+def pivot_rule(pivots: int, box: str) -> PivotRule:
+    """Return the pivot function of the settings ``pivots`` and ``pivot_box``."""
+    return nine_pivots_gof if (pivots, box) == (9, "gof") else PIVOTS[pivots]
 
 
 def representative_gaussians(arrays: GaussianArrays, index: np.ndarray, limit: int) -> np.ndarray:

@@ -116,14 +116,6 @@ def local_tetrahedra(
     return numbers, tetrahedra
 
 
-def circumradii(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the circumradii, (m,)."""
-    base = points[tetrahedra[:, 0]]
-    edges = points[tetrahedra[:, 1:]] - base[:, None]  # (m, 3, 3)
-    offsets = np.linalg.solve(2.0 * edges, (edges**2).sum(2)[:, :, None])[:, :, 0]
-    return np.asarray(np.linalg.norm(offsets, axis=1))
-
-
 def _no_faces() -> TileFaces:
     none = np.zeros((0, 3), np.int64)
     return TileFaces(none, none, np.zeros(0, np.bool_), {})

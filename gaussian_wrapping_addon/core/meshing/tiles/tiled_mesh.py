@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ...dataset.camera import Camera
-from ...errors import MeshingError
 from ...field.depth_samples import DepthSamples
 from ...gaussians.model import GaussianArrays
 from ...mesh.surface_mesh import SurfaceMesh
@@ -27,8 +26,8 @@ from ..primal_adaptive import (
     vertex_counts,
 )
 from .plan import Field, TilePlan, make_plan
-from .tile_faces import TileFaces, joined_faces, tile_faces
-from .tile_points import KIND_STEINER, GatheredPoints, gather, tile_points
+from .tile_faces import TileFaces, joined_faces
+from .tile_points import KIND_STEINER, GatheredPoints
 
 _logger = logging.getLogger(__name__)
 
@@ -130,43 +129,3 @@ def join_tiles(
     progress.update(1.0, f"{len(faces)} faces")
     _logger.info("Meshed region %s: %d faces", plan.region.name, len(faces))
     return SurfaceMesh(vertices, faces.astype(np.int32), None, provenance)
-
-
-def mesh_in_tiles(
-    vacancy: Any,
-    vectors: Any,
-    arrays: GaussianArrays,
-    cameras: Sequence[Camera],
-    region: Region,
-    settings: MeshingSettings,
-    progress: Progress,
-    *,
-    tiles: int,
-    seed: int,
-    threads: int,
-    edge_length_scene: float = 0.0,
-    depth_samples: DepthSamples | None = None,
-) -> SurfaceMesh:
-    """Mesh a region tile by tile in this process; see :func:`~.primal_adaptive.mesh_region`.
-
-    The mesh is one closed 2-manifold. It varies with the number of tiles as with the seed.
-    """
-    if len(cameras) == 0:
-        raise MeshingError("The scene has no cameras.", "Check the scene.")
-    field = Field(vacancy, vectors, threads)
-    plan = plan_tiles(
-        field, arrays, cameras, region, settings, progress.span(0.0, 0.3), tiles=tiles, seed=seed,
-        edge_length_scene=edge_length_scene, depth_samples=depth_samples,
-    )  # fmt: skip
-    count = len(plan.tiling)
-    sampling, labelling = progress.span(0.3, 0.6), progress.span(0.6, 0.9)
-    points = [
-        tile_points(field, plan, tile, sampling.span(tile / count, (tile + 1) / count))
-        for tile in range(count)
-    ]
-    gathered = gather(plan, points)
-    parts = [
-        tile_faces(field, plan, gathered, tile, labelling.span(tile / count, (tile + 1) / count))
-        for tile in range(count)
-    ]
-    return join_tiles(field, plan, gathered, parts, settings, progress.span(0.9, 1.0))

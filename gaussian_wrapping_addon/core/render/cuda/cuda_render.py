@@ -55,7 +55,7 @@ def render_cuda(
     camera : Camera
         In the scene frame.
     options : RenderOptions, optional
-        ``threads`` is ignored.
+        ``threads`` and ``budget_bytes``, which is for the CPU's lists, are not used.
     budget_bytes : int
         GPU memory for tile intersections; 0 uses half of what is free.
 
@@ -93,7 +93,7 @@ def render_with(
                 f"Give float32 on {device}.",
             )
     count = len(gaussians)
-    statistics = _empty_statistics(count) if options.statistics else None
+    statistics = _empty_statistics(count, options) if options.gathers_statistics else None
     tensors = [getattr(gaussians, name) for name in _TRAINED]
     with _translate_out_of_memory(camera):
         images = _Rasterize.apply(
@@ -151,11 +151,11 @@ class _Rasterize(torch.autograd.Function):
         screen = project(kernels, raw)
         images = _allocate(camera, options, means.device)
         bands = []
-        sums = _WeightSums.zeros(len(means), means.device) if statistics is not None else None
+        sums = _BandSums.zeros(len(means), options, means.device)
         for band in bin_bands(kernels, screen, camera, budget_bytes):
             _blend(kernels, screen, band, camera, options, images, sums)
             bands.append(band)
-        if statistics is not None and sums is not None:
+        if statistics is not None:
             _fill_statistics(statistics, screen, images, sums)
         ctx.set_materialize_grads(False)
         ctx.kernels, ctx.raw, ctx.screen, ctx.bands = kernels, raw, screen, bands
@@ -205,12 +205,11 @@ def _backward(ctx: Any, grads: tuple[Tensor | None, ...]) -> list[Tensor]:
         kernels.launch(
             "sum_pairs", blocks, len(params), intersections, band.intersection_offsets, grad_params
         )
-    # Rows that overflow float32 are dropped.
-    grad_params.masked_fill_(~grad_params.isfinite().all(1, keepdim=True), 0.0)
-    if statistics is not None:
-        # In float64: squares of float32 overflow beyond 1e19.
-        statistics.grad_px[:] = grad_params[:, 0:2].double().norm(dim=1).cpu().numpy()
-        statistics.grad_abs_px[:] = grad_params[:, 22:24].double().norm(dim=1).cpu().numpy()
+    gathers = statistics is not None
+    norms = params.new_empty((2, len(params) if gathers else 0))
+    kernels.launch_each("finish_params", len(params), int(gathers), grad_params, norms[0], norms[1])
+    if gathers:
+        statistics.grad_px[:], statistics.grad_abs_px[:] = norms.cpu().numpy()
     raw = ctx.raw
     found = [torch.zeros_like(getattr(raw.gaussians, trained)) for trained in _TRAINED]
     kernels.launch_each(
@@ -231,11 +230,12 @@ def _blend(
     camera: Camera,
     options: RenderOptions,
     images: _Images,
-    sums: _WeightSums | None,
+    sums: _BandSums,
 ) -> None:
-    intersection_weights = screen.params.new_zeros((len(band.gaussian_ids) if sums else 0, 2))
+    weighed = options.statistics
+    intersection_weights = screen.params.new_zeros((len(band.gaussian_ids) if weighed else 0, 2))
     kernels.launch(
-        "forward_tiles_weights" if sums else "forward_tiles",
+        "forward_tiles_weights" if weighed else "forward_tiles",
         band.tiles,
         screen.params,
         screen.boxes,
@@ -253,8 +253,9 @@ def _blend(
         intersection_weights,
         images.strongest,
     )
-    if sums:
+    if options.gathers_statistics:
         sums.reached.logical_or_(band.intersection_offsets.diff() > 0)
+    if weighed:
         kernels.launch_each(
             "sum_weights",
             len(screen.params),
@@ -280,19 +281,21 @@ def _blend(
 
 
 @dataclass(frozen=True)
-class _WeightSums:
-    """Blending weights per Gaussian, accumulated over bands; all (n,)."""
+class _BandSums:
+    """What the bands of an image say of each Gaussian; (n,), or (0,) where nobody asked."""
 
-    reached: Tensor  # bool
+    reached: Tensor  # bool: has a tile in the image
     weight_sum: Tensor
     weight_max: Tensor
 
     @classmethod
-    def zeros(cls, count: int, device: torch.device) -> _WeightSums:
+    def zeros(cls, count: int, options: RenderOptions, device: torch.device) -> _BandSums:
+        reached = count if options.gathers_statistics else 0
+        weighed = count if options.statistics else 0
         return cls(
-            torch.zeros(count, dtype=torch.bool, device=device),
-            torch.zeros(count, device=device),
-            torch.zeros(count, device=device),
+            torch.zeros(reached, dtype=torch.bool, device=device),
+            torch.zeros(weighed, device=device),
+            torch.zeros(weighed, device=device),
         )
 
 
@@ -323,23 +326,25 @@ def _free_bytes(device: torch.device) -> int:
     return int(_BUDGET_SHARE * (free + kept))
 
 
-def _empty_statistics(count: int) -> RenderStatistics:
+def _empty_statistics(count: int, options: RenderOptions) -> RenderStatistics:
+    weighed = count if options.statistics else 0
     return RenderStatistics(
         visible=np.zeros(count, np.bool_),
         radii_px=np.zeros(count, np.float32),
-        weight_sum=np.zeros(count, np.float32),
-        weight_max=np.zeros(count, np.float32),
+        weight_sum=np.zeros(weighed, np.float32),
+        weight_max=np.zeros(weighed, np.float32),
         grad_px=np.zeros(count, np.float32),
         grad_abs_px=np.zeros(count, np.float32),
     )
 
 
 def _fill_statistics(
-    statistics: RenderStatistics, screen: DeviceScreen, images: _Images, sums: _WeightSums
+    statistics: RenderStatistics, screen: DeviceScreen, images: _Images, sums: _BandSums
 ) -> None:
     sides = (screen.boxes[:, 2:] - screen.boxes[:, :2]).amax(1)  # (n,)
     statistics.visible = sums.reached.cpu().numpy()
     statistics.radii_px = torch.where(sums.reached, 0.5 * sides, 0.0).cpu().numpy()
     statistics.weight_sum = sums.weight_sum.cpu().numpy()
     statistics.weight_max = sums.weight_max.cpu().numpy()
-    statistics.strongest = images.strongest.cpu().numpy()
+    if images.strongest.numel():
+        statistics.strongest = images.strongest.cpu().numpy()

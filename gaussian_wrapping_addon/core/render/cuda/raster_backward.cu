@@ -157,3 +157,22 @@ extern "C" __global__ void __launch_bounds__(BLOCK) sum_pairs(
     for (int64 slot = first; slot < end; ++slot) sum += pairs[slot * 24 + column];
     grad_params[(int64)i * 24 + column] = sum;
 }
+
+// Set rows that overflow float32 to 0 and, if asked for, write the norms of the gradient on (u, v)
+// and of its sum of absolute values over pixels (AbsGS); params have no columns 22 and 23.
+extern "C" __global__ void __launch_bounds__(BLOCK) finish_params(
+    int count, int with_norms, float* grad_params, float* grad_px, float* grad_abs_px) {
+    const int i = blockIdx.x * BLOCK + threadIdx.x;
+    if (i >= count) return;
+    float* row = grad_params + (int64)i * 24;
+    // In float64: squares of float32 overflow beyond 1e19.
+    double size = 0.0;
+    for (int column = 0; column < 24; ++column) size += fabs((double)row[column]);
+    if (!(size <= FLOAT32_MAX))
+        for (int column = 0; column < 24; ++column) row[column] = 0.0f;
+    if (!with_norms) return;
+    const double u = row[0], v = row[1], absolute_u = row[22], absolute_v = row[23];
+    grad_px[i] = (float)sqrt(u * u + v * v);
+    grad_abs_px[i] = (float)sqrt(absolute_u * absolute_u + absolute_v * absolute_v);
+    row[22] = row[23] = 0.0f;
+}

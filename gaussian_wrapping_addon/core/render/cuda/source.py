@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 from ... import tolerances
-from ..simd.raster_math import FRONT_SIGMAS
+from ..simd.raster_math import FLOAT32_MAX, FRONT_SIGMAS
 
 PARTS = (
     "common.cu",
@@ -35,6 +35,7 @@ KERNELS = (
     "backward_tiles_absolute",
     "backward_tiles_depth_absolute",
     "sum_pairs",
+    "finish_params",
     "locate_points",
     "transmittance_tiles",
 )
@@ -61,7 +62,7 @@ _SINGLE = {
     "NEGLIGIBLE": 30.0,
     "FALL_END": 22.4,
     "SOLVER_STEP_SIGMAS": 5e-4,
-    "SOLVER_LEVEL_MARGIN": 3e-7,
+    "SOLVER_LEVEL_MARGIN": 3e-7,  # as in isosurface_steps.py
     "SOLVER_BRACKET_SHARE": 1.25e-7,
     "SOLVER_LEAST_SHARE": 1.25e-7,
     "SOLVER_POLISH_SIGMAS": 3e-3,
@@ -85,6 +86,7 @@ _DOUBLE = {
     "FINITE_Z_MAX": tolerances.FINITE_Z_MAX,
     "FINITE_SIGMA_Z": tolerances.FINITE_SIGMA_Z,
     "FINITE_COLOR": tolerances.FINITE_COLOR,
+    "FLOAT32_MAX": FLOAT32_MAX,
     # As in projection_backward.py.
     "GRADIENT_MAX": 1e38,
     "BASIS_MAX": 3.0,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Depth and transmittance at any sub-pixel position, and their gradients.
+"""Depth at any sub-pixel position, and its gradients.
 
-In: a view and positions. Out: values there, and gradients of Gaussians and positions.
+In: a view and positions. Out: depths there, and gradients of Gaussians and positions.
 """

@@ -127,7 +127,7 @@ def query_gradient_range(
     ----------
     depths, weights : (k,) float32
     stops : (k,) int32
-        As :func:`~.depth_query_kernels.query_kernel` wrote them.
+        As :func:`~.depth_query_kernels.query_range` wrote them.
     intersection_grads : (intersections, 13) float32
         Zero on entry; each intersection accumulates at its slot, cell by cell.
     grad_coordinates : (k, 2) float32

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiled query at positions of a view: the depth of the isosurface, or the transmittance."""
+"""Compiled query at positions of a view: the depth of the isosurface."""
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any
 
@@ -44,7 +43,7 @@ from .query_spans import (
     fill_tile,
     longest_list,
 )
-from .ray_solver import NEGLIGIBLE, TINY, evaluate_ray, solve_ray
+from .ray_solver import NEGLIGIBLE, TINY, solve_ray, transmittance_at
 
 # Columns of a span after those of the Gaussians: their values on the ray of the current position.
 _RAW, _PEAK, _SHARPNESS = 13 * SPAN, 14 * SPAN, 15 * SPAN
@@ -68,148 +67,126 @@ def _evaluate_span(span: Any, x: Any, y: Any) -> None:
         span[_SHARPNESS + j] = span[A0 + j] * den
 
 
-@functools.cache
-def query_kernel(solve: bool) -> Any:
-    """Return the query kernel, compiled on first call.
+@kernel(fast=True)
+def query_range(
+    first_tile: int,
+    end_tile: int,
+    params: np.ndarray,
+    boxes: np.ndarray,
+    skews: np.ndarray,
+    start: np.ndarray,
+    gaussian_ids: np.ndarray,
+    tiles_x: int,
+    shift: int,
+    cell_start: np.ndarray,
+    coordinates: np.ndarray,
+    limit: float,
+    values: np.ndarray,
+    slopes: np.ndarray,
+    stops: np.ndarray,
+) -> None:
+    """Write the depth of the isosurface and the slope of ``-log T`` at the positions of tiles.
 
-    Parameters
-    ----------
-    solve : bool
-        Solve the depth of the isosurface; otherwise evaluate the transmittance at given depths.
+    ``values (k,)`` are 0 where there is no depth. ``stops (k,) int32`` receives the number of
+    Gaussians of the cell's list up to the one that makes the ray opaque.
     """
-
-    @kernel(fast=True)
-    def query_range(
-        first_tile: int,
-        end_tile: int,
-        params: np.ndarray,
-        boxes: np.ndarray,
-        skews: np.ndarray,
-        start: np.ndarray,
-        gaussian_ids: np.ndarray,
-        tiles_x: int,
-        shift: int,
-        cell_start: np.ndarray,
-        coordinates: np.ndarray,
-        limit: float,
-        depths: np.ndarray,
-        values: np.ndarray,
-        slopes: np.ndarray,
-        stops: np.ndarray,
-    ) -> None:
-        """Query the positions of tiles: write ``values`` and ``slopes``, read ``depths``.
-
-        If the depth is solved, ``depths (k,)`` is the array that is written. ``stops (k,) int32``
-        receives the number of Gaussians of the cell's list up to the one that makes the ray opaque.
-        """
-        longest = longest_list(first_tile, end_tile, start, shift, cell_start)
-        room = (longest + SPAN - 1) // SPAN
-        tile_spans = np.empty((room, TILE_COLUMNS * SPAN), np.float32)
-        spans = np.empty((room, _COLUMNS * SPAN), np.float32)
-        nearest_depths = np.empty(room + 1, np.float32)
-        members = np.empty(longest, np.int64)
-        alphas = np.empty(room * SPAN, np.float32)
-        peaks = np.empty(room * SPAN, np.float32)
-        sharpnesses = np.empty(room * SPAN, np.float32)
-        filled = -1
-        for cell in range(first_tile << (2 * shift), end_tile << (2 * shift)):
-            if cell_start[cell] == cell_start[cell + 1]:
-                continue
-            tile = cell >> (2 * shift)
-            if tile != filled:
-                fill_tile(
-                    tile, tiles_x, params, boxes, skews, start, gaussian_ids, tile_spans
-                )  # fmt: skip
-                filled = tile
-            total = fill_cell(
-                _COLUMNS, cell & ((1 << (2 * shift)) - 1), shift,
-                start[tile + 1] - start[tile], tile_spans, spans, nearest_depths, members,
+    longest = longest_list(first_tile, end_tile, start, shift, cell_start)
+    room = (longest + SPAN - 1) // SPAN
+    tile_spans = np.empty((room, TILE_COLUMNS * SPAN), np.float32)
+    spans = np.empty((room, _COLUMNS * SPAN), np.float32)
+    nearest_depths = np.empty(room + 1, np.float32)
+    members = np.empty(longest, np.int64)
+    alphas = np.empty(room * SPAN, np.float32)
+    peaks = np.empty(room * SPAN, np.float32)
+    sharpnesses = np.empty(room * SPAN, np.float32)
+    filled = -1
+    for cell in range(first_tile << (2 * shift), end_tile << (2 * shift)):
+        if cell_start[cell] == cell_start[cell + 1]:
+            continue
+        tile = cell >> (2 * shift)
+        if tile != filled:
+            fill_tile(
+                tile, tiles_x, params, boxes, skews, start, gaussian_ids, tile_spans
             )  # fmt: skip
-            for p in range(cell_start[cell], cell_start[cell + 1]):
-                x, y = coordinates[p, 0], coordinates[p, 1]
-                transmittance, high = ONE, ZERO
-                before_crossing, crossing = ZERO, 0
-                count: Any = 0
-                stop: Any = total
-                end = depths[p]
-                for at in range((total + SPAN - 1) // SPAN):
-                    if solve:
-                        if (
-                            transmittance <= limit
-                            and transmittance < ISO_LEVEL
-                            and nearest_depths[at] >= high
-                        ):
-                            break
-                    elif nearest_depths[at] >= end:
-                        break
-                    span = spans[at]
-                    _evaluate_span(span, x, y)
-                    saturated = False
-                    for run in range(0, SPAN, RUN):
-                        hits = positive_run(RUN, span, _RAW + run)
-                        while hits != np.uint64(0):
-                            j = run + np.int64(lowest_bit(hits))
-                            hits &= hits - np.uint64(1)
-                            raw, peak = span[_RAW + j], span[_PEAK + j]
-                            alphas[count] = raw
-                            peaks[count] = peak
-                            sharpnesses[count] = span[_SHARPNESS + j]
-                            before = transmittance
-                            transmittance -= min(raw, ALPHA_MAX) * transmittance
-                            if solve and before > ISO_LEVEL:
-                                high = max(high, peak)
-                                if transmittance <= ISO_LEVEL:
-                                    before_crossing, crossing = before, count
-                            count += 1
-                            if transmittance < TRANSMITTANCE_MIN:
-                                stop = at * SPAN + j + 1
-                                saturated = True
-                                break
-                        if saturated:
+            filled = tile
+        total = fill_cell(
+            _COLUMNS, cell & ((1 << (2 * shift)) - 1), shift,
+            start[tile + 1] - start[tile], tile_spans, spans, nearest_depths, members,
+        )  # fmt: skip
+        for p in range(cell_start[cell], cell_start[cell + 1]):
+            x, y = coordinates[p, 0], coordinates[p, 1]
+            transmittance, high = ONE, ZERO
+            before_crossing, crossing = ZERO, 0
+            count: Any = 0
+            stop: Any = total
+            for at in range((total + SPAN - 1) // SPAN):
+                if (
+                    transmittance <= limit
+                    and transmittance < ISO_LEVEL
+                    and nearest_depths[at] >= high
+                ):
+                    break
+                span = spans[at]
+                _evaluate_span(span, x, y)
+                saturated = False
+                for run in range(0, SPAN, RUN):
+                    hits = positive_run(RUN, span, _RAW + run)
+                    while hits != np.uint64(0):
+                        j = run + np.int64(lowest_bit(hits))
+                        hits &= hits - np.uint64(1)
+                        raw, peak = span[_RAW + j], span[_PEAK + j]
+                        alphas[count] = raw
+                        peaks[count] = peak
+                        sharpnesses[count] = span[_SHARPNESS + j]
+                        before = transmittance
+                        transmittance -= min(raw, ALPHA_MAX) * transmittance
+                        if before > ISO_LEVEL:
+                            high = max(high, peak)
+                            if transmittance <= ISO_LEVEL:
+                                before_crossing, crossing = before, count
+                        count += 1
+                        if transmittance < TRANSMITTANCE_MIN:
+                            stop = at * SPAN + j + 1
+                            saturated = True
                             break
                     if saturated:
                         break
-                stops[p] = stop
-                if not solve:
-                    values[p], slopes[p] = evaluate_ray(
-                        True, count, end, alphas, peaks, sharpnesses
-                    )
+                if saturated:
+                    break
+            stops[p] = stop
+            values[p], slopes[p] = ZERO, ONE
+            if not (
+                before_crossing > ZERO and transmittance <= limit and transmittance < ISO_LEVEL
+            ):
+                continue
+            sharpest = ZERO
+            kept = 0
+            for c in range(count):
+                sharpness, peak = sharpnesses[c], peaks[c]
+                beyond = max(peak - high, ZERO)
+                matters = sharpness * beyond * beyond < NEGLIGIBLE
+                if c == crossing:
+                    crossing = kept
+                alphas[kept] = alphas[c]
+                peaks[kept] = peak
+                sharpnesses[kept] = sharpness
+                if matters:
+                    sharpest = max(sharpest, sharpness)
+                    kept += 1
+            if nearest_depths[0] <= ZERO:
+                # Some Gaussian may reach the camera: a crossing needs T > 0.5 at depth 0.
+                product = transmittance_at(kept, ZERO, alphas, peaks, sharpnesses)
+                if product <= ISO_LEVEL:
                     continue
-                values[p], slopes[p] = ZERO, ONE
-                if not (
-                    before_crossing > ZERO and transmittance <= limit and transmittance < ISO_LEVEL
-                ):
-                    continue
-                sharpest = ZERO
-                kept = 0
-                for c in range(count):
-                    sharpness, peak = sharpnesses[c], peaks[c]
-                    beyond = max(peak - high, ZERO)
-                    matters = sharpness * beyond * beyond < NEGLIGIBLE
-                    if c == crossing:
-                        crossing = kept
-                    alphas[kept] = alphas[c]
-                    peaks[kept] = peak
-                    sharpnesses[kept] = sharpness
-                    if matters:
-                        sharpest = max(sharpest, sharpness)
-                        kept += 1
-                if nearest_depths[0] <= ZERO:
-                    # Some Gaussian may reach the camera: a crossing needs T > 0.5 at depth 0.
-                    product, _ = evaluate_ray(False, kept, ZERO, alphas, peaks, sharpnesses)
-                    if product <= ISO_LEVEL:
-                        continue
-                # The Gaussian at the crossing alone reaches T = 0.5 where its fall-off is ratio.
-                weight = min(alphas[crossing], ALPHA_MAX) * before_crossing
-                ratio = min(max((before_crossing - ISO_LEVEL) / max(weight, TINY), ZERO), ONE)
-                log_ratio = math.log(max(ratio, TINY))
-                ahead = math.sqrt(max(-TWO * log_ratio / max(sharpnesses[crossing], TINY), ZERO))
-                guess = peaks[crossing] - ahead
-                if not (guess > ZERO and guess < high):
-                    guess = HALF * high
-                values[p], slopes[p] = solve_ray(
-                    kept, alphas, peaks, sharpnesses, high, guess,
-                    math.sqrt(max(sharpest, TINY)), math.sqrt(max(sharpnesses[crossing], TINY)),
-                )  # fmt: skip
-
-    return query_range
+            # The Gaussian at the crossing alone reaches T = 0.5 where its fall-off is ratio.
+            weight = min(alphas[crossing], ALPHA_MAX) * before_crossing
+            ratio = min(max((before_crossing - ISO_LEVEL) / max(weight, TINY), ZERO), ONE)
+            log_ratio = math.log(max(ratio, TINY))
+            ahead = math.sqrt(max(-TWO * log_ratio / max(sharpnesses[crossing], TINY), ZERO))
+            guess = peaks[crossing] - ahead
+            if not (guess > ZERO and guess < high):
+                guess = HALF * high
+            values[p], slopes[p] = solve_ray(
+                kept, alphas, peaks, sharpnesses, high, guess,
+                math.sqrt(max(sharpest, TINY)), math.sqrt(max(sharpnesses[crossing], TINY)),
+            )  # fmt: skip

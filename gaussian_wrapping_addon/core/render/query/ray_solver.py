@@ -50,21 +50,14 @@ TINY = np.float32(1e-30)
 
 
 @inline
-def evaluate_ray(capped: Any, count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
-    """Return T and -d(log T)/dt at depth t; if ``capped``, densities above 0.99 have no slope."""
-    product, slope = ONE, ZERO
+def transmittance_at(count: Any, t: Any, alphas: Any, peaks: Any, sharpnesses: Any) -> Any:
+    """Return T at depth t."""
+    product = ONE
     for c in range(count):
         ahead = max(peaks[c] - t, ZERO)
-        log_slope = sharpnesses[c] * ahead
-        raw = alphas[c] * exp_wide(HALF * log_slope * ahead)
-        density = min(raw, ALPHA_MAX)
-        keep = ONE - density
-        product *= keep
-        rate = density * log_slope / keep
-        if capped:
-            rate = rate if raw < ALPHA_MAX else ZERO
-        slope += rate
-    return product, slope
+        density = alphas[c] * exp_wide(HALF * sharpnesses[c] * ahead * ahead)
+        product *= ONE - min(density, ALPHA_MAX)
+    return product
 
 
 @inline

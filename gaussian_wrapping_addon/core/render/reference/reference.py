@@ -89,6 +89,8 @@ def reference_depth_at(
 ) -> Tensor:
     """Return the depth of :func:`render_reference` at any positions of the image.
 
+    The definition of :func:`~..query.depth_query.solve_depths`; only tests compare with it.
+
     Parameters
     ----------
     gaussians, camera, options
@@ -103,35 +105,6 @@ def reference_depth_at(
     """
     rays, seen = _evaluate_rays_at(gaussians, camera, positions, options)
     return positions.new_zeros(len(positions)).index_put((seen,), _depth(rays, options))
-
-
-def reference_transmittance_at(
-    gaussians: OrientedGaussians,
-    camera: Camera,
-    positions: Tensor,
-    depths: Tensor,
-    options: RenderOptions,
-) -> Tensor:
-    """Return the transmittance of the contributors of :func:`render_reference` up to z-depths.
-
-    Parameters
-    ----------
-    gaussians, camera, positions, options
-        As for :func:`reference_depth_at`.
-    depths : (m,) tensor
-        Scene units, >= 0; differentiable.
-
-    Returns
-    -------
-    (m,) tensor
-        In [0, 1]; 0 off the image.
-    """
-    rays, seen = _evaluate_rays_at(gaussians, camera, positions, options)
-    before = (rays.peak - depths[seen][:, None]).clamp_min(0.0)  # (k, n)
-    density = torch.exp(rays.log_alpha - 0.5 * rays.sharpness * before * before)
-    density = torch.where(rays.contributes, density.clamp_max(tolerances.ALPHA_MAX), 0.0)
-    transmittance = torch.prod(1.0 - density, dim=1)
-    return positions.new_zeros(len(positions)).index_put((seen,), transmittance)
 
 
 def _evaluate_rays_at(

@@ -60,13 +60,6 @@ def required_side(
     return max(wanted, math.sqrt(room / EXPECTED_UTILISATION))
 
 
-def automatic_size(
-    graph: FaceGraph, photos: PhotoSource, count: int, detail_points: int = 0, seed: int = 0
-) -> int:
-    """Return the side in pixels, a power of two from 256 to 4096, of :func:`required_side`."""
-    return _power_of_two(required_side(graph, photos, count, detail_points, seed))
-
-
 def _power_of_two(wanted: float) -> int:
     exponent = math.ceil(math.log2(max(wanted, 1.0)))
     largest = min(MAX_AUTOMATIC_SIZE_PX, limits.MAX_TEXTURE_SIDE_PX)

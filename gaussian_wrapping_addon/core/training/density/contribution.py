@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,25 +15,14 @@ from ..optimizer.adam import Adam
 from .wrapping import WrapView
 
 
-@dataclass(frozen=True)
-class Contributions:
-    """Blending weights over views, all (n,) float64."""
-
-    share: np.ndarray
-    """Mean over the views of the share of the image that the Gaussian fills: sum of its blending
-    weights divided by the number of pixels."""
-    largest: np.ndarray
-    """Largest blending weight at any pixel of any view."""
-
-
 def contributions(
     gaussians: OrientedGaussians,
     views: Iterable[WrapView],
     renderer: ViewRenderer,
     *,
     threads: int = 0,
-) -> Contributions:
-    """Measure the contribution of each Gaussian to the images of the views.
+) -> np.ndarray:
+    """Return the contribution of each Gaussian to the images of the views.
 
     Masked pixels count like all others: Gaussians there are in front of, or behind, something that
     other views train.
@@ -46,48 +34,78 @@ def contributions(
     views : iterable of WrapView
     renderer : ViewRenderer
         Overwrites its last view.
+
+    Returns
+    -------
+    (n,) float64
+        Mean over the views of the share of the image that the Gaussian fills: sum of its blending
+        weights divided by the number of pixels.
     """
     raw = RawArrays.from_gaussians(gaussians)
     options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
-    share, largest = np.zeros(len(gaussians)), np.zeros(len(gaussians))
+    share = np.zeros(len(gaussians))
     count = 0
     for view in views:
         statistics = renderer.render(raw, view.camera, options).statistics
         assert statistics is not None
         share += statistics.weight_sum / (view.camera.width * view.camera.height)
-        np.maximum(largest, statistics.weight_max, out=largest)
         count += 1
-    return Contributions(share / max(1, count), largest)
+    return share / max(1, count)
 
 
-def least_contributors(
-    found: Contributions, total_share: float, weights: np.ndarray | None = None
+def needed_by_a_view(
+    gaussians: OrientedGaussians,
+    views: Iterable[WrapView],
+    renderer: ViewRenderer,
+    share: float,
+    weights: np.ndarray | None = None,
+    *,
+    threads: int = 0,
 ) -> np.ndarray:
-    """Return (n,) bool: the Gaussians of least contribution that add up to a share of the total.
+    """Tell which Gaussians any view needs (docs/method.md, section 4.3).
 
-    Removing them changes the images by no more than that share on average, however many they are; a
-    fixed number or threshold would depend on the scene (compare the pruning by significance of
-    LightGaussian and the blending weights of Mini-Splatting).
+    A view does not need its least contributors, which together make up ``share`` of its blending
+    weights. The Gaussians that any view needs therefore keep at least ``1 - share`` of the weights
+    of every view, however many views there are, and however few of them see a part of the scene.
 
     Parameters
     ----------
-    total_share : float
-        Share of the sum of all contributions, in [0, 1).
+    gaussians : OrientedGaussians
+        Scene frame.
+    views : iterable of WrapView
+        All training views.
+    renderer : ViewRenderer
+        Overwrites its last view.
+    share : float
+        In [0, 1).
     weights : (n,), optional
         Factors on the contributions of the Gaussians.
+
+    Returns
+    -------
+    (n,) bool
     """
-    share = found.share if weights is None else found.share * weights
-    order = np.argsort(share, kind="stable")
-    running = np.cumsum(share[order])
-    least = np.zeros(len(order), np.bool_)
-    least[order[running <= total_share * running[-1]]] = True
-    return least
+    raw = RawArrays.from_gaussians(gaussians)
+    options = RenderOptions(depth=False, sh_degree=0, threads=threads, statistics=True)
+    needed = np.zeros(len(gaussians), np.bool_)
+    for view in views:
+        statistics = renderer.render(raw, view.camera, options).statistics
+        assert statistics is not None
+        seen = np.flatnonzero(statistics.weight_sum > 0.0)
+        amount = statistics.weight_sum[seen].astype(np.float64)
+        if weights is not None:
+            amount *= weights[seen]
+        order = np.argsort(amount, kind="stable")
+        running = np.cumsum(amount[order])
+        if len(seen):
+            needed[seen[order[running > share * running[-1]]]] = True
+    return needed
 
 
-def prune_contributors(adam: Adam, least: np.ndarray) -> int:
-    """Remove the Gaussians of a mask, unless that is all of them; return their number."""
-    keep = np.flatnonzero(~least)
-    if len(keep) == 0 or len(keep) == len(least):
+def prune_contributors(adam: Adam, needed: np.ndarray) -> int:
+    """Keep the Gaussians of a mask, unless it is empty; return the number of those removed."""
+    keep = np.flatnonzero(needed)
+    if len(keep) == 0 or len(keep) == len(needed):
         return 0
     adam.rebuild(keep, np.zeros(len(keep), np.bool_), {})
-    return len(least) - len(keep)
+    return len(needed) - len(keep)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ... import tolerances
 from ...render.types.images import RenderStatistics
+from ...settings import TrainingSettings
 from ..optimizer.adam import Adam
 
 GRADIENT_THRESHOLD = 2e-4
@@ -17,7 +18,7 @@ GRADIENT_THRESHOLD = 2e-4
 See docs/method.md, section 4.1.
 """
 
-LOWEST_SCORE = 0.3
+LOWEST_SCORE = TrainingSettings.densify_score
 """If the budget has room for more than those above the threshold, candidates down to this share of
 it are taken, best first: the budget decides how many, the gradients which (Taming 3DGS)."""
 
@@ -25,7 +26,7 @@ CLONE_SIZE = 0.01 * tolerances.SCENE_RADIUS
 """Gaussians with a largest raw standard deviation of at most this are cloned, others are split."""
 
 SPLIT_FACTOR = 1.6
-MIN_OPACITY = 0.02
+MIN_OPACITY = TrainingSettings.min_opacity
 """Gaussians with a smaller raw opacity are pruned. Between the 0.05 and 0.005 of the two published
 codes (docs/method.md, section 4.1): short runs hardly recover what 0.05 removes."""
 
@@ -84,6 +85,9 @@ def densify_and_prune(
     limit: int,
     random: np.random.Generator,
     weights: np.ndarray | None = None,
+    *,
+    least_score: float = LOWEST_SCORE,
+    min_opacity: float = MIN_OPACITY,
 ) -> DensityChange:
     """Clone small and split large Gaussians with high gradients; prune transparent ones.
 
@@ -103,13 +107,17 @@ def densify_and_prune(
         Draws the means of new Gaussians from the distributions of the old ones.
     weights : (n,), optional
         Factors on the gradients in the ranking when room is short.
+    least_score : float
+        Share of the gradient threshold from which a Gaussian is a candidate.
+    min_opacity : float
+        Gaussians with a smaller raw opacity are pruned.
     """
     log_scales = adam.array("log_scales")
     opacity = 1.0 / (1.0 + np.exp(-adam.array("opacity_logits").astype(np.float64)))
-    keep = opacity >= MIN_OPACITY
+    keep = opacity >= min_opacity
     if not keep.any():
         keep[np.argmax(opacity)] = True
-    chosen = _qualified(statistics, keep, limit - int(keep.sum()), weights)
+    chosen = _qualified(statistics, keep, limit - int(keep.sum()), weights, least_score)
     small = log_scales.max(axis=1) <= np.log(CLONE_SIZE)
     cloned = np.nonzero(chosen & small)[0]
     split = np.nonzero(chosen & ~small)[0]
@@ -128,7 +136,11 @@ def densify_and_prune(
 
 
 def _qualified(
-    statistics: DensityStatistics, keep: np.ndarray, room: int, weights: np.ndarray | None
+    statistics: DensityStatistics,
+    keep: np.ndarray,
+    room: int,
+    weights: np.ndarray | None,
+    least_score: float,
 ) -> np.ndarray:
     """Return (n,) bool: Gaussians to densify, at most ``room`` of them."""
     views = np.maximum(statistics.views, 1)
@@ -141,7 +153,7 @@ def _qualified(
         level = float(np.quantile(average_abs, 1.0 - share))
         if level > 0.0:
             score = np.maximum(score, average_abs / level)
-    chosen = (score >= LOWEST_SCORE) & keep & (statistics.views > 0)
+    chosen = (score >= least_score) & keep & (statistics.views > 0)
     if chosen.sum() > room:
         weighted = score if weights is None else score * weights
         ranked = np.argsort(-np.where(chosen, weighted, -np.inf), kind="stable")

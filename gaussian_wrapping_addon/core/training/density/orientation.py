@@ -12,18 +12,23 @@ from ...dataset.camera import Camera
 from ...gaussians.model import OrientedGaussians
 from ...render.render import render
 from ...render.types.options import RenderOptions
+from ...settings import TrainingSettings
 
-FIRST_SIGN = 0.5
-"""Magnitude of the sign parameter after the vote (docs/method.md, section 1.3)."""
+FIRST_SIGN = TrainingSettings.first_sign
+"""Magnitude of the sign parameter after the vote of views of a splat."""
 
 
 def voted_orientation(
-    gaussians: OrientedGaussians, cameras: Iterable[Camera], *, threads: int = 0
+    gaussians: OrientedGaussians,
+    cameras: Iterable[Camera],
+    *,
+    first_sign: float = FIRST_SIGN,
+    threads: int = 0,
 ) -> np.ndarray:
     """Return orientation parameters for Gaussians whose orientation was not trained.
 
     The direction is the shortest axis. Each camera votes for the side that it sees, weighted by the
-    Gaussian's blending weight; the sign parameter is +-0.5, or 0 if no camera sees the Gaussian
+    Gaussian's blending weight; the sign parameter is +-``first_sign``, or 0 if no camera sees it
     (docs/method.md, section 1.3).
 
     Parameters
@@ -49,7 +54,7 @@ def voted_orientation(
         assert statistics is not None
         toward = camera.center - means  # (n, 3)
         votes += statistics.weight_sum * np.sign((toward * direction).sum(1))
-    sign = FIRST_SIGN * np.sign(votes)  # (n,)
+    sign = first_sign * np.sign(votes)  # (n,)
     return np.concatenate([direction, sign[:, None]], axis=1).astype(np.float32)
 
 

@@ -17,7 +17,7 @@ from ...render.render import render
 from ...render.types.options import RenderOptions
 from ..losses.losses import normals_from_depth
 from ..optimizer.adam import Adam
-from .orientation import voted_orientation
+from .orientation import FIRST_SIGN, voted_orientation
 
 SHIFT = 0.1
 """Original and clone are each moved by this many standard deviations along the normal."""
@@ -39,14 +39,19 @@ class WrapView:
     """(h, w) bool."""
 
 
-def start_orientation(adam: Adam, views: Iterable[WrapView], *, threads: int = 0) -> None:
+def start_orientation(
+    adam: Adam, views: Iterable[WrapView], *, first_sign: float = FIRST_SIGN, threads: int = 0
+) -> None:
     """Initialise orientations: the shortest axis, with its sign by a vote of the views.
 
     Each view votes for the side that it sees, weighted by the Gaussian's blending weight; the sign
-    parameter becomes +-0.5, or stays 0 if no view sees the Gaussian (docs/method.md, section 1.3).
+    parameter becomes +-``first_sign``, or stays 0 if no view sees the Gaussian (docs/method.md,
+    section 1.3).
     """
     cameras = (view.camera for view in views)
-    adam.array("orientation")[:] = voted_orientation(adam.gaussians(), cameras, threads=threads)
+    adam.array("orientation")[:] = voted_orientation(
+        adam.gaussians(), cameras, first_sign=first_sign, threads=threads
+    )
     adam.reset_moments("orientation")
 
 

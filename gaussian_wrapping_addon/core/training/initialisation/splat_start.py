@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -26,10 +25,9 @@ from ...render.render import render
 from ...render.types.options import RenderOptions
 from ...report_warning import ReportWarning
 from ...settings import TrainingSettings
+from ..cancellation import cancellable
 from ..density.orientation import orient
 from .splat_transform import transform_gaussians, with_degree
-
-_logger = logging.getLogger(__name__)
 
 ITERATIONS_SHARE = 0.3
 """Share of the preset's iterations: positions and colours exist, shapes and orientations do not."""
@@ -50,9 +48,6 @@ MATCH_DB = 12.0
 
 CLEAR_DB = 20.0
 """From this PSNR a splat matches even if a uniform image would match as well."""
-
-WEIGHT_VIEWS = 24
-"""Views from which Gaussians are ranked if there are too many."""
 
 _SMALL_DIVISOR = 4
 
@@ -131,7 +126,7 @@ def start_from_splat(
     wanted = with_degree(baked(splat.gaussians), settings.sh_degree)
     moved = transform_gaussians(wanted, scene.world_from_scene.inverse())
     cameras = [photos.camera(i, 1) for i in view_indices]
-    gaussians = fit_filter(moved, cameras, threads=threads)
+    gaussians = fit_filter(moved, cameras, variance_px=settings.filter_variance, threads=threads)
     warnings, facts = list(splat.warnings), dict(splat.facts)
     if len(gaussians) > settings.max_gaussians:
         text = (
@@ -139,8 +134,7 @@ def start_from_splat(
             "largest contribution to the photos are kept."
         )
         warnings.append(ReportWarning("gaussians-over-cap", text))
-        chosen = _evenly_spaced(view_indices, WEIGHT_VIEWS)
-        small = [photos.camera(i, _divisor(photos, i)) for i in chosen]
+        small = [photos.camera(i, _divisor(photos, i)) for i in view_indices]
         weights = _mean_weights(gaussians, small, progress, threads=threads)
         # A stable order makes ties depend on the file alone.
         kept = np.sort(np.argsort(-weights, kind="stable")[: settings.max_gaussians])
@@ -158,9 +152,8 @@ def start_from_splat(
             "splat alone, without photos.",
         )
     if not splat.oriented:
-        chosen = _evenly_spaced(view_indices, WEIGHT_VIEWS)
-        small = [photos.camera(i, _divisor(photos, i)) for i in chosen]
-        gaussians = orient(gaussians, small, threads=threads)
+        voters = (photos.camera(i, _divisor(photos, i)) for i in view_indices)
+        gaussians = orient(gaussians, cancellable(voters, progress), threads=threads)
     return SplatStart(gaussians, tuple(warnings), facts)
 
 
@@ -177,7 +170,11 @@ def baked(gaussians: OrientedGaussians) -> OrientedGaussians:
 
 
 def fit_filter(
-    gaussians: OrientedGaussians, cameras: Sequence[Camera], *, threads: int = 0
+    gaussians: OrientedGaussians,
+    cameras: Sequence[Camera],
+    *,
+    variance_px: float = TrainingSettings.filter_variance,
+    threads: int = 0,
 ) -> OrientedGaussians:
     """Return Gaussians that look with the cameras' 3D filter like the given ones without.
 
@@ -190,6 +187,8 @@ def fit_filter(
         Scene frame, with a filter of 0.
     cameras : sequence of Camera
         Training cameras at full size.
+    variance_px : float
+        Variance of the filter, squared pixels.
 
     Returns
     -------
@@ -197,7 +196,9 @@ def fit_filter(
         float32, with the filter of the cameras.
     """
     wide = {name: t.detach().double() for name, t in gaussians.tensors()}
-    width = torch.from_numpy(mip_filter(wide["means"].numpy(), cameras, threads=threads))  # (n,)
+    means = wide["means"].numpy()
+    widths = mip_filter(means, cameras, variance_px=variance_px, threads=threads)  # (n,)
+    width = torch.from_numpy(widths)
     least = (FILTER_MULTIPLE * width)[:, None]
     wanted = torch.maximum(torch.exp(wide["log_scales"]), least)  # (n, 3) effective
     raw = torch.sqrt(wanted**2 - width[:, None] ** 2)

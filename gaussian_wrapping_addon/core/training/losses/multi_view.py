@@ -33,8 +33,7 @@ from ..optimizer.gradient_sums import add_image_gradients, merge_gradients
 from .multi_view_kernels import (
     BROKEN,
     KEPT,
-    MAX_RISE,
-    PATCH_SIZES,
+    SAMPLES,
     compare_range,
     lift_range,
     return_range,
@@ -58,15 +57,17 @@ _GEOMETRY_COLUMNS = 13
 class MultiViewOptions:
     """Weights and sizes of the multi-view terms."""
 
-    lambda_photometric: float = 0.6
+    lambda_photometric: float = TrainingSettings.lambda_photometric
     lambda_geometric: float = 0.02
     correlation: str = "signed"
     pixels: int = 4000
-    """Largest number of sampled pixels."""
-    patch_sizes: int = PATCH_SIZES
+    """Largest number of sampled pixels; as many as the image has, or more, take all."""
+    patch_sizes: int = TrainingSettings.patch_sizes
     """Number of patch sizes, the larger ones for regions where smaller patches are flat."""
-    max_rise: float = MAX_RISE
+    max_rise: float = TrainingSettings.patch_rise
     """Largest deviation of the surface from a patch's plane, in half sides of the patch."""
+    min_contrast: float = TrainingSettings.patch_contrast
+    """Least standard deviation of grey, in [0, 1], of a patch that is compared."""
     weight: float = 1.0
     """Factor on both terms: n if they are evaluated in every n-th iteration."""
 
@@ -85,6 +86,9 @@ class MultiViewOptions:
             settings.lambda_geometric,
             settings.correlation,
             settings.multi_view_pixels,
+            patch_sizes=settings.patch_sizes,
+            max_rise=settings.patch_rise,
+            min_contrast=settings.patch_contrast,
             weight=float(settings.multi_view_every),
         )
 
@@ -155,7 +159,7 @@ def multi_view_losses(
         False pixels are ignored.
     settings : MultiViewOptions
     random : numpy Generator
-        ``settings.pixels`` numbers are drawn.
+        ``settings.pixels`` numbers are drawn, none where all pixels are taken.
     threads : int
         The result does not depend on it.
     store : ArrayStore, optional
@@ -207,6 +211,7 @@ def multi_view_losses(
         settings.correlation == "squared",
         settings.patch_sizes,
         settings.max_rise,
+        SAMPLES * settings.min_contrast**2,
     )
     kept = states == KEPT
     photometric, geometric = _mean(weights * errors, kept), _mean(weights * _finite(noise), valid)
@@ -296,6 +301,7 @@ class _ViewPair:
         squared: bool,
         sizes: int,
         max_rise: float,
+        min_spread: float,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return states (m,), errors (m,), their derivatives by depth (m,) and normal (m, 3)."""
         count, image = len(self.pixels), self.image
@@ -306,7 +312,8 @@ class _ViewPair:
             compare_range(
                 begin, end, self.pixels, noise, image.depth, image.geometric_normal, image.alpha,
                 self.rotation, self.camera, self.other, self.pose, self.near_z, grey, other_grey,
-                mask, other_mask, squared, sizes, max_rise, states, errors, by_depth, by_normals,
+                mask, other_mask, squared, sizes, max_rise, min_spread, states, errors, by_depth,
+                by_normals,
             )  # fmt: skip
 
         run_chunks(run, self.bounds, self.threads)
@@ -318,7 +325,7 @@ def _other_gradients(
 ) -> tuple[VisibleGradients, np.ndarray, int]:
     """Return gradients on the Gaussians (m', ...) and positions (m, 2), and Gaussians dropped."""
     grad_params = np.zeros_like(view.screen.params)
-    by_positions, _ = add_query_gradients(view, depths, by_found, grad_params)
+    by_positions = add_query_gradients(view, depths, by_found, grad_params)
     # All values are finite if the sum of their absolute values is.
     with np.errstate(all="ignore"):
         sizes = np.abs(grad_params[:, :_GEOMETRY_COLUMNS]).sum(1)  # (n,)

@@ -16,16 +16,12 @@ import numpy as np
 
 from ...kernels.compiled import inline, kernel
 
-CAMERA_VALUES = 6
-"""fx, fy, cx, cy, width, height."""
+# Cameras are (6,): fx, fy, cx, cy, width, height.
 
 HALF_PATCH = 3
 """A patch has ``2 * 3 + 1`` samples per side ..."""
 PATCH_STEP_PX = 0.5
 """... half a pixel of the reference apart, where that is not flat."""
-PATCH_SIZES = 3
-"""Flat patches are retried at twice and four times the size: plain walls and glaze show shading and
-stains at a larger scale only."""
 SAMPLES = (2 * HALF_PATCH + 1) ** 2
 
 MAX_NOISE_PX = 1.0
@@ -33,10 +29,6 @@ MAX_NOISE_PX = 1.0
 MIN_NOISE_PX = 1e-9
 """Below this, the direction of the reprojection error is rounding: no gradient."""
 
-MIN_SPREAD = SAMPLES * 0.012**2
-"""Smallest sum of squared deviations in a patch, of grey in [0, 1]: contrast of three grey levels.
-The usual 5e-6 (docs/method.md, section 3.4) is far below the noise of photos: such patches agree by
-chance, displace the surface at random, and a surface displaced at random recedes."""
 SPREAD_PRODUCT = 1e-8
 """Added to the product of two such sums: patches of weak contrast correlate less."""
 MAX_ERROR = 0.9
@@ -45,12 +37,6 @@ MIN_NORMAL = 0.3
 """Shortest blended normal that defines a plane (docs/method.md, section 3.4)."""
 MIN_FACING = 0.1
 """Smallest cosine between normal and ray (84 degrees): more grazing planes have no patch."""
-MAX_RISE = 4.0
-"""Largest deviation of the surface from the plane within a patch, in half sides of the patch:
-beyond it there is no plane, as for a spoke before a wall, and thin parts would be pulled towards
-what lies behind. With 1, thin parts gain slightly more, but rooms lose most of the terms' benefit,
-as early surfaces are rough."""
-
 # States of a compared pixel.
 SKIPPED, KEPT, BROKEN = 0, 1, 2
 
@@ -213,8 +199,8 @@ def _all_count(mask: Any, row: Any, column: Any) -> Any:
 @kernel(fast=False, fused=True)
 def compare_range(  # type: ignore[no-untyped-def]
     begin, end, pixels, noise, depth, normals, alpha, rotation, camera, other, pose, near_z,
-    grey, other_grey, mask, other_mask, squared, sizes, max_rise, states, errors, by_depth,
-    by_normals,
+    grey, other_grey, mask, other_mask, squared, sizes, max_rise, min_spread, states, errors,
+    by_depth, by_normals,
 ):  # fmt: skip
     """Compare patches around pixels with the other photo, warped by their planes.
 
@@ -232,7 +218,9 @@ def compare_range(  # type: ignore[no-untyped-def]
     sizes : int
         Number of patch sizes, each twice the one before, tried until a patch is not flat.
     max_rise : float
-        See :data:`MAX_RISE`.
+        Largest deviation of the surface from the plane within a patch, in half sides of the patch.
+    min_spread : float
+        Smallest sum of squared deviations of the grey of a patch.
     states : (m,) uint8
         Written: :data:`KEPT` for compared patches, :data:`BROKEN` for non-finite values.
     errors : (m,) float64
@@ -334,7 +322,7 @@ def compare_range(  # type: ignore[no-untyped-def]
                 our_spread += a * a
                 their_spread += b * b
                 common += a * b
-            flat = not (our_spread > MIN_SPREAD and their_spread > MIN_SPREAD)
+            flat = not (our_spread > min_spread and their_spread > min_spread)
             if not flat:
                 break
         if flat:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ... import tolerances
 from ...dataset.camera import Camera
+from ...settings import TrainingSettings
 
 _MOST_POINTS = 2000
 """Most points for estimating the overlap of two images, subsampled from those given."""
@@ -22,7 +23,7 @@ class NeighbourLimits:
     """Criteria for candidate cameras; lengths in scene units.
 
     40 photos around an object are 16 to 28 degrees and 0.25 to 0.4 scene radii apart: with the
-    method's 0.3 radii (:data:`FIXED_LIMITS`) 23 of 40 have no neighbour, with these all have; on a
+    method's 0.3 radii 23 of 40 have no neighbour, with these all have; on a
     capture of 50 to 80 photos every camera has eight, the nearest of which are the method's. In a
     room, where axes differ by 28 to 101 degrees, 32 of 40 have none, with these all have. Angles
     beyond 30 degrees would add pairs with too different views of a patch, and no camera needs them.
@@ -32,15 +33,19 @@ class NeighbourLimits:
     """Between the optical axes."""
     min_distance: float = 0.002 * tolerances.SCENE_RADIUS
     """Between the centres: without a baseline, depth is not constrained."""
-    max_distance: float = 1.0 * tolerances.SCENE_RADIUS
-    min_overlap: float = 0.3
+    max_distance: float = TrainingSettings.neighbour_distance * tolerances.SCENE_RADIUS
+    min_overlap: float = TrainingSettings.neighbour_overlap
     """Share of the sparse points in a camera's image that must also lie in the other's image."""
     most: int = 8
     """Most neighbours of each camera; the nearest are kept."""
 
-
-FIXED_LIMITS = NeighbourLimits(max_distance=0.3 * tolerances.SCENE_RADIUS, min_overlap=0.0)
-"""The limits of docs/method.md, section 3.4, tuned on captures of hundreds of photos."""
+    @classmethod
+    def of_settings(cls, settings: TrainingSettings) -> NeighbourLimits:
+        """Return the limits of a training's settings."""
+        return cls(
+            max_distance=settings.neighbour_distance * tolerances.SCENE_RADIUS,
+            min_overlap=settings.neighbour_overlap,
+        )
 
 
 def find_neighbours(

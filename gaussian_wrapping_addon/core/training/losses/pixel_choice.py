@@ -49,7 +49,7 @@ def choose_pixels(
     threads: int,
     store: ArrayStore | None = None,
 ) -> np.ndarray:
-    """Sample up to ``count`` distinct pixels with depth, inside the mask.
+    """Sample up to ``count`` distinct pixels with depth, inside the mask; all, if it has no more.
 
     Stratified along blocks of pixels. The probability of a pixel is proportional to its brightness
     gradient plus the mean one: half of the pixels follow texture, half are uniform.
@@ -61,7 +61,8 @@ def choose_pixels(
     mask : (h, w) bool, optional
         False pixels are never chosen.
     random : numpy Generator
-        ``count`` numbers are drawn, whatever the images contain.
+        ``count`` numbers are drawn, whatever the images contain; none if ``count`` is not less
+        than the number of pixels.
 
     Returns
     -------
@@ -69,7 +70,8 @@ def choose_pixels(
         ``row * width + column``, m <= count.
     """
     height = len(grey)
-    jitter = random.random(count)
+    takes_all = count >= grey.size
+    jitter = random.random(0 if takes_all else count)
     steepness = (
         np.empty(grey.shape, np.float32)
         if store is None
@@ -85,6 +87,8 @@ def choose_pixels(
     steep, usable = sums.sum(0).tolist()
     if usable == 0:
         return np.zeros(0, np.int32)
+    if takes_all:
+        return np.flatnonzero(steepness.reshape(-1) >= 0.0).astype(np.int32)
     even = steep / usable if steep > 0.0 else 1.0
     chosen = np.empty(count, np.int32)
     found = _pick(steepness, even, steep + even * usable, jitter, chosen)

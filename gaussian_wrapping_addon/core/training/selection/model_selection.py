@@ -55,11 +55,6 @@ class Decision:
                 f"Give one of {', '.join(SELECTION_MODES)}.",
             )
 
-    @property
-    def overridden(self) -> bool:
-        """Whether a setting decided instead of the photos."""
-        return self.setting != "auto"
-
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; figures that are not finite are left out."""
         values = dataclasses.asdict(self)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -82,11 +83,15 @@ def test_memory_stays_bounded_and_results_the_same(tmp_path: Path) -> None:
     one_photo = 101 * 67 * 3
     store = PhotoStore(scene, 101, memory_bytes=int(2.5 * one_photo))
     wide = PhotoStore(scene, 101)
+    given: list[weakref.ref[np.ndarray]] = []
     for i in [0, 1, 2, 3, 4, 5, 0, 3]:
         for divisor in (1, 2):
             np.testing.assert_array_equal(store.photo(i, divisor), wide.photo(i, divisor))
             assert store.photo(i)[0, 0, 2] == i
-            assert store.cached_bytes <= 2.5 * one_photo
+            given += [weakref.ref(store.photo(i)), weakref.ref(store.photo(i, divisor))]
+            held = {id(photo): photo.nbytes for ref in given if (photo := ref()) is not None}
+            photo = None
+            assert one_photo <= sum(held.values()) <= 2.5 * one_photo
     assert store.photo(3) is store.photo(3)
     with pytest.raises(ValueError, match="read-only"):
         store.photo(0)[0, 0, 0] = 1

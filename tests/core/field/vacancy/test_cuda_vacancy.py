@@ -297,16 +297,6 @@ def test_prepared_small_batches_and_no_memory_change_nothing(cuda_field: FieldMa
     np.testing.assert_array_equal(parts[resolved], whole.vacancy[resolved])
 
 
-def test_gradients_are_the_processors(cuda_field: FieldMaker) -> None:
-    arrays, cameras = random_arrays(100), cameras_around(3)
-    points = query_points(arrays.means, 40)
-    camera = np.arange(len(points)) % 4 - 1
-    np.testing.assert_array_equal(
-        cuda_field(arrays, cameras).log_gradient(points, camera),
-        VacancyField(arrays, cameras, threads=1).log_gradient(points, camera),
-    )
-
-
 def test_cancelling(cuda_field: FieldMaker) -> None:
     field = cuda_field(make_arrays(np.zeros(3), 0.1, 0.9), cameras_around(2))
     with pytest.raises(Cancelled):

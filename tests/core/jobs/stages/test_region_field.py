@@ -10,18 +10,24 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.field.vacancy import cuda_vacancy
 from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
-from gaussian_wrapping_addon.core.jobs.stages.region_field import field_figures, region_field
+from gaussian_wrapping_addon.core.jobs.stages.region_field import (
+    field_figures,
+    field_views,
+    region_field,
+)
 from gaussian_wrapping_addon.core.meshing.pivot_meshing import mesh_by_pivots
 from gaussian_wrapping_addon.core.meshing.points.candidate_surface import halo_bounds
 from gaussian_wrapping_addon.core.meshing.primal_adaptive import mesh_region
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 from gaussian_wrapping_addon.core.settings import MeshingSettings, TrainingSettings
-from tests.core.field.field_scenes import cameras_around, shell_arrays
+from tests.core.field.field_scenes import camera_at, cameras_around, shell_arrays
 from tests.core.meshing.meshing_scenes import ShapeField, cube, gaussians_on, sphere
 
 
@@ -73,7 +79,7 @@ def test_unseen_space_is_what_the_settings_say_and_is_counted(tmp_path: Path) ->
         behind = 2 * field.cameras[0].center - far[:1]
         assert field.is_empty(behind).tolist() == [unseen == "empty"]
         assert field_figures(field) == {
-            "field_device": "cpu", "unseen": unseen, "field_evaluations": 1,
+            "field_device": "cpu", "field_cameras": 1, "unseen": unseen, "field_evaluations": 1,
             "unseen_evaluations": 1,
         }  # fmt: skip
 
@@ -81,11 +87,71 @@ def test_unseen_space_is_what_the_settings_say_and_is_counted(tmp_path: Path) ->
 def test_bounds_change_nothing_in_and_around_the_region(tmp_path: Path) -> None:
     scene, arrays = scene_with_masks(tmp_path, slice(None)), shell_arrays(0.9)
     region = Region.box("part", np.array([0.3, -0.4, -0.4]), np.array([1.2, 0.5, 0.4]))
-    field = region_field(scene, arrays, region, TrainingSettings(), MeshingSettings(), threads=1)
+    training = TrainingSettings(holdout_every=0)
+    field = region_field(scene, arrays, region, training, MeshingSettings(), threads=1)
     low, high = halo_bounds(region)
     points = np.random.default_rng(1).uniform(low, high, (500, 3))
     whole = VacancyField(arrays, scene.cameras, threads=1)
     assert np.array_equal(field.is_empty(points), whole.is_empty(points))
+
+
+def scene_looked_into() -> Scene:
+    """Cameras around the unit shell, and two held-out ones (first and last by name) within it."""
+    around = [replace(c, name=f"b{i}") for i, c in enumerate(cameras_around(7))]
+    within = [
+        replace(camera_at(0.5 * place, focal=100.0), name=name)
+        for name, place in (("a", np.array([0.0, 0.0, 1.0])), ("c", np.array([0.0, 1.0, 0.0])))
+    ]
+    views = tuple(View(camera, Path("unused.png")) for camera in [*around, *within])
+    none = np.zeros((0, 3))
+    return Scene(views, none, none.astype(np.uint8), Similarity(1.0, np.eye(3), np.zeros(3)))
+
+
+def within_reach_of_both() -> np.ndarray:
+    points = np.random.default_rng(2).normal(size=(200, 3))
+    return 0.2 * points / np.linalg.norm(points, axis=1)[:, None]
+
+
+@pytest.mark.parametrize(
+    ("holdout_every", "cameras", "carved"),
+    [(8, "training", False), (8, "all", True), (0, "training", True), (0, "all", True)],
+)
+def test_held_out_cameras_carve_only_if_all_cameras_are_asked_for(
+    holdout_every: int, cameras: str, carved: bool
+) -> None:
+    scene, training = scene_looked_into(), TrainingSettings(holdout_every=holdout_every)
+    field = region_field(
+        scene, shell_arrays(0.95), cube(1.5), training, MeshingSettings(cameras=cameras), threads=1
+    )
+    used = {camera.name for camera in field.cameras}
+    assert used == {f"b{i}" for i in range(7)} | ({"a", "c"} if carved else set())
+    assert (field.is_empty(within_reach_of_both()) == carved).all()
+
+
+@pytest.mark.parametrize(("cameras", "walls"), [("training", 1), ("all", 2)])
+def test_a_ball_that_only_held_out_cameras_look_into_is_meshed_solid(
+    cameras: str, walls: int
+) -> None:
+    scene, arrays = scene_looked_into(), shell_arrays(0.95, sigma_n=0.05)
+    settings = MeshingSettings(method="pivots", cameras=cameras)
+    field = region_field(scene, arrays, cube(1.5), TrainingSettings(), settings, threads=1)
+    mesh = mesh_by_pivots(field, arrays, field.cameras, cube(1.5), settings, Progress(), seed=0)
+    assert mesh.provenance["components"] == walls
+
+
+def test_the_method_asks_the_cameras_that_were_trained_on(tmp_path: Path) -> None:
+    assert MeshingSettings().cameras == "training"
+    scene = scene_with_masks(tmp_path, slice(None))
+    black = tmp_path / "mask3.png"
+    Image.fromarray(np.zeros((300, 400), np.uint8)).save(black)
+    photos = PhotoStore(scene, 400)
+    assert field_views(scene, photos, 8, "training") == [1, 2, 4, 5]
+    assert field_views(scene, photos, 0, "training") == [0, 1, 2, 4, 5]
+    assert field_views(scene, photos, 8, "all") == [0, 1, 2, 3, 4, 5]
+    for index in range(6):
+        Image.fromarray(np.zeros((300, 400), np.uint8)).save(tmp_path / f"mask{index}.png")
+    with pytest.raises(DatasetError, match="cover every photo"):
+        field_views(scene, PhotoStore(scene, 400), 8, "training")
 
 
 def test_without_a_usable_gpu_the_log_says_why_and_the_report_where(
@@ -120,7 +186,8 @@ def test_gaussians_on_a_gpu_get_its_field_with_the_same_options(
             self.device = device
 
     monkeypatch.setattr(cuda_vacancy, "CudaVacancyField", OnGpu)
-    settings = TrainingSettings(mask_mode="background"), MeshingSettings(unseen="occupied")
+    training = TrainingSettings(mask_mode="background", holdout_every=0)
+    settings = training, MeshingSettings(unseen="occupied")
     field = region_field(scene, arrays, cube(1.5), *settings, threads=1, device="cuda:1")
     assert isinstance(field, OnGpu)
     assert field_figures(field)["field_device"] == "cuda:1"

@@ -30,11 +30,7 @@ from gaussian_wrapping_addon.core.meshing.tiles.store import (
     load_plan,
     save_plan,
 )
-from gaussian_wrapping_addon.core.meshing.tiles.tiled_mesh import (
-    join_tiles,
-    mesh_in_tiles,
-    plan_tiles,
-)
+from gaussian_wrapping_addon.core.meshing.tiles.tiled_mesh import join_tiles, plan_tiles
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import MeshingSettings
 from tests.core.jobs.tile_process import torus_tasks
@@ -46,6 +42,7 @@ from tests.core.meshing.meshing_scenes import (
     some_cameras,
     torus,
 )
+from tests.core.meshing.tiled_meshing import mesh_in_tiles
 
 ROOT = Path(__file__).resolve().parents[4]
 SETTINGS = MeshingSettings(points=1200, spacing="uniform")

@@ -24,8 +24,8 @@ from tests.core.meshing.test_tiles import (
     MeshingSettings,
     Progress,
     ShapeField,
-    mesh_in_tiles,
 )
+from tests.core.meshing.tiled_meshing import mesh_in_tiles
 
 
 def on_ball(count: int) -> np.ndarray:

@@ -29,10 +29,11 @@ HALF = Region.box("half", np.array([-0.1, -2, -2]), np.array([2, 2, 2]))
 @pytest.mark.parametrize("pivots", PIVOTS)
 @pytest.mark.parametrize("region", [cube(1.5), HALF], ids=["whole", "half"])
 @pytest.mark.parametrize("shape", [sphere, torus])
-def test_ranges_hold_the_mesh(shape, region: Region, pivots: int) -> None:
+@pytest.mark.parametrize("samples", ["depth", "none"])
+def test_ranges_hold_the_mesh(shape, region: Region, pivots: int, samples: str) -> None:
     arrays = gaussians_on(shape(), cube(1.5), 4000, SIGMA)
-    expected = estimate_pivot_mesh(arrays, region, pivots, 0)
-    settings = MeshingSettings(method="pivots", pivots=pivots)
+    expected = estimate_pivot_mesh(arrays, region, pivots, 0, alone=samples == "none")
+    settings = MeshingSettings(method="pivots", pivots=pivots, pivot_samples=samples)
     mesh = mesh_by_pivots(
         ShapeField(shape(), SIGMA), arrays, some_cameras(), region, settings, Progress(), seed=0
     )
@@ -52,6 +53,8 @@ def test_more_pivots_and_sightings_cost_more() -> None:
     seen = estimate_pivot_mesh(arrays, cube(1.5), 2, 10_000)
     assert seen.pivots_low == two.pivots_low + 10_000
     assert seen.pivots_high == two.pivots_high + 40_000
+    alone = estimate_pivot_mesh(arrays, cube(1.5), 2, 10_000, alone=True)
+    assert alone.pivots_low == alone.pivots_high < two.pivots_low, "no samples and no probes"
     many = estimate_pivot_mesh(arrays, cube(1.5), 2, 10**7)
     assert many.pivots_high <= two.pivots_high + 240_000, "as many as a job looks for"
     assert two.lines()[0].startswith("tetrahedra: ")

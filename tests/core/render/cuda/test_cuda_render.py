@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -119,6 +120,23 @@ def test_the_gpu_equals_the_cpu(gpu: str, count: int, width: int, height: int) -
         a = torch.as_tensor(getattr(found.render.statistics, name)).double()
         b = torch.as_tensor(getattr(wanted.render.statistics, name)).double()
         assert (a - b).abs().max() <= 1e-4 * b.abs().max(), name
+
+
+@pytest.mark.gpu
+def test_screen_gradients_alone_on_the_gpu(gpu: str) -> None:
+    gaussians = random_gaussians(150, seed=150, dtype=torch.float32)
+    options = RenderOptions(depth=False, screen_gradients=True)
+    found, wanted = on_both(gaussians, CAMERA, options)
+    assert found.render.color.device.type == gpu
+    a, b = found.render.statistics, wanted.render.statistics
+    assert a is not None
+    assert b is not None
+    assert np.array_equal(a.visible, b.visible)
+    assert a.strongest is None
+    for name in ("radii_px", "grad_px", "grad_abs_px"):
+        x, y = getattr(a, name), getattr(b, name)
+        assert y.any()
+        assert np.abs(x - y).max() <= 1e-4 * np.abs(y).max(), name
 
 
 @pytest.mark.gpu

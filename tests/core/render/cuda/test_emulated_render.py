@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,55 @@ def assert_same_statistics(found: Outcome, cpu: Outcome) -> None:
     assert a.strongest.dtype == b.strongest.dtype
     # Two equal weights may be ordered either way by rounding.
     assert (a.strongest == b.strongest).mean() > 0.99
+
+
+def test_screen_gradients_alone_are_those_of_the_cpu(emulator_library: Path) -> None:
+    gaussians, camera = scene(150, 33, 17)
+    options = RenderOptions(background=BACKGROUND, depth=False, screen_gradients=True)
+    weights = random_weights(camera, options)
+    kernels = EmulatedKernels(emulator_library)
+    found = outcome(emulated(kernels), gaussians, camera, options, weights=weights)
+    cpu = outcome(render, gaussians, camera, options, weights=weights)
+    a, b = found.render.statistics, cpu.render.statistics
+    assert a is not None
+    assert b is not None
+    assert np.array_equal(a.visible, b.visible)
+    assert np.allclose(a.radii_px, b.radii_px, rtol=1e-6)
+    for name in ("grad_px", "grad_abs_px"):
+        x, y = getattr(a, name), getattr(b, name)
+        assert x.dtype == y.dtype
+        assert y[b.visible].min() > 0
+        assert np.abs(x - y).max() <= 1e-4 * np.abs(y).max(), name
+    # The sums of blending weights were not asked for.
+    assert len(a.weight_sum) == len(b.weight_sum) == 0
+    assert len(a.weight_max) == len(b.weight_max) == 0
+    assert a.strongest is None
+    assert b.strongest is None
+    assert_same_gradients(found, cpu)
+    every = dataclasses.replace(options, statistics=True)
+    whole = outcome(emulated(kernels), gaussians, camera, every, weights=weights)
+    for name in ("visible", "radii_px", "grad_px", "grad_abs_px"):
+        assert np.array_equal(getattr(a, name), getattr(whole.render.statistics, name)), name
+
+
+def test_rows_that_overflow_are_dropped_and_large_ones_have_norms(emulator_library: Path) -> None:
+    kernels = EmulatedKernels(emulator_library)
+    rows = torch.zeros((5, 24))
+    rows[0, [0, 1, 22, 23]] = torch.tensor([3.0, -4.0, 6.0, 8.0])
+    rows[1, [0, 22]] = 1e25  # its square overflows float32
+    rows[2, 0], rows[2, 5] = 1.0, float("nan")
+    rows[3, 0], rows[3, 7] = 1.0, float("-inf")
+    rows[4, 4], rows[4, 22] = 7.0, 2.0
+    kept, (grad_px, grad_abs_px) = rows.clone(), torch.full((2, 5), -1.0)
+    kernels.launch_each("finish_params", 5, 1, kept, grad_px, grad_abs_px)
+    assert torch.allclose(grad_px, torch.tensor([5.0, 1e25, 0.0, 0.0, 0.0]))
+    assert torch.allclose(grad_abs_px, torch.tensor([10.0, 1e25, 0.0, 0.0, 2.0]))
+    wanted = rows.clone()
+    wanted[2:4], wanted[:, 22:] = 0.0, 0.0
+    assert torch.equal(kept, wanted)
+    nothing = torch.empty(0)
+    kernels.launch_each("finish_params", 5, 0, rows, nothing, nothing)
+    assert torch.equal(rows[:, :22], wanted[:, :22])
 
 
 def test_lower_harmonics_and_their_gradient(emulator_library: Path) -> None:

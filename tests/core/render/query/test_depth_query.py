@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Depth and transmittance at sub-pixel positions against the definition from Sigma, mu and rays."""
+"""Depth at sub-pixel positions against the definition from Sigma, mu and rays."""
 
 from __future__ import annotations
 
@@ -10,17 +10,10 @@ import pytest
 import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
-from gaussian_wrapping_addon.core.field.vacancy.vacancy import VacancyField
-from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.query.depth_query import (
-    query_depth,
-    query_transmittance,
-    query_view_of,
-    solve_depths,
-)
-from gaussian_wrapping_addon.core.render.render import project_view, render
+from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.tiling.area_lists import sort_positions
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from tests.core.render.query_autograd import query_depth
 from tests.core.render.query_scenes import SCENES, Oracle, assert_depths, random_positions, scene
 from tests.core.render.scenes import isotropic, look_at
 
@@ -60,52 +53,6 @@ def test_pixel_centres_equal_the_image(name: str) -> None:
     assert error.max() < 5e-5
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_transmittance_is_the_definition(name: str) -> None:
-    gaussians, camera = scene(name)
-    positions = np.clip(random_positions(camera, 2000), 0.0, [50.0, 40.0]).astype(np.float32)
-    depths = np.random.default_rng(1).uniform(0.0, 5.0, 2000).astype(np.float32)
-    found = query_transmittance(
-        gaussians, camera, torch.from_numpy(positions), torch.from_numpy(depths)
-    ).numpy()
-    wanted = Oracle(gaussians, camera).transmittance(positions, depths)
-    error = np.abs(found - wanted)
-    assert ((wanted > 0.05) & (wanted < 0.95)).mean() > 0.05
-    assert (error < 1e-5).mean() >= 0.999
-    assert error.max() < 1.0 / 255.0
-
-
-def test_half_of_the_light_reaches_the_depth() -> None:
-    gaussians, camera = scene("generic")
-    positions = torch.from_numpy(random_positions(camera, 2000))
-    depths = query_depth(gaussians, camera, positions)
-    through = query_transmittance(gaussians, camera, positions, depths)
-    assert (through[depths > 0] - 0.5).abs().max() < 2e-6
-
-
-def test_transmittance_is_that_of_the_vacancy() -> None:
-    gaussians, camera = scene("generic")
-    positions = random_positions(camera, 1500).astype(np.float64).clip(0.5, [49.5, 39.5])
-    depths = np.random.default_rng(4).uniform(0.3, 4.0, 1500)
-    local = np.stack(
-        [
-            (positions[:, 0] - camera.cx) / camera.fx,
-            (positions[:, 1] - camera.cy) / camera.fy,
-            np.ones(1500),
-        ],
-        1,
-    )
-    points = (depths[:, None] * local - camera.cam_from_world[:, 3]) @ camera.rotation
-    field = VacancyField(gaussians.arrays(), [camera], threads=1)
-    wanted = field.transmittance(points, 0)
-    found = query_transmittance(
-        gaussians, camera, torch.from_numpy(positions), torch.from_numpy(depths)
-    ).numpy()
-    # What lies behind 1e-4 is left out by one, all below 1e-4 is 0 for the other.
-    assert np.abs(found - wanted)[wanted > 0].max() < 1e-4
-    assert found[wanted == 0].max(initial=0.0) <= 1.1e-4
-
-
 def test_a_gaussian_between_pixel_centres_is_found() -> None:
     # At (8, 8), the corner of four pixels, and a tenth of a pixel wide.
     gaussians = isotropic([(0.0, 0.0, 0.0)], [0.01], [0.9], torch.float32)
@@ -117,11 +64,6 @@ def test_a_gaussian_between_pixel_centres_is_found() -> None:
     wanted = 4.0 - 0.01 * math.sqrt(2.0 * math.log(1.8))
     assert depth[0] == pytest.approx(wanted, rel=1e-6)
     np.testing.assert_allclose(depth, Oracle(gaussians, camera).depth(positions.numpy()), 2e-6)
-    # A view that is shared with the image has no such Gaussian.
-    shared = query_view_of(
-        project_view(RawArrays.from_gaussians(gaussians), camera, RenderOptions())
-    )
-    assert not solve_depths(shared, positions.numpy()).values.any()
 
 
 @pytest.mark.parametrize("alpha", [0.56, 0.8, 0.95])

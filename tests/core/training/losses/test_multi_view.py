@@ -14,7 +14,6 @@ from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.render.projection.projection import RawArrays
-from gaussian_wrapping_addon.core.render.query.depth_query import query_depth
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewPass, ViewRenderer
@@ -24,9 +23,10 @@ from gaussian_wrapping_addon.core.training.losses.multi_view import (
     MultiViewOptions,
     multi_view_losses,
 )
-from gaussian_wrapping_addon.core.training.losses.multi_view_kernels import MAX_RISE, MIN_SPREAD
+from gaussian_wrapping_addon.core.training.losses.multi_view_kernels import SAMPLES
 from gaussian_wrapping_addon.core.training.losses.pixel_choice import choose_pixels, grey_image
 from gaussian_wrapping_addon.core.training.optimizer.gradient_sums import merge_gradients
+from tests.core.render.query_autograd import query_depth
 from tests.core.training.plane_scene import camera_pair, plane_gaussians, plane_photo
 
 REFERENCE, OTHER = camera_pair()
@@ -141,7 +141,8 @@ def definition(
         spreads = (a * a).sum(1), (b * b).sum(1)
         correlation = (a * b).sum(1) / torch.sqrt(spreads[0] * spreads[1] + 1e-8)
         found_error = 1 - (correlation if options.correlation == "signed" else correlation**2)
-        clear = undecided & (spreads[0] > MIN_SPREAD) & (spreads[1] > MIN_SPREAD)
+        least = SAMPLES * options.min_contrast**2
+        clear = undecided & (spreads[0] > least) & (spreads[1] > least)
         error = torch.where(clear, found_error, error)
         kept, undecided = kept | clear, undecided & ~clear
     kept = kept & (error < 0.9) & (normal.norm(dim=1) >= 0.3 * cover)
@@ -155,7 +156,7 @@ def definition(
 
 @pytest.mark.parametrize("correlation", ["signed", "squared"])
 @pytest.mark.parametrize("patch_sizes", [1, 3])
-@pytest.mark.parametrize("max_rise", [0.5, MAX_RISE])
+@pytest.mark.parametrize("max_rise", [0.5, TrainingSettings.patch_rise])
 def test_value_and_gradients_are_those_of_the_definition(
     correlation: str, patch_sizes: int, max_rise: float
 ) -> None:
@@ -280,7 +281,7 @@ def test_patches_across_a_step_of_the_surface_are_left_out() -> None:
         )  # fmt: skip
         return np.asarray(found.gradients.depth != 0.0)
 
-    all_of_them, on_planes = pulled(np.inf), pulled(MAX_RISE)
+    all_of_them, on_planes = pulled(np.inf), pulled(TrainingSettings.patch_rise)
     assert all_of_them[:, edge - 1].any()
     assert not on_planes[:, edge - 1].any()
     far = np.s_[:, : edge - 3]

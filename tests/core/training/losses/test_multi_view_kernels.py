@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.training.losses.multi_view_kernels import KEPT, MAX_RISE, SKIPPED
+from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.training.losses.multi_view_kernels import KEPT, SAMPLES, SKIPPED
 from gaussian_wrapping_addon.core.training.losses.pixel_choice import NO_MASK
 from tests.core.training.plane_scene import (
     NORMAL,
@@ -40,7 +41,8 @@ def compare(  # type: ignore[no-untyped-def]  # four arrays
 ):
     noise = np.zeros(len(pixels))
     pair = pair_of(view, pixels, threads)
-    return pair.compare(noise, grey, other_grey, mask, other_mask, squared, 1, MAX_RISE)
+    rise, spread = TrainingSettings.patch_rise, SAMPLES * TrainingSettings.patch_contrast**2
+    return pair.compare(noise, grey, other_grey, mask, other_mask, squared, 1, rise, spread)
 
 
 def test_true_plane_shows_both_photos_the_same() -> None:

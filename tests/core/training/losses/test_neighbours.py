@@ -8,14 +8,15 @@ import pytest
 
 from gaussian_wrapping_addon.core import tolerances
 from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.settings import preset
 from gaussian_wrapping_addon.core.training.losses.neighbours import (
-    FIXED_LIMITS,
     NeighbourLimits,
     find_neighbours,
 )
 from tests.core.render.scenes import look_at
 
 RADIUS = tolerances.SCENE_RADIUS
+PUBLISHED = NeighbourLimits.of_settings(preset("paper").training)
 
 
 def turned(x: float, angle_deg: float) -> Camera:
@@ -47,14 +48,14 @@ def test_nearest_first_ties_by_angle_then_index() -> None:
     ],
 )
 def test_limits_of_the_method(camera: Camera, counts: bool) -> None:
-    found = listed(find_neighbours([turned(0, 0), camera], FIXED_LIMITS))
+    found = listed(find_neighbours([turned(0, 0), camera], PUBLISHED))
     assert found == ([[1], [0]] if counts else [[], []])
 
 
 def test_default_reaches_across_a_sparse_ring() -> None:
     eyes = [(4.5 * np.cos(a), 4.5 * np.sin(a), 1.0) for a in np.linspace(0, 2 * np.pi, 18)[:-1]]
     cameras = [look_at(eye) for eye in eyes]  # 21 degrees, 0.33 radii apart
-    assert all(len(found) == 0 for found in find_neighbours(cameras, FIXED_LIMITS))
+    assert all(len(found) == 0 for found in find_neighbours(cameras, PUBLISHED))
     for index, found in enumerate(find_neighbours(cameras)):
         assert sorted(found.tolist()) == sorted([(index - 1) % 17, (index + 1) % 17])
 

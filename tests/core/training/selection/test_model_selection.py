@@ -54,7 +54,7 @@ def test_the_setting_overrides_and_the_evidence_stays(needed: bool) -> None:
     for setting in ("on", "off"):
         decision = decide("a", setting, needed, "why")
         assert decision.chosen == setting
-        assert decision.overridden
+        assert decision.setting == setting
         assert decision.evidence == "why"
     with pytest.raises(UsageError, match="maybe"):
         decide("a", "maybe", needed, "why")

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""``evaluate --metric mbr``: mesh-based rendering of a job, or of a mesh file with its photos."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ...errors import DatasetError, ParseError, UsageError
+from ...files import read_json
+from ...progress import Progress
+from ..store.job_folder import MARKER, JobFolder
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ...dataset.scene import Scene
+
+
+@dataclass(frozen=True)
+class MeshBasedRequest:
+    """Options of the command."""
+
+    photos: Path
+    """A job folder, or a dataset with cameras in the frame of the mesh."""
+    test: Path | None = None
+    """Dataset of test photos; ``None``: those that the job held out."""
+    max_image_px: int | None = None
+    seed: int = 0
+    threads: int = 1
+
+
+def evaluate_mesh_based(
+    vertices: np.ndarray, faces: np.ndarray, request: MeshBasedRequest, progress: Progress
+) -> dict[str, Any]:
+    """Return the figures of a mesh in world coordinates as plain JSON values.
+
+    Raises
+    ------
+    UsageError
+        There are no test photos, or one of them is a training photo.
+    DatasetError, ParseError
+        Photos or cameras cannot be used.
+    """
+    from ...evaluation.views.mesh_based_rendering import MeshBasedSettings, mesh_based_rendering
+    from ...evaluation.views.photo_views import LONG_SIDE_PX, folder_scene, photo_views
+    from ...imaging.lpips import lpips_if_ready
+
+    longest = request.max_image_px or LONG_SIDE_PX
+    with tempfile.TemporaryDirectory() as temporary:
+        work = Path(temporary)
+        is_job = (request.photos / MARKER).exists()
+        if is_job:
+            scene, held_out = job_scene(request.photos)
+        else:
+            scene = folder_scene(
+                request.photos, work / "training", progress.span(0.0, 0.1), threads=request.threads
+            )
+            held_out = []
+        apart = set(held_out)
+        names = [view.camera.name for view in scene.views]
+        training = [index for index, name in enumerate(names) if name not in apart]
+        if request.test is not None:
+            tested = folder_scene(
+                request.test, work / "test", progress.span(0.1, 0.2), threads=request.threads
+            )
+            test = photo_views(tested, range(len(tested.views)), max_image_px=longest)
+        else:
+            chosen = [index for index, name in enumerate(names) if name in apart]
+            if not chosen:
+                raise no_test_photos(request.photos.name, is_job)
+            test = photo_views(scene, chosen, max_image_px=longest)
+        lpips, reason = lpips_if_ready()
+        found = mesh_based_rendering(
+            vertices, faces, photo_views(scene, training, max_image_px=longest), test,
+            replace(MeshBasedSettings(), seed=request.seed), lpips=lpips,
+            threads=request.threads, progress=progress.span(0.2, 1.0),
+        )  # fmt: skip
+    values = found.to_json()
+    if reason:
+        values["lpips_note"] = reason
+    test_from = "held-out photos of the job" if request.test is None else str(request.test)
+    return {"metric": "mbr", "photos": str(request.photos), "test_from": test_from, **values}
+
+
+def no_test_photos(name: str, is_job: bool) -> UsageError:
+    """Return the error of an evaluation that would have to judge training photos."""
+    if is_job:
+        return UsageError(
+            f"The job {name} held no photo out of training: there is none to test with.",
+            "Train with --holdout 8, or give other photos with --test.",
+        )
+    return UsageError(
+        f"All photos of {name} are training photos: there is none to test with.",
+        "Give others with --test, or a job that held photos out with --cameras.",
+    )
+
+
+def job_scene(folder: Path) -> tuple[Scene, list[str]]:
+    """Return the scene of a job's result and the names of the photos held out of its training.
+
+    Raises
+    ------
+    DatasetError
+        The job has no result, or the stage that its cameras came from is gone.
+    ParseError
+        A file is not in the format that jobs write.
+    """
+    from ...dataset.scene_file import SCENE_NAME, load_saved_scene
+
+    job = JobFolder(folder)
+    again = "Export the job again with resume."
+    paths = job.result / "scene.json", job.result / "report.json"
+    for path in paths:
+        if not path.is_file():
+            raise DatasetError(f"The job {folder.name} has no {path.name} yet.", "Resume it first.")
+    try:
+        shown = [
+            {key: value for key, value in entry.items() if key != "photo"}
+            for entry in read_json(paths[0])["cameras"]
+        ]
+        held_out = [str(entry["name"]) for entry in read_json(paths[1])["training"]["held_out"]]
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ParseError(paths[0], "cameras", f"not as expected ({error}).", again) from None
+    for stage in sorted(job.stages.glob("cameras-*")):
+        if not (stage / SCENE_NAME).is_file():
+            continue
+        # Photos may have been added since: only the stage with the result's own cameras counts.
+        if [entry.get("camera") for entry in read_json(stage / SCENE_NAME)["views"]] == shown:
+            return load_saved_scene(stage), held_out
+    raise DatasetError(
+        f"The photos that the result of {folder.name} was made from are no longer in its stages.",
+        "Resume the job, or give the photos with --cameras.",
+    )
+
+
+def table(values: dict[str, Any]) -> list[str]:
+    """Return the figures as lines of text."""
+
+    def shown(name: str, digits: int, unit: str = "") -> str:
+        value = values.get(name)
+        return "not measured" if value is None else f"{value:.{digits}f}{unit}"
+
+    tested, trained = len(values["views"]), values["training_views"]
+    figures = f"PSNR {shown('psnr', 2, ' dB')}, SSIM {shown('ssim', 4)}, LPIPS {shown('lpips', 4)}"
+    lines = [
+        f"mesh-based rendering: {tested} test photos, colour field trained on {trained} others",
+        f"{figures} (pixels that no face covers are black)",
+        f"PSNR of covered pixels {shown('covered_psnr', 2, ' dB')}",
+    ]
+    uncovered = values.get("uncovered")
+    if uncovered is not None:
+        lines.append(f"uncovered pixels {100.0 * uncovered:.2f} %")
+    if values["left_out"]:
+        lines.append(f"{values['left_out']} test photos had no pixel to compare")
+    return lines

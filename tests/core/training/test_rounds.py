@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Updates between iterations: what they keep, and what settings and decisions switch off."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.dataset.scene import Scene, View
+from gaussian_wrapping_addon.core.dataset.similarity import Similarity
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.training.iteration import Stepper, is_oriented
+from gaussian_wrapping_addon.core.training.rounds import Rounds
+from gaussian_wrapping_addon.core.training.schedule import Schedule
+from gaussian_wrapping_addon.core.training.selection.model_selection import (
+    Decision,
+    ModelSelection,
+)
+from gaussian_wrapping_addon.core.training.state import TrainingState
+from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
+
+SIZE_PX = 32
+SETTINGS = TrainingSettings(
+    iterations=60, max_gaussians=400, max_image_px=SIZE_PX, sh_degree=1, densify_every=5,
+    wrap_rounds=2,
+)  # fmt: skip
+
+
+def street(views: int) -> tuple[Scene, PhotosInMemory, OrientedGaussians]:
+    """Return cameras in a row, 10 units apart, each looking at an opaque disc of its own."""
+    places = 10.0 * np.arange(views)
+    cameras = []
+    for index, place in enumerate(places):
+        pose = np.concatenate([np.eye(3), [[-place], [0.0], [0.0]]], 1)
+        half = SIZE_PX / 2
+        cameras.append(
+            Camera(f"{index:03d}.png", SIZE_PX, SIZE_PX, SIZE_PX, SIZE_PX, half, half, pose)
+        )
+    template = sphere_gaussians(views)
+    means = np.stack([places, np.zeros(views), np.full(views, 4.0)], 1)
+    discs = template.replaced(
+        means=torch.from_numpy(means.astype(np.float32)),
+        log_scales=torch.log(torch.tensor([[0.5, 0.5, 0.05]])).repeat(views, 1),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(views, 1),
+    )
+    scene = Scene(
+        tuple(View(c, Path(c.name)) for c in cameras),
+        means, np.full((views, 3), 128, np.uint8), Similarity(),
+    )  # fmt: skip
+    grey = np.full((SIZE_PX, SIZE_PX, 3), 128, np.uint8)
+    return scene, PhotosInMemory(scene, [grey] * views), discs
+
+
+def rounds_of(scene: Scene, photos: PhotosInMemory, settings: TrainingSettings) -> Rounds:
+    views = list(range(len(scene.views)))
+    neighbours = {view: np.zeros(0, np.int64) for view in views}
+    stepper = Stepper(photos, Schedule(settings, SIZE_PX), views, neighbours, 1)
+    return Rounds(stepper, [], None, Progress("train"))
+
+
+def run(settings: TrainingSettings, iterations: int = 0) -> tuple[Rounds, TrainingState]:
+    """Train a sphere for some iterations, all where 0, and return rounds and state."""
+    scene, photos = sphere_scene(views=8, size_px=24)
+    rounds = rounds_of(scene, photos, settings)
+    state = TrainingState.start(sphere_gaussians(), 0)
+    rounds.filter(state)
+    for _ in range(iterations or settings.iterations):
+        rounds.before_step(state)
+        rounds.stepper.step(state)
+        rounds.after_step(state)
+    return rounds, state
+
+
+@pytest.mark.parametrize("views", [20, 61, 120])
+def test_pruning_keeps_what_only_one_of_many_views_shows(views: int) -> None:
+    scene, photos, discs = street(views)
+    rounds = rounds_of(scene, photos, SETTINGS)
+    state = TrainingState.start(discs, 0)
+    rounds._prune(state)
+    assert len(state.adam) == views
+
+
+@pytest.mark.parametrize("views", [20, 61, 120])
+def test_every_view_votes_for_orientations(views: int) -> None:
+    scene, photos, discs = street(views)
+    rounds = rounds_of(scene, photos, dataclasses.replace(SETTINGS, orient_from=0.0))
+    state = TrainingState.start(discs.replaced(orientation=torch.zeros(views, 4)), 0)
+    rounds.before_step(state)
+    normals = state.adam.gaussians().normals().numpy()
+    assert (normals[:, 2] < -0.4).all()  # towards the cameras
+
+
+@pytest.mark.parametrize("views", [20, 61, 120])
+def test_normal_errors_are_measured_in_every_view(views: int) -> None:
+    scene, photos, discs = street(views)
+    away = torch.tensor([[0.0, 0.0, 1.0, 1.0]]).repeat(views, 1)
+    state = TrainingState.start(discs.replaced(orientation=away), 0)
+    errors = rounds_of(scene, photos, SETTINGS)._normal_errors(state)
+    assert (errors > 0.5).all()
+
+
+def test_growth_off_keeps_the_number_of_gaussians() -> None:
+    settings = dataclasses.replace(SETTINGS, growth="off", wrapping="off", prune_share=0.4)
+    faint = sphere_gaussians()
+    faint.opacity_logits[:5] = -8.0  # density control would remove them
+    scene, photos = sphere_scene(views=8, size_px=24)
+    rounds = rounds_of(scene, photos, settings)
+    state = TrainingState.start(faint, 0)
+    rounds.filter(state)
+    before = state.adam.array("means").copy()
+    for _ in range(settings.iterations):
+        rounds.before_step(state)
+        rounds.stepper.step(state)
+        rounds.after_step(state)
+        assert len(state.adam) == len(before)
+    assert not rounds.schedule.compact  # no footprint regulariser either
+
+
+def test_growth_on_and_auto_change_the_number() -> None:
+    for growth in ("on", "auto"):
+        _, state = run(dataclasses.replace(SETTINGS, growth=growth, wrapping="off"))
+        assert len(state.adam) != len(sphere_gaussians()), growth
+
+
+def test_wrapping_that_the_photos_refuse_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The normal loss ends with the decision, and what it has trained is given up."""
+    from gaussian_wrapping_addon.core.training import rounds as module
+
+    refused = Decision("wrapping", "auto", "off", "Refused for the test.")
+    monkeypatch.setattr(module, "select_wrapping", lambda *_: refused)
+    at = round(SETTINGS.wrap_from * SETTINGS.iterations)
+    rounds, state = run(SETTINGS, at - 1)
+    assert is_oriented(rounds.schedule, state)
+    assert np.abs(state.adam.array("orientation")).max() > 0.0
+    weights: list[float] = []
+    from gaussian_wrapping_addon.core.training import iteration
+
+    real = iteration.normal_losses
+
+    def watched(*arguments: object, lambda_normal: float, **others: object) -> object:
+        weights.append(lambda_normal)
+        return real(*arguments, lambda_normal=lambda_normal, **others)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(iteration, "normal_losses", watched)
+    for _ in range(at - 1, SETTINGS.iterations):
+        rounds.before_step(state)
+        rounds.stepper.step(state)
+        rounds.after_step(state)
+    assert weights[0] == SETTINGS.lambda_normal  # before the decision
+    assert weights[1:] == [0] * (SETTINGS.iterations - at)
+    assert not state.adam.array("orientation").any()
+
+
+def test_wrapping_is_decided_without_rounds_too() -> None:
+    _, state = run(dataclasses.replace(SETTINGS, wrap_rounds=0))
+    decision = state.model_selection.get("wrapping")
+    assert decision is not None
+    assert decision.setting == "auto"
+
+
+def test_wrapping_on_is_not_decided() -> None:
+    rounds, state = run(dataclasses.replace(SETTINGS, wrapping="on"))
+    assert state.model_selection.get("wrapping") is None or state.model_selection.chose("wrapping")
+    assert is_oriented(rounds.schedule, state)
+    assert state.adam.array("orientation").any()
+
+
+def test_a_decision_of_an_earlier_state_is_kept() -> None:
+    off = ModelSelection((Decision("wrapping", "auto", "off", "Refused before."),))
+    schedule = Schedule(SETTINGS, SIZE_PX)
+    state = TrainingState.start(sphere_gaussians(), 0)
+    state.iteration = SETTINGS.iterations - 1
+    assert is_oriented(schedule, state)
+    state.model_selection = off
+    assert not is_oriented(schedule, state)
