@@ -245,12 +245,11 @@ def _meshers(record: dict[str, Any]) -> list[str]:
         "",
         *paragraph(
             f"Scene {record['scene']}, the training of the row "
-            f"{TRAININGS[record['training']]!r} above, one field for all. Nine pivots are those "
-            "of GOF, the corners of a box along the Gaussian's own axes. Two pivots, nine pivots "
-            "and the first row of primal adaptive meshing (PAM) begin with the Gaussians alone, "
-            "as in the paper; the last row adds the samples of the depth maps, as jobs do. For "
-            "equal counts every mesh was decimated by the same program to exactly "
-            f"{record['triangles']} triangles."
+            f"{TRAININGS[record['training']]!r} above, one field for all. Two and nine pivots are "
+            "the paper's (`--pivot-samples none`): of all Gaussians, nothing besides. Primal "
+            "adaptive meshing (PAM) begins with the Gaussians alone, too; its last row adds the "
+            "samples of the depth maps, as jobs do. For equal counts every mesh was decimated by "
+            f"the same program to exactly {record['triangles']} triangles."
         ),
         mesher_table(record).markdown(),
         "![Close-ups](paper-meshers.jpg)",

@@ -89,7 +89,9 @@ def make(
     of the two primal adaptive meshes takes besides.
     """
     if name in (TWO, NINE):
-        settings = MeshingSettings(method="pivots", pivots=2 if name == TWO else 9)
+        settings = MeshingSettings(
+            method="pivots", pivots=2 if name == TWO else 9, pivot_samples="none"
+        )
         return mesh_by_pivots(
             field, trained.gaussians.arrays(), trained.scene.cameras, trained.region, settings,
             Progress(), seed=0,
