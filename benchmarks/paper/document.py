@@ -110,7 +110,8 @@ def _plug_in(record: dict[str, Any]) -> list[str]:
             "viewers read and nothing else: the filter is baked in, there is no orientation. "
             "Wrapping it is the training that `--start-splat` starts: 0.3 of the iterations, no "
             "growth. Without photos, generated cameras take their place, and their views of the "
-            "splat. All rows are meshed by the same mesher with its defaults."
+            "splat. All rows are meshed alike, by primal adaptive meshing with the samples of the "
+            f"depth maps and {record['points']} points."
         ),
         plug_in_table(record).markdown(),
     ]

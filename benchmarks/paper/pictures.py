@@ -27,7 +27,7 @@ from ..scenes.rendering import SENSOR_MM, blender_camera_values, require_bpy
 from ..scenes.viewpoints import look_at
 from ..speed_error.runs import ROOT
 
-SAMPLES = 20
+SAMPLES = 16
 CLAY = (0.60, 0.55, 0.47)
 WIRE = (0.03, 0.04, 0.06)
 WIRE_PX = 0.9
@@ -180,13 +180,18 @@ def _render(request: Path, out: Path) -> None:
     scene.render.dither_intensity = 0.0
     _world(bpy, scene)
     mesh = bpy.data.meshes.new("thing")
-    mesh.from_pydata(vertices.tolist(), [], faces.tolist())
+    mesh.vertices.add(len(vertices))
+    mesh.vertices.foreach_set("co", vertices.reshape(-1))
+    mesh.loops.add(3 * len(faces))
+    mesh.loops.foreach_set("vertex_index", faces.reshape(-1))
+    mesh.polygons.add(len(faces))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * len(faces), 3, dtype=np.int32))
+    mesh.polygons.foreach_set("use_smooth", np.full(len(faces), facts["smooth"]))
+    mesh.update(calc_edges=True)
     if len(colors):
         layer = mesh.color_attributes.new("shown", "FLOAT_COLOR", "POINT")
         filled = np.concatenate([colors, np.ones((len(colors), 1), np.float32)], 1)
         layer.data.foreach_set("color", filled.reshape(-1).astype(np.float32))
-    if facts["smooth"]:
-        mesh.shade_smooth()
     mesh.materials.append(_material(bpy, wires=facts["wires"], colored=len(colors) > 0))
     scene.collection.objects.link(bpy.data.objects.new("thing", mesh))
     sun = bpy.data.lights.new("sun", "SUN")
