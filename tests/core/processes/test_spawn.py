@@ -38,7 +38,8 @@ def test_a_child_leads_a_group_and_inherits_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
-    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    for name in ("OMP_WAIT_POLICY", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
     with (tmp_path / "held").open("wb") as held:
         os.set_inheritable(held.fileno(), True)
         code, output, words = run_to_end([sys.executable, "-I", "-c", TELL], 60.0)
@@ -47,6 +48,7 @@ def test_a_child_leads_a_group_and_inherits_nothing(
     assert told["group"] == told["own"] != os.getpgid(0)
     assert "PYTHONPATH" not in told["environment"]
     assert told["environment"]["OMP_WAIT_POLICY"] == "PASSIVE"
+    assert told["environment"]["OPENBLAS_NUM_THREADS"] == "1"
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
     assert child_environment()["OMP_WAIT_POLICY"] == "ACTIVE"
 
