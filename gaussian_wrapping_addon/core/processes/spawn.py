@@ -11,7 +11,6 @@ import sys
 from pathlib import Path
 from typing import IO, Any
 
-
 _THREADING = {
     # Idle OpenMP threads of torch wait instead of spinning: spinning threads occupy the cores that
     # our own threads compute on (measured: rendering took twice the processor time).
