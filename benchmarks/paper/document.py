@@ -269,7 +269,7 @@ def _meshers(record: dict[str, Any]) -> list[str]:
         *paragraph(
             "Steps of the last row's mesh; in words the median and the 99 % quantile of "
             "`abs(v - 0.5)`. Samples are blue on the isosurface, and orange where the vacancy "
-            "differs from 0.5 by 0.1 or more. The candidate surface is shown without its wires. "
+            "differs from 0.5 by 0.1 or more. "
             "Points and faces up to step 4 are spaced evenly; the final mesh is adaptive: made "
             "the same way with more points, of which those stay that the shape needs."
         ),
