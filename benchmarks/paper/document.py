@@ -9,6 +9,7 @@ A record that is missing leaves its section out. The reading beside the page is 
 from __future__ import annotations
 
 import argparse
+import re
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,6 +24,8 @@ from ..tables import Table
 from .records import ATTENUATION, FOLDER, MESHERS, PLUG_IN, read_record
 
 PAGE = "paper-figures"
+_HELD = "\x00"
+"""Stands for a space at which no line may end."""
 PERCENT = "% of the diagonal"
 
 TRAININGS = {
@@ -75,8 +78,10 @@ def write_page(out: Path, records: Path = FOLDER) -> Path:
 
 
 def paragraph(text: str) -> list[str]:
-    """Return the lines of a paragraph and an empty one."""
-    return [*textwrap.wrap(text, 104, break_long_words=False, break_on_hyphens=False), ""]
+    """Return the lines of a paragraph and an empty one; no line ends inside of code."""
+    held = re.sub(r"`[^`]*`", lambda code: code.group().replace(" ", _HELD), text)
+    lines = textwrap.wrap(held, 104, break_long_words=False, break_on_hyphens=False)
+    return [*(line.replace(_HELD, " ") for line in lines), ""]
 
 
 def made_by(origin: dict[str, Any]) -> list[str]:
@@ -262,8 +267,11 @@ def _meshers(record: dict[str, Any]) -> list[str]:
         "![Steps of primal adaptive meshing](paper-refinement.jpg)",
         "",
         *paragraph(
-            "Steps of the last row's mesh. Samples are blue on the isosurface, and orange where "
-            "the vacancy differs from 0.5 by 0.1 or more."
+            "Steps of the last row's mesh; in words the median and the 99 % quantile of "
+            "`abs(v - 0.5)`. Samples are blue on the isosurface, and orange where the vacancy "
+            "differs from 0.5 by 0.1 or more. "
+            "Points and faces up to step 4 are spaced evenly; the final mesh is adaptive: made "
+            "the same way with more points, of which those stay that the shape needs."
         ),
         step_table(record).markdown(),
     ]
@@ -308,9 +316,7 @@ def step_table(record: dict[str, Any]) -> Table:
         "Steps of primal adaptive meshing",
         rows,
         "A round is a batch of evaluations of the field. The samples that are followed through the "
-        'rounds keep those that never converge, which the mesher drops. From "points, thinned" on '
-        "the rows hold points on the region's boundary and where sight ends, too, which lie off "
-        "0.5 on purpose, and vertices that were moved apart.",
+        "rounds include those that never converge, which the mesher drops.",
     )
 
 

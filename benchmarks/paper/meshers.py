@@ -54,6 +54,8 @@ STEPS_SHOWN = (
 NEAR_COLOR, FAR_COLOR, FAR = (0.02, 0.10, 0.45), (0.90, 0.30, 0.02), 0.1
 """Linear colours of samples on the isosurface, and of those whose residual is FAR or more."""
 DOT_RADIUS = 0.0022
+WIRED = 100_000
+"""The wires of more triangles would hide the surface."""
 ACROSS = 3
 """Close-ups beside one another."""
 
@@ -126,7 +128,8 @@ def step_strip(steps: Sequence[Step], trained: Trained, *, threads: int) -> np.n
             vertices, faces, shades = dots(points, DOT_RADIUS, colors)
             image = render_mesh(vertices, faces, eye, wires=False, colors=shades, threads=threads)
         else:
-            image = render_mesh(points, step.faces, eye, threads=threads)
+            wires = len(step.faces) <= WIRED
+            image = render_mesh(points, step.faces, eye, wires=wires, threads=threads)
         facts = step.figures()
         words = f"{number + 1}. {step.name}\nmedian {facts['median']:.4f}, 99 % {facts['p99']:.3f}"
         row.append(labelled(image, words, size=13))

@@ -69,7 +69,8 @@ def steps_of(
 
     The samples that are followed through the projection are drawn evenly from the candidate
     surface, as many as the mesh is to have points; the mesher itself projects more and thins them,
-    so its own points begin anew at the step "points, thinned".
+    so its own points begin anew at the step "points, thinned". These and the faces between labels
+    are of uniform spacing; the final mesh is as the settings say.
     """
     arrays, region = trained.gaussians.arrays(), trained.region
     vectors = VectorField(arrays, threads=threads)
@@ -87,7 +88,7 @@ def steps_of(
     for rounds in ROUNDS:
         # The first batch is the evaluation of the start.
         moved = project_to_isosurface(samples, field, vectors, max_steps=rounds + 1)
-        steps.append(_step(field, f"after {rounds} rounds of projection", moved.points))
+        steps.append(_step(field, after(rounds), moved.points))
     sampler = SurfaceSampler(field, vectors, region, surface, threads)
     cloud = sampler.sample(request, rng, Progress())
     steps.append(_step(field, "points, thinned", cloud.points))
@@ -122,6 +123,11 @@ def pam(
         field, VectorField(arrays, threads=threads), arrays, trained.scene.cameras, trained.region,
         settings, Progress(), seed=0, threads=threads, depth_samples=depth_samples,
     )  # fmt: skip
+
+
+def after(rounds: int) -> str:
+    """Return the name of the step of so many rounds."""
+    return f"after {rounds} round{'s' if rounds > 1 else ''} of projection"
 
 
 def shown(steps: Sequence[Step], names: Sequence[str]) -> list[Step]:
