@@ -178,7 +178,7 @@ def test_another_region_and_resolution_needs_no_training(
     mesh = world_mesh(root, "cap")
     assert mesh.is_watertight
     local = (mesh.vertices - scene.offset) / scene.scale
-    assert np.abs(local[:, :2]).max() < 0.6 + 1e-6
+    assert np.abs(local[:, :2]).max() < 0.6 + 1e-5  # regions lie on the grid of the scene
     edges = mesh.edges_unique_length / scene.scale
     assert 0.02 < np.median(edges) < 0.08
 
@@ -269,7 +269,7 @@ def test_a_mesh_of_pivots_open_at_its_region(wrapped: tuple[BallScene, Path, str
     assert figures["provenance"]["field_evaluations"] > figures["provenance"]["unseen_evaluations"]
     assert "open by request" in (root / "out" / "result" / "report.md").read_text(encoding="utf-8")
     local = (world_mesh(root, "open").vertices - scene.offset) / scene.scale
-    assert np.abs(local[:, :2]).max() < 0.6 + 1e-6
+    assert np.abs(local[:, :2]).max() < 0.6 + 1e-5  # regions lie on the grid of the scene
     distance = np.abs(np.linalg.norm(local, axis=1) - BALL_RADIUS)
     assert np.median(distance) < 0.03
 
