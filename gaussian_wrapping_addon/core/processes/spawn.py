@@ -17,9 +17,14 @@ def child_environment() -> dict[str, str]:
 
     Idle OpenMP threads of torch wait instead of spinning: spinning threads occupy the cores that
     our own threads compute on (measured: rendering took twice the processor time).
+
+    OpenBLAS has one thread: it would share each of many small systems (``numpy.linalg.solve``)
+    among threads that yield until the others are done. On a machine with other work that is a turn
+    of the scheduler for each: 2000 systems of 4 x 4 took 7 s instead of 5 ms on 2 cores with a load
+    of 10, and the trial of the harmonics did not end within a quarter of an hour.
     """
     kept = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
-    return {"OMP_WAIT_POLICY": "PASSIVE", **kept}
+    return {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", **kept}
 
 
 def group_options() -> dict[str, Any]:
