@@ -18,6 +18,7 @@ from pathlib import Path
 
 # Torch's idle threads otherwise spin for a while and take the cores from the renderer's.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import torch
 

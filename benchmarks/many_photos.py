@@ -10,7 +10,6 @@ both results are judged by the same test views and the true surface. Each run le
 from __future__ import annotations
 
 import argparse
-import datetime
 import logging
 import shutil
 import tempfile
@@ -19,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from gaussian_wrapping_addon.core.files import read_json, write_json
-from gaussian_wrapping_addon.core.machine import processor_name
 
+from .judged_run import SHARES, judged_run
 from .scenes import ensure_scene
-from .speed_error.plan import THRESHOLD_SHARES, Run
-from .speed_error.runs import ROOT, Settings, code_state, judged_by, measured, run_wrap
+from .speed_error.plan import Run
+from .speed_error.runs import ROOT
 from .tables import Table
 
 _logger = logging.getLogger("benchmarks")
@@ -64,28 +63,8 @@ def record(name: str, part: int, threads: int, label: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         scene = whole if part == 1 else every_nth_photo(whole, part, Path(folder) / name)
         run = Run(name, "draft", 0, f"photos{PHOTOS // part}", ARGUMENTS)
-        done = run_wrap(run, scene, Settings(Path(folder) / "runs", threads, False))
-        values = measured(done)
-        arguments = [str(whole), str(Path(folder) / "scores.json"), "--mesh", str(done / "mesh")]
-        arguments += ["--job", str(done / "out"), "--stages"]
-        settings = Settings(Path(folder), threads, False)
-        scores = judged_by("score", arguments, Path(folder) / "scores.json", settings)
-    training = values["report"]["training"]
-    uniform = scores["surface"]["uniform"]
-    return {
-        "scene": name,
-        "photos": PHOTOS // part,
-        "label": label,
-        "code": code_state(),
-        "date": datetime.date.today().isoformat(),
-        "machine": processor_name(),
-        "threads": threads,
-        "command": values["command"],
-        "gaussians": training["gaussians"],
-        "psnr": scores["gaussians"]["psnr"],
-        "ssim": scores["gaussians"]["ssim"],
-        "f1": dict(zip(map(str, THRESHOLD_SHARES), uniform["f1"], strict=True)),
-    }
+        found = judged_run(run, scene, whole, threads)
+    return {**found, "photos": PHOTOS // part, "label": label}
 
 
 def every_nth_photo(scene: Path, step: int, target: Path) -> Path:
@@ -130,8 +109,6 @@ def _content(path: Path) -> list[str]:
     return [line for line in lines[:-1] if not line.startswith("#")]
 
 
-_SHARES = tuple(f"{100 * share:g} %" for share in THRESHOLD_SHARES)
-
 _NOTE = (
     "PSNR and SSIM of eight test views that no run was given; F1 over the whole true surface at "
     "shares of the crop volume's diagonal."
@@ -163,7 +140,7 @@ def document() -> str:
         "Gaussians",
         "PSNR dB",
         "SSIM",
-        *(f"F1 {s}" for s in _SHARES),
+        *(f"F1 {s}" for s in SHARES),
     )
     table = Table("Many photos", header, [_cells(of) for of in records], (_NOTE,))
     facts = sorted({(of["label"] or "this version", of["code"], of["date"]) for of in records})

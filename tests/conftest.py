@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A private data folder; which tests are slow; which tests share a process when run in parallel.
+"""A private data folder; threads; which tests are slow, and which share a process in parallel runs.
 
 No test sees or changes the worker that the person who runs it has set up.
 """
@@ -19,6 +19,8 @@ _DATA = "GAUSSIAN_WRAPPING_DATA"
 
 _folder = tempfile.mkdtemp(prefix="gwrap-data-")
 os.environ[_DATA] = _folder
+# As in workers (core/processes/spawn.py), before anything imports numpy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 atexit.register(shutil.rmtree, _folder, ignore_errors=True)
 
 _ROOT = Path(__file__).resolve().parents[1]

@@ -19,7 +19,7 @@ from gaussian_wrapping_addon.command_line.options.setting_options import option_
 from gaussian_wrapping_addon.command_line.options.training_options import training_settings
 from gaussian_wrapping_addon.command_line.parser import build_parser
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.jobs.commands import evaluate_command
+from gaussian_wrapping_addon.core.jobs.commands import run_in_worker
 from gaussian_wrapping_addon.core.settings import (
     MODEL_SELECTION,
     PRESETS,
@@ -266,7 +266,7 @@ def test_export_asks_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (tmp_path / "result" / "scene.json").write_text("{}")
     asked = []
     monkeypatch.setattr(
-        evaluate_command, "run_in_worker", lambda request, **how: asked.append((request, how)) or 3
+        run_in_worker, "run_in_worker", lambda request, **how: asked.append((request, how)) or 3
     )
     command = ["export", str(tmp_path), "--out", str(tmp_path / "o"), "--format", "obj,splat,obj"]
     command += ["--placed", "--lods", "--region", "a", "b", "--shading", "unlit"]

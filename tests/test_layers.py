@@ -33,7 +33,8 @@ FOLDERS = (
     "core/texture/atlas", "core/texture/unwrap", "core/texture/bake", "core/texture/cost",
     "core/texture/files", "core/texture/detail", "core/texture",
     "core/evaluation/surface", "core/evaluation/alignment", "core/evaluation/layouts",
-    "core/evaluation/views", "core/evaluation/report", "core/evaluation",
+    "core/evaluation/color_field", "core/evaluation/views", "core/evaluation/report",
+    "core/evaluation",
     "core/jobs/store", "core/jobs/stages", "core/jobs", "core/jobs/commands", "core/setup",
     "ops/common", "ops/cameras", "ops/regions", "ops/placement", "ops/results", "ops/export",
     "ops/worker", "ops/jobs", "ops/training", "ops/dataset", "ops/meshing", "ops",
@@ -53,7 +54,8 @@ MOST_MODULES = 12
 
 # Blender's own process has only the standard library and numpy: what it loads may import no more.
 BLENDER_SIDE = (
-    "core.jobs.client", "core.jobs.commands.evaluate_command", "core.jobs.store.job_file",
+    "core.jobs.client", "core.jobs.commands.run_in_worker",
+    "core.jobs.commands.evaluate_command", "core.jobs.store.job_file",
     "core.dataset.loading.check", "core.settings", "core.setup.install",
     "core.processes.worker_environment", "core.regions.box", "core.regions.region_file",
     "core.names",

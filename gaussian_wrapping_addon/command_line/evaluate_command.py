@@ -87,7 +87,7 @@ def _floats(text: str) -> list[float]:
 
 def _evaluate(options: Namespace) -> int:
     from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.evaluate_command import run_in_worker
+    from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.settings import JobSettings
 
     JobSettings(seed=options.seed, threads=options.threads).validated()
@@ -115,4 +115,9 @@ def _evaluate(options: Namespace) -> int:
         "threads": options.threads,
         "out": None if options.out is None else str(options.out),
     }
-    return run_in_worker(request, python=worker_python())
+    return run_in_worker(
+        request,
+        python=worker_python(),
+        module="jobs.commands.evaluate_command",
+        what="evaluation",
+    )

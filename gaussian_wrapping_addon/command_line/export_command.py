@@ -50,8 +50,8 @@ def _export(options: Namespace) -> int:
     from ..core.errors import UsageError
     from ..core.export_formats import BLENDER_FORMATS, EXPORT_FORMATS
     from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.evaluate_command import run_in_worker
     from ..core.jobs.commands.export_files import result_of
+    from ..core.jobs.commands.run_in_worker import run_in_worker
 
     formats = list(dict.fromkeys(f for f in options.format.split(",") if f))
     wrong = [f for f in formats if f not in EXPORT_FORMATS]

@@ -62,7 +62,7 @@ def add_estimate_mesh(commands: Commands) -> None:
 
 def _estimate_mesh(options: Namespace) -> int:
     from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.evaluate_command import run_in_worker
+    from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.names import AUTOMATIC_REGIONS
     from ..core.settings import JobSettings, MeshingSettings, to_json
 
@@ -99,7 +99,7 @@ def add_work_tiles(commands: Commands) -> None:
 def _work_tiles(options: Namespace) -> int:
     from ..core.errors import UsageError
     from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.evaluate_command import run_in_worker
+    from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.settings import JobSettings
 
     JobSettings(threads=options.threads).validated()

@@ -111,7 +111,7 @@ def add_estimate(commands: Commands) -> None:
 
 def _estimate(options: Namespace) -> int:
     from ..core.jobs.client import worker_python
-    from ..core.jobs.commands.evaluate_command import run_in_worker
+    from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.jobs.store.job_file import make_job
 
     job = make_job("wrap", options.input, training_settings(options))

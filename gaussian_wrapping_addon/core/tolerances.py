@@ -10,6 +10,14 @@ from __future__ import annotations
 SCENE_RADIUS = 5.0
 """Scenes are scaled so that 1.1 x the largest distance of a camera from their mean equals this."""
 
+POINT_REACH = 1e4 * SCENE_RADIUS
+"""Sparse points farther than this from the centre of the cameras are not used.
+
+From there the cameras' largest baseline of two radii is 2e-4 rad, less than a pixel of a photo
+5000 pixels wide: no photo tells the depth, and such points are errors of the reconstruction, which
+reach 1e6 radii. Nearer ones are well within what kernels can compute (:data:`FINITE_Z_MAX`), and
+float32 rounds their place by 1e-7 rad."""
+
 NEAR_Z = 0.04 * SCENE_RADIUS
 """Gaussians whose centre is nearer than this (z-depth) are not rendered.
 

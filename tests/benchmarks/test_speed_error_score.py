@@ -19,9 +19,11 @@ from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import save_gaussians
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.convex_region import Region
 from gaussian_wrapping_addon.core.regions.region import write_region
+from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.field.field_scenes import unit_sphere
 from tests.synthetic import write_ball_scene
 
@@ -59,6 +61,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     write_json(scene_folder / "test" / "cameras.json", {"cameras": cameras})
 
     job = folder / "out" / "stages"
+    job.mkdir(parents=True)
+    write_job(folder / "out" / "job.json", make_job("wrap", scene_folder, JobSettings()))
     for name in ("cameras-0", "train-0"):
         (job / name).mkdir(parents=True)
         write_json(job / name / "done.json", {})

@@ -72,6 +72,8 @@ def test_full_report(tmp_path: Path) -> None:
         ("Closed", "No"),
         ("Texture Coverage", "25.0 %"),
         ("Textured Mesh PSNR", "20.0 dB"),
+        ("Photo Not Covered", "25.0 %"),
+        ("PSNR, That as Black", "8.0 dB"),
     ):
         assert found[name] == value
     assert not any("vacancy" in value for value in found.values())
@@ -112,6 +114,7 @@ def test_what_an_older_report_lacks_is_not_measured(tmp_path: Path, report: Any)
     if "regions" in report:
         for name in ("Faces", "Closed", "Texture Coverage", "Textured Mesh PSNR"):
             assert found[name] == "not measured"
+        assert "Photo Not Covered" not in found
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from tests.fake_setting import GROUPS, copy_with_fake_setting, said_by
 
 # As in 0.1.0: .blend files hold the names of the properties and the indices of the entries.
 STORED = {
-    "preset": ["DRAFT", "STANDARD", "FINE"],
+    "preset": ["DRAFT", "STANDARD", "FINE", "PAPER"],
     "resolution": ["AUTOMATIC", "EDGE_LENGTH", "POINTS"],
     "edge_length": None,
     "points": None,

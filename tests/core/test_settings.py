@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields, replace
+from pathlib import Path
 
 import pytest
 
@@ -13,7 +15,9 @@ from gaussian_wrapping_addon.core.settings import (
     JobSettings,
     MeshingSettings,
     TrainingSettings,
+    declarations,
     from_json,
+    key_values,
     preset,
     to_json,
 )
@@ -90,3 +94,43 @@ def test_numbers_that_make_no_sense_are_refused(name: str, value: float) -> None
     wrong = replace(preset("draft"), training=replace(TrainingSettings(), **{name: value}))
     with pytest.raises(UsageError, match=f"training.{name}"):
         wrong.validated()
+
+
+def test_keys_hold_what_decides_about_the_result_and_is_not_a_later_default() -> None:
+    settings = TrainingSettings()
+    held = key_values(settings)
+    assert "preview_every_s" not in held  # has no influence
+    later = {d.name for d in declarations(TrainingSettings) if d.since}
+    assert "filter_variance" in later
+    assert not later & set(held)
+    assert later | set(held) | {"checkpoint_every_s", "preview_every_s"} == set(to_json(settings))
+    other = key_values(replace(settings, filter_variance=0.2))
+    assert other == {**held, "filter_variance": 0.2}
+
+
+def test_trainings_of_the_first_version_keep_their_keys() -> None:
+    """Else a finished training of 0.1.0 would be made again."""
+    path = Path(__file__).parents[1] / "data" / "job-0.1.0" / "job" / "job.json"
+    stored = json.loads(path.read_text(encoding="utf-8"))["settings"]["training"]
+    independent = {"checkpoint_every_s", "preview_every_s"}
+    held = key_values(from_json(TrainingSettings, stored))
+    assert held == {name: value for name, value in stored.items() if name not in independent}
+
+
+def test_paper_has_the_published_constants() -> None:
+    paper = preset("paper").training
+    assert (paper.iterations, paper.sh_degree, paper.wrap_rounds) == (30_000, 3, 5)
+    weights = (
+        paper.lambda_dssim, paper.lambda_depth_normal, paper.lambda_normal,
+        paper.lambda_photometric, paper.lambda_geometric,
+    )  # fmt: skip
+    assert weights == (0.2, 0.05, 0.05, 0.6, 0.02)
+    at = {
+        name: round(getattr(paper, name) * paper.iterations)
+        for name in (
+            "densify_from", "depth_from", "densify_until", "orient_from", "wrap_from", "wrap_until",
+            "degree_every",
+        )
+    }  # fmt: skip
+    assert list(at.values()) == [500, 7000, 15_000, 20_000, 22_000, 26_000, 1000]
+    assert (paper.filter_variance, paper.overlap_price, paper.prune_share) == (0.2, 0.0, 0.0)

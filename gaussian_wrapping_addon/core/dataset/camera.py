@@ -45,6 +45,16 @@ class Camera:
         """(3,) unit viewing direction in the world frame."""
         return self.cam_from_world[2, :3]
 
+    @property
+    def gaze(self) -> np.ndarray:
+        """(3,) direction of the image's middle in the world frame, with a z-depth of 1.
+
+        It is :attr:`forward` unless the principal point is off the middle, as in a cropped photo.
+        """
+        x = (0.5 * self.width - self.cx) / self.fx
+        y = (0.5 * self.height - self.cy) / self.fy
+        return np.array([x, y, 1.0]) @ self.rotation
+
     def to_camera(self, points: np.ndarray) -> np.ndarray:
         """Map (n, 3) world points to camera coordinates, float64."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.cam_from_world[:, 3]

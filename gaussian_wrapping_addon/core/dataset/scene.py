@@ -10,8 +10,18 @@ from typing import Any
 import numpy as np
 
 from ..report_warning import ReportWarning
+from ..tolerances import POINT_REACH
 from .camera import Camera
 from .similarity import Similarity
+
+
+def usable_points(points: np.ndarray) -> np.ndarray:
+    """Tell which sparse points (n, 3), scene frame, are finite and within reach, (n,) bool.
+
+    The reach is ``tolerances.POINT_REACH``.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.linalg.norm(points, axis=1) <= POINT_REACH
 
 
 @dataclass(frozen=True)

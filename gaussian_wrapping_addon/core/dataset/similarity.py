@@ -21,19 +21,28 @@ class Similarity:
     """(3, 3) float64, orthonormal, determinant +1."""
     translation: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """(3,) float64, units of the target frame."""
+    origin: np.ndarray | None = None
+    """(3,) float64: the point that is mapped to 0, where it is known. It is subtracted first, so
+    that points near it keep the digits that a huge translation would take from them."""
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Map (n, 3) points; float64 in, float64 out."""
-        return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation
+        points = np.asarray(points, np.float64)
+        if self.origin is not None:
+            return self.scale * ((points - self.origin) @ self.rotation.T)
+        return self.scale * (points @ self.rotation.T) + self.translation
 
     def directions(self, directions: np.ndarray) -> np.ndarray:
         """Rotate (n, 3) directions; lengths stay."""
         return np.asarray(directions, np.float64) @ self.rotation.T
 
     def inverse(self) -> Similarity:
-        """Return the inverse transform."""
+        """Return the inverse transform; twice gives the translation bit for bit."""
         rotation = self.rotation.T
-        return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+        if self.origin is not None:
+            return Similarity(1.0 / self.scale, rotation, self.origin)
+        translation = -(rotation @ self.translation) / self.scale
+        return Similarity(1.0 / self.scale, rotation, translation, self.translation)
 
     def after(self, first: Similarity) -> Similarity:
         """Return the composition that applies ``first``, then this transform."""

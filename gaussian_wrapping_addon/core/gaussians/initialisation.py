@@ -6,6 +6,7 @@ The start from an existing splat is in ``core/training/initialisation/``.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 
@@ -15,9 +16,11 @@ from scipy.spatial import cKDTree
 
 from .. import tolerances
 from ..dataset.camera import Camera
-from ..dataset.scene import Scene
+from ..dataset.scene import Scene, usable_points
 from ..errors import DatasetError
 from .model import OrientedGaussians
+
+_logger = logging.getLogger(__name__)
 
 PhotoLoader = Callable[[int], tuple[Camera, np.ndarray, np.ndarray | None]]
 """Returns camera, (h, w, 3) uint8 photo and (h, w) bool mask or ``None``, at a small size."""
@@ -28,11 +31,6 @@ SH_C0 = 0.28209479177387814
 
 MIN_START_POINTS = 5000
 """With fewer sparse points, more are added until there are this many."""
-
-MAX_DISTANCE = 20.0 * tolerances.SCENE_RADIUS
-"""Points farther from the cameras' centroid are moved to this distance along their direction, which
-hardly changes their projections: outliers of the reconstruction reach 1e6 units and would waste
-float32 precision."""
 
 MIN_SPACING_SQ = 1e-7
 """Squared distances between neighbours are clamped to this (docs/method.md, section 1.3)."""
@@ -58,10 +56,10 @@ def initial_gaussians(
 ) -> OrientedGaussians:
     """Return the Gaussians that training starts from (docs/method.md, section 1.3).
 
-    One per sparse point: round, as large as the mean distance to its three nearest neighbours,
-    opacity 0.1, orientation zero. Where there are fewer than :data:`MIN_START_POINTS`, random
-    pixels are lifted to the depth of the nearest sparse points; where there are none, to a random
-    depth, keeping the positions that most cameras see.
+    One per sparse point within ``tolerances.POINT_REACH``: round, as large as the mean distance to
+    its three nearest neighbours, opacity 0.1, orientation zero. Where there are fewer than
+    :data:`MIN_START_POINTS`, random pixels are lifted to the depth of the nearest sparse points;
+    where there are none, to a random depth, keeping the positions that most cameras see.
 
     Parameters
     ----------
@@ -89,9 +87,15 @@ def initial_gaussians(
     if not view_indices:
         raise DatasetError("There is no view to train on.", "Add photos.")
     random = np.random.default_rng([seed, 1])
-    finite = np.isfinite(scene.points).all(axis=1) if len(scene.points) else np.zeros(0, bool)
-    points = np.asarray(scene.points, np.float64).reshape(-1, 3)[finite]
-    colors = np.asarray(scene.point_colors).reshape(-1, 3)[finite] / 255.0
+    points = np.asarray(scene.points, np.float64).reshape(-1, 3)
+    usable = usable_points(points)
+    if not usable.all():
+        _logger.warning(
+            "%d of %d sparse points are not finite or too far away: no Gaussian starts there",
+            int((~usable).sum()), len(usable),
+        )  # fmt: skip
+    points = points[usable]
+    colors = np.asarray(scene.point_colors).reshape(-1, 3)[usable] / 255.0
     cameras = [scene.views[i].camera for i in view_indices]
     if len(points) > max_gaussians:
         chosen = np.sort(random.choice(len(points), max_gaussians, replace=False))
@@ -103,14 +107,7 @@ def initial_gaussians(
         )
         points = np.concatenate([points, more_points])
         colors = np.concatenate([colors, more_colors])
-    points = clamp_distances(points)
     return _gaussians_at(points, colors, _spacing(points, cameras), sh_degree)
-
-
-def clamp_distances(points: np.ndarray) -> np.ndarray:
-    """Return points with their distance from the scene centre clamped to :data:`MAX_DISTANCE`."""
-    distance = np.linalg.norm(points, axis=1, keepdims=True)
-    return points * np.minimum(1.0, MAX_DISTANCE / np.maximum(distance, MAX_DISTANCE))
 
 
 def _spacing(points: np.ndarray, cameras: list[Camera]) -> np.ndarray:

@@ -11,20 +11,24 @@ import sys
 from pathlib import Path
 from typing import IO, Any
 
+_THREADING = {
+    # Idle OpenMP threads of torch wait instead of spinning: spinning threads occupy the cores that
+    # our own threads compute on (measured: rendering took twice the processor time).
+    "OMP_WAIT_POLICY": "PASSIVE",
+    # numpy's linear algebra stays in the calling thread: it is asked for thousands of tiny systems,
+    # and OpenBLAS lets its threads meet for each. On two busy cores 2000 systems of 12 x 12 took
+    # 3 to 18 s instead of 3 ms, and a training stood still.
+    "OPENBLAS_NUM_THREADS": "1",
+}
+
 
 def child_environment() -> dict[str, str]:
     """Return the environment for a child, without variables that configure Python.
 
-    Idle OpenMP threads of torch wait instead of spinning: spinning threads occupy the cores that
-    our own threads compute on (measured: rendering took twice the processor time).
-
-    OpenBLAS has one thread: it would share each of many small systems (``numpy.linalg.solve``)
-    among threads that yield until the others are done. On a machine with other work that is a turn
-    of the scheduler for each: 2000 systems of 4 x 4 took 7 s instead of 5 ms on 2 cores with a load
-    of 10, and the trial of the harmonics did not end within a quarter of an hour.
+    Variables that decide about threads of libraries are set unless the user has set them.
     """
     kept = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
-    return {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", **kept}
+    return {**_THREADING, **kept}
 
 
 def group_options() -> dict[str, Any]:

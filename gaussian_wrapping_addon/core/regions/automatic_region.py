@@ -51,8 +51,8 @@ def automatic_region(scene: Scene) -> Region:
     """Return a Z-up box, possibly rotated about Z, around what the cameras look at.
 
     Sparse points are weighted by the share of views whose frame contains them and by their
-    closeness to the point where the optical axes converge, in units of the frame size there; the
-    box spans robust quantiles of the weight. Outlying cameras and points have no weight.
+    closeness to the point where the middles of the photos converge, in units of the frame size
+    there; the box spans robust quantiles of the weight. Outlying cameras and points have no weight.
 
     Parameters
     ----------
@@ -135,15 +135,16 @@ def _half_frame(cameras: Sequence[Camera]) -> float:
 
 
 def _focus(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the point closest to the optical axes, and its median distance to the cameras.
+    """Return the point closest to the rays of the images' middles, and its median camera distance.
 
-    A weak prior at the depth of the sparse points along each axis gives a sensible point even for
-    near-parallel axes (one camera, a forward-facing row).
+    A weak prior at the depth of the sparse points along each ray gives a sensible point even for
+    near-parallel rays (one camera, a forward-facing row).
     """
     centers = np.array([c.center for c in cameras])  # (c, 3)
-    forwards = np.array([c.forward for c in cameras])  # (c, 3)
+    gazes = np.array([c.gaze for c in cameras])  # (c, 3)
     depth = _median_depth(cameras, points)
-    prior = centers + forwards * depth[:, None]  # (c, 3)
+    prior = centers + gazes * depth[:, None]  # (c, 3)
+    forwards = gazes / np.linalg.norm(gazes, axis=1, keepdims=True)
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # (c, 3, 3)
     focus = np.median(prior, 0)
     for _ in range(20):

@@ -101,8 +101,9 @@ def figures_of_report(report: Any) -> dict[str, Any]:
         ``seconds``, ``gaussians``, ``psnr`` (held-out photos, dB), ``psnr_count``,
         ``memory_bytes``, ``stages`` (pairs of name and seconds), ``decisions`` (name, choice and
         setting), ``warnings`` (texts), and
-        ``regions``: for each name ``faces``, ``vertices``, ``closed``, ``coverage`` and
-        ``mesh_psnr`` (dB).
+        ``regions``: for each name ``faces``, ``vertices``, ``closed``, ``coverage``,
+        ``mesh_psnr`` (dB, where the mesh covers the photos), ``uncovered`` (share of the photos)
+        and ``whole_psnr`` (dB, uncovered pixels black).
     """
     if not isinstance(report, dict) or not report:
         return {}
@@ -143,6 +144,8 @@ def _region(region: Any) -> dict[str, Any]:
         vertices=statistics.get("vertices"),
         coverage=part(region, "texture").get("coverage"),
         mesh_psnr=part(region, "mesh_rendering").get("psnr"),
+        uncovered=part(region, "mesh_rendering").get("uncovered"),
+        whole_psnr=part(region, "mesh_rendering").get("whole_psnr"),
     )
     if isinstance(statistics.get("closed"), bool):
         figures["closed"] = statistics["closed"]
@@ -212,11 +215,19 @@ def _decision(name: str, chosen: str, setting: str) -> Row:
 def _region_rows(region: dict[str, Any]) -> tuple[Row, ...]:
     closed = region.get("closed")
     no = "Open by request" if region.get("open_by_request") else "No"
-    return (
+    rows = (
         ("Faces", number(region.get("faces"))),
         ("Closed", ("Yes" if closed else no) if isinstance(closed, bool) else NOT_MEASURED),
         ("Texture Coverage", percent(region.get("coverage"))),
         ("Textured Mesh PSNR", number(region.get("mesh_psnr"), "dB", digits=1)),
+    )
+    uncovered = measured(region.get("uncovered"))
+    if uncovered is None:  # version 0.1.0 did not measure it
+        return rows
+    return (
+        *rows,
+        ("Photo Not Covered", percent(uncovered)),
+        ("PSNR, That as Black", number(region.get("whole_psnr"), "dB", digits=1)),
     )
 
 

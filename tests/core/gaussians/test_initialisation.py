@@ -13,11 +13,13 @@ from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.gaussians.initialisation import (
-    MAX_DISTANCE,
     MIN_START_POINTS,
     SH_C0,
     initial_gaussians,
 )
+from gaussian_wrapping_addon.core.render.render import render
+from gaussian_wrapping_addon.core.render.types.options import RenderOptions
+from gaussian_wrapping_addon.core.tolerances import POINT_REACH, SCENE_RADIUS
 from tests.core.render.scenes import look_at
 
 
@@ -120,20 +122,53 @@ def test_without_points_most_cameras_see_the_gaussians() -> None:
     assert seen.min() >= 1
 
 
-def test_outliers_are_pulled_in_and_bad_points_left_out() -> None:
+def test_unusable_points_are_left_out_and_counted(caplog: pytest.LogCaptureFixture) -> None:
     random = np.random.default_rng(0)
-    points = random.uniform(-1, 1, (MIN_START_POINTS + 2, 3))
-    points[7] = (3e6, 4e6, 0.0)
+    points = random.uniform(-1, 1, (MIN_START_POINTS + 3, 3))
+    points[7] = 1.01 * POINT_REACH * np.array([0.6, 0.8, 0.0])
     points[8] = (np.nan, 0.0, 0.0)
     points[9] = (0.0, -np.inf, 0.0)
-    gaussians, _ = start(scene(points))
-    assert len(gaussians) == MIN_START_POINTS
+    with np.errstate(all="raise"):
+        gaussians, _ = start(scene(points))
+    assert caplog.messages == [
+        "3 of 5003 sparse points are not finite or too far away: no Gaussian starts there"
+    ]
+    good = np.delete(points, [7, 8, 9], axis=0)
+    np.testing.assert_array_equal(gaussians.means.numpy(), good.astype(np.float32))
     assert all(torch.isfinite(t).all() for _, t in gaussians.tensors())
-    far = gaussians.means[7].double().numpy()
-    assert far == pytest.approx(MAX_DISTANCE * np.array([0.6, 0.8, 0.0]), abs=1e-3)
-    # No first Gaussian covers the scene, however lonely its point is.
-    assert float(gaussians.log_scales.exp()[7].max()) <= 0.1 * (MAX_DISTANCE + 5)
-    assert float(np.delete(gaussians.log_scales.exp().numpy(), 7, axis=0).max()) < 1.0
+
+
+def test_a_lonely_far_point_stays_where_it_is_and_covers_a_tenth_of_its_distance() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (MIN_START_POINTS, 3))
+    points[7] = 0.99 * POINT_REACH * np.array([0.6, 0.8, 0.0])
+    gaussians, _ = start(scene(points))
+    np.testing.assert_array_equal(gaussians.means.numpy(), points.astype(np.float32))
+    sizes = gaussians.log_scales.exp().numpy()
+    assert sizes[7] == pytest.approx(0.1 * 0.99 * POINT_REACH, rel=1e-3)
+    assert np.delete(sizes, 7, axis=0).max() < 1.0
+
+
+@pytest.mark.parametrize("radii", [3.0, 100.0, 1000.0])
+def test_a_far_wall_starts_in_its_place_and_as_closed_as_a_near_one(radii: float) -> None:
+    # A grid of 30 by 20 points that looks the same from the scene's centre at any distance.
+    distance = radii * SCENE_RADIUS
+    across, up = np.meshgrid(np.linspace(-0.3, 0.3, 30), np.linspace(-0.2, 0.2, 20))
+    wall = distance * np.stack([across.ravel(), np.ones(600), up.ravel()], 1)
+    near = np.random.default_rng(0).uniform(-1, 1, (MIN_START_POINTS, 3))
+    gaussians, _ = start(scene(np.concatenate([near, wall])))
+    assert len(gaussians) == MIN_START_POINTS + 600
+    found = gaussians.means[MIN_START_POINTS:].double().numpy()
+    np.testing.assert_allclose(found, wall, rtol=1e-6, atol=1e-6 * distance)
+    sizes = gaussians.log_scales[MIN_START_POINTS:].exp().double().numpy()
+    spacing = distance * 0.6 / 29
+    assert sizes.min() > 0.99 * spacing, "no holes between neighbours"
+    assert sizes.max() < 1.8 * spacing, "at a corner two of three neighbours are next to it"
+    camera = look_at((0.0, -4.0, 0.0), (0.0, 0.0, 0.0), width=64, height=48, focal=64.0)
+    alpha = render(gaussians.select(slice(MIN_START_POINTS, None)), camera, RenderOptions()).alpha
+    # The wall covers the middle of the image as evenly as its opacity of 0.1 lets it.
+    middle = alpha.detach().numpy()[18:30, 20:44]
+    assert middle.min() > 0.3
+    assert middle.max() - middle.min() < 0.05
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

@@ -38,10 +38,11 @@ def job(tmp_path: Path) -> JobFolder:
     return JobFolder(tmp_path / "copy" / "job")
 
 
-def batch(job: JobFolder, *arguments: str) -> str:
+def batch(job: JobFolder, *arguments: str, timeout_s: float = 240.0) -> str:
     done = subprocess.run(
         [sys.executable, str(ROOT / "gaussian_wrapping_addon" / "batch.py"), *arguments],
-        cwd=job.root.parent, capture_output=True, text=True, check=False, timeout=240,
+        cwd=job.root.parent, capture_output=True, text=True, check=False,
+        timeout=timeout_s,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -86,15 +87,14 @@ def test_its_files_are_exported(job: JobFolder, tmp_path: Path) -> None:
     assert len(list((tmp_path / "files").glob("*.ply"))) == 1
 
 
-def test_resume_finds_its_training_finished_and_meshes_anew(job: JobFolder) -> None:
-    before, figures = contents(job.stages), report(job)
-    batch(job, "resume", "job", "--no-blend")
-    assert reused(job) == {
-        "cameras": True, "train": True, "mesh-ball": False, "texture-ball": False,
-    }  # fmt: skip
+@pytest.mark.slow
+def test_resume_makes_anew_what_is_computed_otherwise_since(job: JobFolder) -> None:
+    before = contents(job.stages)
+    batch(job, "resume", "job", "--no-blend", timeout_s=540.0)
+    assert set(reused(job).values()) == {False}
     assert contents(job.stages).items() >= before.items()
     after = report(job)
-    assert after["training"] == figures["training"]
+    assert after["training"]["iterations"] == ITERATIONS
     assert after["regions"]["ball"]["check"]["good"] is True
     # Its setting of the cameras is the default: those that were trained on.
     assert after["regions"]["ball"]["provenance"]["cameras"] == "training"

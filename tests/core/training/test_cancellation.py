@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.progress import Progress
@@ -48,7 +49,7 @@ def test_no_view_is_rendered_after_the_request(
     monkeypatch: pytest.MonkeyPatch, loop: Callable[[Adam, object], None], after: int
 ) -> None:
     _, photos = sphere_scene()
-    adam = Adam(sphere_gaussians(40))
+    adam = Adam(sphere_gaussians(40).replaced(orientation=torch.zeros(40, 4)))
     before = {name: adam.array(name).copy() for name in adam.values}
     rendered: list[int] = []
     honest = ViewRenderer.render

@@ -14,6 +14,7 @@ import torch
 
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError, UsageError, WrapError
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.gaussians.splat_ply import write_splat_ply
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
@@ -191,6 +192,23 @@ def test_numbers_that_break_down_are_recovered_once(
     (tmp_path / "again").mkdir()
     with pytest.raises(WrapError, match="twice"):
         train(scene, photos, settings, tmp_path / "again", Progress(), threads=1)
+
+
+def test_a_start_from_an_oriented_splat_keeps_its_orientation(tmp_path: Path) -> None:
+    scene, photos = sphere_scene(views=9, size_px=32)
+    truth = sphere_gaussians(150)
+    given = truth.orientation.clone()
+    given[::2, 3] *= -1.0  # every other one inwards, which no vote would give
+    path = tmp_path / "oriented.ply"
+    write_splat_ply(path, truth.replaced(orientation=given), scene.world_from_scene)
+    settings = dataclasses.replace(
+        SETTINGS, iterations=10, wrapping="on", wrap_rounds=0, full_size="on"
+    )
+    result = train(scene, photos, settings, tmp_path, Progress(), threads=1, start_splat=path)
+    assert len(result.gaussians) == 150
+    outward = (result.gaussians.normals().detach() * truth.means).sum(1).numpy()
+    assert (outward[::2] < 0).all(), "a few iterations turn no normal over"
+    assert (outward[1::2] > 0).all()
 
 
 def test_training_more_equals_a_longer_run(tmp_path: Path) -> None:

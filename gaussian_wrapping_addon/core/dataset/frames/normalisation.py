@@ -11,6 +11,7 @@ from ...errors import DatasetError
 from ...limits import MIN_IMAGES
 from ...tolerances import SCENE_RADIUS
 from ..similarity import Similarity
+from .scene_grid import FRAME_STEP, snapped_rotation
 
 RADIUS_MARGIN = 1.1
 """The largest camera distance times this becomes ``SCENE_RADIUS`` (docs/method.md, section 1.7)."""
@@ -82,11 +83,12 @@ def find_scene_frame(rotations: np.ndarray, centers: np.ndarray) -> SceneFrame:
             "Walk around the object while taking photos.",
         )
     up, rule = up_direction(rotations[keep], offsets)
-    rotation = _rotation_to_z(up, rotations[keep])
-    scale = SCENE_RADIUS / (RADIUS_MARGIN * reach)
+    # Rounded as seen by the first camera: no similarity of the input changes that view of the axes.
+    first = rotations[keep][0]
+    rotation = snapped_rotation(_rotation_to_z(up, rotations[keep]) @ first.T, FRAME_STEP) @ first
     spread = np.linalg.svd(offsets, compute_uv=False)
     return SceneFrame(
-        Similarity(scale, rotation, -scale * (rotation @ mean)),
+        Similarity(RADIUS_MARGIN * reach / SCENE_RADIUS, rotation.T, mean).inverse(),
         keep,
         rule,
         bool(spread[1] < 1e-3 * spread[0]),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +13,24 @@ from ...errors import DatasetError
 from ...limits import MIN_IMAGES
 from ...progress import Progress
 from ...report_warning import LEFT_OUT_HINT, ReportWarning
-from ...tolerances import SCENE_RADIUS
+from ...tolerances import POINT_REACH, SCENE_RADIUS
 from ..camera import Camera
 from ..frames.normalisation import find_scene_frame
+from ..frames.scene_grid import POINT_STEP, snapped, snapped_camera
 from ..photos.photo_finder import list_photos, photo_root
 from ..poses.pose_solver import solve_poses
 from ..readers.source_kind import SourceKind, read_poses, source_kind
 from ..readers.source_model import SourceModel
-from ..scene import Scene, View
+from ..scene import Scene, View, usable_points
 from ..similarity import Similarity
 from .start_points import MIN_POINTS, make_start_points
 from .views import PreparedView, prepare_views
 
-POINT_REACH = 100.0 * SCENE_RADIUS
-"""Sparse points further than this from the cameras are triangulation errors."""
+_ONE_PLACE_REACH = 100.0 * SCENE_RADIUS
+"""Points farther than this are far away for the distances between the cameras."""
+_MIN_NEAR_SHARE = 0.1
+"""Where fewer of the sparse points are nearer, it is not the points that are far: the cameras
+hardly moved."""
 
 
 def load_scene(
@@ -81,10 +86,10 @@ def load_scene(
     views, notes, counts = prepare_views(model, kind, work_folder, prepare_span, threads=threads)
     warnings.extend(notes)
     facts.update(counts)
-    check_photo_count(len(views))
+    check_photo_count(len(views), notes)
     views, scene_from_world, frame_facts = _frame(views, warnings)
     facts.update(frame_facts)
-    cameras = [_camera(view).moved(scene_from_world) for view in views]
+    cameras = [snapped_camera(_camera(view).moved(scene_from_world)) for view in views]
     points, colors = _points(model, scene_from_world, warnings)
     if len(points) < MIN_POINTS:
         points, colors, facts["start_points"] = make_start_points(
@@ -113,13 +118,18 @@ def load_scene(
     )
 
 
-def check_photo_count(count: int) -> None:
-    """Raise :class:`DatasetError` where fewer than ``MIN_IMAGES`` photos are usable."""
+def check_photo_count(count: int, left_out: Sequence[ReportWarning] = ()) -> None:
+    """Raise :class:`DatasetError` where fewer than ``MIN_IMAGES`` photos are usable.
+
+    ``left_out`` tells why others are not; its texts and next steps become part of the message.
+    """
     if count < MIN_IMAGES:
         photos = "photo is" if count == 1 else "photos are"
+        reasons = "".join(f" {warning.text}" for warning in left_out)
+        hints = [warning.hint for warning in left_out if warning.hint]
         raise DatasetError(
-            f"Only {count} {photos} usable; at least {MIN_IMAGES} are needed.",
-            "Add photos of the same thing from other places.",
+            f"Only {count} {photos} usable; at least {MIN_IMAGES} are needed.{reasons}",
+            " ".join(hints) or "Add photos of the same thing from other places.",
         )
 
 
@@ -173,11 +183,22 @@ def _camera(view: PreparedView) -> Camera:
 def _points(
     model: SourceModel, scene_from_world: Similarity, warnings: list[ReportWarning]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Transform the input's sparse points to the scene frame and drop outliers."""
+    """Transform the input's sparse points to the scene frame's grid; leave out unusable ones."""
     with np.errstate(over="ignore", invalid="ignore"):
-        points = scene_from_world.points(model.points.reshape(-1, 3))
-        near = np.linalg.norm(points, axis=1) <= POINT_REACH
+        points = snapped(scene_from_world.points(model.points.reshape(-1, 3)), POINT_STEP)
+        beyond = ~(np.linalg.norm(points, axis=1) <= _ONE_PLACE_REACH)
+    if len(points) >= MIN_POINTS and beyond.mean() > 1.0 - _MIN_NEAR_SHARE:
+        raise DatasetError(
+            f"{int(beyond.sum())} of {len(points)} sparse points are more than "
+            f"{_ONE_PLACE_REACH / SCENE_RADIUS:.0f} times as far away as the cameras are from each "
+            "other: all photos were taken from nearly one place, so that no depth can be measured.",
+            "Walk around the object while taking photos.",
+        )
+    near = usable_points(points)
     if not near.all():
-        text = f"{int((~near).sum())} sparse points are impossibly far away and were left out."
+        text = (
+            f"{int((~near).sum())} of {len(near)} sparse points were left out: they are not finite "
+            f"or farther away than {POINT_REACH / SCENE_RADIUS:.0f} scene radii."
+        )
         warnings.append(ReportWarning("points-far-away", text, LEFT_OUT_HINT))
     return points[near], model.point_colors[near]

@@ -129,8 +129,7 @@ def scene_frame(cameras: list[Camera]) -> Similarity:
     centers = np.stack([camera.center for camera in cameras])
     mean = centers[0] + (centers - centers[0]).mean(axis=0)
     reach = float(np.linalg.norm(centers - mean, axis=1).max())
-    scale = SCENE_RADIUS / (RADIUS_MARGIN * reach)
-    return Similarity(scale, np.eye(3), -scale * mean)
+    return Similarity(RADIUS_MARGIN * reach / SCENE_RADIUS, np.eye(3), mean).inverse()
 
 
 def fibonacci_directions(count: int) -> np.ndarray:

@@ -64,10 +64,11 @@ def make_start_points(
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the (3,) point nearest to all optical axes (least squares, regularised towards 0)."""
+    """Return the (3,) point nearest to the rays of all images' middles (regularised towards 0)."""
     total, right = 1e-3 * np.eye(3), np.zeros(3)
     for camera in cameras:
-        across = np.eye(3) - np.outer(camera.forward, camera.forward)
+        gaze = camera.gaze / np.linalg.norm(camera.gaze)
+        across = np.eye(3) - np.outer(gaze, gaze)
         total += across
         right += across @ camera.center
     return np.linalg.solve(total, right)

@@ -35,6 +35,11 @@ from ..readers.source_model import LensCamera, PosedPhoto, SourceModel
 from .undistort import pinhole_of, sampling_map
 
 MIN_PHOTO_SIDE_PX = 16
+_MAX_ONE_COLOUR_RANGE = 2
+"""Levels of 255 between darkest and brightest pixel up to which a photo counts as of one colour: a
+JPEG of one colour may differ by one, the noise of a camera by more."""
+_QUICK_STEP = 16
+"""Every so many pixels are compared before all are."""
 _SMALLEST_MASKED_SHARE = 1e-4
 """Smallest share of unmasked pixels; photos with less are not used."""
 
@@ -60,6 +65,7 @@ class _Notes:
     rescaled: int = 0
     wrong_masks: list[str] = field(default_factory=list)
     fully_masked: list[str] = field(default_factory=list)
+    one_colour: list[str] = field(default_factory=list)
     masked: int = 0
     undistorted: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -163,6 +169,10 @@ def _prepare(
         color = apply_orientation(color, header.orientation)
         alpha = None if alpha is None else apply_orientation(alpha, header.orientation)
     mask = _find_mask(posed, path, kind, color.shape[:2], alpha, header, upright, notes)
+    if mask is None and _is_one_colour(color):  # a mask's outline tells about shape
+        with notes.lock:
+            notes.one_colour.append(posed.name)
+        return None
     pinhole = pinhole_of(lens)
     photo_path = path
     if not lens.is_pinhole:
@@ -186,6 +196,17 @@ def _prepare(
         mask_path = work_folder / "masks" / f"{index:06d}.png"
         write_mask(mask_path, mask)
     return PreparedView(posed.name, pinhole, posed.cam_from_world, photo_path, mask_path)
+
+
+def _is_one_colour(color: np.ndarray) -> bool:
+    """Tell whether all pixels of (h, w, 3) agree, such as under a lens cap.
+
+    Such a photo says nothing about shape, and contradicts the others wherever they see something.
+    """
+    quick = color[::_QUICK_STEP, ::_QUICK_STEP]  # most photos differ among a few pixels
+    return all(
+        int(np.ptp(pixels, axis=(0, 1)).max()) <= _MAX_ONE_COLOUR_RANGE for pixels in (quick, color)
+    )
 
 
 def _is_plain(photo: DecodedPhoto, header: PhotoHeader) -> bool:
@@ -337,6 +358,13 @@ def _warnings(notes: _Notes, total: int, kind: str) -> list[ReportWarning]:
         "photos-masked-altogether",
         notes.fully_masked,
         "photos are masked altogether and are not used",
+        "White or opaque is kept, black or transparent is masked: check the masks.",
+    )
+    add(
+        "photos-of-one-colour",
+        notes.one_colour,
+        "photos show one colour only and are not used",
+        "Remove them, or take photos that show something with texture.",
     )
     if notes.renamed:
         text = (

@@ -13,9 +13,10 @@ from ... import limits
 from ...errors import DatasetError, ParseError
 from ...files import resolve_inside
 from ...report_warning import LEFT_OUT_HINT, ReportWarning
+from ..quaternion import rotation_from_quaternion
 from . import colmap_binary, colmap_text
 from .colmap_binary import RawImage, RawPoints
-from .source_model import LensCamera, PosedPhoto, SourceModel, rotation_from_quaternion
+from .source_model import LensCamera, PosedPhoto, SourceModel
 
 _LAYOUTS = ("sparse", "colmap/sparse", ".")
 _EXAMPLES = 3

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -216,7 +217,7 @@ class _System:
         far = np.repeat(self._gathered(coarse, coarse_sums), 3, axis=1)
         return [1.0 / (near + self.ridges[0]), 1.0 / (far + self.ridges[1])]
 
-    def _over_cells(self, run: object) -> None:
+    def _over_cells(self, run: Callable[[int, int], object]) -> None:
         run_chunks(run, even_bounds(len(self.levels[1].cells), self.threads, 16), self.threads)
 
     def _gathered(self, level: Level, sums: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from ...settings import TrainingSettings, declarations
 from .text import escaped, measured, number
 
 # Lists of records that have tables or pictures of their own.
@@ -36,6 +37,8 @@ _UNITS = {
     "utilisation": "of 1",
     "coverage": "of 1",
     "covered": "of 1",
+    "uncovered": "of 1",
+    "whole_psnr": "dB",
     "exposure_spread": "of 1, standard deviation",
     "brightness_spread_within_photos": "of 1, standard deviation",
     "stretch_mean": "1 is even",
@@ -123,6 +126,8 @@ def unit_of(path: tuple[str, ...]) -> str:
     key = path[-1]
     if key.isdigit():  # an entry of a list
         path, key = path[:-1], path[-2]
+    if "settings" in path and (unit := _setting_unit(key)):
+        return unit
     if "seconds" in path:
         return "s"
     if "peak_memory_bytes" in path:
@@ -138,6 +143,13 @@ def unit_of(path: tuple[str, ...]) -> str:
         if key.startswith(start):
             return unit
     return "count" if key in _COUNTS else ""
+
+
+def _setting_unit(name: str) -> str:
+    """Return the unit of a setting of the training as it is declared, ``"number"`` without one."""
+    units = {entry.name: entry.unit or "number" for entry in declarations(TrainingSettings)}
+    unit = units.get(name, "")
+    return f"of 1 ({unit})" if unit.startswith("share") else unit
 
 
 def _leaves(values: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:

@@ -195,11 +195,23 @@ def _mesh_accuracy_sentence(report: dict[str, Any]) -> str:
                 # The Gaussians are measured over whole photos: the two values are not comparable.
                 covered = percent(rendering.get("covered"))
                 views += f", over the pixels the mesh covers: {covered} of the photo"
+            views += _uncovered_clause(rendering)
             note = rendering.get("note")
             if isinstance(note, str) and note.strip():
                 views += f"; {escaped(note.strip().rstrip('.'))}"
             text += f' The textured mesh of "{escaped(name)}": {psnr:.1f} dB ({views}).'
     return text
+
+
+def _uncovered_clause(rendering: dict[str, Any]) -> str:
+    """Return what the PSNR leaves out; nothing for reports of versions that did not measure it."""
+    uncovered, whole = measured(rendering.get("uncovered")), measured(rendering.get("whole_psnr"))
+    if uncovered is None or whole is None:
+        return ""
+    return (
+        f"; no face covers {percent(uncovered)} of the photo, and with these pixels counted as "
+        f"black it is {whole:.1f} dB"
+    )
 
 
 def _coverage_sentence(report: dict[str, Any]) -> str:

@@ -253,21 +253,27 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
         lines = [f"How well the textured mesh reproduces photos was {NOT_MEASURED}."]
         return lines + note_lines(rendering)
     perceptual = any(measured(view.get("lpips")) is not None for view in views)
+    counted = any(measured(view.get("uncovered")) is not None for view in (*views, rendering))
     where = {
         "mask": "Only pixels inside the photos' masks are compared.",
-        "covered": "Only pixels that the mesh covers are compared.",
+        "covered": "PSNR and SSIM are over the pixels that the mesh covers wholly.",
     }.get(str(rendering.get("pixels")), "")
-    rows = [_view_row(escaped_or(view.get("name")), view, perceptual) for view in views]
-    rows.append(_view_row("**mean**", rendering, perceptual))
+    rows = [_view_row(escaped_or(view.get("name")), view, counted, perceptual) for view in views]
+    rows.append(_view_row("**mean**", rendering, counted, perceptual))
     header = ["photo", "PSNR", "SSIM (1 is identical)", "covered share of the photo"]
+    header += ["share that no face covers", "PSNR, uncovered pixels black"] * counted
     trained = {
         "True": "The Gaussians were not trained on these photos.",
         "False": "The Gaussians were trained on these photos.",
     }.get(str(rendering.get("held_out")), "")
+    if counted:
+        where += " The last PSNR counts every pixel, black where no face covers it."
     intro = ("The textured mesh, unlit, rendered from the cameras of the photos.", where, trained)
     lines = [" ".join(filter(None, intro)), ""]
     lines += table(
-        header + ["LPIPS (0 is identical)"] * perceptual, rows, "lrrr" + "r" * perceptual
+        header + ["LPIPS (0 is identical)"] * perceptual,
+        rows,
+        "lrrr" + "rr" * counted + "r" * perceptual,
     )
     left_out = measured(rendering.get("left_out"))
     if left_out:
@@ -275,7 +281,7 @@ def _rendering(rendering: dict[str, Any]) -> list[str]:
     return lines + note_lines(rendering)
 
 
-def _view_row(name: str, view: dict[str, Any], perceptual: bool) -> list[str]:
+def _view_row(name: str, view: dict[str, Any], counted: bool, perceptual: bool) -> list[str]:
     covered = "" if "views" in view and "covered" not in view else percent(view.get("covered"))
     row = [
         name,
@@ -283,6 +289,8 @@ def _view_row(name: str, view: dict[str, Any], perceptual: bool) -> list[str]:
         number(view.get("ssim"), digits=4),
         covered,
     ]
+    if counted:
+        row += [percent(view.get("uncovered")), number(view.get("whole_psnr"), "dB", digits=2)]
     return [*row, number(view.get("lpips"), digits=4)] if perceptual else row
 
 

@@ -60,7 +60,17 @@ def headline(report: dict[str, Any]) -> list[str]:
         rendered = measured(part(region, "mesh_rendering").get("psnr"))
         if rendered is not None:
             line += f", textured mesh PSNR {rendered:.2f} dB"
+            line += _uncovered(part(region, "mesh_rendering"))
         lines.append(line)
     warnings = collect_warnings(report)
     lines += [f"warning ({warning.stage}): {warning.text}" for warning in warnings]
     return lines
+
+
+def _uncovered(rendering: dict[str, Any]) -> str:
+    """Return over which pixels the PSNR is, and what it leaves out, where that was measured."""
+    share, whole = measured(rendering.get("uncovered")), measured(rendering.get("whole_psnr"))
+    if share is None or whole is None:
+        return ""
+    where = " where it covers the photos" if rendering.get("pixels") == "covered" else ""
+    return f"{where} ({percent(share)} of them uncovered; {whole:.2f} dB with these black)"

@@ -237,9 +237,9 @@ def _check(training: Sequence[PhotoView], test: Sequence[PhotoView]) -> None:
                     "Resize the camera or the picture.",
                 )
     centers = np.array([view.camera.center for view in training])
-    size = max(float(np.ptp(centers, axis=0).max()), float(np.finfo(np.float64).tiny))
+    spread = max(float(np.ptp(centers, axis=0).max()), float(np.finfo(np.float64).tiny))
     for view in test:
-        near = np.linalg.norm(centers - view.camera.center, axis=1) <= SAME_PLACE_SHARE * size
+        near = np.linalg.norm(centers - view.camera.center, axis=1) <= SAME_PLACE_SHARE * spread
         for at in np.flatnonzero(near).tolist():
             other = training[at].camera
             if np.abs(other.rotation - view.camera.rotation).max() <= SAME_PLACE_SHARE:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Mesh-based rendering: compare renderings of the textured mesh with photos.
 
-Unlike the measure of the same name in the papers (docs/method.md, section 9.3), no colour field is
-trained on the mesh: the mesh is evaluated with its final texture.
+Unlike :mod:`.mesh_based_rendering`, no colour field is trained on the mesh: the mesh is evaluated
+with its final texture (docs/method.md, section 9.3).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from ...dataset.camera import Camera
 from ...errors import UsageError
 from ...imaging.lpips import Lpips, lpips_ready
-from ...imaging.view_metrics import ViewScores, has_windows, score_images
+from ...imaging.view_metrics import PSNR_CAP_DB, ViewScores, has_windows, psnr, score_images
 from ...kernels.parallel import default_threads
 from ...mesh.textured_mesh import TexturedMesh
 from .textured_rendering import TexturedRenderer
@@ -34,10 +34,20 @@ class MeshView:
     covered: float
     """Share of the candidate pixels (of the mask, or of the whole photo without one) that the mesh
     covers wholly."""
+    uncovered: float
+    """Share of the candidate pixels in which no ray meets a face."""
+    whole_psnr: float
+    """PSNR over all candidate pixels, black where no face covers them, dB."""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; ``lpips`` only if measured."""
-        return {"name": self.name, **self.scores.to_json(), "covered": self.covered}
+        return {
+            "name": self.name,
+            **self.scores.to_json(),
+            "covered": self.covered,
+            "uncovered": self.uncovered,
+            "whole_psnr": self.whole_psnr,
+        }
 
 
 @dataclass(frozen=True)
@@ -72,9 +82,20 @@ class MeshRenderingScore:
         """Mean covered share; ``None`` without any view."""
         return _mean([view.covered for view in self.views])
 
+    @property
+    def uncovered(self) -> float | None:
+        """Mean uncovered share; ``None`` without any view."""
+        return _mean([view.uncovered for view in self.views])
+
+    @property
+    def whole_psnr(self) -> float | None:
+        """Mean PSNR that counts uncovered pixels as black, dB; ``None`` without any view."""
+        return _mean([view.whole_psnr for view in self.views])
+
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; unmeasured values are absent, and no value is infinite."""
-        means = {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips, "covered": self.covered}
+        names = ("psnr", "ssim", "lpips", "covered", "uncovered", "whole_psnr")
+        means = {name: getattr(self, name) for name in names}
         values: dict[str, Any] = {
             "views": [view.to_json() for view in self.views],
             **{name: value for name, value in means.items() if value is not None},
@@ -151,8 +172,16 @@ def render_views(
             left_out += 1
             continue
         scores = score_images(view.image, photo, judged, lpips=lpips, threads=threads)
-        share = np.count_nonzero(view.covered & candidates) / np.count_nonzero(candidates)
-        views.append(MeshView(camera.name, scores, share))
+        count = np.count_nonzero(candidates)
+        views.append(
+            MeshView(
+                camera.name,
+                scores,
+                np.count_nonzero(view.covered & candidates) / count,
+                np.count_nonzero((view.coverage == 0.0) & candidates) / count,
+                min(psnr(view.on_black(), photo, candidates), PSNR_CAP_DB),
+            )
+        )
         if on_view is not None:
             on_view(camera.name, photo, view.image)
     pixels = "covered" if masks is None else "mask"

@@ -34,6 +34,11 @@ class TexturedView:
         """(h, w) bool: every ray of the pixel meets the mesh."""
         return self.coverage == 1.0
 
+    def on_black(self) -> np.ndarray:
+        """Return (h, w, 3) float32, white 1: the same picture on a black background."""
+        behind = (1.0 - self.coverage)[..., None] * np.array(BACKGROUND, np.float32)
+        return (np.maximum(self.image - behind, 0.0) / 255.0).astype(np.float32)
+
 
 class TexturedRenderer:
     """Render one textured mesh from many cameras; faces are two-sided.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The ``estimate`` command in the worker's Python: time, memory and disk of a training.
 
-Writes one JSON object per line to stdout, in the protocol of :mod:`~.evaluate_command`.
+Writes one JSON object per line to stdout, in the protocol of :mod:`~.run_in_worker`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 """The ``estimate-mesh`` command in the worker's Python: triangles, time and memory of a mesh.
 
 Needs a finished training. Writes one JSON object per line to stdout, in the protocol of
-:mod:`~.evaluate_command`.
+:mod:`~.run_in_worker`.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ def _newest_stage(stages: Path, name: str) -> Path:
 
 
 def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
+    from ...dataset.frames.scene_grid import snapped_length
     from ...dataset.photos.photo_store import PhotoStore
     from ...dataset.scene_file import load_saved_scene
     from ...field.depth_samples import sample_depth_maps
@@ -53,6 +54,7 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     from ...meshing.points.resolution import checked_request
     from ...regions.automatic_region import automatic_region, whole_region
     from ...regions.region import read_region
+    from ...regions.scene_region import on_scene_grid, region_in_scene
 
     folder = JobFolder(Path(request["out"]))
     if not folder.is_job():
@@ -65,15 +67,16 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     gaussians = load_gaussians(_newest_stage(folder.stages, "train") / "gaussians.npz")
     arrays = gaussians.arrays()
     if request["region"] not in AUTOMATIC_REGIONS:
-        region = world_region.transformed(scene.world_from_scene.inverse())
+        region = region_in_scene(world_region, scene.world_from_scene)
     else:
         automatic = request["region"] == "auto"
         region = automatic_region(scene) if automatic else whole_region(scene, arrays)
+        region = on_scene_grid(region)
     training = read_job(folder.job_path).settings.training
     photos = PhotoStore(scene, training.max_image_px)
     views = field_views(scene, photos, training.holdout_every, meshing.cameras)
     cameras = [scene.views[index].camera for index in views]
-    edge_length = meshing.edge_length / scene.world_from_scene.scale
+    edge_length = snapped_length(meshing.edge_length / scene.world_from_scene.scale)
     notes = checked_request(edge_length, meshing.points, region).notes  # raises before any work
     depth_samples = sample_depth_maps(
         gaussians, cameras[:: max(1, -(-len(cameras) // MAX_VIEWS))],

@@ -1,36 +1,27 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The ``evaluate`` command: score a mesh or a job in the worker's Python.
 
-The parent process needs neither scipy nor libigl. The child writes one JSON object per line to
-stdout: ``{"message"}`` for progress, ``{"line"}`` for the table, ``{"warning", "code"}``, and
-``{"error", "hint"}`` at the end.
+:func:`~.run_in_worker.run_in_worker` starts it: the parent process needs neither scipy nor libigl.
 """
 
 from __future__ import annotations
 
 import errno
 import json
-import logging
 import os
-import tempfile
 import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...errors import (
-    EXIT_CANCELLED,
-    EXIT_DONE,
-    EXIT_OTHER,
     DatasetError,
     ParseError,
     UsageError,
-    WorkerError,
     unwritable_error,
 )
 from ...files import read_json, write_json
-from ...processes.helper_process import child_command, emit
-from ...processes.spawn import kill_group, spawn
+from ...processes.helper_process import emit
 from ..store.job_folder import MARKER, JobFolder
 from .worker_call import run_command
 
@@ -39,87 +30,6 @@ if TYPE_CHECKING:
 
     from ...dataset.camera import Camera
     from ...progress import Progress
-
-_logger = logging.getLogger("gaussian_wrapping")
-
-ERROR_TAIL_BYTES = 2000
-
-
-def run_in_worker(
-    request: dict[str, Any],
-    *,
-    python: str,
-    module: str = "jobs.commands.evaluate_command",
-    what: str = "evaluation",
-) -> int:
-    """Run a command in a child process, log its output, and return its exit code.
-
-    Parameters
-    ----------
-    request : dict
-        ``mesh`` (path of a mesh or a job folder), ``metric``, ``region``, ``cameras``, ``test``,
-        ``max_image_px``, ``out``, and the entries of :class:`~.command.EvaluationRequest`; plain
-        JSON values.
-    python : str
-        The worker's interpreter.
-    module, what : str
-        The child's module, and its name in errors; all commands use the same protocol.
-
-    Raises
-    ------
-    WorkerError
-        It does not start, or ends without reporting an error.
-    """
-    text = json.dumps(request, allow_nan=False)
-    with tempfile.TemporaryFile() as error_file:
-        try:
-            process = spawn(child_command(module, text, python=python), stderr=error_file)
-        except OSError as error:
-            raise WorkerError(
-                f"{python} does not run: {error}.", "Choose another Python."
-            ) from None
-        error_shown = False
-        try:
-            assert process.stdout is not None
-            for raw in process.stdout:
-                error_shown = _log_line(raw) or error_shown
-            code = process.wait()
-        except KeyboardInterrupt:
-            _logger.info("cancelled")
-            return EXIT_CANCELLED
-        finally:
-            kill_group(process)
-        if code not in (EXIT_DONE, *range(EXIT_OTHER, EXIT_CANCELLED + 1)) or (
-            code and not error_shown
-        ):
-            error_file.seek(max(0, error_file.seek(0, os.SEEK_END) - ERROR_TAIL_BYTES))
-            error_lines = error_file.read().decode(errors="replace").strip().splitlines()
-            reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
-            raise WorkerError(
-                f"The {what} {reason}: {error_lines[-1] if error_lines else 'no output'}.",
-                "Run batch.py doctor to check the worker's Python.",
-            )
-        return code
-
-
-def _log_line(raw: bytes) -> bool:
-    """Log one line of the child; tell whether it was an error."""
-    try:
-        values = json.loads(raw)
-    except ValueError:
-        return False
-    if not isinstance(values, dict):
-        return False
-    if "error" in values:
-        _logger.error("error: %s", f"{values['error']} {values.get('hint', '')}".strip())
-        return True
-    if "warning" in values:
-        _logger.info("warning: %s", values["warning"])
-    elif "line" in values:
-        _logger.info("%s", values["line"])
-    elif "message" in values:
-        _logger.info("[%5.1f %%] %s", 100 * float(values.get("fraction", 0)), values["message"])
-    return False
 
 
 def main(arguments: list[str]) -> int:

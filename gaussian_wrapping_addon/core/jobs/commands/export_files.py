@@ -2,7 +2,7 @@
 """The ``export`` command in the worker's Python: GLB, OBJ, PLY and splat files with sidecars.
 
 Needs no Blender (USD and FBX do: ``ops/export/export_objects.py``). Writes one JSON object per
-line to stdout, in the protocol of :mod:`~.evaluate_command`.
+line to stdout, in the protocol of :mod:`~.run_in_worker`.
 """
 
 from __future__ import annotations

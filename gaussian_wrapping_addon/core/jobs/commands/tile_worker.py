@@ -2,7 +2,7 @@
 """The ``work-tiles`` command: mesh tiles of a running job in a further process.
 
 Runs in the worker's Python, on this machine or on another one that shares the job folder. Writes
-one JSON object per line to stdout, in the protocol of :mod:`~.evaluate_command`.
+one JSON object per line to stdout, in the protocol of :mod:`~.run_in_worker`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Run a command of the command line in the worker's Python and report lines or an error.
 
-Writes one JSON object per line to stdout, which :mod:`.evaluate_command` reads.
+Writes one JSON object per line to stdout, which :mod:`.run_in_worker` reads.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ...progress import Progress
+from ..store.continue_training import shorter_training
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
 from ..store.stage_folder import (
@@ -26,7 +27,8 @@ _logger = logging.getLogger(__name__)
 def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads: int) -> Stage:
     """Load the scene, or re-use a finished cameras stage.
 
-    ``mesh`` uses the cameras of the finished training even if the photos have changed since.
+    ``mesh`` and ``more`` use the cameras of the finished training even if the photos have changed
+    since, or an earlier version has loaded them.
 
     Raises
     ------
@@ -41,12 +43,13 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     key = stage_key(
         STAGE_VERSIONS["cameras"], job.source, source_fingerprint(source), job.settings.seed
     )
-    if job.command == "mesh" and read_done(folder.stages / f"cameras-{key}") is None:
+    if job.command in ("mesh", "more") and read_done(folder.stages / f"cameras-{key}") is None:
         earlier = _cameras_of_finished_training(folder, job)
         if earlier is not None:
             _logger.warning(
-                "%s has changed since the training, or its files have new dates: the mesh is of "
-                "the training as it is. To train anew, run wrap.", source,
+                "%s has changed since the training, its files have new dates, or an earlier "
+                "version loaded it: the mesh is of the training as it is. To train anew, run wrap.",
+                source,
             )  # fmt: skip
             return earlier
 
@@ -69,12 +72,19 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
 
 
 def _cameras_of_finished_training(folder: JobFolder, job: JobFile) -> Stage | None:
-    """Return the newest finished cameras stage with a finished training of this job."""
+    """Return the newest finished cameras stage with a finished training of this job.
+
+    For ``more``, a shorter training that it can continue is one as well.
+    """
+    extra = job.settings.training.extra_iterations
     found: list[tuple[float, int, Stage]] = []
     for path in sorted(folder.stages.glob("cameras-*")):
         done, key = read_done(path), path.name.removeprefix("cameras-")
-        train_key, _ = training_keys(STAGE_VERSIONS["train"], key, job)
+        train_key, base_key = training_keys(STAGE_VERSIONS["train"], key, job)
         trained = read_done(folder.stages / f"train-{train_key}")
+        if trained is None and job.command == "more":
+            shorter = shorter_training(folder.stages, base_key, extra)
+            trained = None if shorter is None else read_done(shorter)
         if done is not None and trained is not None:
             stage = Stage("cameras", key, path, done, True)
             found.append((trained["finished_unix_s"], len(found), stage))

@@ -49,6 +49,7 @@ def run_mesh(
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         import numpy as np
 
+        from ...dataset.frames.scene_grid import snapped_length
         from ...dataset.scene_file import load_saved_scene
         from ...field.depth_samples import DepthSamples, sample_depth_maps
         from ...field.vector_field import VectorField
@@ -94,7 +95,9 @@ def run_mesh(
                 stage_folder, vacancy, VectorField(arrays, threads=threads), arrays,
                 vacancy.cameras, region, meshing, progress.span(0.15, 0.9),
                 seed=job.settings.seed, threads=threads,
-                edge_length_scene=meshing.edge_length / scene.world_from_scene.scale,
+                edge_length_scene=snapped_length(
+                    meshing.edge_length / scene.world_from_scene.scale
+                ),
                 depth_samples=sampled(),
                 origin=tiles_origin(cameras.folder, trained.folder, job.settings),
             )  # fmt: skip

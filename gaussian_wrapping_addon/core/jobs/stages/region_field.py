@@ -24,7 +24,7 @@ _logger = logging.getLogger(__name__)
 def requested_region(
     request: str, body: Any, scene: Scene, arrays: GaussianArrays
 ) -> tuple[Region, Region]:
-    """Return the requested region in the scene frame and in the world frame.
+    """Return the requested region in the scene frame, on its grid, and in the world frame.
 
     The world-frame region of a file is returned as read: transforming it to the scene frame and
     back would change its last digits each time.
@@ -38,12 +38,14 @@ def requested_region(
     """
     from ...regions.automatic_region import automatic_region, whole_region
     from ...regions.region import parse_region
+    from ...regions.scene_region import on_scene_grid, region_in_scene
 
     if request in AUTOMATIC_REGIONS:
         region = automatic_region(scene) if request == "auto" else whole_region(scene, arrays)
+        region = on_scene_grid(region)
         return region, region.transformed(scene.world_from_scene)
     world_region = parse_region(body, Path(request))
-    return world_region.transformed(scene.world_from_scene.inverse()), world_region
+    return region_in_scene(world_region, scene.world_from_scene), world_region
 
 
 def field_views(scene: Scene, photos: PhotoSource, holdout_every: int, cameras: str) -> list[int]:

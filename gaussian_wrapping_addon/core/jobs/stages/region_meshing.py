@@ -140,10 +140,10 @@ def estimate_region_pivots(
     from ...meshing.cost.mesh_estimate import evaluation_seconds
     from ...meshing.cost.pivot_estimate import estimate_pivot_mesh
 
-    samples = 0 if depth_samples is None else len(depth_samples)
-    near = (
-        arrays.means[region.contains(arrays.means, 0.0)] if samples == 0 else depth_samples.points
-    )
+    if depth_samples is None:
+        samples, near = 0, arrays.means[region.contains(arrays.means, 0.0)]
+    else:
+        samples, near = len(depth_samples), depth_samples.points
     return estimate_pivot_mesh(
         arrays, region, meshing.pivots, samples,
         box=meshing.pivot_box, alone=meshing.pivot_samples == "none",

@@ -47,6 +47,7 @@ def run_texture(
         from ...limits import MAX_IMAGE_SIDE_PX
         from ...mesh.mesh_file import load_mesh
         from ...regions.region import parse_region
+        from ...regions.scene_region import region_in_scene
         from ...texture.detail.levels_of_detail import levels_of_detail
         from ...texture.files.textured_files import file_offset, write_textured
         from ...texture.texture_mesh import texture_mesh
@@ -73,7 +74,7 @@ def run_texture(
         region = parse_region(read_json(region_path), region_path)
         levels = levels_of_detail(
             textured, dense, texture, stage_folder, progress.span(coarse_from, 0.9),
-            threads=threads, region=region.transformed(scene.world_from_scene.inverse()),
+            threads=threads, region=region_in_scene(region, scene.world_from_scene),
         )  # fmt: skip
         formats = tuple(f for f in job.settings.export if f in RESULT_FORMATS)
         offset = file_offset(scene.world_from_scene.points(mesh.vertices))

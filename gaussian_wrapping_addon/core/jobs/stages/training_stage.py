@@ -156,13 +156,13 @@ def _train(
 def _inside_regions(job: JobFile, scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
     """Return the test whether points lie in the job's weighted regions, scene frame, if any."""
     from ...regions.region import parse_region
+    from ...regions.scene_region import region_in_scene
 
     focus = job.settings.training.focus
     if not focus:
         return None
-    scene_from_world = scene.world_from_scene.inverse()
     regions = [
-        parse_region(body, Path("job.json")).transformed(scene_from_world)
+        region_in_scene(parse_region(body, Path("job.json")), scene.world_from_scene)
         for body in json.loads(focus)
     ]
 

@@ -128,7 +128,7 @@ def bake(
     bounds = np.linspace(0, len(points), blocks + 1).astype(int).tolist()
     steps = max(1, blocks * len(used_photos))
     for block, (begin, end) in enumerate(pairwise(bounds)):
-        part = points.part(slice(begin, end))
+        block_points = points.part(slice(begin, end))
         weights = np.zeros((end - begin, KEPT_VIEWS), np.float32)
         kept = np.zeros((end - begin, KEPT_VIEWS, 3), np.uint8)
         for step, used_photo in enumerate(used_photos):
@@ -136,7 +136,7 @@ def bake(
             progress.update(fraction, f"texture: photo {step + 1} of {len(used_photos)}")
             view = _view(photos, used_photo.index, used_photo.divisor, surface, threads)
             sample_photo(
-                part,
+                block_points,
                 surface,
                 view,
                 correction.factors[used_photo.index],
@@ -184,7 +184,7 @@ def correction_sample_count(count: int) -> int:
 
 
 def prepare_photos(
-    part: SurfacePoints,
+    sample: SurfacePoints,
     surface: SurfaceArrays,
     photos: PhotoSource,
     count: int,
@@ -196,16 +196,16 @@ def prepare_photos(
 
     Parameters
     ----------
-    part : SurfacePoints
+    sample : SurfacePoints
         Evenly spread over the surface, :func:`correction_sample_count` of them.
     count : int
         Number of photos.
     """
-    wanted = len(part)
+    wanted = len(sample)
     colors = np.zeros((wanted, count, 3), np.uint8)
     valid = np.zeros((wanted, count), np.bool_)
     image_positions = np.zeros((wanted, count, 2), np.float32)
-    positions = surface_positions(part, surface)
+    positions = surface_positions(sample, surface)
     used_photos = []
     for index in range(count):
         progress.update(index / count, f"texture: analysing photo {index + 1} of {count}")
@@ -223,7 +223,7 @@ def prepare_photos(
         weights = np.zeros((wanted, 1), np.float32)
         one = np.zeros((wanted, 1, 3), np.uint8)
         unused = np.zeros(wanted, np.uint8)
-        sample_photo(part, surface, view, np.ones((1, 1, 3)), weights, one, unused, threads)
+        sample_photo(sample, surface, view, np.ones((1, 1, 3)), weights, one, unused, threads)
         valid[:, index] = weights[:, 0] > LAST_RESORT_BELOW
         colors[:, index] = one[:, 0]
         image_positions[:, index] = full.project(positions)[0] / [full.width, full.height]

@@ -42,16 +42,20 @@ class WrapView:
 def start_orientation(
     adam: Adam, views: Iterable[WrapView], *, first_sign: float = FIRST_SIGN, threads: int = 0
 ) -> None:
-    """Initialise orientations: the shortest axis, with its sign by a vote of the views.
+    """Initialise missing orientations: the shortest axis, with its sign by a vote of the views.
 
     Each view votes for the side that it sees, weighted by the Gaussian's blending weight; the sign
     parameter becomes +-``first_sign``, or stays 0 if no view sees the Gaussian (docs/method.md,
-    section 1.3).
+    section 1.3). Gaussians that are oriented already, those of a splat, keep their orientation.
     """
+    gaussians = adam.gaussians()
+    length = np.linalg.norm(gaussians.detached().normals().numpy(), axis=1)  # (n,)
+    missing = length < tolerances.ORIENTED_MIN_NORM
+    if not missing.any():
+        return
     cameras = (view.camera for view in views)
-    adam.array("orientation")[:] = voted_orientation(
-        adam.gaussians(), cameras, first_sign=first_sign, threads=threads
-    )
+    voted = voted_orientation(gaussians, cameras, first_sign=first_sign, threads=threads)
+    adam.array("orientation")[missing] = voted[missing]
     adam.reset_moments("orientation")
 
 

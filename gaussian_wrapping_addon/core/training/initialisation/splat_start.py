@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,6 @@ from ...render.render import render
 from ...render.types.options import RenderOptions
 from ...report_warning import ReportWarning
 from ...settings import TrainingSettings
-from ..cancellation import cancellable
 from ..density.orientation import orient
 from .splat_transform import transform_gaussians, with_degree
 
@@ -152,8 +151,7 @@ def start_from_splat(
             "splat alone, without photos.",
         )
     if not splat.oriented:
-        voters = (photos.camera(i, _divisor(photos, i)) for i in view_indices)
-        gaussians = orient(gaussians, cancellable(voters, progress), threads=threads)
+        gaussians = orient(gaussians, _voters(photos, view_indices, progress), threads=threads)
     return SplatStart(gaussians, tuple(warnings), facts)
 
 
@@ -226,6 +224,15 @@ def _divisor(photos: PhotoSource, index: int) -> int:
     """Return the divisor of a small image that still has a few tiles."""
     camera = photos.camera(index, 1)
     return _SMALL_DIVISOR if min(camera.width, camera.height) >= 32 * _SMALL_DIVISOR else 1
+
+
+def _voters(
+    photos: PhotoSource, view_indices: Sequence[int], progress: Progress
+) -> Iterator[Camera]:
+    """Yield small cameras of all views, checking for cancellation before each."""
+    for index in view_indices:
+        progress.check()
+        yield photos.camera(index, _divisor(photos, index))
 
 
 def _mean_weights(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...dataset.loading.splat_cameras import fibonacci_directions
-from ...dataset.readers.source_model import quaternion_from_rotation
+from ...dataset.quaternion import quaternion_from_rotation
 from ...dataset.similarity import Similarity
 from ...gaussians.model import OrientedGaussians
 from ...render.reference.reference_projection import harmonics_basis

@@ -18,7 +18,7 @@ from gaussian_wrapping_addon.core.dataset.loading.start_points import (
 )
 from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
 from gaussian_wrapping_addon.core.dataset.poses.match_pairs import pairs_by_order, pairs_by_pose
-from gaussian_wrapping_addon.core.dataset.readers.source_model import quaternion_from_rotation
+from gaussian_wrapping_addon.core.dataset.quaternion import quaternion_from_rotation
 from gaussian_wrapping_addon.core.errors import Cancelled, DatasetError
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.tolerances import SCENE_RADIUS

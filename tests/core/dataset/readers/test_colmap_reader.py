@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset.readers.colmap_reader import read_colmap
-from gaussian_wrapping_addon.core.dataset.readers.source_model import (
-    LENS_PARAMETERS,
+from gaussian_wrapping_addon.core.dataset.quaternion import (
     quaternion_from_rotation,
     rotation_from_quaternion,
 )
+from gaussian_wrapping_addon.core.dataset.readers.colmap_reader import read_colmap
+from gaussian_wrapping_addon.core.dataset.readers.source_model import LENS_PARAMETERS
 from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, DatasetError, ParseError
 from tests.core.dataset.model_writers import (
     HEIGHT,

@@ -235,7 +235,8 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         "typical error of 7.1 % of full brightness",  # 10 ** (-23 / 20)
         "photos saw 25.0 % of the texture",
         f'The textured mesh of "{escaped(REGION)}": 20.0 dB (2 photos, over the pixels the mesh',
-        "covers: 62.5 % of the photo; the texture compared was baked without the held-out photos)",
+        "covers: 62.5 % of the photo; no face covers 25.0 % of the photo, and with these pixels",
+        "counted as black it is 8.0 dB; the texture compared was baked without the held-out photos",
         "too few for a reliable mean",
     ):
         assert words in summary, words
@@ -345,6 +346,28 @@ def test_pictures_are_linked_exactly_where_they_are(tmp_path: Path) -> None:
     (tmp_path.parent / "secret.jpg").write_bytes(b"x")
     _, text = write(tmp_path, summary)
     assert "secret" not in section(text, "## Training")
+
+
+def test_uncovered_pixels_are_told_where_they_were_measured(tmp_path: Path) -> None:
+    """Wherever the textured mesh's PSNR stands, so does what it leaves out."""
+    region = full_region()
+    report, text = write(tmp_path, full_summary(), {REGION: region})
+    (line,) = [line for line in headline(report) if line.startswith("region")]
+    assert "PSNR 20.00 dB where it covers the photos (25.0 % of them uncovered; 8.00 dB" in line
+    part = section(text, f"## Region {escaped(REGION)}")
+    assert "| 62.5 % | 25.0 % | 8.00 dB |" in part
+    assert "over the pixels that the mesh covers wholly" in part
+    assert "every pixel, black where no face covers it" in part
+    # Reports of version 0.1.0 hold neither share nor second PSNR, and none is made up.
+    rendering = region["mesh_rendering"]
+    for figures in (rendering, *rendering["views"]):
+        del figures["uncovered"], figures["whole_psnr"]
+    report, text = write(tmp_path, full_summary(), {REGION: region})
+    assert any(line.endswith("textured mesh PSNR 20.00 dB") for line in headline(report))
+    part = section(text, f"## Region {escaped(REGION)}")
+    assert "| 0.5000 | 62.5 % |" in part
+    assert "no face covers" not in text
+    assert "black where" not in text
 
 
 @pytest.mark.parametrize("perceptual", [False, True])

@@ -133,6 +133,23 @@ def test_a_hole_counts_under_a_mask_and_not_over_covered_pixels() -> None:
     assert (found.covered, found.pixels) == (pytest.approx(0.5), "mask")
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_uncovered_pixels_are_counted_and_black_in_a_second_figure(masked: bool) -> None:
+    """The wall covers columns 20 to 60 of 120 and rows 5 to 85 of 90; its edges lie on pixels."""
+    textured, cameras, photos = flat_wall()
+    masks = [np.ones((90, 120), bool)] if masked else None
+    found = render_views(half_of(textured), cameras, photos, masks=masks)
+    share = 1 - 80 * 40 / (90 * 120)
+    assert found.uncovered == pytest.approx(share)
+    assert found.covered == pytest.approx(1 - share)
+    error = (photos[0] / 255.0) ** 2
+    error[5:85, 20:60] = 0.0
+    assert found.whole_psnr == pytest.approx(-10 * math.log10(error.mean()), abs=1e-4)
+    values = found.to_json()
+    assert (values["uncovered"], values["whole_psnr"]) == (found.uncovered, found.whole_psnr)
+    assert values["views"][0]["uncovered"] == found.uncovered
+
+
 def test_pixels_that_may_not_count_do_not() -> None:
     textured, cameras, photos = flat_wall()
     spoilt = photos[0].copy()

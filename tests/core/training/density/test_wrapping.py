@@ -104,6 +104,23 @@ def test_the_vote_orients_a_sphere_outwards() -> None:
     assert np.abs(outward[voted]).min() > 0.99 * np.tanh(FIRST_SIGN)
 
 
+def test_the_vote_leaves_those_that_are_oriented_as_they_are() -> None:
+    truth = sphere_gaussians(150)
+    given = truth.orientation.clone()
+    given[:, 3] *= -1.0  # inwards: no vote would have it so
+    given[::3] = 0.0
+    given[1::3, 3] = 0.03  # too short a normal to count
+    adam = Adam(truth.replaced(orientation=given))
+    start_orientation(adam, views(), threads=1)
+    found = adam.array("orientation")
+    kept = np.arange(150) % 3 == 2
+    assert np.array_equal(found[kept], given.numpy()[kept])
+    voted = found[~kept]
+    assert (np.abs(voted[:, 3]) == FIRST_SIGN).mean() > 0.9
+    outward = (adam.gaussians().detached().normals().numpy() * truth.means.numpy()).sum(1)
+    assert (outward[~kept][voted[:, 3] != 0] > 0).mean() > 0.97
+
+
 def test_errors_point_at_the_gaussians_with_wrong_normals() -> None:
     truth = sphere_gaussians(150)
     right = normal_errors(truth, views(), threads=1)

@@ -13,7 +13,7 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import fibonacci_directions
-from gaussian_wrapping_addon.core.dataset.readers.source_model import rotation_from_quaternion
+from gaussian_wrapping_addon.core.dataset.quaternion import rotation_from_quaternion
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
