@@ -11,6 +11,7 @@ from PIL import Image
 from scipy import ndimage
 
 from gaussian_wrapping_addon.core.dataset.camera import Camera
+from gaussian_wrapping_addon.core.dataset.frames.scene_grid import CENTER_STEP
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.loading.start_points import (
     count_observing_views,
@@ -133,7 +134,8 @@ def test_points_are_triangulated_from_posed_photos(tmp_path: Path) -> None:
     scene = load_scene(tmp_path / "set", tmp_path / "work", Progress(), seed=1, threads=1)
     for camera, moved in zip(cameras, scene.cameras, strict=True):
         center = scene.world_from_scene.points(moved.center[None])[0]
-        np.testing.assert_allclose(center, camera.center, atol=1e-9)
+        step = CENTER_STEP * scene.world_from_scene.scale
+        np.testing.assert_allclose(center, camera.center, rtol=0, atol=step)
     assert scene.facts["start_points"] == "triangulated from the photos"
     assert len(scene.points) >= 200
     world = scene.world_from_scene.points(scene.points)
@@ -149,8 +151,10 @@ def test_posed_photos_without_texture_start_from_random_points(tmp_path: Path) -
     model.points = []
     write_binary(model, tmp_path / "set" / "sparse")
     (tmp_path / "set" / "images").mkdir()
+    ramp = np.repeat(np.linspace(60, 120, 64)[None], 48, 0)  # of more than one colour
+    plain = np.rint(np.stack([ramp] * 3, 2)).astype(np.uint8)
     for image in model.images:
-        Image.new("RGB", (64, 48), (90, 80, 70)).save(tmp_path / "set" / "images" / str(image.name))
+        Image.fromarray(plain).save(tmp_path / "set" / "images" / str(image.name))
     scene = load_scene(tmp_path / "set", tmp_path / "work", Progress())
     assert scene.facts["start_points"] == "random"
     assert len(scene.points) > 1000
