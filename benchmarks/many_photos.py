@@ -51,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             words = [name, str(PHOTOS // part), *([options.label] if options.label else [])]
             path = RECORDS / f"{'-'.join(words)}.json"
             if options.again or not path.is_file():
+                path.parent.mkdir(parents=True, exist_ok=True)
                 write_json(path, record(name, part, options.threads, options.label))
                 _logger.info("%s", path.name)
     DOCUMENT.write_text(document(), encoding="utf-8")

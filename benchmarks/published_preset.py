@@ -75,6 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         path = _path(run)
         if options.again or not path.is_file():
             scene = ensure_scene(run.scene)
+            path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, {**judged_run(run, scene, scene, options.threads), "run": run.name})
             _logger.info("%s", path.name)
     DOCUMENT.write_text(document(), encoding="utf-8")
