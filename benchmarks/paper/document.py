@@ -17,7 +17,7 @@ from typing import Any
 
 from gaussian_wrapping_addon.core.files import write_bytes
 
-from ..speed_error.document import reading
+from ..meshing_study.document import reading
 from ..speed_error.runs import ROOT
 from ..speed_error.tables import AT, MIDDLE, SHARES, Row, table_of, thin_recall, three
 from ..tables import Table
