@@ -133,6 +133,11 @@ def test_options_of_the_other_metric_are_refused(job: Path, words: str) -> None:
     assert batch.main(["evaluate", str(job), *words.split()]) == 2
 
 
+def test_a_job_that_is_not_there_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert batch.main(["evaluate", str(tmp_path / "gone"), "--metric", "mbr"]) == 2
+    assert "gone does not exist" in caplog.text
+
+
 def test_broken_jobs_and_folders_are_named(job: Path, tmp_path: Path) -> None:
     folder = write_test_folder(job, tmp_path / "test", ["00.jpg"])
     (folder / "images" / "00.jpg").unlink()
