@@ -16,6 +16,7 @@ from gaussian_wrapping_addon.core.settings import (
     MeshingSettings,
     TrainingSettings,
     declarations,
+    declared,
     from_json,
     key_values,
     preset,
@@ -27,6 +28,13 @@ from gaussian_wrapping_addon.core.settings import (
 def test_presets_are_valid_and_survive_json(name: str) -> None:
     settings = preset(name).validated()
     assert from_json(JobSettings, to_json(settings)) == settings
+
+
+def test_an_excluded_end_of_a_range_is_said() -> None:
+    check = declared("training.prune_share").check
+    assert check is not None
+    assert not check.holds(0.5)
+    assert check.wanted == "from 0 to below 0.5"
 
 
 def test_presets_grow() -> None:

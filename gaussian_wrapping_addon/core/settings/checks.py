@@ -37,7 +37,8 @@ class Range:
     def wanted(self) -> str:
         if self.words:
             return self.words
-        span = f"from {_plain(self.low)} to {_plain(self.high)}"
+        to = "to below" if self.below_high else "to"
+        span = f"from {_plain(self.low)} {to} {_plain(self.high)}"
         return f"0 ({self.zero}) or {span}" if self.zero else span
 
     @property

@@ -46,6 +46,13 @@ def is_oriented(schedule: Schedule, state: TrainingState) -> bool:
     return not off and schedule.is_oriented(state.iteration)
 
 
+def may_wrap(schedule: Schedule, state: TrainingState) -> bool:
+    """Tell whether a wrapping round may clone now: oriented, and decided where photos decide."""
+    undecided = state.model_selection.get("wrapping") is None
+    waits = undecided and schedule.settings.wrapping == "auto"
+    return not waits and is_oriented(schedule, state)
+
+
 class NotFinite(Exception):  # noqa: N818 - asks for a restart, caught in trainer.py
     """A loss is not finite."""
 

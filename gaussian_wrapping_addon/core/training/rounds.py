@@ -18,7 +18,7 @@ from .cancellation import cancellable
 from .density.contribution import contributions, needed_by_a_view, prune_contributors
 from .density.density_control import densify_and_prune, reset_opacity
 from .density.wrapping import WrapView, normal_errors, start_orientation, wrap
-from .iteration import Stepper, is_oriented
+from .iteration import Stepper, may_wrap
 from .live_view import divisor_for
 from .schedule import Schedule
 from .selection.harmonics_selection import select_harmonics
@@ -101,7 +101,7 @@ class Rounds:
             changed = True
         if schedule.decides_wrapping(iteration):
             self._decide_wrapping(state)
-        if schedule.wraps(iteration) and is_oriented(schedule, state):
+        if schedule.wraps(iteration) and may_wrap(schedule, state):
             changed |= self._wrap(state)
         if changed:
             state.clear_statistics()

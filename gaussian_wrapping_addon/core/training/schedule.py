@@ -148,10 +148,13 @@ class Schedule:
         return wanted and iteration == self._at(self.settings.orient_from)
 
     def decides_wrapping(self, iteration: int) -> bool:
-        """Tell whether the photos decide about wrapping after this iteration, if they are to."""
-        first = self.settings.wrap_from
-        automatic = self.settings.wrapping == "auto"
-        return automatic and iteration == max(1, self._at(first))
+        """Tell whether the photos decide about wrapping after this iteration, if they are to.
+
+        Not before the orientation was trained: without it every normal looks wrong.
+        """
+        settings = self.settings
+        first = max(1, self._at(settings.wrap_from), self._at(settings.orient_from) + 1)
+        return settings.wrapping == "auto" and iteration == first
 
     def tries_harmonics(self, iteration: int) -> bool:
         """Tell whether the next degree is tried after this iteration, if trials decide."""

@@ -65,11 +65,13 @@ def rounds_of(scene: Scene, photos: PhotosInMemory, settings: TrainingSettings) 
     return Rounds(stepper, [], None, Progress("train"))
 
 
-def run(settings: TrainingSettings, iterations: int = 0) -> tuple[Rounds, TrainingState]:
+def run(
+    settings: TrainingSettings, iterations: int = 0, start: OrientedGaussians | None = None
+) -> tuple[Rounds, TrainingState]:
     """Train a sphere for some iterations, all where 0, and return rounds and state."""
     scene, photos = sphere_scene(views=8, size_px=24)
     rounds = rounds_of(scene, photos, settings)
-    state = TrainingState.start(sphere_gaussians(), 0)
+    state = TrainingState.start(start or sphere_gaussians(), 0)
     rounds.filter(state)
     for _ in range(iterations or settings.iterations):
         rounds.before_step(state)
@@ -163,6 +165,42 @@ def test_wrapping_is_decided_without_rounds_too() -> None:
     decision = state.model_selection.get("wrapping")
     assert decision is not None
     assert decision.setting == "auto"
+
+
+@pytest.mark.parametrize(
+    ("orient_from", "wrap_from", "wrap_until"),
+    [(0.7, 0.7, 0.9), (0.8, 0.4, 0.9), (0.2, 0.9, 0.5), (0.0, 0.0, 0.5)],
+)
+def test_wrapping_is_decided_on_orientations_and_before_clones(
+    orient_from: float, wrap_from: float, wrap_until: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the order of the milestones; undecided, every normal would look wrong."""
+    from gaussian_wrapping_addon.core.training import rounds as module
+
+    decide, wrap = Rounds._decide_wrapping, Rounds._wrap
+    oriented: list[bool] = []
+    decided: list[bool] = []
+
+    def watched_decision(self: Rounds, state: TrainingState) -> None:
+        oriented.append(bool(state.adam.array("orientation").any()))
+        decide(self, state)
+
+    def watched_wrap(self: Rounds, state: TrainingState) -> bool:
+        decided.append(state.model_selection.get("wrapping") is not None)
+        return wrap(self, state)
+
+    accepted = Decision("wrapping", "auto", "on", "Accepted for the test.")
+    monkeypatch.setattr(module, "select_wrapping", lambda *_: accepted)
+    monkeypatch.setattr(Rounds, "_decide_wrapping", watched_decision)
+    monkeypatch.setattr(Rounds, "_wrap", watched_wrap)
+    settings = dataclasses.replace(
+        SETTINGS, orient_from=orient_from, wrap_from=wrap_from, wrap_until=wrap_until
+    )
+    sphere = sphere_gaussians()
+    run(settings, start=sphere.replaced(orientation=torch.zeros_like(sphere.orientation)))
+    assert oriented == [True]
+    assert decided
+    assert all(decided)
 
 
 def test_wrapping_on_is_not_decided() -> None:

@@ -116,6 +116,10 @@ def _check_metric(given: dict[str, Any]) -> None:
                 "surface.",
                 "Omit it, or use --metric surface.",
             )
+        if not Path(given["mesh"]).exists():
+            raise UsageError(
+                f"{given['mesh']} does not exist.", "Give the folder of --out, or a mesh file."
+            )
         if not Path(given["mesh"]).is_dir() and given["cameras"] is None:
             raise UsageError(
                 "--metric mbr needs the photos of the mesh.",

@@ -15,7 +15,7 @@ from PIL import Image
 from gaussian_wrapping_addon import batch
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
 from gaussian_wrapping_addon.core.evaluation.layouts.mesh_input import read_mesh
-from gaussian_wrapping_addon.core.jobs.commands.evaluate_command import job_mesh
+from gaussian_wrapping_addon.core.jobs.commands.evaluate_command import _check_metric, job_mesh
 from gaussian_wrapping_addon.core.jobs.commands.mesh_based_command import (
     MeshBasedRequest,
     evaluate_mesh_based,
@@ -131,6 +131,13 @@ def test_a_mesh_file_with_the_photos_of_a_job(job: Path, tmp_path: Path) -> None
 )
 def test_options_of_the_other_metric_are_refused(job: Path, words: str) -> None:
     assert batch.main(["evaluate", str(job), *words.split()]) == 2
+
+
+def test_a_job_that_is_not_there_is_named(tmp_path: Path) -> None:
+    absent = ("truth", "scan", "distances", "align", "protocols", "samples", "shares", "cameras")
+    given = {"metric": "mbr", "mesh": str(tmp_path / "gone"), **dict.fromkeys(absent)}
+    with pytest.raises(UsageError, match="gone does not exist"):
+        _check_metric(given)
 
 
 def test_broken_jobs_and_folders_are_named(job: Path, tmp_path: Path) -> None:
