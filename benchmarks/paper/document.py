@@ -101,6 +101,7 @@ def _plug_in(record: dict[str, Any]) -> list[str]:
     count, width, height = record["photos"]
     plain = next((row["settings"] for row in record["rows"] if row["training"] == "plain"), {})
     off = ", ".join(f"`{name}` {value}" for name, value in plain.items())
+    codes = ", ".join(sorted({row["code"] for row in record["rows"] if row.get("code")}))
     return [
         "## A plain splat, and the same with Gaussian Wrapping",
         "",
@@ -116,7 +117,8 @@ def _plug_in(record: dict[str, Any]) -> list[str]:
             "Wrapping it is the training that `--start-splat` starts: 0.3 of the iterations, no "
             "growth. Without photos, generated cameras take their place, and their views of the "
             "splat. All rows are meshed alike, by primal adaptive meshing with the samples of the "
-            f"depth maps and {record['points']} points."
+            f"depth maps and {record['points']} points. The trainings were made by the code of "
+            f"{codes or 'an unknown commit'}."
         ),
         plug_in_table(record).markdown(),
     ]
