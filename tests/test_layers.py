@@ -20,7 +20,7 @@ FOLDERS = (
     "core/settings", "core/ply", "core/kernels", "core/processes", "core/imaging",
     "core/dataset", "core/dataset/frames", "core/dataset/photos", "core/dataset/readers",
     "core/dataset/poses", "core/dataset/loading",
-    "core/mesh", "core/gaussians", "core/regions", "core/mesh/simplification",
+    "core/mesh", "core/stereo", "core/gaussians", "core/regions", "core/mesh/simplification",
     "core/render/types", "core/render/simd", "core/render/projection", "core/render/tiling",
     "core/render/isosurface", "core/render/raster", "core/render/query", "core/render/reference",
     "core/render/cuda", "core/render",

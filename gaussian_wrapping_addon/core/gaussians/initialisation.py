@@ -107,10 +107,10 @@ def initial_gaussians(
         )
         points = np.concatenate([points, more_points])
         colors = np.concatenate([colors, more_colors])
-    return _gaussians_at(points, colors, _spacing(points, cameras), sh_degree)
+    return gaussians_at(points, colors, point_spacing(points, cameras), sh_degree)
 
 
-def _spacing(points: np.ndarray, cameras: list[Camera]) -> np.ndarray:
+def point_spacing(points: np.ndarray, cameras: list[Camera]) -> np.ndarray:
     """(n,) RMS distance to the three nearest neighbours, capped by the distance to the cameras."""
     neighbours = min(3, len(points) - 1)
     if neighbours > 0:
@@ -124,20 +124,47 @@ def _spacing(points: np.ndarray, cameras: list[Camera]) -> np.ndarray:
     return np.minimum(np.sqrt(mean_sq), cap)
 
 
-def _gaussians_at(
-    points: np.ndarray, colors: np.ndarray, spacing: np.ndarray, sh_degree: int
+def gaussians_at(
+    points: np.ndarray,
+    colors: np.ndarray,
+    sizes: np.ndarray,
+    sh_degree: int,
+    *,
+    normals: np.ndarray | None = None,
+    flatness: np.ndarray | float = 1.0,
+    opacities: np.ndarray | float = INITIAL_OPACITY,
 ) -> OrientedGaussians:
+    """Return Gaussians at points, round or flat across normals, without orientation.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+    colors : (n, 3)
+        In [0, 1].
+    sizes : (n,)
+        Standard deviations along the surface.
+    sh_degree : int
+    normals : (n, 3), optional
+        Unit; the third axis of a Gaussian points along it.
+    flatness : (n,) or float
+        Standard deviation along the third axis, as a share of the size.
+    opacities : (n,) or float
+    """
     count = len(points)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (colors - 0.5) / SH_C0
     quats = np.zeros((count, 4), np.float32)
     quats[:, 0] = 1.0
-    logit = math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))
+    if normals is not None:
+        quats = _turning_z_to(normals)
+    log_scales = np.repeat(np.log(sizes)[:, None], 3, axis=1)  # (n, 3)
+    log_scales[:, 2] += np.log(flatness)
+    opacities = np.broadcast_to(opacities, count)
     arrays = {
         "means": points,
-        "log_scales": np.repeat(np.log(spacing)[:, None], 3, axis=1),
+        "log_scales": log_scales,
         "quats": quats,
-        "opacity_logits": np.full(count, logit),
+        "opacity_logits": np.log(opacities / (1.0 - opacities)),
         "sh": sh,
         "orientation": np.zeros((count, 4)),
         "filter_3d": np.zeros(count),
@@ -145,6 +172,16 @@ def _gaussians_at(
     return OrientedGaussians(
         **{name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}
     )
+
+
+def _turning_z_to(normals: np.ndarray) -> np.ndarray:
+    """Return (n, 4) unit quaternions w x y z that turn the z axis to unit vectors."""
+    quats = np.zeros((len(normals), 4))
+    quats[:, 0] = 1.0 + normals[:, 2]
+    quats[:, 1], quats[:, 2] = -normals[:, 1], normals[:, 0]
+    opposite = quats[:, 0] < 1e-6
+    quats[opposite] = (0.0, 1.0, 0.0, 0.0)
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
 def _points_along_rays(

@@ -196,6 +196,25 @@ class TrainingSettings(MethodSettings):
             ),
         ),
     )
+    dense_start: str = setting(
+        "auto",
+        help="Initial Gaussians from stereo matching of the photos. auto: where other photos "
+        "confirm the depth of enough pixels; off: from the sparse points alone.",
+        presets={"paper": "off"},
+        check=Choices(SELECTION_MODES),
+        model_selection=True,
+        option=Option("--dense-start", help="initial Gaussians from stereo matching of the photos"),
+        panel=PanelProperty(
+            "Dense Start",
+            "Match neighbouring photos before training, and start on the surfaces found",
+            items=_selection(
+                "Where neighbouring photos show the same surfaces",
+                "On whatever surfaces matching finds",
+                "Start from the sparse points alone",
+            ),
+        ),
+        since="0.2.0",
+    )
     region_weight: float = setting(
         1.0,
         help="Gaussians inside the job's regions count this many times where their number is "

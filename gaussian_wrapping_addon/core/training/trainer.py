@@ -30,6 +30,7 @@ from .appearance.background import inside_masks
 from .appearance.photo_exposure import Exposure, corrected_for_measuring
 from .cancellation import CancellablePhotos
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
+from .initialisation.dense_start import dense_start
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import Correction, LiveView, evenly_spaced, measure_held_out
@@ -54,6 +55,9 @@ REPORT_EVERY = 10
 
 DETAIL_PHOTOS = 8
 """Number of photos, evenly spread, whose detail is measured."""
+
+SET = "Not measured: decided by the settings."
+"""Evidence of decisions that the settings take."""
 
 TOO_SMALL = "The photos are too small for LPIPS."
 
@@ -248,8 +252,9 @@ class _Trainer:
             count = len(self.scene.views)
             text = f"Few photos ({count}): {len(self.held_out)} held out for measuring."
             warnings.append(ReportWarning("few-photos", text, "Take more photos, from all around."))
+        decision = None
         if self.start_splat is None:
-            gaussians = self._initial()
+            gaussians, decision = self._initial(progress)
         else:
             start = start_from_splat(
                 self.start_splat, self.scene, self.photos, self.views, self.settings, progress,
@@ -262,10 +267,13 @@ class _Trainer:
         if self.start_splat is not None:
             state.degree = self.settings.sh_degree if self.settings.harmonics != "off" else 0
         self._select_model(state)
+        if decision is not None:
+            state.model_selection = state.model_selection.with_decision(decision)
         rounds.filter(state)
         return state
 
-    def _initial(self) -> OrientedGaussians:
+    def _initial(self, progress: Progress) -> tuple[OrientedGaussians, Decision]:
+        """Return the Gaussians at dense or sparse points, and why."""
         small = self.schedule.divisor(0)
         scene = self.scene
         if self.settings.mask_mode == "background" and len(scene.points):
@@ -277,7 +285,17 @@ class _Trainer:
             scene = dataclasses.replace(
                 scene, points=scene.points[kept], point_colors=scene.point_colors[kept]
             )
-        return initial_gaussians(
+        decision = Decision("dense_start", "off", "off", SET, measured=False)
+        if self.settings.dense_start != "off":
+            start = dense_start(
+                scene, self.photos, self.views, self.settings.dense_start, progress,
+                max_gaussians=self.schedule.growth_limit(), sh_degree=self.settings.sh_degree,
+                seed=self.seed, threads=self.threads,
+            )  # fmt: skip
+            if start.gaussians is not None:
+                return start.gaussians, start.decision
+            decision = start.decision
+        gaussians = initial_gaussians(
             scene,
             self.views,
             lambda i: (
@@ -289,6 +307,7 @@ class _Trainer:
             sh_degree=self.settings.sh_degree,
             seed=self.seed,
         )
+        return gaussians, decision
 
     def _select_model(self, state: TrainingState) -> None:
         """Take the decisions that need no training; record those made by settings."""
@@ -317,15 +336,14 @@ class _Trainer:
                     "harmonics", settings.harmonics, f"degree {degree}", evidence, measured=False
                 )
             )
-        evidence = "Not measured: decided by the settings."
         if settings.wrapping != "auto":
             word = settings.wrapping
             model_selection = model_selection.with_decision(
-                Decision("wrapping", word, word, evidence, measured=False)
+                Decision("wrapping", word, word, SET, measured=False)
             )
         if settings.growth == "off":
             model_selection = model_selection.with_decision(
-                Decision("growth", "off", "off", evidence, measured=False)
+                Decision("growth", "off", "off", SET, measured=False)
             )
         state.model_selection = model_selection
 

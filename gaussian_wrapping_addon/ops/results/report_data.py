@@ -38,6 +38,7 @@ _DECISIONS = {
     "wrapping": "Wrap Thin Parts",
     "growth": "Add Gaussians",
     "full_size": "Photo Size",
+    "dense_start": "Dense Start",
 }
 """Labels of what was decided, as the panel Training has them."""
 

@@ -14,6 +14,7 @@ _TITLES = {
     "wrapping": "Thin parts (two-sided surfaces)",
     "growth": "Number of Gaussians",
     "full_size": "Size of the training images",
+    "dense_start": "Start on surfaces found by matching photos",
 }
 """Title of each choice, in an artist's words."""
 
@@ -23,6 +24,7 @@ _EFFECTS = {
     "multi_view": '"on" or "off"',
     "wrapping": '"on" or "off"',
     "full_size": '"on" trains at full size up to `max_image_px`; "off" at half of it',
+    "dense_start": '"on" starts on whatever is found; "off" starts from the sparse points',
     "growth": '"on" lets the number grow up to `max_gaussians`; "off" adds none',
 }
 

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Points where stereo confirms nothing, so that training starts without holes.
+
+See docs/method.md, section 11.8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from .depth_maps import DepthMap
+from .fusion import DensePoints, lifted, merged
+
+MOST_COST = 0.7
+"""A depth that no source confirms is a guess if it costs less; else nothing is known."""
+
+UNCONFIRMED_WEIGHT = 0.2
+"""Weight of a depth that no source confirms; each source adds as much."""
+
+CLEARANCE = 0.5
+"""Sizes of a point from confirmed ones within which it is left out."""
+
+SEEN_THROUGH_SHARE = 0.03
+"""A confirmed depth this much larger than a point's sees through the point."""
+
+SEEN_THROUGH_VIEWS = 2
+"""Views that must see through a point for it to be left out."""
+
+
+def fill_gaps(depth_maps: Sequence[DepthMap], confirmed: DensePoints, wanted: int) -> DensePoints:
+    """Return points from unconfirmed depths, away from confirmed points and from free space.
+
+    Parameters
+    ----------
+    confirmed : DensePoints
+    wanted : int
+        Largest number of points, about.
+    """
+    weights = [_guessed(depth_map) for depth_map in depth_maps]
+    guesses = merged(lifted(depth_maps, weights), wanted)
+    if len(guesses) == 0 or len(confirmed) == 0:
+        return guesses
+    distance, nearest = cKDTree(confirmed.positions).query(guesses.positions)
+    reach = CLEARANCE * np.maximum(guesses.sizes, confirmed.sizes[nearest])
+    guesses = guesses.select(distance > reach)
+    return guesses.select(count_seen_through(guesses.positions, depth_maps) < SEEN_THROUGH_VIEWS)
+
+
+def count_seen_through(points: np.ndarray, depth_maps: Sequence[DepthMap]) -> np.ndarray:
+    """Count the views whose confirmed depth lies clearly behind each point.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Scene frame.
+
+    Returns
+    -------
+    (n,) int64
+    """
+    count = np.zeros(len(points), np.int64)
+    for depth_map in depth_maps:
+        seen, there = sampled(points, depth_map)
+        depth = depth_map.camera.to_camera(points[seen])[:, 2]
+        behind = depth_map.depth[there] > (1.0 + SEEN_THROUGH_SHARE) * depth
+        count[seen] += behind & (depth_map.confidence[there] > 0)
+    return count
+
+
+def sampled(
+    points: np.ndarray, depth_map: DepthMap
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Return which points lie in the image (m,), and rows and columns of their pixels."""
+    camera = depth_map.camera
+    pixels, depth = camera.project(points)
+    inside = (depth > 0) & (pixels >= 0).all(1)
+    inside &= (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    seen = np.flatnonzero(inside)
+    column, row = pixels[seen].astype(np.int64).T
+    return seen, (row, column)
+
+
+def _guessed(depth_map: DepthMap) -> np.ndarray:
+    """Return (h, w) weights of the depths that are unconfirmed and yet better than nothing."""
+    guess = (depth_map.confidence == 0) & ((depth_map.agreeing > 0) | (depth_map.cost < MOST_COST))
+    if depth_map.mask is not None:
+        guess &= depth_map.mask
+    weight = UNCONFIRMED_WEIGHT * (1.0 + depth_map.agreeing)
+    return np.where(guess, weight, 0.0).astype(np.float32)

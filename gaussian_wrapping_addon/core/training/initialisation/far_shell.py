@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Initial Gaussians far away, where the photos show what stereo cannot place (docs/method.md, section 11.9).
+
+Sky and the far distance have no parallax. Without Gaussians there, training explains them by fog
+before the things.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ... import tolerances
+from ...stereo.depth_maps import DepthMap
+from ...stereo.fusion import DensePoints
+
+CELL_PX = 8
+"""Side of the cells of a photo, at the size it was matched at, that are covered or open."""
+
+OPEN_SHARE = 0.75
+"""Share of a cell's pixels that must be unexplained for the cell to be open."""
+
+REACH_FACTOR = 4.0
+"""Radius of the shell over the distance of the farthest points but one in a hundred."""
+
+LEAST_REACH = 10.0 * tolerances.SCENE_RADIUS
+"""Smallest radius: the cameras lie within a tenth of it."""
+
+BEHIND_COST = 0.7
+"""Matching cost from which a pixel is unexplained: nothing matches."""
+
+
+def far_shell(
+    depth_maps: Sequence[DepthMap], points: np.ndarray, wanted: int
+) -> tuple[DensePoints, float]:
+    """Return points on a sphere where photos show something and nothing is known of its depth.
+
+    Parameters
+    ----------
+    depth_maps : sequence of DepthMap
+    points : (n, 3) float64
+        Points known so far, scene frame; they cover the cells that they project into.
+    wanted : int
+        Largest number of points; cells are merged until it is kept.
+
+    Returns
+    -------
+    shell : DensePoints
+        Sizes are the distances of neighbours.
+    radius : float
+        Of the sphere around the origin of the scene frame.
+    """
+    reach = float(np.percentile(np.linalg.norm(points, axis=1), 99)) if len(points) else 0.0
+    radius = max(LEAST_REACH, REACH_FACTOR * reach)
+    directions, colors, angles = [], [], []
+    for depth_map in depth_maps:
+        row, column, color = _open_cells(depth_map, points)
+        camera = depth_map.camera
+        at = (np.stack([column, row], 1) + 0.5) * CELL_PX  # (m, 2) pixels
+        rays = np.ones((len(at), 3))
+        rays[:, 0] = (at[:, 0] - camera.cx) / camera.fx
+        rays[:, 1] = (at[:, 1] - camera.cy) / camera.fy
+        directions.append(_onto_sphere(camera.center, rays @ camera.rotation, radius))
+        colors.append(color)
+        angles.append(np.full(len(at), CELL_PX / camera.fx))
+    found, color = np.concatenate(directions), np.concatenate(colors)
+    if len(found) == 0:
+        return _shell(np.zeros((0, 3)), np.zeros((0, 3)), 0.0, radius), radius
+    step = float(np.median(np.concatenate(angles)))
+    while True:
+        key = np.floor(found / step + 0.5).astype(np.int64)
+        cells, cell, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+        if len(cells) <= wanted:
+            break
+        step *= 1.25
+    cell = cell.reshape(-1)
+    direction = np.stack([np.bincount(cell, found[:, k]) for k in range(3)], 1)
+    direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    mean = np.stack([np.bincount(cell, color[:, k]) / count for k in range(3)], 1)
+    return _shell(direction, mean, step, radius), radius
+
+
+def _shell(direction: np.ndarray, color: np.ndarray, step: float, radius: float) -> DensePoints:
+    count = len(direction)
+    return DensePoints(
+        radius * direction,
+        -direction,
+        np.clip(color + 0.5, 0, 255).astype(np.uint8),
+        np.full(count, radius * step),
+        np.zeros(count, np.float32),
+    )
+
+
+def _open_cells(
+    depth_map: DepthMap, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows, columns and mean colours (m, 3) of the cells that nothing explains."""
+    camera = depth_map.camera
+    rows, columns = camera.height // CELL_PX, camera.width // CELL_PX
+    unknown = (depth_map.agreeing == 0) & (depth_map.cost >= BEHIND_COST)
+    if depth_map.mask is not None:
+        unknown &= depth_map.mask
+    share = _by_cell(unknown.astype(np.float64), rows, columns)
+    covered = np.zeros((rows, columns), bool)
+    pixels, depth = camera.project(points)
+    at = np.floor(pixels / CELL_PX)
+    inside = (depth > 0) & (at >= 0).all(1) & (at[:, 1] < rows) & (at[:, 0] < columns)
+    column, row = at[inside].astype(np.int64).T
+    covered[row, column] = True
+    row, column = np.nonzero((share >= OPEN_SHARE) & ~covered)
+    color = _by_cell(depth_map.color.astype(np.float64), rows, columns)[row, column]
+    return row, column, color
+
+
+def _by_cell(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Return the means of an image over its cells, (rows, columns) or (rows, columns, 3)."""
+    whole = image[: rows * CELL_PX, : columns * CELL_PX]
+    return whole.reshape(rows, CELL_PX, columns, CELL_PX, *image.shape[2:]).mean((1, 3))
+
+
+def _onto_sphere(center: np.ndarray, rays: np.ndarray, radius: float) -> np.ndarray:
+    """Return the unit directions of the points where rays from inside meet the sphere."""
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    along = unit @ center
+    distance = -along + np.sqrt(along**2 + radius**2 - center @ center)
+    return (center + unit * distance[:, None]) / radius
