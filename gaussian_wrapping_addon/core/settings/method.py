@@ -83,6 +83,22 @@ class MethodSettings:
     lambda_depth_normal: float = _constant(
         0.05, "--lambda-depth-normal", "Weight of the depth-normal loss.", _WEIGHT
     )
+    lambda_depth_prior: float = _constant(
+        0.1,
+        "--lambda-depth-prior",
+        "Weight of the depths that stereo confirmed, after a dense start.",
+        _WEIGHT,
+        paper=0.0,
+        since="0.2.0",
+    )
+    depth_prior_until: float = _constant(
+        1.0,
+        "--depth-prior-until",
+        "End of the loss on depths that stereo confirmed.",
+        _SHARE,
+        unit=_OF_ITERATIONS,
+        since="0.2.0",
+    )
     lambda_normal: float = _constant(
         0.03, "--lambda-normal", "Weight of the normal loss.", _WEIGHT, paper=0.05
     )

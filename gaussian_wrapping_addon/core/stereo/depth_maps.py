@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Depth, normal and confidence of all photos by multi-view PatchMatch (docs/method.md, section 11)."""
+"""Depth, normal and confidence of all photos by multi-view PatchMatch.
+
+See docs/method.md, section 11.
+"""
 
 from __future__ import annotations
 
@@ -110,7 +113,7 @@ def estimate_depth_maps(
         return []
     sources = source_views(full, points)
     ranges = np.array([_depth_range(camera, points) for camera in full])
-    fine = _divisor(full)
+    fine = matching_divisor(full)
     matcher = _Matcher(photos, views, points, sources, ranges, seed, threads, progress)
     coarse = matcher.coarse(2 * fine)
     level, means = matcher.fine(coarse, fine)
@@ -285,8 +288,8 @@ def _depth_range(camera: Camera, points: np.ndarray) -> tuple[float, float]:
     return FARTHEST_FACTOR / far, NEAREST_FACTOR / near
 
 
-def _divisor(cameras: Sequence[Camera]) -> int:
-    """Return the divisor of the fine level."""
+def matching_divisor(cameras: Sequence[Camera]) -> int:
+    """Return the divisor of the size at which photos are matched; ``cameras`` are of divisor 1."""
     side = max(max(camera.width, camera.height) for camera in cameras)
     pixels = sum(camera.width * camera.height for camera in cameras)
     divisor = 1

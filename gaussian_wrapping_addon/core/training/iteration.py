@@ -18,8 +18,10 @@ from ..render.projection.projection import RawArrays
 from ..render.types.gradients import ImageGradients, VisibleGradients
 from ..render.types.options import RenderOptions
 from ..render.view_renderer import ViewPass, ViewRenderer
+from ..stereo.depth_priors import DepthPrior
 from .appearance.background import background_gradient, composited, draw_background
 from .appearance.photo_exposure import exposure_rate
+from .losses.depth_prior_loss import depth_prior_loss
 from .losses.footprint_regulariser import add_footprint_regulariser
 from .losses.losses import color_loss, normal_losses
 from .losses.multi_view import (
@@ -97,6 +99,8 @@ class Stepper:
         self.settings, self.threads = schedule.settings, threads
         self.neighbours = neighbours
         self.renderer, self.store = ViewRenderer(), ArrayStore()
+        self.priors: dict[int, DepthPrior] = {}
+        """Confirmed depths of views that training started on."""
         self.multi_view = MultiViewOptions.of_settings(schedule.settings)
 
     def step(self, state: TrainingState) -> None:
@@ -133,6 +137,14 @@ class Stepper:
             )
             value += normal_value
             gradients = add_image_gradients(by_normals, gradients)
+            weight, prior = schedule.prior_weight(iteration), self.priors.get(sample.view)
+            if weight > 0.0 and prior is not None:
+                prior_value, by_prior = depth_prior_loss(
+                    image.depth, sample.camera, prior, sample.mask, weight=weight,
+                    threads=self.threads, store=self.store,
+                )  # fmt: skip
+                value += prior_value
+                gradients = add_image_gradients(by_prior, gradients)
             if self._compares_views(state, sample):
                 shared = self._compare_views(state, sample, image, gaussians)
                 value += shared[0]

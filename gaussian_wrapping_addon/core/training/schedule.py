@@ -128,6 +128,12 @@ class Schedule:
         """Tell whether the depth-normal loss is on."""
         return iteration >= self._at(self.settings.depth_from)
 
+    def prior_weight(self, iteration: int) -> float:
+        """Return the weight of the depths that stereo confirmed; they count with the depth loss."""
+        wanted = self.uses_depth(iteration)
+        wanted &= iteration < self._at(self.settings.depth_prior_until)
+        return self.settings.lambda_depth_prior if wanted else 0.0
+
     def compares_views(self, iteration: int) -> bool:
         """Tell whether the multi-view terms are evaluated in this iteration."""
         begin, end = self._at(self.settings.depth_from), self._at(self.settings.multi_view_until)

@@ -26,11 +26,13 @@ from ..render.projection.projection import RawArrays
 from ..render.types.options import RenderOptions
 from ..report_warning import ReportWarning
 from ..settings import TrainingSettings
+from ..stereo.depth_maps import matching_divisor
+from ..stereo.depth_priors import DepthPrior, load_priors, priors_of, save_priors
 from .appearance.background import inside_masks
 from .appearance.photo_exposure import Exposure, corrected_for_measuring
 from .cancellation import CancellablePhotos
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
-from .initialisation.dense_start import dense_start
+from .initialisation.dense_start import dense_start, matched_photos
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import Correction, LiveView, evenly_spaced, measure_held_out
@@ -189,9 +191,10 @@ class _Trainer:
         rounds = Rounds(self.stepper, self.held_out, self.inside, progress)
         state = load_checkpoint(self.folder, key)
         if state is None:
-            state = self._start(rounds, progress)
+            state = self._start(rounds, key, progress)
         else:
             _logger.info("resuming at iteration %d", state.iteration)
+            self.stepper.priors = self._saved_priors(state, key, progress)
         begun_s = saved_s = time.monotonic()
         spent_s, begun_at = state.seconds, state.iteration
         snapshot = (state.to_arrays(), state.to_json())
@@ -246,7 +249,7 @@ class _Trainer:
             state.exposure is not None,
         )
 
-    def _start(self, rounds: Rounds, progress: Progress) -> TrainingState:
+    def _start(self, rounds: Rounds, key: str, progress: Progress) -> TrainingState:
         warnings: list[ReportWarning] = []
         if self.settings.holdout_every > 0 and len(self.scene.views) < FEW_PHOTOS:
             count = len(self.scene.views)
@@ -254,7 +257,7 @@ class _Trainer:
             warnings.append(ReportWarning("few-photos", text, "Take more photos, from all around."))
         decision = None
         if self.start_splat is None:
-            gaussians, decision = self._initial(progress)
+            gaussians, decision = self._initial(key, progress)
         else:
             start = start_from_splat(
                 self.start_splat, self.scene, self.photos, self.views, self.settings, progress,
@@ -272,19 +275,9 @@ class _Trainer:
         rounds.filter(state)
         return state
 
-    def _initial(self, progress: Progress) -> tuple[OrientedGaussians, Decision]:
+    def _initial(self, key: str, progress: Progress) -> tuple[OrientedGaussians, Decision]:
         """Return the Gaussians at dense or sparse points, and why."""
-        small = self.schedule.divisor(0)
-        scene = self.scene
-        if self.settings.mask_mode == "background" and len(scene.points):
-            kept = inside_masks(
-                scene.points,
-                [self.photos.camera(i, small) for i in self.views],
-                [self.photos.mask(i, small) for i in self.views],
-            )
-            scene = dataclasses.replace(
-                scene, points=scene.points[kept], point_colors=scene.point_colors[kept]
-            )
+        small, scene = self.schedule.divisor(0), self._start_scene()
         decision = Decision("dense_start", "off", "off", SET, measured=False)
         if self.settings.dense_start != "off":
             start = dense_start(
@@ -293,6 +286,9 @@ class _Trainer:
                 seed=self.seed, threads=self.threads,
             )  # fmt: skip
             if start.gaussians is not None:
+                if self._uses_priors():
+                    self.stepper.priors = start.priors
+                    save_priors(self.folder, start.priors, key)
                 return start.gaussians, start.decision
             decision = start.decision
         gaussians = initial_gaussians(
@@ -308,6 +304,42 @@ class _Trainer:
             seed=self.seed,
         )
         return gaussians, decision
+
+    def _start_scene(self) -> Scene:
+        """Return the scene with the sparse points that masks do not show to be background."""
+        scene, small = self.scene, self.schedule.divisor(0)
+        if self.settings.mask_mode != "background" or not len(scene.points):
+            return scene
+        kept = inside_masks(
+            scene.points,
+            [self.photos.camera(i, small) for i in self.views],
+            [self.photos.mask(i, small) for i in self.views],
+        )
+        return dataclasses.replace(
+            scene, points=scene.points[kept], point_colors=scene.point_colors[kept]
+        )
+
+    def _uses_priors(self) -> bool:
+        return self.settings.lambda_depth_prior > 0.0
+
+    def _saved_priors(
+        self, state: TrainingState, key: str, progress: Progress
+    ) -> dict[int, DepthPrior]:
+        """Return the confirmed depths of a resumed training; lost ones are made again."""
+        if not (state.model_selection.chose("dense_start") and self._uses_priors()):
+            return {}
+        divisor = matching_divisor([self.photos.camera(view, 1) for view in self.views])
+        cameras = {view: self.photos.camera(view, divisor) for view in self.views}
+        priors = load_priors(self.folder, cameras, key)
+        if priors is None:
+            _logger.info("the confirmed depths are not there: matching the photos again")
+            maps = matched_photos(
+                self._start_scene(), self.photos, self.views, progress,
+                seed=self.seed, threads=self.threads,
+            )  # fmt: skip
+            priors = priors_of(self.views, maps)
+            save_priors(self.folder, priors, key)
+        return priors
 
     def _select_model(self, state: TrainingState) -> None:
         """Take the decisions that need no training; record those made by settings."""

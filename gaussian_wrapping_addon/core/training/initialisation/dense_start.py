@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Initial Gaussians on the surfaces that stereo finds before training (docs/method.md, section 11)."""
+"""Initial Gaussians on the surfaces that stereo finds (docs/method.md, section 11)."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from ...gaussians.initialisation import gaussians_at, point_spacing
 from ...gaussians.model import OrientedGaussians
 from ...progress import Progress
 from ...stereo.depth_maps import DepthMap, estimate_depth_maps
+from ...stereo.depth_priors import DepthPrior, priors_of
 from ...stereo.fusion import DensePoints, fuse
 from ...stereo.gap_filling import fill_gaps
 from ..selection.model_selection import Decision, decide
@@ -62,6 +63,8 @@ class DenseStart:
 
     gaussians: OrientedGaussians | None
     """``None`` where stereo confirms too little."""
+    priors: dict[int, DepthPrior]
+    """Confirmed depths by view; empty without Gaussians."""
     decision: Decision
 
 
@@ -91,14 +94,12 @@ def dense_start(
     max_gaussians : int
         Limit of the growth; the start leaves room below it.
     """
-    points = np.asarray(scene.points, np.float64).reshape(-1, 3)
-    usable = usable_points(points)
-    points, colors = points[usable], np.asarray(scene.point_colors).reshape(-1, 3)[usable]
-    maps = estimate_depth_maps(photos, views, points, progress, seed=seed, threads=threads)
+    points, colors = _usable(scene)
+    maps = matched_photos(scene, photos, views, progress, seed=seed, threads=threads)
     confirmed = _confirmed_share(maps)
     decision = _decision(setting, confirmed, len(maps))
     if decision.chosen != "on":
-        return DenseStart(None, decision)
+        return DenseStart(None, {}, decision)
     wanted = max(1, min(MOST_POINTS, round(BUDGET_SHARE * max_gaussians)))
     found = fuse(maps, wanted)
     guesses = fill_gaps(maps, found, round(GUESS_SHARE * wanted))
@@ -116,7 +117,28 @@ def dense_start(
         random = np.random.default_rng([seed, 4])
         kept = np.sort(random.choice(len(gaussians), max_gaussians, replace=False))
         gaussians = gaussians.select(torch.from_numpy(kept))
-    return DenseStart(gaussians, decision)
+    return DenseStart(gaussians, priors_of(views, maps), decision)
+
+
+def matched_photos(
+    scene: Scene,
+    photos: PhotoSource,
+    views: Sequence[int],
+    progress: Progress,
+    *,
+    seed: int,
+    threads: int,
+) -> list[DepthMap]:
+    """Return the depth maps of the training views; empty where there is too little to match."""
+    points, _ = _usable(scene)
+    return estimate_depth_maps(photos, views, points, progress, seed=seed, threads=threads)
+
+
+def _usable(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sparse points within reach (n, 3) and their colours (n, 3) uint8."""
+    points = np.asarray(scene.points, np.float64).reshape(-1, 3)
+    usable = usable_points(points)
+    return points[usable], np.asarray(scene.point_colors).reshape(-1, 3)[usable]
 
 
 def _confirmed_share(maps: Sequence[DepthMap]) -> float:

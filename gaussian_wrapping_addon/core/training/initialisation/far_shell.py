@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Initial Gaussians far away, where the photos show what stereo cannot place (docs/method.md, section 11.9).
+"""Initial Gaussians far away, where the photos show what stereo cannot place.
 
 Sky and the far distance have no parallax. Without Gaussians there, training explains them by fog
-before the things.
+before the things. See docs/method.md, section 11.9.
 """
 
 from __future__ import annotations
