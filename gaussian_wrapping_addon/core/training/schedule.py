@@ -134,6 +134,11 @@ class Schedule:
         wanted &= iteration < self._at(self.settings.depth_prior_until)
         return self.settings.lambda_depth_prior if wanted else 0.0
 
+    @property
+    def flattening_step(self) -> float:
+        """Return by how much the log of the smallest scales falls in an iteration."""
+        return self.settings.flattening / self.settings.iterations
+
     def compares_views(self, iteration: int) -> bool:
         """Tell whether the multi-view terms are evaluated in this iteration."""
         begin, end = self._at(self.settings.depth_from), self._at(self.settings.multi_view_until)
