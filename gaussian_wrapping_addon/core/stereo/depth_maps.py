@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Depth, normal and confidence of all photos by multi-view PatchMatch (docs/method.md, section 11)."""
+"""Depth, normal and confidence of photos by multi-view PatchMatch (docs/method.md, section 11)."""
 
 from __future__ import annotations
 

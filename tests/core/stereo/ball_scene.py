@@ -47,11 +47,10 @@ def ball_scene() -> tuple[Scene, PhotosInMemory]:
     """Return the scene with exact sparse points on all surfaces, and its photos."""
     cameras = arc_cameras()
     random = np.random.default_rng(5)
-    parts = [
-        random.permutation(surface_points(camera).reshape(-1, 3))[:60] for camera in cameras
-    ]
+    parts = [random.permutation(surface_points(camera).reshape(-1, 3))[:60] for camera in cameras]
     points = np.concatenate(parts)
-    colors = np.round(255 * trace(np.zeros(3) + [0, 0, 3.0], points - [0, 0, 3.0]))
+    eye = np.array([0.0, 0.0, 3.0])
+    colors = np.round(255 * trace(eye, points - eye))
     views = tuple(View(camera, Path(camera.name)) for camera in cameras)
     scene = Scene(views, points, colors.astype(np.uint8), Similarity())
     return scene, PhotosInMemory(scene, [photograph(camera) for camera in cameras])

@@ -20,6 +20,7 @@ from gaussian_wrapping_addon.core.stereo.depth_maps import (
     estimate_depth_maps,
 )
 from gaussian_wrapping_addon.core.stereo.matching_cost import WORST_COST
+from gaussian_wrapping_addon.core.stereo.source_views import in_image
 from tests.core.stereo.ball_scene import (
     ball_maps,
     ball_scene,
@@ -99,9 +100,7 @@ def test_few_points_few_views_and_tiny_photos_give_nothing() -> None:
     assert few_maps(photos, views=range(2)) == []
     assert estimate_depth_maps(photos, FEW, scene.points[:19], Progress(), threads=1) == []
     assert estimate_depth_maps(photos, FEW, np.zeros((0, 3)), Progress(), threads=1) == []
-    views = tuple(
-        dataclasses.replace(v, camera=v.camera.resized(128, 1)) for v in scene.views[:4]
-    )
+    views = tuple(dataclasses.replace(v, camera=v.camera.resized(128, 1)) for v in scene.views[:4])
     flat = dataclasses.replace(scene, views=views)
     lines = PhotosInMemory(flat, [photo[:1] for photo in photos.photos[:4]])
     assert estimate_depth_maps(lines, range(4), scene.points, Progress(), threads=1) == []
@@ -184,9 +183,10 @@ def test_both_limits_are_kept_by_the_least_divisor(
 def test_the_range_of_depths_is_finite_wherever_the_points_are() -> None:
     camera = _camera(128, 96)
     points = ball_scene()[0].points
-    depth = camera.project(points)[1]
+    inside, depth = in_image(camera, points)
     low, high = _depth_range(camera, points)
-    assert low < 1 / depth[depth > 0.2].max() < 1 / depth[depth > 0.2].min() <= 1.5 * high
+    assert low < 0.1 / depth[inside].max()
+    assert 1 / depth[inside].min() < high < 2 / depth[inside].min()
     at_the_camera = np.tile(camera.center, (30, 1))
     low, high = _depth_range(camera, at_the_camera)
     assert 0 < low < high < 100

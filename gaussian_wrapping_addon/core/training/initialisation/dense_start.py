@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Initial Gaussians on the surfaces that stereo finds before training (docs/method.md, section 11)."""
+"""Initial Gaussians on the surfaces that stereo finds (docs/method.md, section 11)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Initial Gaussians far away, where the photos show what stereo cannot place (docs/method.md, section 11.9).
+"""Initial Gaussians far away, where photos show what stereo cannot place.
+
+See docs/method.md, section 11.9.
 
 Sky and the far distance have no parallax. Without Gaussians there, training explains them by fog
 before the things.
