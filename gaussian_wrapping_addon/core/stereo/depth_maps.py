@@ -7,6 +7,7 @@ See docs/method.md, section 11.
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -104,16 +105,19 @@ def estimate_depth_maps(
     Returns
     -------
     list of DepthMap
-        In the order of ``views``; empty where there are too few points or views to compare.
+        In the order of ``views``; empty where there are too few points or views to compare, or a
+        photo is too small to be halved.
     """
     threads = threads or default_threads()
     views = list(views)
     full = [photos.camera(view, 1) for view in views]
     if len(views) <= LEAST_SOURCES or len(points) < FEW_POINTS:
         return []
+    fine = matching_divisor(full)
+    if min(min(camera.width, camera.height) for camera in full) < 2 * fine:
+        return []
     sources = source_views(full, points)
     ranges = np.array([_depth_range(camera, points) for camera in full])
-    fine = matching_divisor(full)
     matcher = _Matcher(photos, views, points, sources, ranges, seed, threads, progress)
     coarse = matcher.coarse(2 * fine)
     level, means = matcher.fine(coarse, fine)
@@ -138,7 +142,7 @@ class _Matcher:
         self.threads, self.progress = threads, progress
         # A fine sweep visits four times the pixels of a coarse one.
         self.steps = len(views) * (COARSE_SWEEPS + COARSE_GEOMETRIC_SWEEPS + 4 * FINE_SWEEPS)
-        self.done = 0
+        self.done, self.lock = 0, threading.Lock()
 
     def coarse(self, divisor: int) -> MatchingLevel:
         """Match from sparse points and random planes."""
@@ -196,12 +200,16 @@ class _Matcher:
             for view in range(begin, end):
                 self.progress.check()
                 work(view)
-                self.done += weight
                 if weight:
-                    share = self.done / self.steps
-                    self.progress.update(min(1.0, share), "matching photos for a dense start")
+                    self._report(weight)
 
         run_chunks(run, np.arange(len(self.views) + 1), self.threads)
+
+    def _report(self, weight: int) -> None:
+        with self.lock:  # or a thread could report less than another one before it
+            self.done += weight
+            share = self.done / self.steps
+            self.progress.update(share, f"matching photos for a dense start · {share:.0%}")
 
     def _start(self, level: MatchingLevel, view: int) -> None:
         """Planes between sparse points; random ones elsewhere and for a share of the pixels."""
@@ -285,6 +293,7 @@ def _depth_range(camera: Camera, points: np.ndarray) -> tuple[float, float]:
         near, far = np.percentile(distance, (1, 99))
     else:
         near, far = np.percentile(depth[inside], (1, 99))
+    near, far = max(near, tolerances.NEAR_Z), max(far, tolerances.NEAR_Z)
     return FARTHEST_FACTOR / far, NEAREST_FACTOR / near
 
 

@@ -138,8 +138,10 @@ def _cell_size(pixels: DensePoints, wanted: int) -> float:
 
 def _cells(pixels: DensePoints, size: float) -> np.ndarray:
     """Return (n,) int64 keys of the octree cells; equal for equal cells of equal level."""
-    level = np.round(np.log2(pixels.sizes * size)).astype(np.int64)
+    # Levels of the footprints alone, so that the number of cells follows ``size`` without steps.
+    level = np.round(np.log2(pixels.sizes)).astype(np.int64)
     lowest = pixels.positions.min(0)
-    place = np.floor((pixels.positions - lowest) / 2.0 ** level[:, None]).astype(np.int64)
+    side = size * 2.0 ** level[:, None]
+    place = np.floor((pixels.positions - lowest) / side).astype(np.int64)
     # A hash: two cells of one key would merge, which the normals' test makes harmless.
     return ((place[:, 0] * 1000003 + place[:, 1]) * 1000003 + place[:, 2]) * 257 + level

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..dataset.camera import Camera
 from .consistency import confirm
+from .matching_cost import WORST_COST
 from .sweep import sweep
 
 _GREY = np.array([0.299, 0.587, 0.114])
@@ -20,6 +21,9 @@ _FAR_PX = (3, 5, 9, 7)
 
 _FIRST_SPAN, _LATER_SPAN = 0.1, 0.02
 """Relative change of the depth by the first refinement, while planes are random and later."""
+
+_MOST_SEED = 2**32 - 1
+"""Seeds of a sweep lie between 1 and this: the generator would stay at 0."""
 
 NO_PRIOR = np.zeros((0, 0, 3), np.float32)
 NO_DEPTHS = np.zeros(1, np.float32)
@@ -73,9 +77,9 @@ class MatchingLevel:
         self._quads, self._stride = quads.reshape(-1).view(np.int32), np.float32(width)
         self._photo_pixels = height * width
         self.planes = np.zeros((count, height, width, 3), np.float32)
-        self.costs, self.variances = (
-            [np.zeros(grey.shape, np.float32) for grey in self.greys] for _ in range(2)
-        )
+        # A photo without sources is never swept: nothing matches there.
+        self.costs = [np.full(grey.shape, WORST_COST, np.float32) for grey in self.greys]
+        self.variances = [np.zeros(grey.shape, np.float32) for grey in self.greys]
         self._best_sources, self.confirmed = (
             [np.zeros(grey.shape, np.uint8) for grey in self.greys] for _ in range(2)
         )
@@ -125,7 +129,7 @@ class MatchingLevel:
             self._best_sources[view], self.variances[view], maps, back_maps, self._quads, sizes,
             bases, self._stride, inverse_depths, np.float32(geometric), self.lenses[view],
             self.depth_ranges[view], np.float32(_FIRST_SPAN if fresh else _LATER_SPAN), prior,
-            np.uint32(1 + 7919 * (view + 1) + 104729 * turn + 31 * seed),
+            np.uint32(1 + (7919 * (view + 1) + 104729 * turn + 31 * seed) % _MOST_SEED),
         )  # fmt: skip
         self.planes_of(view)[:] = planes
 

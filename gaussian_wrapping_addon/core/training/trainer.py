@@ -281,7 +281,7 @@ class _Trainer:
         decision = Decision("dense_start", "off", "off", SET, measured=False)
         if self.settings.dense_start != "off":
             start = dense_start(
-                scene, self.photos, self.views, self.settings.dense_start, progress,
+                scene, self.photos, self.views, self.settings.dense_start, progress.span(0.0, 0.0),
                 max_gaussians=self.schedule.growth_limit(), sh_degree=self.settings.sh_degree,
                 seed=self.seed, threads=self.threads,
             )  # fmt: skip

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from gaussian_wrapping_addon.core.dataset.scene import Scene, View
 from gaussian_wrapping_addon.core.dataset.similarity import Similarity
@@ -15,6 +16,7 @@ from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.gaussians.initialisation import (
     MIN_START_POINTS,
     SH_C0,
+    gaussians_at,
     initial_gaussians,
 )
 from gaussian_wrapping_addon.core.render.render import render
@@ -183,3 +185,40 @@ def test_no_view_is_refused() -> None:
         initial_gaussians(
             scene(np.zeros((5, 3))), [], lambda i: None, max_gaussians=9, sh_degree=0, seed=0
         )
+
+
+def test_gaussians_lie_flat_across_normals() -> None:
+    random = np.random.default_rng(4)
+    normals = random.normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals[:3] = [[0, 0, 1], [0, 0, -1], [1, 0, 0]]
+    points, sizes = random.normal(size=(50, 3)), random.uniform(0.01, 2.0, 50)
+    flatness, opacities = random.uniform(0.1, 1.0, 50), random.uniform(0.1, 0.9, 50)
+    colors = random.uniform(size=(50, 3))
+    made = gaussians_at(
+        points, colors, sizes, 2, normals=normals, flatness=flatness, opacities=opacities
+    )
+    w, *vector = made.quats.numpy().astype(float).T
+    turned = Rotation.from_quat(np.stack([*vector, w], 1)).as_matrix()
+    assert turned[:, :, 2] == pytest.approx(normals, abs=1e-6)
+    scales = np.exp(made.log_scales.numpy())
+    assert scales[:, 0] == pytest.approx(sizes, rel=1e-5)
+    assert scales[:, 1] == pytest.approx(sizes, rel=1e-5)
+    assert scales[:, 2] == pytest.approx(sizes * flatness, rel=1e-5)
+    assert torch.sigmoid(made.opacity_logits).numpy() == pytest.approx(opacities, abs=1e-5)
+    assert made.means.numpy() == pytest.approx(points, abs=1e-6)
+    assert 0.5 + SH_C0 * made.sh[:, 0].numpy() == pytest.approx(colors, abs=1e-6)
+    assert made.sh.shape == (50, 9, 3)
+    assert not made.orientation.any()
+
+
+def test_without_normals_gaussians_are_round_and_there_may_be_none() -> None:
+    made = gaussians_at(np.ones((3, 3)), np.zeros((3, 3)), np.full(3, 0.5), 0)
+    assert made.quats.tolist() == [[1, 0, 0, 0]] * 3
+    assert np.exp(made.log_scales.numpy()) == pytest.approx(0.5)
+    assert torch.sigmoid(made.opacity_logits).numpy() == pytest.approx(0.1, abs=1e-6)
+    nothing = gaussians_at(
+        np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), 1, normals=np.zeros((0, 3)), flatness=0.1
+    )
+    assert len(nothing) == 0
+    assert nothing.sh.shape == (0, 4, 3)

@@ -356,7 +356,9 @@ def test_a_round_that_is_cancelled_half_way_is_done_again(
 
 def test_every_decision_is_written_down_and_can_be_overridden(tmp_path: Path) -> None:
     scene, photos = sphere_scene(views=9, size_px=24)
-    names = {"full_size", "exposure", "multi_view", "harmonics", "wrapping", "growth"}
+    names = {
+        "full_size", "exposure", "multi_view", "harmonics", "wrapping", "growth", "dense_start",
+    }  # fmt: skip
     settings = dataclasses.replace(SETTINGS, densify_until=0.9)
     result = train(scene, photos, settings, tmp_path, Progress(), threads=1)
     assert {d.name for d in result.model_selection} == names

@@ -65,7 +65,7 @@ def far_shell(
         colors.append(color)
         angles.append(np.full(len(at), CELL_PX / camera.fx))
     found, color = np.concatenate(directions), np.concatenate(colors)
-    if len(found) == 0:
+    if len(found) == 0 or wanted < 1:
         return _shell(np.zeros((0, 3)), np.zeros((0, 3)), 0.0, radius), radius
     step = float(np.median(np.concatenate(angles)))
     while True:

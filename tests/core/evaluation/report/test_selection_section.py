@@ -19,7 +19,9 @@ from gaussian_wrapping_addon.core.training.selection.model_selection import (
 )
 from tests.core.evaluation.report.report_examples import full_summary
 
-NAMES = ("harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size")
+NAMES = (
+    "harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size", "dense_start",
+)  # fmt: skip
 
 
 def training() -> dict[str, Any]:

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The start on surfaces found by stereo: flat Gaussians on the ball scene, and the decision."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_wrapping_addon.core.dataset.photo_source import PhotoSource
+from gaussian_wrapping_addon.core.dataset.scene import Scene
+from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
+from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.training import trainer
+from gaussian_wrapping_addon.core.training.initialisation.dense_start import (
+    FLATNESS,
+    LEAST_CONFIRMED,
+    OPACITY,
+    DenseStart,
+    dense_start,
+    joined,
+)
+from gaussian_wrapping_addon.core.training.rounds import Rounds
+from gaussian_wrapping_addon.core.training.state import TrainingState
+from tests.core.stereo.ball_scene import (
+    ball_scene,
+    surface_distance,
+    true_normals,
+    with_photos,
+)
+from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians
+
+FEW = range(3, 8)
+
+
+def start(
+    setting: str = "on",
+    photos: PhotoSource | None = None,
+    scene: Scene | None = None,
+    *,
+    max_gaussians: int = 3000,
+    seed: int = 0,
+) -> DenseStart:
+    own_scene, own_photos = ball_scene()
+    return dense_start(
+        scene or own_scene, photos or own_photos, FEW, setting, Progress(),
+        max_gaussians=max_gaussians, sh_degree=1, seed=seed, threads=1,
+    )  # fmt: skip
+
+
+@functools.cache
+def plain_start() -> DenseStart:
+    return start()
+
+
+def started() -> OrientedGaussians:
+    gaussians = plain_start().gaussians
+    assert gaussians is not None
+    return gaussians
+
+
+def one_colour() -> PhotosInMemory:
+    photos = ball_scene()[1]
+    return with_photos(photos, [np.full_like(p, 120) for p in photos.photos])
+
+
+def third_axes(gaussians: OrientedGaussians) -> np.ndarray:
+    w, x, y, z = gaussians.quats.numpy().astype(float).T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+
+
+def test_confirmed_gaussians_lie_flat_on_the_surfaces() -> None:
+    gaussians = started()
+    scales = gaussians.log_scales.numpy().astype(float)
+    flat = np.exp(scales[:, 2] - scales[:, 0])
+    confirmed = np.abs(flat - FLATNESS) < 1e-3
+    confirmed &= np.linalg.norm(gaussians.means.numpy(), axis=1) < 2.5
+    assert confirmed.sum() > 400
+    opacities = torch.sigmoid(gaussians.opacity_logits).numpy()
+    assert opacities[confirmed] == pytest.approx(OPACITY, abs=1e-5)
+    points = gaussians.means.numpy()[confirmed].astype(float)
+    assert np.median(surface_distance(points)) < 0.03
+    cosine = (third_axes(gaussians)[confirmed] * true_normals(points)).sum(1)
+    assert np.median(np.degrees(np.arccos(np.clip(cosine, -1, 1)))) < 12.0
+    assert np.array_equal(scales[:, 0], scales[:, 1])
+    assert gaussians.sh_degree == 1
+    assert all(torch.isfinite(t).all() for _, t in gaussians.tensors())
+    # No larger than the photos' resolution and the number allow, no gaps either.
+    assert 0.01 < np.median(np.exp(scales[confirmed, 0])) < 0.2
+
+
+def test_the_decision_tells_how_much_was_confirmed() -> None:
+    decision = plain_start().decision
+    assert (decision.name, decision.setting, decision.chosen) == ("dense_start", "on", "on")
+    assert decision.figures["photos"] == len(FEW)
+    assert decision.figures["limit"] == LEAST_CONFIRMED
+    assert 0.3 < decision.figures["confirmed"] < 1.0
+    assert f"{100 * decision.figures['confirmed']:.0f} %" in decision.evidence
+    automatic = start("auto")
+    assert automatic.decision.chosen == "on"
+    assert automatic.gaussians is not None
+    assert torch.equal(automatic.gaussians.means, started().means)
+
+
+@pytest.mark.parametrize("setting", ["auto", "on"])
+def test_photos_of_one_colour_start_from_sparse_points(setting: str) -> None:
+    found = start(setting, one_colour())
+    assert found.gaussians is None
+    assert (found.decision.setting, found.decision.chosen) == (setting, "off")
+    assert found.decision.figures["confirmed"] == 0.0
+
+
+def test_too_few_points_or_only_excluded_pixels_start_from_sparse_points() -> None:
+    scene, photos = ball_scene()
+    few = dataclasses.replace(scene, points=scene.points[:5], point_colors=scene.point_colors[:5])
+    found = start("on", scene=few)
+    assert found.gaussians is None
+    assert found.decision.chosen == "off"
+    assert "Too few" in found.decision.evidence
+    masks = [np.zeros(p.shape[:2], bool) for p in photos.photos]
+    assert start("on", with_photos(photos, photos.photos, masks)).decision.chosen == "off"
+
+
+def test_on_takes_less_than_auto_does() -> None:
+    photos = ball_scene()[1]
+    grey = [np.full_like(p, 120) for p in photos.photos]
+    for changed, photo in zip(grey, photos.photos, strict=True):
+        changed[36:70, 44:84] = photo[36:70, 44:84]
+    little = with_photos(photos, grey)
+    automatic, asked = start("auto", little), start("on", little)
+    assert 0.0 < asked.decision.figures["confirmed"] < LEAST_CONFIRMED
+    assert automatic.gaussians is None
+    assert automatic.decision.chosen == "off"
+    assert asked.gaussians is not None
+    assert asked.decision.chosen == "on"
+
+
+@pytest.mark.parametrize("limit", [1, 5, 200, 900])
+def test_there_are_never_more_than_allowed(limit: int) -> None:
+    found = start(max_gaussians=limit)
+    assert found.gaussians is not None
+    assert 0.5 * limit <= len(found.gaussians) <= limit
+
+
+def test_sparse_points_away_from_dense_ones_are_kept_round() -> None:
+    scene, _ = ball_scene()
+    away = np.array([[0.0, 0.0, 5.0], [0.3, -0.2, 6.0]])
+    more = dataclasses.replace(
+        scene,
+        points=np.concatenate([scene.points, away, [[np.nan] * 3]]),
+        point_colors=np.concatenate([scene.point_colors, np.full((3, 3), 200, np.uint8)]),
+    )
+    gaussians = start(scene=more).gaussians
+    assert gaussians is not None
+    means = gaussians.means.numpy()
+    for point in away:
+        nearest = np.linalg.norm(means - point, axis=1).argmin()
+        assert means[nearest] == pytest.approx(point, abs=1e-6)
+        assert np.ptp(gaussians.log_scales[nearest].numpy()) < 1e-6
+        assert torch.sigmoid(gaussians.opacity_logits[nearest]) == pytest.approx(0.1, abs=1e-5)
+    # Those on the surfaces that stereo found say nothing new.
+    near = scene.points[np.abs(np.linalg.norm(scene.points, axis=1) - 1.0) < 1e-6]
+    gap = np.linalg.norm(means[:, None] - near[None], axis=2).min(0)
+    assert (gap < 1e-6).mean() < 0.5
+
+
+def test_joined_gaussians_are_those_of_both() -> None:
+    first, second = sphere_gaussians(5), sphere_gaussians(3)
+    both = joined(first, second)
+    for name, tensor in both.tensors():
+        expected = torch.cat([getattr(first, name), getattr(second, name)])
+        assert torch.equal(tensor, expected), name
+
+
+SETTINGS = TrainingSettings(
+    iterations=4, max_gaussians=1500, max_image_px=128, sh_degree=1, wrapping="off", growth="off",
+    harmonics="off", exposure="off", multi_view="off", holdout_every=0,
+)  # fmt: skip
+
+
+def first_state(setting: str, folder: Path, events: list[ProgressEvent]) -> TrainingState:
+    scene, photos = ball_scene()
+    few = dataclasses.replace(scene, views=scene.views[3:8])
+    own = PhotosInMemory(few, photos.photos[3:8])
+    settings = dataclasses.replace(SETTINGS, dense_start=setting)
+    run = trainer._Trainer(few, own, settings, folder, 0, 1)
+    progress = Progress("train", events.append)
+    return run._start(Rounds(run.stepper, run.held_out, run.inside, progress), progress)
+
+
+def test_the_training_starts_from_what_the_setting_says(tmp_path: Path) -> None:
+    events: list[ProgressEvent] = []
+    dense, sparse = (first_state(setting, tmp_path, events) for setting in ("on", "off"))
+    decisions = [
+        {d.name: d for d in state.model_selection}["dense_start"] for state in (dense, sparse)
+    ]
+    assert [(d.setting, d.chosen, d.measured) for d in decisions] == [
+        ("on", "on", True), ("off", "off", False),
+    ]  # fmt: skip
+    scales = [state.to_arrays() for state in (dense, sparse)]
+    flat = [
+        np.ptp(next(v for k, v in arrays.items() if k.endswith("log_scales")), axis=1)
+        for arrays in scales
+    ]
+    assert (flat[0] > 1.0).mean() > 0.4
+    assert (flat[1] < 1e-5).all()
+    # Matching comes before the training, whose share of the work is counted from 0.
+    matching = [event for event in events if "matching" in event.message]
+    assert len(matching) == 25
+    assert {event.fraction for event in matching} == {0.0}
+    assert matching[-1].message.endswith("100%")
