@@ -16,8 +16,8 @@ from gaussian_wrapping_addon.core.stereo.depth_maps import (
     MOST_PIXELS,
     DepthMap,
     _depth_range,
-    matching_divisor,
     estimate_depth_maps,
+    matching_divisor,
 )
 from gaussian_wrapping_addon.core.stereo.matching_cost import WORST_COST
 from gaussian_wrapping_addon.core.stereo.source_views import in_image
