@@ -17,6 +17,9 @@ from .depth_maps import DepthMap
 
 FILE_NAME = "depth_priors.npz"
 
+PLAIN_VARIANCE = np.float32(20.0)
+"""Variance of grey in a window, squared levels of 256, at which a depth counts half."""
+
 
 @dataclass(frozen=True)
 class DepthPrior:
@@ -27,16 +30,20 @@ class DepthPrior:
     depth: np.ndarray
     """(h, w) float32 z-depth, scene units; 0 where nothing is confirmed."""
     confidence: np.ndarray
-    """(h, w) float32 in [0, 1]; 0 where nothing is confirmed."""
+    """(h, w) float32 in [0, 1], the less the more texture; 0 where nothing is confirmed."""
 
 
 def priors_of(views: Sequence[int], depth_maps: Sequence[DepthMap]) -> dict[int, DepthPrior]:
-    """Return the priors of views, by view."""
+    """Return the priors of views, by view.
+
+    Texture takes from their weight: where there is some, photos tell the depth more finely than
+    windows do, and thin parts are what windows miss.
+    """
     return {
         view: DepthPrior(
             found.camera,
             np.where(found.confidence > 0, found.depth, np.float32(0)),
-            found.confidence,
+            found.confidence * (PLAIN_VARIANCE / (PLAIN_VARIANCE + found.variance)),
         )
         for view, found in zip(views, depth_maps, strict=True)
     }

@@ -15,7 +15,7 @@ from ...stereo.depth_priors import DepthPrior
 TOLERANCE_SHARE = 0.01
 """Relative difference in depth up to which the loss is quadratic; beyond, it is linear."""
 
-OUTLIER_SHARE = 0.05
+OUTLIER_SHARE = 0.03
 """Relative difference from which the photos are believed: stereo misses what is thin."""
 
 _NO_MASK = np.zeros((0, 0), np.bool_)
