@@ -302,9 +302,21 @@ def _depth_range(camera: Camera, points: np.ndarray) -> tuple[float, float]:
 
 def matching_divisor(cameras: Sequence[Camera]) -> int:
     """Return the divisor of the size at which photos are matched; ``cameras`` are of divisor 1."""
-    side = max(max(camera.width, camera.height) for camera in cameras)
-    pixels = sum(camera.width * camera.height for camera in cameras)
+    side_px = max(max(camera.width, camera.height) for camera in cameras)
+    return least_divisor(side_px, sum(camera.width * camera.height for camera in cameras))
+
+
+def least_divisor(side_px: float, pixels: float) -> int:
+    """Return the least power of 2 that brings photos below both limits.
+
+    Parameters
+    ----------
+    side_px : float
+        Long side of the largest photo.
+    pixels : float
+        Of all photos together.
+    """
     divisor = 1
-    while side / divisor > MATCHED_SIDE_PX or pixels / divisor**2 > MOST_PIXELS:
+    while side_px / divisor > MATCHED_SIDE_PX or pixels / divisor**2 > MOST_PIXELS:
         divisor *= 2
     return divisor

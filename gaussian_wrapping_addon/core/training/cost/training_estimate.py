@@ -27,6 +27,8 @@ from ...gaussians.initialisation import MIN_START_POINTS
 from ...machine import available_memory_bytes
 from ...report_warning import ReportWarning
 from ...settings import TrainingSettings
+from ...stereo.depth_maps import least_divisor
+from ..initialisation.dense_start import start_budget
 from ..schedule import Schedule
 
 if TYPE_CHECKING:
@@ -50,6 +52,13 @@ GAUSSIAN_S = 0.254e-6
 MULTI_VIEW_SHARE = 0.4
 """Additional time of a multi-view iteration, as a share of a plain one (57 ms against 144 ms of one
 thread, 40 000 Gaussians, 4000 pixels)."""
+
+MATCHING_PIXEL_S = 4e-6
+"""Per pixel of all photos at the size at which they are matched for a dense start: 7.6 us of one
+thread (35 photos of 320 x 240 px, benchmarks/scenes wheel) on two threads."""
+
+MATCHING_PIXEL_BYTES = 200
+"""Per such pixel: planes, costs, and the points that are fused."""
 
 LOW, HIGH = 0.75, 1.95
 """The reported range is the model's time times these: it covers every measured training."""
@@ -186,6 +195,8 @@ def gaussian_counts(facts: SceneFacts, settings: TrainingSettings, growth: float
     schedule = _schedule(facts, settings)
     limit = schedule.growth_limit()
     start = min(limit, max(facts.points, MIN_START_POINTS))
+    if settings.dense_start != "off" and facts.photos > 1:
+        start = max(start, start_budget(limit))
     top = limit if settings.growth == "on" else start + growth * (limit - start)
     if settings.growth == "off":
         top = start
@@ -235,6 +246,15 @@ def _seconds(
     return total_s
 
 
+def _matched_pixels(facts: SceneFacts, settings: TrainingSettings) -> float:
+    """Return the pixels of all photos at the size at which they are matched."""
+    if settings.dense_start == "off":
+        return 0.0
+    side = min(facts.long_side_px, settings.max_image_px)
+    pixels = facts.photos * _trained_pixels(facts, settings)
+    return pixels / least_divisor(side, pixels) ** 2
+
+
 def _window(pixels: float, most: int) -> float:
     """Return the approximate number of pixels of a window (:mod:`..windows`)."""
     across = math.ceil(math.sqrt(pixels / most))
@@ -266,8 +286,10 @@ def estimate(
     cheap = dataclasses.replace(settings, multi_view="off") if decided else settings
     least = gaussian_counts(scene_facts, settings, LITTLE_GROWTH)
     most = gaussian_counts(scene_facts, settings, 1.0)
-    low_s = LOW * _seconds(scene_facts, cheap, least, first) / machine.speed
-    high_s = HIGH * _seconds(scene_facts, settings, most, first) / machine.speed
+    matched = _matched_pixels(scene_facts, settings)
+    matching_s = MATCHING_PIXEL_S * matched if first == 0 else 0.0
+    low_s = LOW * (_seconds(scene_facts, cheap, least, first) + matching_s) / machine.speed
+    high_s = HIGH * (_seconds(scene_facts, settings, most, first) + matching_s) / machine.speed
     count = math.ceil(float(most.max()))
     coefficients = 3 * (settings.sh_degree + 1) ** 2
     trained = 3 + 3 + 4 + 1 + coefficients + 4  # values of a Gaussian that are trained
@@ -280,6 +302,7 @@ def estimate(
         + count * (4 * trained * GAUSSIAN_COPIES + RENDER_GAUSSIAN_BYTES)
         + pixels * PIXEL_BYTES
         + min(photos_bytes, PHOTO_CACHE_BYTES)
+        + matched * MATCHING_PIXEL_BYTES
     )
     disk = CHECKPOINTS * count * state_bytes + count * RESULT_BYTES_PER_GAUSSIAN
     return Estimate(low_s, high_s, round(memory), round(disk) + OTHER_DISK_BYTES, count)

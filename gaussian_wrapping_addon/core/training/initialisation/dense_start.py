@@ -100,7 +100,7 @@ def dense_start(
     decision = _decision(setting, confirmed, len(maps))
     if decision.chosen != "on":
         return DenseStart(None, {}, decision)
-    wanted = max(1, min(MOST_POINTS, round(BUDGET_SHARE * max_gaussians)))
+    wanted = start_budget(max_gaussians)
     found = fuse(maps, wanted)
     guesses = fill_gaps(maps, found, round(GUESS_SHARE * wanted))
     known = np.concatenate([found.positions, guesses.positions, points])
@@ -118,6 +118,11 @@ def dense_start(
         kept = np.sort(random.choice(len(gaussians), max_gaussians, replace=False))
         gaussians = gaussians.select(torch.from_numpy(kept))
     return DenseStart(gaussians, priors_of(views, maps), decision)
+
+
+def start_budget(max_gaussians: int) -> int:
+    """Return how many points on confirmed depths are wanted below a limit of Gaussians."""
+    return max(1, min(MOST_POINTS, round(BUDGET_SHARE * max_gaussians)))
 
 
 def matched_photos(
