@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Decay of the smallest scale, so that Gaussians become flat unless photos keep them thick.
+"""Decay of the smallest scale, so that large discs become flat unless photos keep them thick.
 
 See docs/method.md, section 3.7.
 """
@@ -20,6 +20,14 @@ their gradients grow with the inverse."""
 FILTER_SHARE = 0.2
 """... and no further than this share of the 3D filter, which hides anything thinner."""
 
+DISC_SHARE = 0.25
+"""Least share of the largest scale that the middle one of a disc has. Needles stay round: they are
+wires, which a ribbon does not replace."""
+
+LEAST_WIDTH = 8.0
+"""Least middle scale of a disc, in 3D filters (a filter is about 0.22 px): what is narrower may be
+part of a wire."""
+
 _LEAST_SCALE = 1e-9
 
 
@@ -28,6 +36,7 @@ def _flatten_rows(
     begin: int, end: int, log_scales: np.ndarray, filter_3d: np.ndarray, step: float
 ) -> None:
     log_flat, log_share = math.log(MOST_FLAT), math.log(FILTER_SHARE)
+    log_disc, log_width = math.log(DISC_SHARE), math.log(LEAST_WIDTH)
     for i in range(begin, end):
         a, b, c = log_scales[i, 0], log_scales[i, 1], log_scales[i, 2]
         least = 0
@@ -37,13 +46,16 @@ def _flatten_rows(
             least = 2
         smallest = log_scales[i, least]
         middle = max(min(a, b), min(max(a, b), c))
-        floor = max(middle + log_flat, math.log(max(filter_3d[i], _LEAST_SCALE)) + log_share)
+        log_filter = math.log(max(filter_3d[i], _LEAST_SCALE))
+        if middle < max(a, b, c) + log_disc or middle < log_filter + log_width:
+            continue
+        floor = max(middle + log_flat, log_filter + log_share)
         if smallest > floor:
             log_scales[i, least] = max(smallest - step, floor)
 
 
 def flatten(log_scales: np.ndarray, filter_3d: np.ndarray, step: float, *, threads: int) -> None:
-    """Reduce the smallest scale of each Gaussian, down to a floor.
+    """Reduce the smallest scale of each disc, down to a floor.
 
     Parameters
     ----------
