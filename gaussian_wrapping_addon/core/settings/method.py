@@ -91,23 +91,6 @@ class MethodSettings:
         paper=0.0,
         since="0.2.0",
     )
-    depth_prior_until: float = _constant(
-        1.0,
-        "--depth-prior-until",
-        "End of the loss on depths that stereo confirmed.",
-        _SHARE,
-        unit=_OF_ITERATIONS,
-        since="0.2.0",
-    )
-    flattening: float = _constant(
-        3.0,
-        "--flattening",
-        "Natural logarithm of the factor by which the smallest scale of a Gaussian decays over a "
-        "training, where photos do not keep it.",
-        Range(0.0, 100.0),
-        paper=0.0,
-        since="0.2.0",
-    )
     lambda_normal: float = _constant(
         0.03, "--lambda-normal", "Weight of the normal loss.", _WEIGHT, paper=0.05
     )

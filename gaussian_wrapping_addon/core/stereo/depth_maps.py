@@ -75,8 +75,6 @@ class DepthMap:
     """(h, w) uint8 number of sources whose depth agrees."""
     cost: np.ndarray
     """(h, w) float32 mean cost in the two best sources; about 1 where nothing matches."""
-    variance: np.ndarray
-    """(h, w) float32 weighted variance of grey in the window, squared levels of 256."""
     color: np.ndarray
     """(h, w, 3) uint8."""
     mask: np.ndarray | None
@@ -275,7 +273,6 @@ def _depth_map(
         np.where(good, confidence, 0.0).astype(np.float32),
         count,
         level.costs[view],
-        level.variances[view],
         color,
         mask,
     )

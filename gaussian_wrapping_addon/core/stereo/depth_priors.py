@@ -17,36 +17,63 @@ from .depth_maps import DepthMap
 
 FILE_NAME = "depth_priors.npz"
 
-PLAIN_VARIANCE = np.float32(20.0)
-"""Variance of grey in a window, squared levels of 256, at which a depth counts half."""
+PLANE_STEP_PX = 5
+PLANE_SHARE = 0.002
+"""A pixel lies on a plane if the plane foretells the depths so far away within this share. On the
+room of benchmarks/scenes the depths of such pixels err by 0.02 % of the diagonal in the median and
+0.05 % at 90 % (all confirmed ones: 0.03 and 0.27 %); on curved things few pixels pass, and there
+training finds the surface better than windows do."""
+
+LEAST_FACING = 0.05
+"""Least cosine between normal and ray at which the slopes of a plane are known."""
 
 
 @dataclass(frozen=True)
 class DepthPrior:
-    """Confirmed depths of one photo."""
+    """Confirmed depths of planes in one photo."""
 
     camera: Camera
     """Of this size, scene frame."""
     depth: np.ndarray
-    """(h, w) float32 z-depth, scene units; 0 where nothing is confirmed."""
+    """(h, w) float32 z-depth, scene units; 0 where nothing is confirmed or planar."""
     confidence: np.ndarray
-    """(h, w) float32 in [0, 1], the less the more texture; 0 where nothing is confirmed."""
+    """(h, w) float32 in [0, 1]; 0 where nothing is confirmed."""
 
 
 def priors_of(views: Sequence[int], depth_maps: Sequence[DepthMap]) -> dict[int, DepthPrior]:
-    """Return the priors of views, by view.
-
-    Texture takes from their weight: where there is some, photos tell the depth more finely than
-    windows do, and thin parts are what windows miss.
-    """
-    return {
-        view: DepthPrior(
+    """Return the priors of views, by view: the confirmed depths of planes."""
+    priors = {}
+    for view, found in zip(views, depth_maps, strict=True):
+        plane = planar_pixels(found)
+        priors[view] = DepthPrior(
             found.camera,
-            np.where(found.confidence > 0, found.depth, np.float32(0)),
-            found.confidence * (PLAIN_VARIANCE / (PLAIN_VARIANCE + found.variance)),
+            np.where(plane, found.depth, np.float32(0)),
+            np.where(plane, found.confidence, np.float32(0)),
         )
-        for view, found in zip(views, depth_maps, strict=True)
-    }
+    return priors
+
+
+def planar_pixels(depth_map: DepthMap) -> np.ndarray:
+    """Tell where the plane of a pixel holds in all directions, (h, w) bool.
+
+    The neighbours at :data:`PLANE_STEP_PX` are confirmed and lie on it.
+    """
+    camera, confirmed = depth_map.camera, depth_map.confidence > 0
+    inverse = 1.0 / depth_map.depth.astype(np.float64)
+    normal = depth_map.normal.astype(np.float64) @ camera.rotation.T
+    facing = (normal * camera.rays()).sum(-1)
+    scale = inverse / np.where(facing < -LEAST_FACING, facing, -LEAST_FACING)
+    slope_x, slope_y = normal[..., 0] * scale / camera.fx, normal[..., 1] * scale / camera.fy
+    step = PLANE_STEP_PX
+    planar = confirmed & (facing < -LEAST_FACING)
+    for x, y in ((step, 0), (-step, 0), (0, step), (0, -step)):
+        there = np.roll(inverse, (-y, -x), (0, 1))
+        reached = inverse + x * slope_x + y * slope_y
+        planar &= np.abs(reached - there) <= PLANE_SHARE * there
+        planar &= np.roll(confirmed, (-y, -x), (0, 1))
+    planar[:step] = planar[-step:] = False
+    planar[:, :step] = planar[:, -step:] = False
+    return planar
 
 
 def save_priors(folder: Path, priors: Mapping[int, DepthPrior], key: str) -> None:

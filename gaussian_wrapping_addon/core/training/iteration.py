@@ -30,7 +30,6 @@ from .losses.multi_view import (
     merge_gradients,
     multi_view_losses,
 )
-from .optimizer.flattening import flatten
 from .schedule import Schedule
 from .state import TrainingState
 from .windows import Window, windows
@@ -174,9 +173,6 @@ class Stepper:
         if not oriented:
             rates.pop("orientation", None)
         adam.step_rows(seen, rates, sh_degree=state.degree, threads=self.threads)
-        step = schedule.flattening_step
-        if step > 0.0:
-            flatten(adam.array("log_scales"), adam.array("filter_3d"), step, threads=self.threads)
         if state.exposure is not None:
             rate = exposure_rate(iteration, self.settings.iterations, len(self.views))
             state.exposure.step(sample.view, state.rate_factor * rate)

@@ -130,14 +130,7 @@ class Schedule:
 
     def prior_weight(self, iteration: int) -> float:
         """Return the weight of the depths that stereo confirmed; they count with the depth loss."""
-        wanted = self.uses_depth(iteration)
-        wanted &= iteration < self._at(self.settings.depth_prior_until)
-        return self.settings.lambda_depth_prior if wanted else 0.0
-
-    @property
-    def flattening_step(self) -> float:
-        """Return by how much the log of the smallest scales falls in an iteration."""
-        return self.settings.flattening / self.settings.iterations
+        return self.settings.lambda_depth_prior if self.uses_depth(iteration) else 0.0
 
     def compares_views(self, iteration: int) -> bool:
         """Tell whether the multi-view terms are evaluated in this iteration."""

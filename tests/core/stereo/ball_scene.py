@@ -124,7 +124,6 @@ def exact_map(camera: Camera, **changes: object) -> DepthMap:
         confidence=np.ones(shape, np.float32),
         agreeing=np.full(shape, 4, np.uint8),
         cost=np.zeros(shape, np.float32),
-        variance=np.full(shape, 100.0, np.float32),
         color=photograph(camera),
         mask=None,
     )

@@ -8,14 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
+from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap
 from gaussian_wrapping_addon.core.stereo.depth_priors import (
     FILE_NAME,
-    PLAIN_VARIANCE,
+    PLANE_SHARE,
+    PLANE_STEP_PX,
     load_priors,
+    planar_pixels,
     priors_of,
     save_priors,
 )
-from tests.core.stereo.ball_scene import ball_scene, exact_map
+from tests.core.stereo.ball_scene import ball_scene, exact_map, surface_points
 
 VIEW = 5
 
@@ -56,14 +59,56 @@ def test_a_damaged_file_is_not_loaded(tmp_path: Path) -> None:
         assert load_priors(tmp_path, {VIEW: camera}, "key") is None
 
 
-def test_texture_takes_weight_and_unconfirmed_depths_are_zero() -> None:
+def plane_map(tilt: float = 0.3) -> tuple[DepthMap, np.ndarray]:
+    """Return a confirmed map of a tilted plane in every pixel, and the plane's normal."""
     _, found = exact_prior()
-    plain = np.zeros(found.depth.shape, np.float32)
-    confidence = np.full(found.depth.shape, 0.8, np.float32)
-    confidence[0] = 0.0
-    for variance, share in ((plain, 1.0), (plain + PLAIN_VARIANCE, 0.5)):
-        changed = dataclasses.replace(found, variance=variance, confidence=confidence)
-        prior = priors_of([VIEW], [changed])[VIEW]
-        np.testing.assert_allclose(prior.confidence, share * confidence, rtol=1e-6)
-        assert (prior.depth[0] == 0).all()
-        assert np.array_equal(prior.depth[1:], found.depth[1:])
+    camera = found.camera
+    normal = np.array([tilt, -0.2, -1.0])
+    normal /= np.linalg.norm(normal)
+    rays = camera.rays()
+    depth = (4.0 * normal[2]) / (rays @ normal)
+    normals = np.broadcast_to(normal @ camera.rotation, found.normal.shape)
+    changed = dataclasses.replace(
+        found, depth=depth.astype(np.float32), normal=normals.astype(np.float32)
+    )
+    return changed, normal
+
+
+def test_all_pixels_of_a_plane_count_but_those_near_the_border() -> None:
+    found, _ = plane_map()
+    inner = np.zeros(found.depth.shape, bool)
+    inner[PLANE_STEP_PX:-PLANE_STEP_PX, PLANE_STEP_PX:-PLANE_STEP_PX] = True
+    assert np.array_equal(planar_pixels(found), inner)
+    prior = priors_of([VIEW], [found])[VIEW]
+    assert np.array_equal(prior.confidence, np.where(inner, found.confidence, 0))
+    assert np.array_equal(prior.depth, np.where(inner, found.depth, 0))
+
+
+def test_steps_noise_and_unconfirmed_neighbours_do_not_count() -> None:
+    found, _ = plane_map()
+    half = found.depth.shape[1] // 2
+    step = found.depth.copy()
+    step[:, half:] *= np.float32(1.0 + 2.0 * PLANE_SHARE)
+    planar = planar_pixels(dataclasses.replace(found, depth=step))
+    assert not planar[:, half - PLANE_STEP_PX : half + PLANE_STEP_PX].any()
+    assert planar[8:-8, 8 : half - PLANE_STEP_PX].all()
+    noise = np.random.default_rng(0).normal(0.0, 4.0 * PLANE_SHARE, step.shape)
+    noisy = (found.depth * (1.0 + noise)).astype(np.float32)
+    assert planar_pixels(dataclasses.replace(found, depth=noisy)).mean() < 0.01
+    holes = found.confidence.copy()
+    holes[20, 30] = 0.0
+    planar = planar_pixels(dataclasses.replace(found, confidence=holes))
+    assert not planar[20, 30]
+    assert not planar[20 + PLANE_STEP_PX, 30]
+    assert planar[21 + PLANE_STEP_PX, 30]
+
+
+def test_the_ball_does_not_count_and_the_floor_does() -> None:
+    """Exact depths of a ball deviate from its tangent planes within five pixels."""
+    _, found = exact_prior()
+    points = surface_points(found.camera)
+    on_ball = np.abs(np.linalg.norm(points, axis=-1) - 1.0) < 1e-3
+    on_floor = (np.abs(points[..., 2] + 1.0) < 1e-3) & ~on_ball
+    planar = planar_pixels(found)
+    assert planar[on_ball].mean() < 0.05
+    assert planar[on_floor].mean() > 0.5

@@ -73,7 +73,6 @@ def wrapping_settings(settings: TrainingSettings) -> TrainingSettings:
         growth="off",
         full_size="on",
         prune_share=0.0,
-        flattening=0.0,
         depth_from=0.0,
         densify_from=0.0,
         densify_until=0.0,

@@ -11,7 +11,10 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import ResourceError
 from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.stereo.depth_maps import least_divisor
 from gaussian_wrapping_addon.core.training.cost.training_estimate import (
+    MATCHING_PIXEL_BYTES,
+    MATCHING_PIXEL_S,
     Machine,
     SceneFacts,
     check_resources,
@@ -19,6 +22,7 @@ from gaussian_wrapping_addon.core.training.cost.training_estimate import (
     gaussian_counts,
     this_machine,
 )
+from gaussian_wrapping_addon.core.training.initialisation.dense_start import start_budget
 from gaussian_wrapping_addon.core.training.schedule import Schedule
 
 FACTS = SceneFacts(40, 640 * 480, 640, 3000)
@@ -92,14 +96,29 @@ def test_images_count_at_the_size_that_is_trained() -> None:
 
 
 def test_growth_off_keeps_the_start_and_on_reaches_the_cap() -> None:
-    off = gaussian_counts(FACTS, replace(PLAIN, growth="off", wrapping="off"), 1.0)
-    assert (off == 5000).all()
+    kept = replace(PLAIN, growth="off", wrapping="off")
+    sparse = gaussian_counts(FACTS, replace(kept, dense_start="off"), 1.0)
+    assert (sparse == 5000).all()
+    dense = gaussian_counts(FACTS, kept, 1.0)
+    assert (dense == start_budget(Schedule(kept, 640).growth_limit())).all()
     on = gaussian_counts(FACTS, replace(PLAIN, extra_iterations=50), 1.0)
     assert len(on) == PLAIN.iterations + 50
     assert (np.diff(on) >= 0).all()
     assert 0.97 * PLAIN.max_gaussians < on[-1] <= PLAIN.max_gaussians
     few = gaussian_counts(replace(FACTS, points=10**6), PLAIN, 1.0)
     assert few[0] == Schedule(PLAIN, 640).growth_limit()
+
+
+def test_matching_adds_time_and_memory_once() -> None:
+    without = estimate(FACTS, replace(PLAIN, dense_start="off", growth="on"), MACHINE)
+    fixed = replace(PLAIN, growth="on")
+    whole, later = (estimate(FACTS, fixed, MACHINE, first=first) for first in (0, 1))
+    matched = FACTS.photos * FACTS.pixels / least_divisor(640, FACTS.photos * FACTS.pixels) ** 2
+    assert whole.memory_bytes - without.memory_bytes == pytest.approx(
+        MATCHING_PIXEL_BYTES * matched, rel=0.01
+    )
+    # The first iteration takes far less than matching all photos.
+    assert whole.seconds_low - later.seconds_low > 0.7 * MATCHING_PIXEL_S * matched
 
 
 def test_a_full_disk_is_refused_and_little_memory_is_told() -> None:

@@ -39,7 +39,6 @@ def sky_map(camera: Camera) -> DepthMap:
         confidence=np.zeros(shape, np.float32),
         agreeing=np.zeros(shape, np.uint8),
         cost=np.ones(shape, np.float32),
-        variance=np.zeros(shape, np.float32),
         color=np.round(sky_color(rays)).astype(np.uint8),
         mask=None,
     )
