@@ -15,14 +15,22 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from gaussian_wrapping_addon.core.errors import WrapError
+from gaussian_wrapping_addon.core.errors import UsageError, WrapError
 
-from ..scenes.contact_sheet import write_contact_sheet
+from ..study.command import DOCUMENTS
+from ..study.making import carry_out
+from ..study.record import read_records, record_path
 from .build import build_zoo_scene
 from .cache import ensure_zoo_scene
 from .catalogue import DEVELOPMENT, PARTS, SCENES, zoo_scene
+from .document import write_document
+from .runs import BASELINES, alpha_case, find_scene, make_one, run_case
+from .sheet import draw_sheet
 
 _logger = logging.getLogger("benchmarks")
+
+_FURTHER = "--"
+"""What follows is given to the command line of every job."""
 
 
 def _arguments(given: Sequence[str]) -> argparse.Namespace:
@@ -32,7 +40,13 @@ def _arguments(given: Sequence[str]) -> argparse.Namespace:
         "--only", nargs="+", default=[], metavar="WORD",
         help="scenes whose names have one of these words in them",
     )  # fmt: skip
+    parser.add_argument("--preset", default="standard")
+    parser.add_argument("--label", help="folder of the records (default: the preset)")
+    parser.add_argument("--runs", type=int, default=0, help="make at most so many; 0: no limit")
+    parser.add_argument("--again", action="store_true", help="make runs that have a record, too")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--document", action="store_true", help="write the page, make no run")
+    parser.add_argument("--out", type=Path, default=DOCUMENTS, help="folder of the page")
     parser.add_argument("--render", action="store_true", help="render the scenes, make no run")
     parser.add_argument(
         "--sheet", type=Path, metavar="FILE", help="draw a contact sheet of the scenes, make no run"
@@ -45,7 +59,9 @@ def _arguments(given: Sequence[str]) -> argparse.Namespace:
 
 def main(given: Sequence[str] | None = None) -> int:
     """Run the command line, return the exit code."""
-    options = _arguments(sys.argv[1:] if given is None else given)
+    words = list(sys.argv[1:] if given is None else given)
+    at = words.index(_FURTHER) if _FURTHER in words else len(words)
+    options, further = _arguments(words[:at]), words[at + 1 :]
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     logging.getLogger("PIL").setLevel(logging.WARNING)
     try:
@@ -58,18 +74,49 @@ def main(given: Sequence[str] | None = None) -> int:
             if options.part in (scene.part, "all")
             and (not options.only or any(word in name for word in options.only))
         ]
-        folders = []
+        if options.sheet is not None:
+            draw_sheet(names, options.sheet, options.threads)
+            return 0
+        if options.document:
+            path = write_document(options.out)
+            _logger.info("%s", path or "there is no record yet, so no page")
+            return int(path is None)
+        if not options.render:
+            return _make_runs(names, options, further)
         for name in names:
             begun_s = time.monotonic()
-            folders.append(ensure_zoo_scene(name, options.threads))
-            _logger.info("%s: %.0f s, %s", name, time.monotonic() - begun_s, folders[-1].name)
-        if options.sheet is not None:
-            write_contact_sheet(folders, options.sheet)
-            _logger.info("%s", options.sheet)
+            folder = ensure_zoo_scene(name, options.threads)
+            _logger.info("%s: %.0f s, %s", name, time.monotonic() - begun_s, folder.name)
     except WrapError as error:
         _logger.error("%s", error)
         return error.exit_code
     return 0
+
+
+def _make_runs(names: Sequence[str], options: argparse.Namespace, further: Sequence[str]) -> int:
+    """Make the alpha shapes and runs that are missing; return 1 where one failed, else 0."""
+    label = options.label or options.preset
+    if label == BASELINES or (further and not options.label):
+        raise UsageError(
+            f"Runs of {label!r} need a label of their own.",
+            "Give the variant a name: --label NAME.",
+        )
+    jobs = [run_case(name, label, options.preset, further) for name in names]
+    trivial = [alpha_case(name) for name in names]
+    if not options.again:
+        read_records([*jobs, *trivial])  # raises where a label was made with other arguments
+    common = {"threads": options.threads, "maker": make_one, "find_scene": find_scene}
+    # One scene after the other, so that a scene is rendered when its turn comes.
+    failed = made = 0
+    for job, alpha in zip(jobs, trivial, strict=True):
+        if record_path(job).is_file() and not options.again:
+            continue
+        if options.runs and made == options.runs:
+            break
+        made += 1
+        failed += carry_out([alpha], **common)
+        failed += carry_out([job], again=options.again, **common)
+    return int(failed > 0)
 
 
 if __name__ == "__main__":

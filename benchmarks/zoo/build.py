@@ -70,7 +70,9 @@ def build_zoo_scene(scene: ZooScene, folder: Path, threads: int, samples: int = 
     paths = [images / c.name for c in cameras] + [tests / c.name for c in content.test_cameras]
     render_photos(content, [*cameras, *content.test_cameras], paths, threads)
     if shot.exposure:
-        for path, gain in zip(paths[: len(cameras)], draw_gains(len(cameras), scene.seed), strict=True):
+        for path, gain in zip(
+            paths[: len(cameras)], draw_gains(len(cameras), scene.seed), strict=True
+        ):
             Image.fromarray(expose(_read(path), gain)).save(path)
     solid = joined([p for p in (*content.subject.parts, *content.around) if p.name != SKY_NAME])
     photos = [_read(path) for path in paths[: len(cameras)]]

@@ -30,7 +30,7 @@ from .surroundings import FAR, NEAR, OPEN, around, sky
 
 DEVELOPMENT, TEST = "development", "test"
 PARTS = (DEVELOPMENT, TEST)
-TEST_VIEWS = 8
+TEST_VIEWS = 6
 
 FEW = 12
 """Photos of the scenes that have few."""
@@ -119,7 +119,7 @@ _GIVEN: dict[str, dict[str, tuple[tuple[str, ...], ...]]] = {
 SCENES = {
     scene.name: scene
     for scene in (
-        ZooScene(family, part, number + 1, *given[:2], few=len(given) > 2)
+        ZooScene(family, part, number + 1, given[0], "".join(given[1:2]), few=len(given) > 2)
         for part in PARTS
         for family in FAMILIES
         for number, given in enumerate(_GIVEN[family][part])
@@ -128,6 +128,12 @@ SCENES = {
 
 _SIZES = ((4, 3), (3, 2), (1, 1), (3, 4), (16, 9))
 """Ratios of width to height."""
+_SHORT_SIDE_PX = 544
+"""Of the largest photos."""
+_PHOTOS = (24, 49)
+"""Least number, and one more than the largest."""
+_PIXELS = 9e6
+"""Of all photos together, where more than the least number would have more: time to render."""
 _GROUND_GAP = (0.08, 0.3)
 """Things hover so high: the ground stays out of their region."""
 _MARGIN, _CROP_MARGIN = 0.05, 0.03
@@ -151,13 +157,15 @@ def draw_photography(scene: ZooScene) -> Photography:
     """Draw how a scene is photographed."""
     random = np.random.default_rng([scene.seed, 1])
     long = 16 * int(random.integers(30, 51))  # 480 to 800 pixels
+    photos = int(random.integers(*_PHOTOS))
     across, down = _SIZES[int(random.integers(len(_SIZES)))]
     if scene.family in _PLACES:
         across, down = max(across, down), min(across, down)
     share = min(across, down) / max(across, down)
+    long = min(long, 16 * int(_SHORT_SIDE_PX / share / 16))
     short = 2 * round(long * share / 2)
     width, height = (long, short) if across >= down else (short, long)
-    photos = int(random.integers(24, 49))
+    photos = max(_PHOTOS[0], min(photos, int(_PIXELS / (width * height))))
     return Photography(
         width=width,
         height=height,

@@ -124,7 +124,7 @@ def draw_colors(random: np.random.Generator, *, weak: bool = False) -> tuple[Col
     colors = []
     for value in values * random.uniform(0.85, 1.1):
         turned = hue if weak else (hue + random.uniform(-0.3, 0.3)) % 1.0
-        saturation = random.uniform(0.05, 0.15) if weak else random.uniform(0.25, 0.75)
+        saturation = random.uniform(0.05, 0.15) if weak else random.uniform(0.15, 0.6)
         colors.append(colorsys.hsv_to_rgb(turned, saturation, min(value, 0.68)))
     return colors[0], colors[1], colors[2]
 

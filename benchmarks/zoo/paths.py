@@ -78,7 +78,7 @@ def _camera(name: str, pose: np.ndarray, shot: Photography, focal_share: float) 
 def thing_distance(shot: Photography) -> float:
     """Return the distance at which a thing fills the short side of the photo."""
     share = min(shot.width, shot.height) / max(shot.width, shot.height)
-    return THING_RADIUS * 1.05 * _FOCAL_SHARE / (share / 2)
+    return THING_RADIUS * 0.92 * _FOCAL_SHARE / (share / 2)
 
 
 def pixel_at_thing(shot: Photography) -> float:
@@ -112,10 +112,13 @@ def _on_walk(
     cameras = []
     for k in range(count):
         share = (k + 0.5 + 0.5 * phase) / count
-        x = low[0] + share * (high[0] - low[0]) + random.uniform(-0.15, 0.15)
+        x = 0.85 * (low[0] + share * (high[0] - low[0])) + random.uniform(-0.15, 0.15)
         y = low[1] + (high[1] - low[1]) * (0.15, 0.40, 0.0)[k % 3] + random.uniform(-0.2, 0.2)
         center = np.array([x, y, random.uniform(1.4, 2.0)])
-        yaw = np.radians(90.0 + (0.0, -32.0, 32.0)[k % 3] + random.uniform(-8, 8))
+        turn = (0.0, -32.0, 32.0)[k % 3]  # to the right below 0, where x grows
+        outward = (share < 0.5) == (turn > 0)
+        turn *= 1.0 - abs(2 * share - 1) if outward else 1.0  # nothing stands beyond the ends
+        yaw = np.radians(90.0 + turn + random.uniform(-8, 8))
         pitch = np.radians((4.0, 14.0, 0.0, 9.0)[k % 4] + random.uniform(-4, 4))
         gaze = [np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)]
         pose = look_at(center, center + np.array(gaze), random.uniform(-3, 3))

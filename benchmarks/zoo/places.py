@@ -40,16 +40,23 @@ def rooms(random: np.random.Generator) -> tuple[Subject, Volume]:
         **{f"thing{k}": draw_look(random, _OBJECTS) for k in range(6)},
         "plain": draw_look(random, (1.0, 2.0), patterns=(WEAK,), weak=True),
     }
-    planes = [np.array([a - WALL, a, b, b + WALL]) for a, b in zip(low, high, strict=True)]
+    xs, ys, zs = (np.array([a - WALL, a, b, b + WALL]) for a, b in zip(low, high, strict=True))
     filled = np.ones((3, 3, 3), bool)
     filled[1, 1, 1] = False
     parts = [
         # Light passes through the walls, so that the closed room is lit.
-        replace(part("walls", shapes.blocks(*planes, filled), "walls", smooth=False), surrounding=True),
+        replace(
+            part("walls", shapes.blocks(xs, ys, zs, filled), "walls", smooth=False),
+            surrounding=True,
+        ),
         # The floor's own look lies on the shell as a board that nearly reaches the walls.
-        box("floor", (low[0] + 0.03, low[1] + 0.03, -_SINK), (high[0] - 0.03, high[1] - 0.03, 0.015),
-            "floor"),
-    ]  # fmt: skip
+        box(
+            "floor",
+            (low[0] + 0.03, low[1] + 0.03, -_SINK),
+            (high[0] - 0.03, high[1] - 0.03, 0.015),
+            "floor",
+        ),
+    ]
     makers = [_table, _cupboard, _sofa, _lamp, _crates]
     places = [(-0.55, 0.62), (0.6, 0.6), (0.62, -0.55), (-0.62, -0.6), (0.0, -0.72)]
     order = random.permutation(len(makers))
@@ -75,8 +82,14 @@ def _table(x: float, y: float, random: np.random.Generator) -> list[Part]:
     ball = radius * vertices + [x - 0.4 * w, y, h + radius - _SINK]
     parts.append(part("ball", (ball, faces), _thing(random)))
     parts.append(
-        box("book", (x + 0.1 * w, y - 0.4 * d, h - _SINK), (x + 0.6 * w, y + 0.4 * d, h + 0.05), _thing(random), 20)
-    )  # fmt: skip
+        box(
+            "book",
+            (x + 0.1 * w, y - 0.4 * d, h - _SINK),
+            (x + 0.6 * w, y + 0.4 * d, h + 0.05),
+            _thing(random),
+            20,
+        )
+    )
     return parts
 
 
@@ -96,8 +109,14 @@ def _cupboard(x: float, y: float, random: np.random.Generator) -> list[Part]:
     filled[1, side, hollow] = False
     return [
         part("cupboard", shapes.blocks(xs, ys, zs, filled), _thing(random), smooth=False),
-        box("on cupboard", (x - 0.2, y - 0.12, h - _SINK), (x + 0.1, y + 0.12, h + 0.25), _thing(random), 25),
-    ]  # fmt: skip
+        box(
+            "on cupboard",
+            (x - 0.2, y - 0.12, h - _SINK),
+            (x + 0.1, y + 0.12, h + 0.25),
+            _thing(random),
+            25,
+        ),
+    ]
 
 
 def _sofa(x: float, y: float, random: np.random.Generator) -> list[Part]:
@@ -119,8 +138,16 @@ def _lamp(x: float, y: float, random: np.random.Generator) -> list[Part]:
     return [
         cone("lamp foot", (x, y, 0.0), (x, y, 0.05), 0.16, 0.13, look, 32),
         cone("lamp rod", (x, y, 0.03), (x, y, height), 0.015, 0.015, look, 12),
-        cone("lamp shade", (x, y, height - 0.03), (x, y, height + 0.26), 0.22, 0.13, _thing(random), 40),
-    ]  # fmt: skip
+        cone(
+            "lamp shade",
+            (x, y, height - 0.03),
+            (x, y, height + 0.26),
+            0.22,
+            0.13,
+            _thing(random),
+            40,
+        ),
+    ]
 
 
 def _crates(x: float, y: float, random: np.random.Generator) -> list[Part]:
@@ -128,9 +155,14 @@ def _crates(x: float, y: float, random: np.random.Generator) -> list[Part]:
     top = 2 * size
     return [
         box("crate", (x - size, y - size, 0.0), (x + size, y + size, top), _thing(random), 15),
-        box("upper crate", (x - 0.6 * size, y - 0.5 * size, top - _SINK), (x + 0.5 * size, y + 0.5 * size, 1.5 * top),
-            "plain", 40),
-    ]  # fmt: skip
+        box(
+            "upper crate",
+            (x - 0.6 * size, y - 0.5 * size, top - _SINK),
+            (x + 0.5 * size, y + 0.5 * size, 1.5 * top),
+            "plain",
+            40,
+        ),
+    ]
 
 
 def _pictures(low: np.ndarray, high: np.ndarray, random: np.random.Generator) -> list[Part]:
@@ -180,11 +212,23 @@ def streets(random: np.random.Generator) -> tuple[Subject, Volume]:
         x, y = random.uniform(-0.8 * long, 0.8 * long), random.uniform(-0.9, -0.35)
         if random.random() < 0.5:
             h = random.uniform(0.5, 1.1)
-            parts.append(box(f"bin {k}", (x - 0.25, y - 0.2, 0.05), (x + 0.25, y + 0.2, h), _thing(random), 20))
+            parts.append(
+                box(
+                    f"bin {k}",
+                    (x - 0.25, y - 0.2, 0.05),
+                    (x + 0.25, y + 0.2, h),
+                    _thing(random),
+                    20,
+                )
+            )
         else:
             h = random.uniform(2.2, 3.0)
-            parts.append(cone(f"post {k}", (x, y, 0.05), (x, y, h), 0.05, 0.035, _thing(random), 16))
-            parts.append(cone(f"head {k}", (x, y, h - 0.03), (x, y, h + 0.2), 0.07, 0.15, _thing(random), 20))
+            parts.append(
+                cone(f"post {k}", (x, y, 0.05), (x, y, h), 0.05, 0.035, _thing(random), 16)
+            )
+            parts.append(
+                cone(f"head {k}", (x, y, h - 0.03), (x, y, h + 0.2), 0.07, 0.15, _thing(random), 20)
+            )
     high[2] = max(tops)
     inner = (
         (float(low[0]), float(-0.75 * depth), -_JUDGED * WALL),
@@ -216,6 +260,10 @@ def _facade(
     ledge = rise * 0.99
     return [
         part(f"facade {number}", mesh, f"facade{number}", smooth=False),
-        box(f"ledge {number}", (left + 0.03, front - 0.09, ledge - 0.06), (right - 0.03, front + 0.05, ledge + 0.02),
-            f"thing{number}"),
-    ]  # fmt: skip
+        box(
+            f"ledge {number}",
+            (left + 0.03, front - 0.09, ledge - 0.06),
+            (right - 0.03, front + 0.05, ledge + 0.02),
+            f"thing{number}",
+        ),
+    ]

@@ -15,14 +15,14 @@ from ..scenes.rendering import _add_light, _configure, _mesh_object, _place, req
 from .content import Content
 from .looks import make_look
 
-SAMPLES = 5
+SAMPLES = 4
 """Rays a pixel; the light of the sky is part of the looks and has no noise."""
 
 
 def render_photos(
     content: Content, cameras: Sequence[Camera], paths: Sequence[Path], threads: int
 ) -> None:
-    """Render one PNG a camera.
+    """Render one PNG a camera; all cameras have one size.
 
     Raises
     ------
@@ -31,8 +31,8 @@ def render_photos(
     """
     bpy = require_bpy()
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    shot, bounces = content.photography, int(content.subject.reflects)
-    scene = _configure(shot.width, shot.height, SAMPLES, bounces, threads)
+    bounces = int(content.subject.reflects)
+    scene = _configure(cameras[0].width, cameras[0].height, SAMPLES, bounces, threads)
     materials = {name: make_look(name, look) for name, look in content.looks.items()}
     for part in (*content.subject.parts, *content.around):
         _mesh_object(part, materials[part.material])

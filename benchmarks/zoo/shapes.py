@@ -98,9 +98,12 @@ def lathe(profile: np.ndarray, sides: int = 72) -> Mesh:
     angle = 2 * np.pi * np.arange(sides) / sides
     around = np.stack([np.cos(angle), np.sin(angle)], 1)  # (sides, 2)
     rows = np.concatenate(
-        [inner[:, None, :1] * around, np.broadcast_to(inner[:, None, 1:], (*inner.shape[:1], sides, 1))],
+        [
+            inner[:, None, :1] * around,
+            np.broadcast_to(inner[:, None, 1:], (*inner.shape[:1], sides, 1)),
+        ],
         2,
-    )  # fmt: skip
+    )
     count = len(inner)
     ends = count * sides + np.arange(2)
     first, last = np.arange(sides), (count - 1) * sides + np.arange(sides)
@@ -218,11 +221,13 @@ def perforated(columns: int, rows: int, cell: float, hole: float, thickness: flo
                 if rim:
                     sides.append((base + k, base + n))
     flat, quad = np.concatenate(sheets), np.array(quads)
-    _, first, same = np.unique(np.round(flat / cell, 6), axis=0, return_index=True, return_inverse=True)  # fmt: skip
+    _, first, same = np.unique(
+        np.round(flat / cell, 6), axis=0, return_index=True, return_inverse=True
+    )
     flat, quad, edge = flat[first], same.reshape(-1)[quad], same.reshape(-1)[np.array(sides)]
     count = len(flat)
     front = np.stack([flat[:, 0], np.full(count, -thickness / 2), flat[:, 1]], 1)
-    back = front + [0.0, thickness, 0.0]
+    back = front + np.array([0.0, thickness, 0.0])
     walls = np.stack([edge[:, 0], edge[:, 0] + count, edge[:, 1] + count, edge[:, 1]], 1)
     every = np.concatenate([quad, quad[:, ::-1] + count, walls])
     faces = np.concatenate([every[:, [0, 1, 2]], every[:, [0, 2, 3]]])

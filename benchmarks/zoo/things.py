@@ -46,7 +46,9 @@ def smooth(random: np.random.Generator, pixel: float, variant: int) -> Subject:
         parts = [part("metaballs", mesh, "skin0")]
     else:
         thick = random.uniform(0.2, 0.32)
-        one = shapes.turned(shapes.ring(0.8, thick, 96, 40), about("x", 90 + random.uniform(-30, 30)))
+        one = shapes.turned(
+            shapes.ring(0.8, thick, 96, 40), about("x", 90 + random.uniform(-30, 30))
+        )
         other = shapes.turned(
             shapes.ring(0.8, 0.7 * thick, 96, 40), about("x", random.uniform(-25, 25)), (0.8, 0, 0)
         )
@@ -63,7 +65,9 @@ def thin(random: np.random.Generator, pixel: float, variant: int) -> Subject:
         return _finished(_wheel(random, radius), looks)
     if kind == 1:
         vertices, faces = icosphere(0)
-        edges = {tuple(sorted(e)) for f in faces.tolist() for e in zip(f, f[1:] + f[:1], strict=True)}
+        edges = {
+            tuple(sorted(e)) for f in faces.tolist() for e in zip(f, f[1:] + f[:1], strict=True)
+        }
         turn = shapes.rotation(random)
         corners = vertices @ turn.T
         parts = [
@@ -88,7 +92,15 @@ def thin(random: np.random.Generator, pixel: float, variant: int) -> Subject:
                 end = start.copy()
                 start[axis], end[axis] = -0.08 * step, step * (counts[axis] - 0.92)
                 parts.append(
-                    cone(f"rod {axis}{a}{b}", start, end, 1.2 * radius, 1.2 * radius, "rods", 9 + axis)
+                    cone(
+                        f"rod {axis}{a}{b}",
+                        start,
+                        end,
+                        1.2 * radius,
+                        1.2 * radius,
+                        "rods",
+                        9 + axis,
+                    )
                 )
     return _finished(parts, looks)
 
@@ -124,12 +136,16 @@ def holed(random: np.random.Generator, pixel: float, variant: int) -> Subject:
         cells = random.integers(4, 9, 2)
         cell = 1.5 / cells.max()
         mesh = shapes.perforated(
-            int(cells[0]), int(cells[1]), cell, random.uniform(0.5, 0.8) * cell, random.uniform(0.03, 0.08)
-        )  # fmt: skip
+            int(cells[0]),
+            int(cells[1]),
+            cell,
+            random.uniform(0.5, 0.8) * cell,
+            random.uniform(0.03, 0.08),
+        )
         turn = about("z", random.uniform(-40, 40))
         foot = box("foot", (-0.5, -0.2, 0), (0.5, 0.2, 0.08), "frame", random.uniform(0, 30))
         low = mesh[0][:, 2].min()
-        stands = replace(foot, vertices=foot.vertices + [0, 0, low - 0.07])
+        stands = replace(foot, vertices=foot.vertices + np.array([0, 0, low - 0.07]))
         plate = part("plate", shapes.turned(mesh, turn), "rods", smooth=False)
         return _finished([plate, stands], looks)
     links, radius = int(random.integers(5, 9)), random.uniform(0.11, 0.16)
@@ -145,8 +161,12 @@ def holed(random: np.random.Generator, pixel: float, variant: int) -> Subject:
         link = shapes.turned(link, about("x", 90 * (k % 2) + random.uniform(-12, 12)))
         x = (k - (links - 1) / 2) * step
         parts.append(
-            part(f"link {k}", shapes.turned(link, np.eye(3), (x, 0, arc * x * x)), ("frame", "rods")[k % 2])
-        )  # fmt: skip
+            part(
+                f"link {k}",
+                shapes.turned(link, np.eye(3), (x, 0, arc * x * x)),
+                ("frame", "rods")[k % 2],
+            )
+        )
     return _finished(parts, looks)
 
 
@@ -157,9 +177,19 @@ def _fence(random: np.random.Generator, pixel: float) -> list[Part]:
     parts = [
         box("top", (-width / 2, -0.03, height - 0.05), (width / 2, 0.03, height), "frame"),
         box("bottom", (-width / 2, -0.031, 0), (width / 2, 0.031, 0.05), "frame"),
-        box("left", (-width / 2 - 0.03, -0.04, -0.02), (-width / 2 + 0.03, 0.04, height + 0.02), "frame"),
-        box("right", (width / 2 - 0.03, -0.041, -0.02), (width / 2 + 0.03, 0.041, height + 0.02), "frame"),
-    ]  # fmt: skip
+        box(
+            "left",
+            (-width / 2 - 0.03, -0.04, -0.02),
+            (-width / 2 + 0.03, 0.04, height + 0.02),
+            "frame",
+        ),
+        box(
+            "right",
+            (width / 2 - 0.03, -0.041, -0.02),
+            (width / 2 + 0.03, 0.041, height + 0.02),
+            "frame",
+        ),
+    ]
     slant = random.uniform(-0.25, 0.25) * height
     columns, rows = int(random.integers(6, 12)), int(random.integers(3, 8))
     for k in range(columns):
@@ -167,19 +197,39 @@ def _fence(random: np.random.Generator, pixel: float) -> list[Part]:
         limit = width / 2 - 0.01
         top = float(np.clip(x + slant, -limit, limit))
         parts.append(
-            cone(f"post {k}", (x, radius * 0.6, 0.02), (top, radius * 0.6, height - 0.02), radius, radius, "rods", 11)
-        )  # fmt: skip
+            cone(
+                f"post {k}",
+                (x, radius * 0.6, 0.02),
+                (top, radius * 0.6, height - 0.02),
+                radius,
+                radius,
+                "rods",
+                11,
+            )
+        )
     for k in range(rows):
         z = height * (k + 1) / (rows + 1)
         parts.append(
-            cone(f"rail {k}", (-width / 2, -radius * 0.6, z), (width / 2, -radius * 0.6, z), radius, radius, "rods", 10)
-        )  # fmt: skip
+            cone(
+                f"rail {k}",
+                (-width / 2, -radius * 0.6, z),
+                (width / 2, -radius * 0.6, z),
+                radius,
+                radius,
+                "rods",
+                10,
+            )
+        )
     return parts
 
 
 def _basket(random: np.random.Generator, pixel: float) -> list[Part]:
     """Return rods around a bottom, held together by rings that grow upwards."""
-    low, high, height = random.uniform(0.35, 0.5), random.uniform(0.5, 0.7), random.uniform(0.5, 0.8)
+    low, high, height = (
+        random.uniform(0.35, 0.5),
+        random.uniform(0.5, 0.7),
+        random.uniform(0.5, 0.8),
+    )
     radius = random.uniform(2.0, 4.0) * pixel * 0.5
     parts = [cone("bottom", (0, 0, 0), (0, 0, 0.05), low, low + 0.01, "frame", 48)]
     count, rows = int(random.integers(14, 26)), int(random.integers(3, 7))
@@ -192,7 +242,9 @@ def _basket(random: np.random.Generator, pixel: float) -> list[Part]:
     for k in range(rows):
         share = (k + 1) / rows
         mesh = shapes.ring(low - 0.02 + (high - low + 0.02) * share, 1.5 * radius, 72, 11)
-        parts.append(part(f"ring {k}", shapes.turned(mesh, np.eye(3), (0, 0, height * share)), "frame"))
+        parts.append(
+            part(f"ring {k}", shapes.turned(mesh, np.eye(3), (0, 0, height * share)), "frame")
+        )
     return parts
 
 
@@ -201,7 +253,10 @@ def _vessel(random: np.random.Generator, kind: int) -> Mesh:
     t = np.linspace(0.0, 1.0, 30)
     wall = random.uniform(0.02, 0.045)
     if kind == 0:
-        height, radius = random.uniform(0.9, 1.3), np.full(30, 0.48) + random.uniform(-0.05, 0.12) * t
+        height, radius = (
+            random.uniform(0.9, 1.3),
+            np.full(30, 0.48) + random.uniform(-0.05, 0.12) * t,
+        )
     elif kind == 1:
         height = random.uniform(0.4, 0.6)
         radius = 0.25 + random.uniform(0.4, 0.55) * np.sqrt(1.001 - (1 - t) ** 2)
@@ -255,12 +310,20 @@ def plates(random: np.random.Generator, pixel: float, variant: int) -> Subject:
             x, y = random.uniform(-0.5, 0.5), random.uniform(-0.3, 0.3)
             half, thick = random.uniform(0.15, 0.35), random.uniform(0.006, 0.02)
             parts.append(
-                box(f"card {k}", (x - half, y - thick, 0.03), (x + half, y + thick, random.uniform(0.4, 0.9)),
-                    f"face{1 + k % 2}", random.uniform(0, 180))
-            )  # fmt: skip
+                box(
+                    f"card {k}",
+                    (x - half, y - thick, 0.03),
+                    (x + half, y + thick, random.uniform(0.4, 0.9)),
+                    f"face{1 + k % 2}",
+                    random.uniform(0, 180),
+                )
+            )
     elif kind == 2:
         steps = int(random.integers(4, 7))
-        xs, zs = np.linspace(-0.6, 0.6, steps + 1), np.linspace(0, random.uniform(0.7, 1.0), steps + 1)
+        xs, zs = (
+            np.linspace(-0.6, 0.6, steps + 1),
+            np.linspace(0, random.uniform(0.7, 1.0), steps + 1),
+        )
         filled = np.arange(steps)[None] <= np.arange(steps)[:, None]
         mesh = shapes.blocks(xs, np.array([-0.4, 0.4]), zs, filled[:, None, :])
         parts.append(part("stairs", shapes.turned(mesh, about("z", 25)), "face0", smooth=False))
@@ -277,7 +340,13 @@ def plates(random: np.random.Generator, pixel: float, variant: int) -> Subject:
         filled[1, 1, 1] = filled[3, 1, 1] = False
         parts.append(part("crate", shapes.blocks(xs, ys, zs, filled), "face0", smooth=False))
         parts.append(
-            box("in crate", (0.15 * w, 0.3 * d, 0.5 * thick), (0.35 * w, 0.6 * d, 1.15 * h), "face1", 20)
+            box(
+                "in crate",
+                (0.15 * w, 0.3 * d, 0.5 * thick),
+                (0.35 * w, 0.6 * d, 1.15 * h),
+                "face1",
+                20,
+            )
         )
     return _finished(parts, looks)
 
@@ -285,9 +354,11 @@ def plates(random: np.random.Generator, pixel: float, variant: int) -> Subject:
 def foliage(random: np.random.Generator, pixel: float, variant: int) -> Subject:
     """Thin two-sided leaves on stems that leave a pot."""
     looks = {
-        "leaf0": draw_look(random, (4.0, 8.0)), "leaf1": draw_look(random, (4.0, 8.0)),
-        "stem": draw_look(random, _SCALES), "pot": draw_look(random, _SCALES),
-    }  # fmt: skip
+        "leaf0": draw_look(random, (4.0, 8.0)),
+        "leaf1": draw_look(random, (4.0, 8.0)),
+        "stem": draw_look(random, _SCALES),
+        "pot": draw_look(random, _SCALES),
+    }
     parts = [cone("pot", (0, 0, -0.45), (0, 0, 0.0), 0.20, 0.28, "pot", 48)]
     t = np.linspace(0.0, 1.0, 14)[:, None]
     thick = random.uniform(0.008, 0.016)
@@ -300,7 +371,10 @@ def foliage(random: np.random.Generator, pixel: float, variant: int) -> Subject:
         for k in range(int(random.integers(6, 11))):
             at = line[int(random.integers(4, 14))]
             mesh = shapes.leaf(
-                random.uniform(0.22, 0.42), random.uniform(0.10, 0.2), random.uniform(-0.6, 0.1), thick
+                random.uniform(0.22, 0.42),
+                random.uniform(0.10, 0.2),
+                random.uniform(-0.6, 0.1),
+                thick,
             )
             turn = about("z", random.uniform(0, 360)) @ about("y", random.uniform(-55, 15))
             parts.append(part(f"leaf {s} {k}", shapes.turned(mesh, turn, at), f"leaf{k % 2}"))
@@ -325,7 +399,12 @@ def gloss(random: np.random.Generator, pixel: float, variant: int) -> Subject:
     parts = [
         part("glazed", shapes.turned((vertices, body[1]), about("z", angle)), "glazed"),
         part("mirror", (radius * ball + [0.72, -0.1, radius], ball_faces), "mirror"),
-        box("cube", (-0.75 - side / 2, -0.2, 0), (-0.75 + side / 2, side - 0.2, side), "cube",
-            random.uniform(0, 90)),
-    ]  # fmt: skip
+        box(
+            "cube",
+            (-0.75 - side / 2, -0.2, 0),
+            (-0.75 + side / 2, side - 0.2, side),
+            "cube",
+            random.uniform(0, 90),
+        ),
+    ]
     return _finished(parts, looks, reflects=True)
