@@ -94,7 +94,7 @@ def _table(x: float, y: float, random: np.random.Generator) -> list[Part]:
 
 
 def _cupboard(x: float, y: float, random: np.random.Generator) -> list[Part]:
-    w, d, h = random.uniform([0.35, 0.2, 0.8], [0.55, 0.3, 1.7])
+    w, d, h = random.uniform([0.35, 0.2, 0.7], [0.55, 0.3, 1.05])
     rows = int(random.integers(2, 4))
     xs = np.array([-w, -w + 0.03, w - 0.03, w]) + x
     ys = np.array([-d, d - 0.02, d]) + y
@@ -112,7 +112,7 @@ def _cupboard(x: float, y: float, random: np.random.Generator) -> list[Part]:
         box(
             "on cupboard",
             (x - 0.2, y - 0.12, h - _SINK),
-            (x + 0.1, y + 0.12, h + 0.25),
+            (x + 0.1, y + 0.12, h + 0.15),
             _thing(random),
             25,
         ),
