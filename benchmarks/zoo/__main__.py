@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Runs on the zoo of scenes: ``python -m benchmarks.zoo [-- ARGUMENTS OF THE COMMAND LINE]``.
 
-Each run leaves a record in ``benchmarks/records/zoo/LABEL``, each scene's alpha shape one in
-``benchmarks/records/zoo/baselines``; what has a record is not made again, so that the command may
-be stopped at any time. ``--document`` writes ``docs/benchmarks/zoo.md`` from all records.
+Each run leaves a record in a folder of ``benchmarks/records`` that its label names, each scene's
+alpha shape one beside them; what has a record is not made again, so that the command may be stopped
+at any time. ``--document`` writes the page of the zoo among the documents from all records.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from gaussian_wrapping_addon.core.errors import UsageError, WrapError
 
 from ..study.command import DOCUMENTS
 from ..study.making import carry_out
-from ..study.record import read_records, record_path
+from ..study.record import read_records
 from .build import build_zoo_scene
 from .cache import ensure_zoo_scene
 from .catalogue import DEVELOPMENT, PARTS, SCENES, zoo_scene
 from .document import write_document
-from .runs import BASELINES, alpha_case, find_scene, make_one, run_case
+from .runs import BASELINES, alpha_case, find_scene, is_made, make_one, run_case
 from .sheet import draw_sheet
 
 _logger = logging.getLogger("benchmarks")
@@ -109,13 +109,14 @@ def _make_runs(names: Sequence[str], options: argparse.Namespace, further: Seque
     # One scene after the other, so that a scene is rendered when its turn comes.
     failed = made = 0
     for job, alpha in zip(jobs, trivial, strict=True):
-        if record_path(job).is_file() and not options.again:
+        if is_made(job) and not options.again:
             continue
         if options.runs and made == options.runs:
             break
         made += 1
-        failed += carry_out([alpha], **common)
-        failed += carry_out([job], again=options.again, **common)
+        if not is_made(alpha):
+            failed += carry_out([alpha], again=True, **common)
+        failed += carry_out([job], again=True, **common)
     return int(failed > 0)
 
 

@@ -60,7 +60,7 @@ class ZooScene:
     part: str
     number: int
     path: str
-    """A key of :data:`.paths.PATHS`."""
+    """A way of :mod:`.paths`."""
     surroundings: str = ""
     few: bool = False
     """Whether it has :data:`FEW` photos only."""
@@ -92,7 +92,7 @@ _GIVEN: dict[str, dict[str, tuple[tuple[str, ...], ...]]] = {
         TEST: ((ORBIT, OPEN), (DOME, FAR)),
     },
     "holed": {
-        DEVELOPMENT: ((ORBIT, OPEN), (FORWARD, FAR), (DOME, NEAR)),
+        DEVELOPMENT: ((ORBIT, OPEN), (FORWARD, FAR), (DOME, NEAR), (ORBIT, FAR)),
         TEST: ((ORBIT, FAR), (DOME, OPEN)),
     },
     "vessels": {

@@ -40,9 +40,9 @@ class Photography:
     height: int
     photos: int
     path: str
-    """A key of :data:`.paths.PATHS`."""
+    """A way of :mod:`.paths`."""
     surroundings: str
-    """Of a thing: a key of :data:`.surroundings.KINDS`; of a place: empty."""
+    """Of a thing: near, far or open (:mod:`.surroundings`); of a place: empty."""
     exposure: bool
     """Whether exposure and white balance change from photo to photo."""
     pose_noise_px: float

@@ -15,7 +15,7 @@ from ..study.origin import made_by, reading
 from ..study.record import RECORDS, Record, read_record
 from ..tables import Table
 from .catalogue import FAMILIES, PARTS, SCENES, ZooScene
-from .runs import BASELINES, FIGURES, STUDY
+from .runs import BASELINES, FIGURES, STUDY, is_present
 
 PAGE, READING = "zoo.md", "zoo-reading.md"
 COMMAND = "python -m benchmarks.zoo"
@@ -55,7 +55,7 @@ def scene_table(records: ByScene, baselines: ByScene, part: str) -> Table:
         scan, photos, alpha = r.scores["surface"]["scan"], r.case.photos, baselines.get(name)
         rows.append(
             {
-                "scene": name,
+                "scene": name + ("" if is_present(r) else " *"),
                 "shown": _shown(SCENES[name]),
                 "photos": f"{photos.count} x {photos.width} x {photos.height}",
                 **{
@@ -80,7 +80,8 @@ def scene_table(records: ByScene, baselines: ByScene, part: str) -> Table:
         "included. Open: share of the true openings, in the test views, that the mesh leaves "
         "open. Floaters: share of the mesh's area farther than 1 % of the diagonal from the "
         "truth. Test dB: whole photos of six views that the job was never given. Alpha shape: of "
-        "the sparse points, with the best alpha by the truth.",
+        "the sparse points, with the best alpha by the truth. *: made on an earlier version of the "
+        "scene.",
     )
 
 
@@ -134,7 +135,7 @@ def _both(
 def write_document(out: Path, root: Path = RECORDS) -> Path | None:
     """Write the page into a folder; return None where no run has a record."""
     found = read_labels(root)
-    baselines = found.pop(BASELINES, {})
+    baselines = {n: r for n, r in found.pop(BASELINES, {}).items() if is_present(r)}
     found = {label: records for label, records in found.items() if records}
     if not found:
         return None

@@ -66,7 +66,6 @@ def _forward(count: int, phase: float, random: np.random.Generator) -> np.ndarra
 _DIRECTIONS: dict[str, Directions] = {
     ORBIT: _orbit, DOME: _dome, CLOSE_UP: _orbit, FORWARD: _forward,
 }  # fmt: skip
-PATHS = (*_DIRECTIONS, INSIDE, WALK)
 
 
 def _camera(name: str, pose: np.ndarray, shot: Photography, focal_share: float) -> Camera:

@@ -22,8 +22,8 @@ from ..speed_error.plan import Photos
 from ..speed_error.score import stage_folder, true_mask
 from ..study.case import Case
 from ..study.making import KEPT_RUNS, make, rounded, run_folder
-from ..study.record import Record, write_record
-from .cache import ensure_zoo_scene
+from ..study.record import Record, read_record, record_path, write_record
+from .cache import ensure_zoo_scene, scene_folder
 from .catalogue import draw_photography, zoo_scene
 
 STUDY = "zoo"
@@ -32,7 +32,7 @@ ALPHA = "alpha"
 """The alpha shape of the sparse points, with the best alpha by the truth."""
 
 FIGURES = "zoo"
-"""Key of a record's scores for what :func:`judged` returns."""
+"""Key of a record's scores for what :func:`judged` returns, and the scene's folder (``scene``)."""
 _FEWEST_PX = 200
 """Openings of fewer pixels in all test views together are not judged."""
 
@@ -59,6 +59,18 @@ def find_scene(case: Case) -> Path:
     return ensure_zoo_scene(case.scene)
 
 
+def is_present(record: Record) -> bool:
+    """Tell whether a run was made on the scene as today's sources draw it."""
+    made_on = record.scores.get(FIGURES, {}).get("scene")
+    return bool(made_on == scene_folder(record.case.scene).name)
+
+
+def is_made(case: Case) -> bool:
+    """Tell whether a case has a record of the scene as today's sources draw it."""
+    path = record_path(case)
+    return path.is_file() and is_present(read_record(path))
+
+
 def make_one(case: Case, *, threads: int, kept: Path = KEPT_RUNS) -> Record:
     """Make a job or an alpha shape, judge it, and write its record.
 
@@ -67,10 +79,14 @@ def make_one(case: Case, *, threads: int, kept: Path = KEPT_RUNS) -> Record:
     WorkerError
         With the last lines of the job's output.
     """
+    scene = find_scene(case)
+    # The folder found here stays the run's, even if the sources of the scenes change meanwhile.
+    figures: dict[str, Any] = {"scene": scene.name}
     if case.name == ALPHA:
-        return make_alpha(case, threads=threads, kept=kept, find_scene=find_scene)
-    made = make(case, threads=threads, kept=kept, find_scene=find_scene)
-    figures = judged(find_scene(case), run_folder(case, kept), threads)
+        made = make_alpha(case, threads=threads, kept=kept, find_scene=lambda _: scene)
+    else:
+        made = make(case, threads=threads, kept=kept, find_scene=lambda _: scene)
+        figures |= judged(scene, run_folder(case, kept), threads)
     record = dataclasses.replace(made, scores={**made.scores, FIGURES: rounded(figures)})
     write_record(record)
     return record

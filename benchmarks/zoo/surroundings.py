@@ -9,7 +9,6 @@ from ..scenes.geometry import Part, icosphere
 from .looks import EVEN, RICH, SKY, WEAK, Look, draw_look
 
 NEAR, FAR, OPEN = "near", "far", "open"
-KINDS = (NEAR, FAR, OPEN)
 """A room, a walled court under the sky, open ground with one wall."""
 
 SKY_NAME = "sky"

@@ -150,7 +150,7 @@ def holed(random: np.random.Generator, pixel: float, variant: int) -> Subject:
         return _finished([plate, stands], looks)
     links, radius = int(random.integers(5, 9)), random.uniform(0.11, 0.16)
     thick = random.uniform(0.025, 0.04)
-    arc = random.uniform(0.2, 0.5)
+    arc = random.uniform(0.03, 0.09)
     parts = []
     step = 2 * radius - 2.6 * thick + 0.09
     for k in range(links):

@@ -11,7 +11,8 @@ import pytest
 
 from benchmarks.scenes.geometry import joined
 from benchmarks.scenes.sparse_points import SparsePoints
-from benchmarks.study.record import read_records, write_record
+from benchmarks.speed_error.tables import three
+from benchmarks.study.record import read_records, record_path, write_record
 from benchmarks.zoo import __main__ as command
 from benchmarks.zoo import shapes
 from benchmarks.zoo.cache import scene_folder
@@ -28,7 +29,14 @@ from benchmarks.zoo.catalogue import (
 from benchmarks.zoo.content import Content
 from benchmarks.zoo.document import floaters, read_labels, write_document
 from benchmarks.zoo.points import disturbed_poses, found_points
-from benchmarks.zoo.runs import BASELINES, alpha_case, open_share, run_case
+from benchmarks.zoo.runs import (
+    BASELINES,
+    FIGURES,
+    alpha_case,
+    is_made,
+    open_share,
+    run_case,
+)
 from benchmarks.zoo.surroundings import SKY_NAME
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import ParseError, UsageError
@@ -225,6 +233,8 @@ def test_a_page_is_written_from_records_alone(tmp_path: Path) -> None:
         invented(run_case("thin-d1", "more", "draft", ("--iterations", "9"))),
         invented(alpha_case("thin-d1"), 0.2),
     ]
+    for record in records[:2] + records[4:]:  # the others are of an earlier version of the scene
+        record.scores[FIGURES] = {"scene": scene_folder(record.case.scene).name}
     for record in records:
         write_record(record, tmp_path)
     found = read_labels(tmp_path)
@@ -246,13 +256,14 @@ def test_a_page_is_written_from_records_alone(tmp_path: Path) -> None:
     seen = [record.f1(1, "scan") for record in records[:2]]
     assert f"{np.mean(seen):.3f} ({min(seen):.3f})" in row
     assert f"{floaters(records[1]):.3f}" in row
+    assert "| thin-t1 * |" in text
+    assert "| thin-d2 |" in text.replace("  ", "")
+    alpha = next(line for line in text.splitlines() if line.startswith("| thin-d1 |"))
+    assert three(records[4].f1(1, "scan")) in alpha
     assert write_document(tmp_path, tmp_path / "nothing") is None
 
 
-def test_a_label_belongs_to_one_set_of_arguments(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("benchmarks.study.record.RECORDS", tmp_path)
+def test_further_arguments_need_a_label_and_scenes_a_known_name() -> None:
     assert command.main(["--only", "thin-d1", "--", "--iterations", "9"]) != 0
     with pytest.raises(UsageError, match="thin-d9"):
         zoo_scene("thin-d9")
@@ -262,6 +273,19 @@ def test_records_of_other_arguments_are_refused(tmp_path: Path) -> None:
     write_record(invented(run_case("thin-d1", "x", "draft", ())), tmp_path)
     with pytest.raises(ParseError, match="other settings"):
         read_records([run_case("thin-d1", "x", "draft", ("--iterations", "9"))], tmp_path)
+
+
+def test_a_run_on_an_earlier_version_of_its_scene_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = run_case("thin-d1", "x", "draft", ())
+    monkeypatch.setattr("benchmarks.zoo.runs.record_path", lambda case: record_path(case, tmp_path))
+    assert not is_made(case)
+    for scene, made in (("zoo-thin-d1-before", False), (scene_folder("thin-d1").name, True)):
+        record = invented(case)
+        record.scores[FIGURES] = {"scene": scene}
+        write_record(record, tmp_path)
+        assert is_made(case) is made
 
 
 def test_folders_of_scenes_are_told_apart_by_name_and_sources(tmp_path: Path) -> None:
