@@ -35,7 +35,9 @@ def render_photos(
     scene = _configure(cameras[0].width, cameras[0].height, SAMPLES, bounces, threads)
     materials = {name: make_look(name, look) for name, look in content.looks.items()}
     for part in (*content.subject.parts, *content.around):
-        _mesh_object(part, materials[part.material])
+        item = _mesh_object(part, materials[part.material])
+        # Looks shine with the sky's share of the light: scattered rays that find them are noise.
+        item.visible_diffuse = False
     _add_light(content.light)
     eye = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(eye)
