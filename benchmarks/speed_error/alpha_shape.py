@@ -24,9 +24,8 @@ from gaussian_wrapping_addon.core.machine import processor_name
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.regions.region import read_region
 
-from ..scenes import ensure_scene
 from ..study.case import Case
-from ..study.making import kept_surface
+from ..study.making import SceneFinder, kept_surface, rendered_scene
 from ..study.record import Record, code_of_tree, write_record
 from ..tables import versions
 from .plan import THRESHOLD_SHARES
@@ -76,12 +75,11 @@ def alpha_shape(points: np.ndarray, alpha: float) -> tuple[np.ndarray, np.ndarra
     return points[used], inverse.reshape(-1, 3)
 
 
-def make_alpha(case: Case, *, threads: int, kept: Path) -> Record:
+def make_alpha(
+    case: Case, *, threads: int, kept: Path, find_scene: SceneFinder = rendered_scene
+) -> Record:
     """Score the best alpha shape of a scene's sparse points, and write its record."""
-    photos = case.photos
-    scene_folder = ensure_scene(
-        case.scene, photos=photos.count, width=photos.width, height=photos.height
-    )
+    scene_folder = find_scene(case)
     folder = kept / case.study / case.identity
     folder.mkdir(parents=True, exist_ok=True)
     scene = load_scene(scene_folder, folder, Progress(), seed=0, threads=threads)

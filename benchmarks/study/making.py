@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -42,6 +42,16 @@ _SURFACE = (
 DIGITS = 6
 
 
+def rendered_scene(case: Case) -> Path:
+    """Return the folder of a case's scene of :mod:`benchmarks.scenes`; render it where missing."""
+    photos = case.photos
+    return ensure_scene(case.scene, photos=photos.count, width=photos.width, height=photos.height)
+
+
+SceneFinder = Callable[[Case], Path]
+"""Returns the folder of a case's scene."""
+
+
 class Maker(Protocol):
     """Makes one run and writes its record."""
 
@@ -56,6 +66,7 @@ def carry_out(
     runs: int = 0,
     maker: Maker | None = None,
     kept: Path = KEPT_RUNS,
+    find_scene: SceneFinder = rendered_scene,
 ) -> int:
     """Make the runs that have no record yet, in their order; return how many failed.
 
@@ -71,6 +82,8 @@ def carry_out(
         Makes one run and writes its record; :func:`make` by default.
     kept : Path
         Folder of the runs themselves.
+    find_scene : callable
+        Where kernels are compiled on, before the first run.
     """
     failed = made = 0
     for number, case in enumerate(cases):
@@ -79,7 +92,7 @@ def carry_out(
         if runs and made == runs:
             break
         made += 1
-        warm_up(case, threads, kept)
+        warm_up(find_scene, case, threads, kept)
         try:
             record = (maker or make)(case, threads=threads, kept=kept)
         except WorkerError as error:
@@ -94,22 +107,23 @@ def carry_out(
     return failed
 
 
-def warm_up(case: Case, threads: int, kept: Path) -> None:
+def warm_up(find_scene: SceneFinder, case: Case, threads: int, kept: Path) -> None:
     """Compile all kernels in a job of a minute, once for each version of the code."""
     stamp = kept / f"warm-{code_of_tree().name.replace(', ', '-')}"
     if stamp.is_file():
         return
     everything = ("--multi-view", "on", "--wrapping", "on", "--harmonics", "on", "--exposure", "on")
-    run_warm_up(_scene(case), Settings(kept, threads, False), everything)
+    run_warm_up(find_scene(case), Settings(kept, threads, False), everything)
     stamp.touch()
 
 
-def _scene(case: Case) -> Path:
-    photos = case.photos
-    return ensure_scene(case.scene, photos=photos.count, width=photos.width, height=photos.height)
-
-
-def make(case: Case, *, threads: int, kept: Path = KEPT_RUNS) -> Record:
+def make(
+    case: Case,
+    *,
+    threads: int,
+    kept: Path = KEPT_RUNS,
+    find_scene: SceneFinder = rendered_scene,
+) -> Record:
     """Make a run, judge it, and write its record.
 
     Raises
@@ -117,7 +131,7 @@ def make(case: Case, *, threads: int, kept: Path = KEPT_RUNS) -> Record:
     WorkerError
         With the last lines of the job's output.
     """
-    scene = _scene(case)
+    scene = find_scene(case)
     folder = run_folder(case, kept)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)

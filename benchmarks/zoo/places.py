@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Families of places that the cameras are in: furnished rooms and streets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..scenes.geometry import Part, box, cone, icosphere
+from . import shapes
+from .content import Subject
+from .looks import WEAK, Look, draw_look
+from .paths import Volume
+from .shapes import part
+
+WALL = 0.2
+"""Thickness of walls and ground; their outer side is never seen."""
+_JUDGED = 0.35
+"""Share of the walls that is judged."""
+_SINK = 0.012
+"""So far things that touch sink into each other."""
+
+_OBJECTS = (2.0, 5.0)
+"""Scales of patterns on furniture."""
+
+
+def _volume(free: Volume) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    low, high = free[0] - _JUDGED * WALL, free[1] + _JUDGED * WALL
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+
+def rooms(random: np.random.Generator) -> tuple[Subject, Volume]:
+    """Return a furnished room with plain walls and the free space in it."""
+    half_x, half_y, height = random.uniform([1.9, 1.6, 2.3], [2.8, 2.2, 2.8])
+    low, high = np.array([-half_x, -half_y, 0.0]), np.array([half_x, half_y, height])
+    looks = {
+        "walls": draw_look(random, (0.8, 1.6), patterns=(WEAK,), weak=True),
+        "floor": draw_look(random, (1.0, 2.5), patterns=("grain", "bricks_xy", "speckles")),
+        **{f"thing{k}": draw_look(random, _OBJECTS) for k in range(6)},
+        "plain": draw_look(random, (1.0, 2.0), patterns=(WEAK,), weak=True),
+    }
+    xs, ys, zs = (np.array([a - WALL, a, b, b + WALL]) for a, b in zip(low, high, strict=True))
+    filled = np.ones((3, 3, 3), bool)
+    filled[1, 1, 1] = False
+    parts = [
+        # Light passes through the walls, so that the closed room is lit.
+        replace(
+            part("walls", shapes.blocks(xs, ys, zs, filled), "walls", smooth=False),
+            surrounding=True,
+        ),
+        # The floor's own look lies on the shell as a board that nearly reaches the walls.
+        box(
+            "floor",
+            (low[0] + 0.03, low[1] + 0.03, -_SINK),
+            (high[0] - 0.03, high[1] - 0.03, 0.015),
+            "floor",
+        ),
+    ]
+    makers = [_table, _cupboard, _sofa, _lamp, _crates]
+    places = [(-0.55, 0.62), (0.6, 0.6), (0.62, -0.55), (-0.62, -0.6), (0.0, -0.72)]
+    order = random.permutation(len(makers))
+    for (x, y), which in zip(places, order, strict=True):
+        parts += makers[which](x * half_x, y * half_y, random)
+    parts += _pictures(low, high, random)
+    return Subject(tuple(parts), looks, place=True, inner=_volume((low, high))), (low, high)
+
+
+def _thing(random: np.random.Generator) -> str:
+    return f"thing{int(random.integers(6))}"
+
+
+def _table(x: float, y: float, random: np.random.Generator) -> list[Part]:
+    w, d, h = random.uniform([0.35, 0.25, 0.5], [0.6, 0.4, 0.78])
+    look = _thing(random)
+    parts = [box("table top", (x - w, y - d, h - 0.04), (x + w, y + d, h), look)]
+    for k, (i, j) in enumerate([(-1, -1), (1, -1), (-1, 1), (1, 1)]):
+        at = (x + i * (w - 0.05), y + j * (d - 0.05))
+        parts.append(cone(f"table leg {k}", (*at, 0.0), (*at, h - 0.02), 0.022, 0.03, look, 12))
+    vertices, faces = icosphere(3)
+    radius = random.uniform(0.09, 0.16)
+    ball = radius * vertices + [x - 0.4 * w, y, h + radius - _SINK]
+    parts.append(part("ball", (ball, faces), _thing(random)))
+    parts.append(
+        box(
+            "book",
+            (x + 0.1 * w, y - 0.4 * d, h - _SINK),
+            (x + 0.6 * w, y + 0.4 * d, h + 0.05),
+            _thing(random),
+            20,
+        )
+    )
+    return parts
+
+
+def _cupboard(x: float, y: float, random: np.random.Generator) -> list[Part]:
+    w, d, h = random.uniform([0.35, 0.2, 0.7], [0.55, 0.3, 1.05])
+    rows = int(random.integers(2, 4))
+    xs = np.array([-w, -w + 0.03, w - 0.03, w]) + x
+    ys = np.array([-d, d - 0.02, d]) + y
+    levels = np.linspace(0.06, h, rows + 1)
+    zs = np.unique(np.concatenate([[0.0], levels, levels[1:] - 0.03]))
+    filled = np.ones((3, 2, len(zs) - 1), bool)
+    hollow = [z in np.arange(1, len(zs) - 1, 2) for z in range(len(zs) - 1)]
+    side = 0
+    if y < 0:
+        ys = 2 * y - ys[::-1]
+        side = 1
+    filled[1, side, hollow] = False
+    return [
+        part("cupboard", shapes.blocks(xs, ys, zs, filled), _thing(random), smooth=False),
+        box(
+            "on cupboard",
+            (x - 0.2, y - 0.12, h - _SINK),
+            (x + 0.1, y + 0.12, h + 0.15),
+            _thing(random),
+            25,
+        ),
+    ]
+
+
+def _sofa(x: float, y: float, random: np.random.Generator) -> list[Part]:
+    w, d = random.uniform(0.5, 0.8), 0.33
+    back = np.sign(y) or -1.0
+    look = _thing(random)
+    b0, b1 = sorted((y + back * d, y + back * (d - 0.14)))
+    return [
+        box("seat", (x - w, y - d, 0.0), (x + w, y + d, random.uniform(0.36, 0.44)), look),
+        box("back", (x - w + 0.01, b0 - 0.007, 0.1), (x + w - 0.01, b1 + 0.007, 0.82), look),
+        box("arm", (x - w - 0.1, y - d - 0.01, 0.0), (x - w + 0.05, y + d + 0.01, 0.6), look),
+        box("cushion", (x + 0.05, y - 0.15, 0.33), (x + 0.4, y + 0.12, 0.6), _thing(random), 15),
+    ]
+
+
+def _lamp(x: float, y: float, random: np.random.Generator) -> list[Part]:
+    height = random.uniform(1.2, 1.6)
+    look = _thing(random)
+    return [
+        cone("lamp foot", (x, y, 0.0), (x, y, 0.05), 0.16, 0.13, look, 32),
+        cone("lamp rod", (x, y, 0.03), (x, y, height), 0.015, 0.015, look, 12),
+        cone(
+            "lamp shade",
+            (x, y, height - 0.03),
+            (x, y, height + 0.26),
+            0.22,
+            0.13,
+            _thing(random),
+            40,
+        ),
+    ]
+
+
+def _crates(x: float, y: float, random: np.random.Generator) -> list[Part]:
+    size = random.uniform(0.2, 0.3)
+    top = 2 * size
+    return [
+        box("crate", (x - size, y - size, 0.0), (x + size, y + size, top), _thing(random), 15),
+        box(
+            "upper crate",
+            (x - 0.6 * size, y - 0.5 * size, top - _SINK),
+            (x + 0.5 * size, y + 0.5 * size, 1.5 * top),
+            "plain",
+            40,
+        ),
+    ]
+
+
+def _pictures(low: np.ndarray, high: np.ndarray, random: np.random.Generator) -> list[Part]:
+    """Return boards on two or three of the walls."""
+    parts = []
+    for k in range(int(random.integers(2, 4))):
+        axis, sign = divmod(k, 2)
+        wall = (high if sign else low)[axis]
+        other = 1 - axis
+        middle = random.uniform(0.45 * low[other], 0.45 * high[other])
+        wide, tall = random.uniform(0.25, 0.5), random.uniform(0.2, 0.35)
+        a, b = np.zeros(3), np.zeros(3)
+        a[axis], b[axis] = wall - (0.03 if sign else _SINK), wall + (_SINK if sign else 0.03)
+        a[other], b[other] = middle - wide, middle + wide
+        a[2], b[2] = 1.45 - tall, 1.45 + tall
+        parts.append(box(f"picture {k}", a.tolist(), b.tolist(), _thing(random)))
+    return parts
+
+
+def streets(random: np.random.Generator) -> tuple[Subject, Volume]:
+    """Return facades along y = 0 with windows, ground before them, and the space of the walk."""
+    long, depth = random.uniform(5.5, 7.5), random.uniform(4.5, 5.5)
+    low, high = np.array([-long, -depth, 0.0]), np.array([long, 0.0, 0.0])
+    houses = int(random.integers(2, 4))
+    looks: dict[str, Look] = {
+        "ground": draw_look(random, (1.2, 2.4), patterns=("bricks_xy", "speckles", "patches")),
+        "kerb": draw_look(random, (1.0, 2.0), patterns=(WEAK,), weak=True),
+        **{f"thing{k}": draw_look(random, _OBJECTS) for k in range(6)},
+    }
+    edges = np.linspace(-long, long, houses + 1)
+    edges[1:-1] += random.uniform(-0.6, 0.6, houses - 1)
+    parts = [
+        box("ground", (-long - WALL, -depth - WALL, -WALL), (long + WALL, 0.3, 0.0), "ground"),
+        box("kerb", (-long - 0.5 * WALL, -1.1, -0.05), (long + 0.5 * WALL, 0.25, 0.12), "kerb"),
+    ]
+    tops = []
+    for k in range(houses):
+        plain = random.random() < 0.3
+        patterns = (WEAK,) if plain else ("bricks_xz", "bricks_xz", "cells", "speckles")
+        looks[f"facade{k}"] = draw_look(random, (1.2, 2.4), patterns=patterns, weak=plain)
+        top = random.uniform(3.4, 5.0)
+        # Neighbours differ in depth, so that no two fronts lie in one plane.
+        front = 0.02 + 0.12 * (k % 2)
+        parts += _facade(k, edges[k] - 0.02 * k, edges[k + 1] + 0.021, front, top, random)
+        tops.append(top)
+    for k in range(int(random.integers(2, 5))):
+        x, y = random.uniform(-0.8 * long, 0.8 * long), random.uniform(-0.9, -0.35)
+        if random.random() < 0.5:
+            h = random.uniform(0.5, 1.1)
+            parts.append(
+                box(
+                    f"bin {k}",
+                    (x - 0.25, y - 0.2, 0.05),
+                    (x + 0.25, y + 0.2, h),
+                    _thing(random),
+                    20,
+                )
+            )
+        else:
+            h = random.uniform(2.2, 3.0)
+            parts.append(
+                cone(f"post {k}", (x, y, 0.05), (x, y, h), 0.05, 0.035, _thing(random), 16)
+            )
+            parts.append(
+                cone(f"head {k}", (x, y, h - 0.03), (x, y, h + 0.2), 0.07, 0.15, _thing(random), 20)
+            )
+    high[2] = max(tops)
+    inner = (
+        (float(low[0]), float(-0.75 * depth), -_JUDGED * WALL),
+        (float(high[0]), 0.5, float(high[2]) + 0.05),
+    )
+    return Subject(tuple(parts), looks, place=True, inner=inner), (low, high)
+
+
+def _facade(
+    number: int, left: float, right: float, front: float, top: float, random: np.random.Generator
+) -> list[Part]:
+    """Return a house's front with windows and a door set back, and a ledge."""
+    columns, floors = max(2, round((right - left) / 1.5)), max(2, round(top / 1.7))
+    step, rise = (right - left) / columns, top / floors
+    wide, tall = step * random.uniform(0.4, 0.6), rise * random.uniform(0.4, 0.6)
+    xs = [left, right]
+    for c in range(columns):
+        middle = left + (c + 0.5) * step
+        xs += [middle - wide / 2, middle + wide / 2]
+    zs = [-0.1, top]
+    for f in range(floors):
+        base = f * rise + 0.3 * (rise - tall) + 0.25
+        zs += [base, base + tall * 0.9]
+    planes_x, planes_z = np.array(sorted(xs)), np.array(sorted(zs))
+    ys = np.array([front, front + random.uniform(0.12, 0.22), front + 0.5])
+    filled = np.ones((len(planes_x) - 1, 2, len(planes_z) - 1), bool)
+    filled[1::2, 0, 1::2] = False  # windows lie between the odd planes
+    mesh = shapes.blocks(planes_x, ys, planes_z, filled)
+    ledge = rise * 0.99
+    return [
+        part(f"facade {number}", mesh, f"facade{number}", smooth=False),
+        box(
+            f"ledge {number}",
+            (left + 0.03, front - 0.09, ledge - 0.06),
+            (right - 0.03, front + 0.05, ledge + 0.02),
+            f"thing{number}",
+        ),
+    ]
