@@ -92,7 +92,7 @@ def test_steps_noise_and_unconfirmed_neighbours_do_not_count() -> None:
     planar = planar_pixels(dataclasses.replace(found, depth=step))
     assert not planar[:, half - PLANE_STEP_PX : half + PLANE_STEP_PX].any()
     assert planar[8:-8, 8 : half - PLANE_STEP_PX].all()
-    noise = np.random.default_rng(0).normal(0.0, 4.0 * PLANE_SHARE, step.shape)
+    noise = np.random.default_rng(0).normal(0.0, 2.0 * PLANE_SHARE, step.shape)
     noisy = (found.depth * (1.0 + noise)).astype(np.float32)
     assert planar_pixels(dataclasses.replace(found, depth=noisy)).mean() < 0.01
     holes = found.confidence.copy()
