@@ -334,7 +334,7 @@ class _Trainer:
         if priors is None:
             _logger.info("the confirmed depths are not there: matching the photos again")
             maps = matched_photos(
-                self._start_scene(), self.photos, self.views, progress,
+                self._start_scene(), self.photos, self.views, progress.span(0.0, 0.0),
                 seed=self.seed, threads=self.threads,
             )  # fmt: skip
             priors = priors_of(self.views, maps)

@@ -13,9 +13,11 @@ import torch
 
 from gaussian_wrapping_addon.core.dataset.photo_source import PhotoSource
 from gaussian_wrapping_addon.core.dataset.scene import Scene
+from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.stereo.depth_priors import FILE_NAME
 from gaussian_wrapping_addon.core.training import trainer
 from gaussian_wrapping_addon.core.training.initialisation.dense_start import (
     FLATNESS,
@@ -214,3 +216,41 @@ def test_the_training_starts_from_what_the_setting_says(tmp_path: Path) -> None:
     assert len(matching) == 25
     assert {event.fraction for event in matching} == {0.0}
     assert matching[-1].message.endswith("100%")
+
+
+def stopping_at(iteration: int) -> Progress:
+    """Return progress that cancels once an iteration was reported."""
+    reached: list[float] = []
+
+    def look(event: ProgressEvent) -> None:
+        if event.figures.get("iteration", 0.0) >= iteration:
+            reached.append(event.fraction)
+
+    return Progress("train", look, lambda: bool(reached))
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_resumed_training_holds_the_same_depths(tmp_path: Path, lost: bool) -> None:
+    """Bit for bit, also where the file of the depths is lost and they are made again."""
+    scene, photos = ball_scene()
+    few = dataclasses.replace(scene, views=scene.views[3:8])
+    own = PhotosInMemory(few, photos.photos[3:8])
+    settings = dataclasses.replace(
+        SETTINGS, dense_start="on", iterations=20, depth_from=0.0, lambda_depth_prior=5.0
+    )
+    for name in ("whole", "free", "cut"):
+        (tmp_path / name).mkdir()
+    whole = trainer.train(few, own, settings, tmp_path / "whole", Progress(), threads=1)
+    free = dataclasses.replace(settings, lambda_depth_prior=0.0)
+    without = trainer.train(few, own, free, tmp_path / "free", Progress(), threads=1)
+    assert not torch.equal(whole.gaussians.means, without.gaussians.means)
+    with pytest.raises(Cancelled):
+        trainer.train(few, own, settings, tmp_path / "cut", stopping_at(10), threads=1)
+    if lost:
+        (tmp_path / "cut" / FILE_NAME).unlink()
+    resumed = trainer.train(few, own, settings, tmp_path / "cut", Progress(), threads=1)
+    for (name, value), (_, expected) in zip(
+        resumed.gaussians.tensors(), whole.gaussians.tensors(), strict=True
+    ):
+        assert torch.equal(value, expected), name
+    assert (tmp_path / "cut" / FILE_NAME).is_file()
