@@ -15,11 +15,10 @@ from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.dataset.scene_file import load_saved_scene
 from gaussian_wrapping_addon.core.evaluation.surface.truth import read_truth
 from gaussian_wrapping_addon.core.files import finite_json, read_json
-from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh
 
 from ..speed_error.alpha_shape import make_alpha
 from ..speed_error.plan import Photos
-from ..speed_error.score import stage_folder, true_mask
+from ..speed_error.score import read_textured, stage_folder, true_mask
 from ..study.case import Case
 from ..study.making import KEPT_RUNS, make, rounded, run_folder
 from ..study.record import Record, read_record, record_path, write_record
@@ -103,7 +102,7 @@ def judged(scene: Path, folder: Path, threads: int) -> dict[str, Any]:
     """
     report = read_json(folder / "out" / "result" / "report.json")["training"]
     saved = load_saved_scene(stage_folder(folder / "out", "cameras"))
-    mesh = load_mesh(folder / "mesh" / "mesh.npz")
+    mesh = read_textured(folder / "mesh").mesh
     truth = read_truth(scene)
     assert truth.mesh is not None
     values = read_json(scene / "test" / "cameras.json")["cameras"]

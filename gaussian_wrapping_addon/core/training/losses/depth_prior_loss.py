@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Loss on rendered depths that leave the depths which stereo confirmed (docs/method.md, 3.6)."""
+"""Loss on rendered depths that leave those that stereo confirmed (docs/method.md, section 3.6)."""
 
 from __future__ import annotations
 
