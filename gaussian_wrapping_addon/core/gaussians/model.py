@@ -70,6 +70,11 @@ class OrientedGaussians:
         """Return the Gaussians selected by an index or mask tensor."""
         return OrientedGaussians(**{name: value[index] for name, value in self.tensors()})
 
+    def joined(self, others: OrientedGaussians) -> OrientedGaussians:
+        """Return these Gaussians, then others with as many harmonics."""
+        pairs = zip(self.tensors(), others.tensors(), strict=True)
+        return self.replaced(**{name: torch.cat([a, b]) for (name, a), (_, b) in pairs})
+
     def detached(self) -> OrientedGaussians:
         """Return a copy that shares memory and carries no gradient."""
         return OrientedGaussians(**{name: value.detach() for name, value in self.tensors()})

@@ -30,6 +30,7 @@ from ..stereo.depth_maps import matching_divisor
 from ..stereo.depth_priors import DepthPrior, load_priors, priors_of, save_priors
 from .appearance.background import inside_masks
 from .appearance.photo_exposure import Exposure, corrected_for_measuring
+from .backdrop import with_backdrop
 from .cancellation import CancellablePhotos
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from .initialisation.dense_start import dense_start, matched_photos
@@ -234,7 +235,7 @@ class _Trainer:
             save_checkpoint(self.folder, state, key)
             raise
         save_checkpoint(self.folder, state, key)
-        gaussians = trimmed(rounds.filtered(state), state.degree)
+        gaussians = self._finished(rounds, state, progress)
         self.live.update(gaussians, state.iteration, self._correction(state), force=True)
         held_out, lpips_note = self._measure(gaussians, state, progress)
         return TrainingResult(
@@ -304,6 +305,19 @@ class _Trainer:
             seed=self.seed,
         )
         return gaussians, decision
+
+    def _finished(
+        self, rounds: Rounds, state: TrainingState, progress: Progress
+    ) -> OrientedGaussians:
+        """Return the trained Gaussians; those of a dense start with a backdrop."""
+        gaussians = trimmed(rounds.filtered(state), state.degree)
+        if self.settings.mask_mode == "background":
+            return gaussians
+        if not state.model_selection.chose("dense_start"):
+            return gaussians  # the large Gaussians of a sparse start reach beyond the photos
+        return with_backdrop(
+            gaussians, self.photos, self.views, threads=self.threads, check=progress.check
+        )
 
     def _start_scene(self) -> Scene:
         """Return the scene with the sparse points that masks do not show to be background."""

@@ -112,7 +112,7 @@ def dense_start(
         "dense start: %d points, %d guesses, %d far away, %d Gaussians",
         len(found), len(guesses), len(shell), len(gaussians) + len(shell),
     )  # fmt: skip
-    gaussians = joined(gaussians, _shell_gaussians(shell, sh_degree))
+    gaussians = gaussians.joined(_shell_gaussians(shell, sh_degree))
     if len(gaussians) > max_gaussians:
         random = np.random.default_rng([seed, 4])
         kept = np.sort(random.choice(len(gaussians), max_gaussians, replace=False))
@@ -200,9 +200,3 @@ def _shell_gaussians(shell: DensePoints, sh_degree: int) -> OrientedGaussians:
         shell.positions, shell.colors / 255.0, SIZE_SHARE * shell.sizes, sh_degree,
         normals=shell.normals, flatness=FLATNESS, opacities=OPACITY,
     )  # fmt: skip
-
-
-def joined(first: OrientedGaussians, second: OrientedGaussians) -> OrientedGaussians:
-    """Return the Gaussians of both."""
-    pairs = zip(first.tensors(), second.tensors(), strict=True)
-    return first.replaced(**{name: torch.cat([a, b]) for (name, a), (_, b) in pairs})

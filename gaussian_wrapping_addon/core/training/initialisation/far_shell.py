@@ -61,7 +61,7 @@ def far_shell(
         rays = np.ones((len(at), 3))
         rays[:, 0] = (at[:, 0] - camera.cx) / camera.fx
         rays[:, 1] = (at[:, 1] - camera.cy) / camera.fy
-        directions.append(_onto_sphere(camera.center, rays @ camera.rotation, radius))
+        directions.append(onto_sphere(camera.center, rays @ camera.rotation, radius))
         colors.append(color)
         angles.append(np.full(len(at), CELL_PX / camera.fx))
     found, color = np.concatenate(directions), np.concatenate(colors)
@@ -119,8 +119,8 @@ def _by_cell(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
     return whole.reshape(rows, CELL_PX, columns, CELL_PX, *image.shape[2:]).mean((1, 3))
 
 
-def _onto_sphere(center: np.ndarray, rays: np.ndarray, radius: float) -> np.ndarray:
-    """Return the unit directions of the points where rays from inside meet the sphere."""
+def onto_sphere(center: np.ndarray, rays: np.ndarray, radius: float) -> np.ndarray:
+    """Return where rays (m, 3) from inside a sphere around the origin meet it, as unit vectors."""
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     along = unit @ center
     distance = -along + np.sqrt(along**2 + radius**2 - center @ center)

@@ -25,7 +25,6 @@ from gaussian_wrapping_addon.core.training.initialisation.dense_start import (
     OPACITY,
     DenseStart,
     dense_start,
-    joined,
 )
 from gaussian_wrapping_addon.core.training.rounds import Rounds
 from gaussian_wrapping_addon.core.training.state import TrainingState
@@ -173,7 +172,7 @@ def test_sparse_points_away_from_dense_ones_are_kept_round() -> None:
 
 def test_joined_gaussians_are_those_of_both() -> None:
     first, second = sphere_gaussians(5), sphere_gaussians(3)
-    both = joined(first, second)
+    both = first.joined(second)
     for name, tensor in both.tensors():
         expected = torch.cat([getattr(first, name), getattr(second, name)])
         assert torch.equal(tensor, expected), name
