@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -153,7 +154,9 @@ def write_document(out: Path, root: Path = RECORDS) -> Path | None:
         more = f" -- {' '.join(given.arguments)}" if given.arguments else ""
         name = "" if label == given.preset else f" --label {label}"
         command = f"{COMMAND} --preset {given.preset}{name}{more}"
-        planned = [r.case for r in records.values()]
+        judged = {r.case.scene for r in records.values()}
+        others = [dataclasses.replace(given, scene=name) for name in SCENES if name not in judged]
+        planned = [*(r.case for r in records.values()), *others]
         lines += [f"## {label}", "", *made_by(command, list(records.values()), planned), ""]
         tables = [
             make(records, baselines, part) for part in PARTS for make in (family_table, scene_table)
