@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..dataset.loading.splat_cameras import fibonacci_directions
 from ..dataset.photo_source import PhotoSource
 from ..gaussians.initialisation import gaussians_at
 from ..gaussians.model import OrientedGaussians
@@ -71,7 +72,7 @@ def with_backdrop(
     """
     farthest = float(gaussians.means.norm(dim=1).max()) if len(gaussians) else 0.0
     radius = max(LEAST_REACH, REACH_FACTOR * farthest)
-    directions = _even_directions(DIRECTIONS)
+    directions = fibonacci_directions(DIRECTIONS)
     tree = cKDTree(directions)
     through, seen = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     colors = np.zeros((DIRECTIONS, 3))
@@ -108,12 +109,3 @@ def with_backdrop(
         normals=-directions[filled], flatness=FLATNESS, opacities=OPACITY,
     )  # fmt: skip
     return gaussians.joined(sphere)
-
-
-def _even_directions(count: int) -> np.ndarray:
-    """Return ``count`` unit vectors (n, 3) on a Fibonacci spiral."""
-    index = np.arange(count) + 0.5
-    height = 1.0 - 2.0 * index / count
-    turn = np.pi * (1.0 + np.sqrt(5.0)) * index
-    flat = np.sqrt(1.0 - height**2)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), height], 1)
