@@ -21,6 +21,7 @@ from ...stereo.depth_maps import DepthMap, estimate_depth_maps
 from ...stereo.depth_priors import DepthPrior, priors_of
 from ...stereo.fusion import DensePoints, fuse
 from ...stereo.gap_filling import fill_gaps
+from ...stereo.plain.filling import fill_plain_parts
 from ..selection.model_selection import Decision, decide
 from .far_shell import far_shell
 
@@ -136,7 +137,8 @@ def matched_photos(
 ) -> list[DepthMap]:
     """Return the depth maps of the training views; empty where there is too little to match."""
     points, _ = _usable(scene)
-    return estimate_depth_maps(photos, views, points, progress, seed=seed, threads=threads)
+    maps = estimate_depth_maps(photos, views, points, progress, seed=seed, threads=threads)
+    return fill_plain_parts(maps, points, progress, seed=seed)
 
 
 def _usable(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

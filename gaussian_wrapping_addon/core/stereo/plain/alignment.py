@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Planes moved until the faint texture of their segments matches between photos.
+
+A window of 11 x 11 pixels on a plain wall shows less texture than noise; thousands of pixels that
+are known to lie on one plane show enough to place it (docs/method.md, section 11.12).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from .evidence import PackedPhotos
+from .evidence_kernels import correlate
+from .planes import Plane, image_plane, lifted_pixels, rays_at, with_ones
+
+SCALES_PX = ((1.5, 8.0), (0.7, 5.0))
+"""Standard deviations of the two Gaussians whose difference is the texture, coarse and fine."""
+
+STEPS = ((0.01, 0.005), (0.0025, 0.00125, 0.0006, 0.0003))
+"""Of the search at each scale, as shares of the depth at the edges of the plane's segments."""
+TURNS = 6
+"""Most turns of the search with one step."""
+
+PENALTY, PENALTY_STEP = 0.03, 0.015
+"""Correlation that a change of the plane by such a share of the depth must gain at least."""
+
+CLIPPED_LEVELS = 4.0
+"""Texture is clipped at this many grey levels."""
+
+MOST_SAMPLES, LEAST_SAMPLES = 1200, 200
+"""Pixels of a segment that take part, and that it needs to."""
+
+MOST_SOURCES = 6
+LEAST_INSIDE = 0.3
+"""Share of a segment's samples that must land on plain pixels of a source."""
+ANGLES = (0.03, 0.8)
+"""Range of the baseline over the depth of sources; those up to :data:`_WIDE` preferred."""
+_WIDE = 0.3
+
+LEAST_GAIN, LEAST_CORRELATION = 0.01, 0.6
+"""Gain of correlation by a move, and correlation after it, for which a plane is moved."""
+
+FALSE_CORRELATION, LEAST_TEXTURE = 0.4, 0.12
+"""A plane whose texture correlates less is no surface, if there is texture of so many grey levels
+(root mean square). True planes of rendered scenes reach .55 to .94, false ones .01 to .36."""
+
+_LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Pixels of one photo on a plane."""
+
+    view: int
+    pixels: np.ndarray  # (n, 2) float64, centres whole
+
+
+@dataclass(frozen=True)
+class _Sampled:
+    """A part with what the search needs."""
+
+    view: int
+    rays: np.ndarray  # (n, 3) scene frame
+    at: np.ndarray  # (n,) int64 index into the flattened photo
+    others: np.ndarray  # (m,) int64
+
+
+class Aligner:
+    """Moves planes to where the texture of plain pixels matches best.
+
+    Parameters
+    ----------
+    photos : PackedPhotos
+    plain : (n, h, w) bool
+        Pixels of the plain segments.
+    """
+
+    def __init__(
+        self, photos: PackedPhotos, plain: np.ndarray, random: np.random.Generator
+    ) -> None:
+        self.photos, self.plain, self.random = photos, plain, random
+        grey = photos.images @ _LUMA  # (n, h, w)
+        self.textures = [_textures(grey, plain, *scale) for scale in SCALES_PX]
+
+    def aligned(self, plane: Plane, parts: Sequence[Part]) -> Plane | None:
+        """Return the plane where it matches best, or ``None`` where it is no surface.
+
+        Planes without parts large enough, or with hardly any texture, stay as they are.
+        """
+        sampled = [found for part in parts if (found := self._sampled(plane, part)) is not None]
+        if not sampled:
+            return plane
+        search = _Search(self, plane, sampled)
+        start = search.score(np.zeros(3), 1)
+        place, best = np.zeros(3), start
+        for level, steps in enumerate(STEPS):
+            place, best = search.climbed(place, level, steps)
+        if best < FALSE_CORRELATION and search.texture_levels() > LEAST_TEXTURE:
+            return None
+        if best > start + LEAST_GAIN and best > LEAST_CORRELATION:
+            return plane.moved(*search.plane(place))
+        return plane
+
+    def _sampled(self, plane: Plane, part: Part) -> _Sampled | None:
+        """Choose samples, and sources that see them as plain pixels from elsewhere."""
+        if len(part.pixels) < LEAST_SAMPLES:
+            return None
+        count = min(MOST_SAMPLES, len(part.pixels))
+        pixels = part.pixels[self.random.choice(len(part.pixels), count, replace=False)]
+        camera = self.photos.cameras[part.view]
+        inverse = with_ones(pixels) @ image_plane(plane, camera)
+        if not (inverse > 1e-9).all():
+            return None
+        points = lifted_pixels(camera, pixels, inverse)
+        depth = float(np.median(np.linalg.norm(points - camera.center, axis=1)))
+        found = []
+        for other in self.photos.asked():
+            if other == part.view:
+                continue
+            angle = float(np.linalg.norm(self.photos.cameras[other].center - camera.center)) / depth
+            if not ANGLES[0] < angle < ANGLES[1]:
+                continue
+            share = self._seen_plain(int(other), points)
+            if share > LEAST_INSIDE:
+                found.append((share * min(angle, _WIDE), int(other)))
+        if not found:
+            return None
+        column, row = pixels.astype(np.int64).T
+        others = np.array([other for _, other in sorted(found, reverse=True)[:MOST_SOURCES]])
+        rays = rays_at(camera, pixels) @ camera.rotation
+        return _Sampled(part.view, rays, row * self.plain.shape[2] + column, others)
+
+    def _seen_plain(self, other: int, points: np.ndarray) -> float:
+        """Return the share of points that land on plain pixels which nothing known hides."""
+        pixels, depth = self.photos.cameras[other].project(points)
+        inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < self.photos.sizes[other]).all(1)
+        column, row = pixels[inside].astype(np.int64).T
+        known = self.photos.depths[other][row, column]
+        hidden = (known > 0) & (known < 0.97 * depth[inside])
+        return float((self.plain[other][row, column] & ~hidden).sum() / len(points))
+
+
+class _Search:
+    """Correlation of a plane's texture as a function of three small changes of the plane."""
+
+    def __init__(self, aligner: Aligner, plane: Plane, parts: Sequence[_Sampled]) -> None:
+        self.aligner, self.parts, self.normal = aligner, parts, plane.normal
+        self.centers = [aligner.photos.cameras[part.view].center for part in parts]
+        points = np.concatenate(
+            [
+                center + part.rays * ((plane.offset - plane.normal @ center) /
+                                      (part.rays @ plane.normal))[:, None]
+                for part, center in zip(parts, self.centers, strict=True)
+            ]
+        )  # fmt: skip
+        self.center = points.mean(0)
+        self.offset_at_center = plane.offset - plane.normal @ self.center
+        around = points - self.center
+        self.axes = np.linalg.svd(around.T @ around)[0][:, :2].T  # (2, 3) along the plane
+        self.extents = np.maximum(np.std(around @ self.axes.T, axis=0), 1e-9)
+        self.scale = float(np.median([np.linalg.norm(self.center - c) for c in self.centers]))
+        self.counts: dict[int, int] = {}
+
+    def plane(self, place: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return normal and offset: moved along the normal, turned about the two axes."""
+        turn = self.scale * (place[1:] / self.extents) @ self.axes
+        normal = self.normal + turn
+        offset = normal @ self.center + self.offset_at_center + place[0] * self.scale
+        length = np.linalg.norm(normal)
+        return normal / length, float(offset / length)
+
+    def score(self, place: np.ndarray, level: int) -> float:
+        """Return the mean correlation less the penalty; samples that get lost count as 0."""
+        normal, offset = self.plane(place)
+        photos, textures = self.aligner.photos, self.aligner.textures[level]
+        total, count = 0.0, 0
+        for part, center in zip(self.parts, self.centers, strict=True):
+            along = (offset - normal @ center) / (part.rays @ normal)
+            found = correlate(
+                center + part.rays * along[:, None],
+                textures[part.view].reshape(-1)[part.at],
+                part.others, photos.projections, photos.sizes, textures, CLIPPED_LEVELS,
+            )  # fmt: skip
+            total, count = total + found[0], count + found[1]
+        least = self.counts.setdefault(level, count)
+        penalty = PENALTY * float(((place / PENALTY_STEP) ** 2).sum())
+        return total / max(count, least, 1) - penalty
+
+    def climbed(
+        self, place: np.ndarray, level: int, steps: Sequence[float]
+    ) -> tuple[np.ndarray, float]:
+        """Return the place and the score after a search along the coordinates."""
+        best = self.score(place, level)
+        for step in steps:
+            for _ in range(TURNS):
+                before = best
+                for change in np.concatenate([np.eye(3), -np.eye(3)]) * step:
+                    value = self.score(place + change, level)
+                    if value > best + 1e-5:
+                        place, best = place + change, value
+                if best == before:
+                    break
+        return place, best
+
+    def texture_levels(self) -> float:
+        """Return the root mean square of the fine texture at the samples, grey levels."""
+        textures = self.aligner.textures[1]
+        values = [textures[part.view].reshape(-1)[part.at] for part in self.parts]
+        clipped = np.clip(np.concatenate(values), -CLIPPED_LEVELS, CLIPPED_LEVELS)
+        return float(np.sqrt(np.mean(clipped**2)))
+
+
+def _textures(grey: np.ndarray, plain: np.ndarray, fine_px: float, coarse_px: float) -> np.ndarray:
+    """Return (n, h, w) float32 band of the grey levels of plain pixels alone, NaN elsewhere."""
+    band = np.full(grey.shape, np.nan, np.float32)
+    for view in range(len(grey)):
+        weight = plain[view].astype(np.float32)
+        weighted = grey[view] * weight
+        means = [
+            ndimage.gaussian_filter(weighted, sigma)
+            / np.maximum(ndimage.gaussian_filter(weight, sigma), 1e-3)
+            for sigma in (fine_px, coarse_px)
+        ]
+        band[view][plain[view]] = (means[0] - means[1])[plain[view]]
+    return band

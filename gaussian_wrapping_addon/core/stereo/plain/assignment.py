@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which plane, or which two, a plain segment lies on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from .candidates import FULL_SPREAD, LEAST_SPREAD, LEAST_WEIGHT, SPEAKING_SHARE, spreads
+from .evidence import PackedPhotos
+from .planes import Plane, image_plane, with_ones
+from .segments import Segment
+
+LEAST_BORDER = 0.12
+"""Share of a segment's known depths, weighed, that its plane must explain."""
+
+PAIR_GAIN = 0.06
+"""Share that a second plane must explain besides."""
+
+LEAST_LIKE = 0.85
+"""Share of the other photos' votes that must not contradict a plane (:class:`~.evidence.Votes`)."""
+
+MOST_THROUGH, MOST_THROUGH_LATER = 0.015, 0.03
+"""Share of the votes that may see through a plane, at first and once planes are known from several
+photos."""
+
+LATER_SPREAD = 0.12
+"""As :data:`~.candidates.LEAST_SPREAD`, once planes are known from several photos."""
+
+FEW_VIEWS = 2.0
+"""A plane of n views counts n / (n + this)."""
+
+MOST_RANKED, MOST_PAIRED, MOST_TRIED = 14, 6, 20
+"""Planes of a segment that are looked at, of these put together in pairs, and choices whose votes
+are counted."""
+
+VOTING_PIXELS = 200
+
+GAP_PX, LIKE_LEVELS = 9, 8.0
+"""A segment takes over the planes of another one so near, whose median colour is so like: the
+ground goes on beyond a rod."""
+NEIGHBOURS, SPREADING_TURNS = 3, 4
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """The planes of a segment; of two, each pixel takes the nearer or the farther one."""
+
+    planes: tuple[int, ...]
+    nearer: bool = False
+
+    def inverse_depths(self, each: np.ndarray) -> np.ndarray:
+        """Return (n,) inverse depths from those on each plane, (n, planes)."""
+        return each.max(1) if self.nearer else each.min(1)
+
+    def owners(self, each: np.ndarray) -> np.ndarray:
+        """Return (n,) which plane of :attr:`planes` each pixel lies on."""
+        return each.argmax(1) if self.nearer else each.argmin(1)
+
+
+def on_planes(
+    assignment: Assignment, planes: Sequence[Plane], photos: PackedPhotos, segment: Segment
+) -> np.ndarray:
+    """Return (p, planes) inverse depths of a segment's pixels on each of its planes."""
+    camera = photos.cameras[segment.view]
+    q = np.array([image_plane(planes[number], camera) for number in assignment.planes])
+    return with_ones(segment.pixels) @ q.T
+
+
+def assigned(
+    segment: Segment, planes: Sequence[Plane], photos: PackedPhotos, *, first: bool
+) -> Assignment | None:
+    """Return the planes that explain most of what is known around a segment and pass the votes.
+
+    Parameters
+    ----------
+    first : bool
+        Planes are proposals of single segments still.
+    """
+    if not planes or segment.weights.sum() < LEAST_WEIGHT:
+        return None
+    through = MOST_THROUGH if first else MOST_THROUGH_LATER
+    choices = _Choices(segment, planes, photos, LEAST_SPREAD if first else LATER_SPREAD)
+    for assignment in choices.best():
+        inverse = assignment.inverse_depths(choices.sampled_on(assignment))
+        votes = photos.votes(segment.view, choices.sampled, inverse)
+        if votes.like >= LEAST_LIKE and votes.through <= through:
+            return assignment
+    return None
+
+
+class _Choices:
+    """Single planes and pairs that a segment may lie on."""
+
+    def __init__(
+        self, segment: Segment, planes: Sequence[Plane], photos: PackedPhotos, least_spread: float
+    ) -> None:
+        self.segment, self.least_spread = segment, least_spread
+        self.trust = np.array([len(p.views) / (len(p.views) + FEW_VIEWS) for p in planes])
+        camera = photos.cameras[segment.view]
+        self.image_planes = np.array([image_plane(plane, camera) for plane in planes])
+        step = max(1, len(segment.pixels) // VOTING_PIXELS)
+        self.sampled = segment.pixels[::step]
+        self.on_sampled = with_ones(self.sampled) @ self.image_planes.T
+        self.on_places = with_ones(segment.places) @ self.image_planes.T  # (b, k)
+        difference = self.on_places / segment.inverse_depths[:, None] - 1.0
+        self.speaking = np.abs(difference) < SPEAKING_SHARE
+        self.total = segment.weights.sum()
+        self.shares = segment.weights @ self.speaking / self.total
+        self.spreads = spreads(self.speaking.T, segment)
+
+    def sampled_on(self, assignment: Assignment) -> np.ndarray:
+        return self.on_sampled[:, list(assignment.planes)]
+
+    def best(self) -> list[Assignment]:
+        """Return the choices that explain enough, the best first."""
+        rank = self.shares * np.minimum(self.spreads / FULL_SPREAD, 1.0)
+        order = [int(k) for k in np.argsort(-rank)[:MOST_RANKED] if self.shares[k] > 0.05]
+        found = [
+            (self.shares[k], Assignment((k,)))
+            for k in order
+            if self.spreads[k] >= self.least_spread
+        ]
+        found += list(self._pairs(order[:MOST_PAIRED]))
+        found = [choice for choice in found if choice[0] >= LEAST_BORDER]
+        found.sort(key=lambda c: -c[0] * self.trust[list(c[1].planes)].min())
+        return [assignment for _, assignment in found[:MOST_TRIED]]
+
+    def _pairs(self, order: Sequence[int]) -> Iterator[tuple[float, Assignment]]:
+        for place, first in enumerate(order):
+            for second in order[place + 1 :]:
+                for nearer in (False, True):
+                    assignment = Assignment((first, second), nearer)
+                    share = self._pair_share(assignment)
+                    alone = max(self.shares[first], self.shares[second])
+                    if share > alone + PAIR_GAIN:
+                        yield share - PAIR_GAIN, assignment
+
+    def _pair_share(self, assignment: Assignment) -> float:
+        """Return the share that a pair explains, 0 where one of the two explains an edge alone."""
+        numbers = list(assignment.planes)
+        owners = assignment.owners(self.on_places[:, numbers])
+        speaking = self.speaking[:, numbers][np.arange(len(owners)), owners]
+        share = float(self.segment.weights @ speaking / self.total)
+        sampled_owners = assignment.owners(self.on_sampled[:, numbers])
+        for own in range(2):
+            chosen, part = speaking & (owners == own), self.sampled[sampled_owners == own]
+            if chosen.sum() < 6 or len(part) < 4:
+                return 0.0
+            if spreads(chosen[None], self.segment, np.cov(part.T))[0] < self.least_spread:
+                return 0.0
+        return share
+
+
+def continued(
+    segments: Sequence[Segment],
+    found: Sequence[Assignment | None],
+    planes: Sequence[Plane],
+    photos: PackedPhotos,
+) -> list[Assignment | None]:
+    """Return the assignments with those that segments take over from like ones nearby."""
+    found = list(found)
+    for view in sorted({segment.view for segment in segments}):
+        own = [number for number, segment in enumerate(segments) if segment.view == view]
+        colors = {n: np.median(_colors(segments[n], photos), axis=0) for n in own}
+        for _ in range(SPREADING_TURNS):
+            taken = _taken_over(own, segments, found, colors, planes, photos)
+            if not taken:
+                break
+            for number, assignment in taken.items():
+                found[number] = assignment
+    return found
+
+
+def _colors(segment: Segment, photos: PackedPhotos) -> np.ndarray:
+    return photos.images[segment.view][segment.rows, segment.columns]
+
+
+def _taken_over(
+    own: Sequence[int],
+    segments: Sequence[Segment],
+    found: Sequence[Assignment | None],
+    colors: dict[int, np.ndarray],
+    planes: Sequence[Plane],
+    photos: PackedPhotos,
+) -> dict[int, Assignment]:
+    """Return the assignments that segments of one photo take over in one turn."""
+    view = segments[own[0]].view
+    done = np.zeros((photos.cameras[view].height, photos.cameras[view].width), np.int64)
+    for number in own:
+        if found[number] is not None:
+            done[segments[number].rows, segments[number].columns] = number + 1
+    if not done.any():
+        return {}
+    distance, (row, column) = ndimage.distance_transform_edt(done == 0, return_indices=True)
+    nearest = done[row, column] - 1
+    taken = {}
+    for number in own:
+        segment = segments[number]
+        close = distance[segment.rows, segment.columns] <= GAP_PX
+        if found[number] is not None or not close.any():
+            continue
+        near, count = np.unique(
+            nearest[segment.rows, segment.columns][close], return_counts=True
+        )  # fmt: skip
+        for other in near[np.argsort(-count)][:NEIGHBOURS]:
+            if np.abs(colors[number] - colors[int(other)]).max() > LIKE_LEVELS:
+                continue
+            assignment = found[int(other)]
+            assert assignment is not None  # or it would not be the nearest
+            step = max(1, len(segment.pixels) // VOTING_PIXELS)
+            each = on_planes(assignment, planes, photos, segment)[::step]
+            votes = photos.votes(view, segment.pixels[::step], assignment.inverse_depths(each))
+            if votes.like >= LEAST_LIKE and votes.through <= MOST_THROUGH_LATER:
+                taken[number] = assignment
+                break
+    return taken
