@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from .candidates import FULL_SPREAD, LEAST_SPREAD, LEAST_WEIGHT, SPEAKING_SHARE, spreads
-from .evidence import PackedPhotos
+from .evidence import ALIKE, PackedPhotos
 from .planes import Plane, image_plane, with_ones
 from .segments import Segment
 
@@ -45,12 +45,29 @@ ground goes on beyond a rod."""
 NEIGHBOURS, SPREADING_TURNS = 3, 4
 
 
+FAR_DISTANCE = 1e6
+"""Of points that stand for what lies too far away for parallax, scene units."""
+
+FAR_SHARE, FAR_VOTES = 0.85, 2.0
+"""Share of the other photos' votes that must be for the same colour and unknown depth, and votes a
+pixel needs on average, for a segment without a plane to lie far away: photos see the sky alike in
+one direction from everywhere."""
+
+
 @dataclass(frozen=True)
 class Assignment:
-    """The planes of a segment; of two, each pixel takes the nearer or the farther one."""
+    """The planes of a segment; of two, each pixel takes the nearer or the farther one.
+
+    Without planes the segment lies too far away for parallax.
+    """
 
     planes: tuple[int, ...]
     nearer: bool = False
+
+    @property
+    def far(self) -> bool:
+        """Whether there is no parallax."""
+        return not self.planes
 
     def inverse_depths(self, each: np.ndarray) -> np.ndarray:
         """Return (n,) inverse depths from those on each plane, (n, planes)."""
@@ -155,6 +172,14 @@ class _Choices:
         return share
 
 
+def lies_far(segment: Segment, photos: PackedPhotos) -> bool:
+    """Tell whether photos see a segment alike in the same directions, whatever their place."""
+    pixels = segment.pixels[:: max(1, len(segment.pixels) // VOTING_PIXELS)]
+    counts = photos.counts(segment.view, pixels, np.full(len(pixels), 1.0 / FAR_DISTANCE))
+    total = counts.sum()
+    return bool(total >= FAR_VOTES * len(pixels) and counts[:, ALIKE].sum() >= FAR_SHARE * total)
+
+
 def continued(
     segments: Sequence[Segment],
     found: Sequence[Assignment | None],
@@ -211,10 +236,18 @@ def _taken_over(
                 continue
             assignment = found[int(other)]
             assert assignment is not None  # or it would not be the nearest
-            step = max(1, len(segment.pixels) // VOTING_PIXELS)
-            each = on_planes(assignment, planes, photos, segment)[::step]
-            votes = photos.votes(view, segment.pixels[::step], assignment.inverse_depths(each))
-            if votes.like >= LEAST_LIKE and votes.through <= MOST_THROUGH_LATER:
+            if _may_have(segment, assignment, planes, photos):
                 taken[number] = assignment
                 break
     return taken
+
+
+def _may_have(
+    segment: Segment, assignment: Assignment, planes: Sequence[Plane], photos: PackedPhotos
+) -> bool:
+    if assignment.far:
+        return lies_far(segment, photos)
+    step = max(1, len(segment.pixels) // VOTING_PIXELS)
+    inverse = assignment.inverse_depths(on_planes(assignment, planes, photos, segment)[::step])
+    votes = photos.votes(segment.view, segment.pixels[::step], inverse)
+    return votes.like >= LEAST_LIKE and votes.through <= MOST_THROUGH_LATER

@@ -163,4 +163,4 @@ def _ratio(
     return np.median(np.log(there / color[inside][agree]), axis=0)
 
 
-__all__ = ["AGREEING", "NEARER", "THROUGH", "PackedPhotos", "Votes", "packed"]
+__all__ = ["AGREEING", "ALIKE", "NEARER", "THROUGH", "PackedPhotos", "Votes", "packed"]

@@ -12,8 +12,9 @@ from scipy import ndimage
 
 from ...progress import Progress
 from ..depth_maps import DepthMap
+from ..matching_cost import WORST_COST
 from .alignment import Aligner, Part
-from .assignment import Assignment, assigned, continued, on_planes
+from .assignment import FAR_DISTANCE, Assignment, assigned, continued, lies_far, on_planes
 from .candidates import SPEAKING_SHARE, proposed_planes
 from .evidence import AGREEING, NEARER, THROUGH, PackedPhotos, packed
 from .planes import Plane, image_plane, lifted_pixels, pooled, refined, with_ones
@@ -53,6 +54,13 @@ KEPT_SHARE = 0.003
 
 FILLED_CONFIDENCE, FILLED_AGREEING = 0.5, 2
 
+FAR_MARGIN_PX, FAR_VIEWS = 2, 2
+"""Photos that must see something far away behind a confirmed point, this far from its border, for
+the point to be none."""
+
+_NOBODY, _FAR = -1, -2
+"""Owners of pixels that lie on no plane: nothing is known, or too far away for parallax."""
+
 
 def fill_plain_parts(
     depth_maps: Sequence[DepthMap], points: np.ndarray, progress: Progress, *, seed: int = 0
@@ -61,7 +69,7 @@ def fill_plain_parts(
 
     Confirmed depths within filled parts that differ from the plane are replaced. Those within
     large plain parts without a plane lose their confirmation: they are borrowed from what lies
-    beside.
+    beside. So do those before the sky, or what else lies too far away for parallax.
 
     Parameters
     ----------
@@ -89,6 +97,11 @@ def fill_plain_parts(
     found = _assigned(tried, planes, photos, progress, first=False)
     every = [*tried, *(s for s in segments if not s.large)]
     found = continued(every, [*found, *[None] * (len(every) - len(tried))], planes, photos)
+    found = [
+        Assignment(()) if one is None and segment.large and lies_far(segment, photos) else one
+        for segment, one in zip(every, found, strict=True)
+    ]
+    found = continued(every, found, planes, photos)
     filled = _Filled(photos, planes)
     for segment, assignment in zip(every, found, strict=True):
         if assignment is not None:
@@ -229,10 +242,13 @@ class _Filled:
         self.photos, self.planes = photos, planes
         shapes = [(camera.height, camera.width) for camera in photos.cameras]
         self.inverse = [np.zeros(shape) for shape in shapes]
-        self.owner = [np.full(shape, -1, np.int32) for shape in shapes]
+        self.owner = [np.full(shape, _NOBODY, np.int32) for shape in shapes]
 
     def put(self, segment: Segment, assignment: Assignment) -> None:
         """Fill a segment."""
+        if assignment.far:
+            self.owner[segment.view][segment.rows, segment.columns] = _FAR
+            return
         each = on_planes(assignment, self.planes, self.photos, segment)
         at = (segment.rows, segment.columns)
         self.inverse[segment.view][at] = np.maximum(assignment.inverse_depths(each), 0.0)
@@ -242,9 +258,11 @@ class _Filled:
         """Fill pixels beside filled segments that look like them."""
         for view, camera in enumerate(self.photos.cameras):
             owner = self.owner[view]
-            if not (owner >= 0).any():
+            if (owner == _NOBODY).all():
                 continue
-            distance, nearest = ndimage.distance_transform_edt(owner < 0, return_indices=True)
+            distance, nearest = ndimage.distance_transform_edt(
+                owner == _NOBODY, return_indices=True
+            )
             row, column = np.nonzero((distance > 0) & (distance <= GROWN_PX))
             near_row, near_column = nearest[:, row, column]
             image = self.photos.images[view, : camera.height, : camera.width].astype(np.float32)
@@ -253,10 +271,12 @@ class _Filled:
             like = difference < GROWN_LEVELS
             row, column = row[like], column[like]
             number = owner[near_row[like], near_column[like]]
-            q = np.array([image_plane(plane, camera) for plane in self.planes])[number]
-            pixels = np.stack([column, row, np.ones_like(row)], 1)
-            self.inverse[view][row, column] = np.maximum((pixels * q).sum(1), 0.0)
             owner[row, column] = number
+            for plane in np.unique(number[number >= 0]):
+                own = number == plane
+                pixels = np.stack([column[own], row[own]], 1).astype(np.float64)
+                inverse = with_ones(pixels) @ image_plane(self.planes[plane], camera)
+                self.inverse[view][row[own], column[own]] = np.maximum(inverse, 0.0)
 
     def check(self, progress: Progress) -> None:
         """Empty the pixels that other photos do not agree with."""
@@ -264,6 +284,7 @@ class _Filled:
         for view, inverse in enumerate(self.inverse):
             row, column = np.nonzero(inverse > 1e-9)
             known[view][row, column] = 1.0 / inverse[row, column]
+            known[view][self._padded(self.owner[view] == _FAR)] = FAR_DISTANCE
         photos = self.photos.with_depths(known)
         for view, inverse in enumerate(self.inverse):
             progress.check()
@@ -276,6 +297,26 @@ class _Filled:
             kept = np.zeros_like(inverse)
             kept[row[good], column[good]] = inverse[row[good], column[good]]
             self.inverse[view] = kept
+
+    def seen_through(self, depth_map: DepthMap, view: int) -> np.ndarray:
+        """Return (h, w) bool: confirmed, and photos see what is far behind the pixel's point."""
+        sky = np.zeros_like(self.photos.depths)
+        for other, owner in enumerate(self.owner):
+            inner = ndimage.binary_erosion(owner == _FAR, iterations=FAR_MARGIN_PX)
+            sky[other][self._padded(inner)] = FAR_DISTANCE
+        found = np.zeros(depth_map.depth.shape, bool)
+        row, column = np.nonzero((depth_map.confidence > 0) & (self.owner[view] < 0))
+        if len(row) and sky.any():
+            pixels = np.stack([column, row], 1).astype(np.float64)
+            inverse = 1.0 / depth_map.depth[row, column].astype(np.float64)
+            counts = self.photos.with_depths(sky).counts(view, pixels, inverse)
+            found[row, column] = counts[:, THROUGH] >= FAR_VIEWS
+        return found
+
+    def _padded(self, layer: np.ndarray) -> np.ndarray:
+        padded = np.zeros(self.photos.depths.shape[1:], bool)
+        padded[: layer.shape[0], : layer.shape[1]] = layer
+        return padded
 
     def applied(self, depth_map: DepthMap, view: int, borrowed: np.ndarray) -> DepthMap:
         """Return a depth map with what is filled and without what is borrowed."""
@@ -292,9 +333,14 @@ class _Filled:
             away = np.sign(plane.offset - plane.normal @ camera.center)
             normal[filled & (self.owner[view] == number)] = -away * plane.normal
         lost = borrowed[view, : camera.height, : camera.width] & (inverse <= 1e-9)
-        confidence = np.where(lost, np.float32(0), depth_map.confidence)
+        far = (self.owner[view] == _FAR) | self.seen_through(depth_map, view)
+        if depth_map.mask is not None:
+            far &= depth_map.mask
+        confidence = np.where(lost | far, np.float32(0), depth_map.confidence)
         confidence[filled] = FILLED_CONFIDENCE
         agreeing = np.where(filled, np.uint8(FILLED_AGREEING), depth_map.agreeing)
         return dataclasses.replace(
-            depth_map, depth=depth, normal=normal, confidence=confidence, agreeing=agreeing
-        )
+            depth_map, depth=depth, normal=normal, confidence=confidence,
+            agreeing=np.where(far, np.uint8(0), agreeing),
+            cost=np.where(far, WORST_COST, depth_map.cost),
+        )  # fmt: skip

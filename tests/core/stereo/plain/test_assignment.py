@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which planes a segment gets."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from gaussian_wrapping_addon.core.stereo.plain.assignment import (
+    Assignment,
+    assigned,
+    continued,
+    lies_far,
+    on_planes,
+)
+from gaussian_wrapping_addon.core.stereo.plain.evidence import packed
+from gaussian_wrapping_addon.core.stereo.plain.segments import segments_of
+from tests.core.stereo.plain.plain_room import (
+    SKY,
+    WALL,
+    cameras,
+    depth_maps,
+    sparse_points,
+    traced,
+)
+from tests.core.stereo.plain.test_candidates import wall_segment
+from tests.core.stereo.plain.test_planes import wall_plane
+
+
+def planes():
+    """Return the floor extended, the wall, and a plane parallel to the wall in the air."""
+    floor = wall_plane().moved(np.array([0.0, 0.0, 1.0]), 0.0)
+    return [floor, wall_plane(), wall_plane(2.0)]
+
+
+def test_the_wall_gets_the_wall() -> None:
+    photos = packed(depth_maps(), np.random.default_rng(0))
+    for view in range(len(cameras())):
+        segment = dataclasses.replace(wall_segment(view), view=view)
+        for first in (True, False):
+            found = assigned(segment, planes(), photos, first=first)
+            assert found is not None
+            assert 1 in found.planes
+            inverse = found.inverse_depths(on_planes(found, planes(), photos, segment))
+            depth, part, _ = traced(cameras()[view])
+            wall = part[segment.rows, segment.columns] == WALL
+            error = np.abs(inverse * depth[segment.rows, segment.columns] - 1.0)
+            assert (error[wall] < 1e-6).mean() > 0.95
+
+
+def test_the_sky_gets_nothing() -> None:
+    photos = packed(depth_maps(), np.random.default_rng(0))
+    for segment in segments_of(depth_maps(), sparse_points()):
+        part = traced(cameras()[segment.view])[1][segment.rows, segment.columns]
+        if segment.large and np.median(part) == SKY:
+            assert assigned(segment, planes(), photos, first=False) is None
+
+
+def test_without_planes_there_is_nothing_to_assign() -> None:
+    photos = packed(depth_maps(), np.random.default_rng(0))
+    assert assigned(wall_segment(0), [], photos, first=True) is None
+
+
+def test_two_planes_meet_where_one_is_nearer() -> None:
+    each = np.array([[0.5, 0.4], [0.3, 0.4]])
+    near, far = Assignment((3, 5), nearer=True), Assignment((3, 5))
+    assert near.inverse_depths(each).tolist() == [0.5, 0.4]
+    assert far.inverse_depths(each).tolist() == [0.4, 0.3]
+    assert near.owners(each).tolist() == [0, 1]
+    assert far.owners(each).tolist() == [1, 0]
+
+
+def test_segments_of_like_colour_nearby_are_continued_and_others_are_not() -> None:
+    photos = packed(depth_maps(), np.random.default_rng(0))
+    whole = dataclasses.replace(wall_segment(3), view=3)
+    middle = int(np.median(whole.columns))
+    left, right = whole.columns < middle - 2, whole.columns > middle + 2
+    halves = [
+        dataclasses.replace(whole, rows=whole.rows[half], columns=whole.columns[half])
+        for half in (left, right)
+    ]
+    sky = next(
+        s
+        for s in segments_of(depth_maps(), sparse_points())
+        if s.view == 3 and s.large and np.median(traced(cameras()[3])[1][s.rows, s.columns]) == SKY
+    )
+    found = continued([*halves, sky], [Assignment((1,)), None, None], planes(), photos)
+    assert found == [Assignment((1,)), Assignment((1,)), None]
+
+
+def test_the_sky_lies_far_and_the_wall_does_not() -> None:
+    photos = packed(depth_maps(), np.random.default_rng(0))
+    far = {SKY: [], WALL: []}
+    for segment in segments_of(depth_maps(), sparse_points()):
+        part = int(np.median(traced(cameras()[segment.view])[1][segment.rows, segment.columns]))
+        if segment.large and part in far:
+            far[part].append(lies_far(segment, photos))
+    assert sum(far[SKY]) >= 0.7 * len(far[SKY]) > 0
+    assert not any(far[WALL])
+    assert far[WALL]
+    assert Assignment(()).far
+    assert not Assignment((0,)).far

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Plain parts lie on the planes that their borders, other photos and faint texture agree on."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core.errors import Cancelled
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.stereo.plain.filling import (
+    FILLED_CONFIDENCE,
+    KEPT_SHARE,
+    fill_plain_parts,
+)
+from tests.core.stereo.ball_scene import ball_maps, ball_scene, true_depth
+from tests.core.stereo.plain.plain_room import (
+    FLOOR,
+    PICTURE,
+    SKY,
+    WALL,
+    cameras,
+    depth_map,
+    depth_maps,
+    near,
+    sparse_points,
+    traced,
+)
+
+
+def assert_wall_is_filled(filled) -> None:
+    for camera, found in zip(cameras(), filled, strict=True):
+        depth, part, _ = traced(camera)
+        wall = part == WALL
+        known = found.confidence > 0
+        error = np.abs(found.depth[wall & known] / depth[wall & known] - 1.0)
+        assert known[wall].mean() > 0.9
+        assert error.max() < KEPT_SHARE
+        assert np.abs(found.normal[wall & known] - [0.0, -1.0, 0.0]).max() < 0.02
+        assert not known[(part == SKY) & ~near(part != SKY, 3)].any()
+
+
+def test_the_wall_gets_its_plane_and_the_sky_none() -> None:
+    filled = fill_plain_parts(depth_maps(), sparse_points(), Progress())
+    assert_wall_is_filled(filled)
+    for camera, before, after in zip(cameras(), depth_maps(), filled, strict=True):
+        part = traced(camera)[1]
+        textured = ((part == FLOOR) | (part == PICTURE)) & (before.confidence > 0)
+        assert np.array_equal(after.depth[textured], before.depth[textured])
+        new = (after.confidence > 0) & (before.confidence == 0)
+        assert (after.confidence[new] == np.float32(FILLED_CONFIDENCE)).all()
+        assert (after.agreeing[new] > 0).all()
+
+
+def test_borrowed_depths_on_the_wall_are_replaced() -> None:
+    maps = []
+    for camera, found in zip(cameras(), depth_maps(), strict=True):
+        depth, part, _ = traced(camera)
+        wrong = np.zeros(part.shape, bool)
+        wrong[30:60, 60:75] = True  # confirmed by windows without texture, a tenth too near
+        wrong &= part == WALL
+        maps.append(
+            dataclasses.replace(
+                found,
+                depth=np.where(wrong, 0.9 * depth, found.depth).astype(np.float32),
+                confidence=np.where(wrong, 0.5, found.confidence).astype(np.float32),
+            )
+        )
+    assert_wall_is_filled(fill_plain_parts(maps, sparse_points(), Progress()))
+
+
+def test_photos_of_different_exposure_agree() -> None:
+    gains = np.linspace(0.8, 1.1, len(cameras()))
+    maps = [depth_map(camera, gain) for camera, gain in zip(cameras(), gains, strict=True)]
+    assert_wall_is_filled(fill_plain_parts(maps, sparse_points(), Progress()))
+
+
+def test_a_rod_before_the_wall_stays_and_the_wall_goes_on_beside_it() -> None:
+    """Windows beside the rod see it and give the wall its depth there, for some pixels."""
+    maps = []
+    for camera, found in zip(cameras(), depth_maps(), strict=True):
+        pixel = camera.project(np.array([[0.0, 1.5, 1.2]]))[0][0]
+        column = round(pixel[0])
+        color, depth, confidence = found.color.copy(), found.depth.copy(), found.confidence.copy()
+        color[:, column : column + 2] = (40, 35, 30)
+        depth[:, column - 4 : column + 6] = camera.to_camera(np.array([[0.0, 1.5, 1.2]]))[0, 2]
+        confidence[:, column - 4 : column + 6] = 0.8
+        maps.append(dataclasses.replace(found, color=color, depth=depth, confidence=confidence))
+    filled = fill_plain_parts(maps, sparse_points(), Progress())
+    for camera, before, after in zip(cameras(), maps, filled, strict=True):
+        depth, part, _ = traced(camera)
+        column = round(camera.project(np.array([[0.0, 1.5, 1.2]]))[0][0, 0])
+        rod = np.zeros(part.shape, bool)
+        rod[:, column : column + 2] = True
+        assert np.array_equal(after.depth[rod], before.depth[rod])
+        beside = np.zeros(part.shape, bool)
+        beside[:, column - 4 : column - 1] = beside[:, column + 3 : column + 6] = True
+        beside &= (part == WALL) & ~near(part != WALL, 4)
+        assert beside.any()
+        right = np.abs(after.depth[beside] / depth[beside] - 1.0) < KEPT_SHARE
+        assert right.mean() > 0.9
+        assert np.abs(before.depth[beside] / depth[beside] - 1.0).min() > KEPT_SHARE
+
+
+def test_what_windows_see_before_the_sky_is_left_out() -> None:
+    """A mast rises into the sky; windows beside it give the sky its depth."""
+    top = np.array([[0.0, 1.5, 1.2]])
+    maps, masts = [], []
+    for camera, found in zip(cameras(), depth_maps(), strict=True):
+        column = round(camera.project(top)[0][0, 0])
+        color, depth, confidence = found.color.copy(), found.depth.copy(), found.confidence.copy()
+        color[:, column : column + 2] = (40, 35, 30)
+        depth[:, column - 5 : column + 7] = camera.to_camera(top)[0, 2]
+        confidence[:, column - 5 : column + 7] = 0.8
+        maps.append(dataclasses.replace(found, color=color, depth=depth, confidence=confidence))
+        masts.append(column)
+    filled = fill_plain_parts(maps, sparse_points(), Progress())
+    left, kept = [], []
+    for camera, column, after in zip(cameras(), masts, filled, strict=True):
+        sky = traced(camera)[1] == SKY
+        sky &= ~near(~sky, 4)
+        for offset in (-5, -4, 5, 6):
+            left.append(after.confidence[sky[:, column + offset], column + offset] > 0)
+        kept.append(after.confidence[sky[:, column], column] > 0)
+    assert np.concatenate(left).mean() < 0.1
+    assert np.concatenate(kept).mean() > 0.8  # an upright stripe is no straight mast in each photo
+
+
+def test_masked_pixels_are_not_filled() -> None:
+    masks = [np.arange(found.depth.shape[1]) > 70 for found in depth_maps()]
+    maps = [
+        dataclasses.replace(found, mask=np.broadcast_to(mask, found.depth.shape))
+        for found, mask in zip(depth_maps(), masks, strict=True)
+    ]
+    for before, after in zip(
+        maps, fill_plain_parts(maps, sparse_points(), Progress()), strict=True
+    ):
+        assert np.array_equal(after.depth[:, :70], before.depth[:, :70])
+        assert np.array_equal(after.confidence[:, :70], before.confidence[:, :70])
+
+
+def test_textured_photos_stay_as_they_are_but_for_what_nothing_confirms() -> None:
+    scene, _ = ball_scene()
+    filled = fill_plain_parts(ball_maps(), scene.points, Progress())
+    changed, before_error, after_error = [], [], []
+    for before, after in zip(ball_maps(), filled, strict=True):
+        confirmed = before.confidence > 0
+        changed.append((before.depth != after.depth)[confirmed])
+        new = (before.depth != after.depth) & ~confirmed
+        depth = true_depth(before.camera)
+        before_error.append(np.abs(before.depth / depth - 1.0)[new])
+        after_error.append(np.abs(after.depth / depth - 1.0)[new])
+    assert np.concatenate(changed).mean() < 0.01
+    assert np.median(np.concatenate(after_error)) < np.median(np.concatenate(before_error)) / 3
+
+
+def test_the_result_is_the_same_each_time() -> None:
+    first, second = (fill_plain_parts(depth_maps(), sparse_points(), Progress()) for _ in "ab")
+    for one, other in zip(first, second, strict=True):
+        assert np.array_equal(one.depth, other.depth)
+        assert np.array_equal(one.confidence, other.confidence)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_single_photos_have_nobody_to_ask(count: int) -> None:
+    maps = list(depth_maps()[:count])
+    assert fill_plain_parts(maps, sparse_points(), Progress()) == maps
+
+
+def test_it_can_be_cancelled() -> None:
+    with pytest.raises(Cancelled):
+        fill_plain_parts(depth_maps(), sparse_points(), Progress(is_cancelled=lambda: True))
