@@ -54,9 +54,9 @@ KEPT_SHARE = 0.003
 
 FILLED_CONFIDENCE, FILLED_AGREEING = 0.5, 2
 
-FAR_MARGIN_PX, FAR_VIEWS = 2, 2
-"""Photos that must see something far away behind a confirmed point, this far from its border, for
-the point to be none."""
+BEHIND_MARGIN_PX, BEHIND_VIEWS = 2, 2
+"""Photos that must see a plane or something far away behind a confirmed point, so far from its
+border, for the point to be none."""
 
 _NOBODY, _FAR = -1, -2
 """Owners of pixels that lie on no plane: nothing is known, or too far away for parallax."""
@@ -69,7 +69,8 @@ def fill_plain_parts(
 
     Confirmed depths within filled parts that differ from the plane are replaced. Those within
     large plain parts without a plane lose their confirmation: they are borrowed from what lies
-    beside. So do those before the sky, or what else lies too far away for parallax.
+    beside. So do those that other photos see through, onto a plane or onto what lies too far away
+    for parallax, as the sky.
 
     Parameters
     ----------
@@ -114,7 +115,11 @@ def fill_plain_parts(
         len(planes), 100.0 * whole / sum(m.depth.size for m in depth_maps),
     )  # fmt: skip
     borrowed = _plain(tried, photos)
-    return [filled.applied(depth_map, view, borrowed) for view, depth_map in enumerate(depth_maps)]
+    behind = filled.behind()
+    return [
+        filled.applied(depth_map, view, borrowed, behind)
+        for view, depth_map in enumerate(depth_maps)
+    ]
 
 
 def _proposals(
@@ -298,27 +303,35 @@ class _Filled:
             kept[row[good], column[good]] = inverse[row[good], column[good]]
             self.inverse[view] = kept
 
-    def seen_through(self, depth_map: DepthMap, view: int) -> np.ndarray:
-        """Return (h, w) bool: confirmed, and photos see what is far behind the pixel's point."""
-        sky = np.zeros_like(self.photos.depths)
-        for other, owner in enumerate(self.owner):
-            inner = ndimage.binary_erosion(owner == _FAR, iterations=FAR_MARGIN_PX)
-            sky[other][self._padded(inner)] = FAR_DISTANCE
+    def seen_through(self, depth_map: DepthMap, view: int, behind: PackedPhotos) -> np.ndarray:
+        """Return (h, w) bool: confirmed, on no plane, and photos see something behind the point."""
         found = np.zeros(depth_map.depth.shape, bool)
         row, column = np.nonzero((depth_map.confidence > 0) & (self.owner[view] < 0))
-        if len(row) and sky.any():
+        if len(row):
             pixels = np.stack([column, row], 1).astype(np.float64)
             inverse = 1.0 / depth_map.depth[row, column].astype(np.float64)
-            counts = self.photos.with_depths(sky).counts(view, pixels, inverse)
-            found[row, column] = counts[:, THROUGH] >= FAR_VIEWS
+            counts = behind.counts(view, pixels, inverse)
+            found[row, column] = counts[:, THROUGH] >= BEHIND_VIEWS
         return found
+
+    def behind(self) -> PackedPhotos:
+        """Return the photos with depths of planes and what is far alone, but for their borders."""
+        known = np.zeros_like(self.photos.depths)
+        for view, (inverse, owner) in enumerate(zip(self.inverse, self.owner, strict=True)):
+            far = owner == _FAR
+            inner = ndimage.binary_erosion(far | (inverse > 1e-9), iterations=BEHIND_MARGIN_PX)
+            depth = np.where(far, FAR_DISTANCE, 1.0 / np.maximum(inverse, 1e-9))
+            known[view, : far.shape[0], : far.shape[1]] = np.where(inner, depth, 0.0)
+        return self.photos.with_depths(known)
 
     def _padded(self, layer: np.ndarray) -> np.ndarray:
         padded = np.zeros(self.photos.depths.shape[1:], bool)
         padded[: layer.shape[0], : layer.shape[1]] = layer
         return padded
 
-    def applied(self, depth_map: DepthMap, view: int, borrowed: np.ndarray) -> DepthMap:
+    def applied(
+        self, depth_map: DepthMap, view: int, borrowed: np.ndarray, behind: PackedPhotos
+    ) -> DepthMap:
         """Return a depth map with what is filled and without what is borrowed."""
         inverse, camera = self.inverse[view], depth_map.camera
         confirmed = depth_map.confidence > 0
@@ -333,7 +346,7 @@ class _Filled:
             away = np.sign(plane.offset - plane.normal @ camera.center)
             normal[filled & (self.owner[view] == number)] = -away * plane.normal
         lost = borrowed[view, : camera.height, : camera.width] & (inverse <= 1e-9)
-        far = (self.owner[view] == _FAR) | self.seen_through(depth_map, view)
+        far = (self.owner[view] == _FAR) | self.seen_through(depth_map, view, behind)
         if depth_map.mask is not None:
             far &= depth_map.mask
         confidence = np.where(lost | far, np.float32(0), depth_map.confidence)
