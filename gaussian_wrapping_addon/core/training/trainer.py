@@ -33,7 +33,7 @@ from .appearance.photo_exposure import Exposure, corrected_for_measuring
 from .backdrop import with_backdrop
 from .cancellation import CancellablePhotos
 from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
-from .initialisation.dense_start import dense_start, matched_photos
+from .initialisation.dense_start import dense_start, matched_photos, on_planes
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
 from .live_view import Correction, LiveView, evenly_spaced, measure_held_out
@@ -347,11 +347,11 @@ class _Trainer:
         priors = load_priors(self.folder, cameras, key)
         if priors is None:
             _logger.info("the confirmed depths are not there: matching the photos again")
+            scene, quiet = self._start_scene(), progress.span(0.0, 0.0)
             maps = matched_photos(
-                self._start_scene(), self.photos, self.views, progress.span(0.0, 0.0),
-                seed=self.seed, threads=self.threads,
-            )  # fmt: skip
-            priors = priors_of(self.views, maps)
+                scene, self.photos, self.views, quiet, seed=self.seed, threads=self.threads
+            )
+            priors = priors_of(self.views, on_planes(scene, maps, quiet, seed=self.seed))
             save_priors(self.folder, priors, key)
         return priors
 

@@ -78,7 +78,7 @@ def fill_plain_parts(
     points : (n, 3) float64
         Sparse points, scene frame.
     progress : Progress
-        Checked for cancellation.
+        Told once, at its end; checked for cancellation.
     """
     if len(depth_maps) < LEAST_VIEWS:
         return list(depth_maps)
@@ -87,6 +87,7 @@ def fill_plain_parts(
     tried = [s for s in segments if s.large and s.unknown >= LEAST_UNKNOWN]
     if not tried:
         return list(depth_maps)
+    progress.update(1.0, "looking for planes of walls and ground")
     photos = packed(depth_maps, random)
     planes = _proposals(tried, photos, random, progress)
     for turn in range(TURNS):

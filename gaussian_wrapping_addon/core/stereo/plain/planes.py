@@ -101,26 +101,25 @@ def pooled(planes: Sequence[Plane], *, fit: bool = True) -> list[Plane]:
     fit : bool
         Fit each to the points of all that were put together.
     """
+    ordered = sorted(planes, key=lambda p: -p.support)
+    normals, centers = np.zeros((len(ordered), 3)), np.zeros((len(ordered), 3))
+    offsets = np.zeros(len(ordered))
     groups: list[list[Plane]] = []
-    for plane in sorted(planes, key=lambda p: -p.support):
-        for group in groups:
-            if _same(group[0], plane):
-                group.append(plane)
-                break
+    for plane in ordered:
+        count = len(groups)
+        cosines = np.abs(normals[:count] @ plane.normal)
+        passing = np.abs(normals[:count] @ plane.center - offsets[:count])
+        passed = np.abs(centers[:count] @ plane.normal - plane.offset)
+        near = LIKE_SHARE * plane.distance
+        same = (cosines >= LIKE_COSINE) & (passing < near) & (passed < 3.0 * near)
+        if same.any():
+            groups[int(np.argmax(same))].append(plane)
         else:
+            normals[count], centers[count] = plane.normal, plane.center
+            offsets[count] = plane.offset
             groups.append([plane])
     joined = [_joined(group) for group in groups]
     return [refined(plane) for plane in joined] if fit else joined
-
-
-def _same(first: Plane, other: Plane) -> bool:
-    if abs(first.normal @ other.normal) < LIKE_COSINE:
-        return False
-    near = LIKE_SHARE * other.distance
-    return bool(
-        abs(first.normal @ other.center - first.offset) < near
-        and abs(other.normal @ first.center - other.offset) < 3.0 * near
-    )
 
 
 def _joined(group: Sequence[Plane]) -> Plane:

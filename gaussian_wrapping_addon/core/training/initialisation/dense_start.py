@@ -101,6 +101,7 @@ def dense_start(
     decision = _decision(setting, confirmed, len(maps))
     if decision.chosen != "on":
         return DenseStart(None, {}, decision)
+    maps = on_planes(scene, maps, progress, seed=seed)
     wanted = start_budget(max_gaussians)
     found = fuse(maps, wanted)
     guesses = fill_gaps(maps, found, round(GUESS_SHARE * wanted))
@@ -137,8 +138,14 @@ def matched_photos(
 ) -> list[DepthMap]:
     """Return the depth maps of the training views; empty where there is too little to match."""
     points, _ = _usable(scene)
-    maps = estimate_depth_maps(photos, views, points, progress, seed=seed, threads=threads)
-    return fill_plain_parts(maps, points, progress, seed=seed)
+    return estimate_depth_maps(photos, views, points, progress, seed=seed, threads=threads)
+
+
+def on_planes(
+    scene: Scene, maps: Sequence[DepthMap], progress: Progress, *, seed: int
+) -> list[DepthMap]:
+    """Return the depth maps with planes through their plain parts."""
+    return fill_plain_parts(maps, _usable(scene)[0], progress, seed=seed)
 
 
 def _usable(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
