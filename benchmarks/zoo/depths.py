@@ -23,6 +23,7 @@ from gaussian_wrapping_addon.core.dataset.photos.photo_store import PhotoStore
 from gaussian_wrapping_addon.core.dataset.scene import Scene
 from gaussian_wrapping_addon.core.dataset.view_split import training_views
 from gaussian_wrapping_addon.core.files import write_bytes
+from gaussian_wrapping_addon.core.machine import processor_name
 from gaussian_wrapping_addon.core.mesh.depth_buffer import depth_buffer
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap, estimate_depth_maps
@@ -72,7 +73,8 @@ def main(given: Sequence[str] | None = None) -> int:
     lines = [
         "# Depths of a dense start",
         "",
-        f"`{COMMAND}`, {today}, {versions()}, threads: {options.threads}. Photos of at most",
+        f"`{COMMAND}`, {today}, {processor_name()}, {versions()},",
+        f"threads: {options.threads}. Photos of at most",
         f"{PHOTO_PX} px are matched at half their size or less. Known is the share of all pixels,",
         "within the share of the known ones whose depth errs by less, relative to it, per cent.",
         "Seconds are of the processor, kernels compiled before.",

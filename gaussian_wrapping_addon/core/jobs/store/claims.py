@@ -3,13 +3,13 @@
 
 A claim is a file that only one process can create; its modification time is refreshed while the
 process works. A claim is taken over when its process has ended (same machine) or has stopped
-refreshing it (another machine). When two processes take over at once, or one resumes after a long
-sleep, a task is done twice. That only costs time: both compute the same result, and results are
-written atomically.
+refreshing it (another machine). When one resumes after a long sleep, a task is done twice. That
+only costs time: both compute the same result, and results are written atomically.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -137,8 +137,12 @@ class Claims:
             os.rename(path, aside)  # only one of several processes succeeds
         except FileNotFoundError:
             return False
+        fresh = self._owner(aside).get("token") != owner.get("token")
+        if fresh:  # another process took over between the look and the rename
+            with contextlib.suppress(OSError):
+                os.link(aside, path)
         aside.unlink(missing_ok=True)
-        return True
+        return not fresh
 
     @staticmethod
     def _owner(path: Path) -> dict[str, Any]:

@@ -151,6 +151,31 @@ def test_tasks_run_in_order_of_need_and_errors_pass(tmp_path: Path) -> None:
     assert Claims(tmp_path).worker_count() == 2
 
 
+def test_two_processes_do_not_take_over_the_same_claim(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    claim_of(tmp_path, "a")  # of a dead process
+    first, second = Claims(tmp_path), Claims(tmp_path)
+    whole = Claims._owner
+    held = first.held("a")
+    taken = []
+
+    def look_and_wait(path: Path) -> dict:
+        owner = whole(path)
+        if not taken:
+            taken.append(None)  # from here on first looks, too, and takes over
+            taken[0] = held.__enter__()
+        return owner
+
+    monkeypatch.setattr(Claims, "_owner", staticmethod(look_and_wait))
+    with second.held("a") as also:
+        assert not also
+    assert taken == [True]
+    assert (tmp_path / "a.json").is_file()
+    held.__exit__(None, None, None)
+    assert not list(tmp_path.iterdir())
+
+
 def planned(folder: Path) -> Field:
     shape = ShapeField(torus(), 0.02)
     field = Field(shape, shape, 1)
