@@ -91,6 +91,14 @@ class MethodSettings:
         paper=0.0,
         since="0.2.0",
     )
+    lambda_opacity: float = _constant(
+        0.001,
+        "--lambda-opacity",
+        "Weight of the opacity prior: what photos leave open is opaque.",
+        _WEIGHT,
+        paper=0.0,
+        since="0.2.0",
+    )
     lambda_normal: float = _constant(
         0.03, "--lambda-normal", "Weight of the normal loss.", _WEIGHT, paper=0.05
     )

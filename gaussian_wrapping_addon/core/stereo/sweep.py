@@ -23,6 +23,9 @@ REFINEMENTS = 2
 LEAST_COSINE = F32(0.12)
 """Between ray and normal, 83 degrees: more grazing planes are not tried."""
 
+GOOD_COST = F32(0.3)
+"""A pixel that costs less in the sources it kept is not judged in the others."""
+
 RANDOM_ABOVE = F32(0.5)
 """A random plane is tried where the cost is at least this."""
 
@@ -88,7 +91,8 @@ def sweep(
 ) -> None:  # fmt: skip
     """Visit the pixels of a photo once and give each the best plane found.
 
-    The present plane is judged in all sources, of which the best few are kept. A neighbour's plane
+    The present plane is judged in the sources that the pixel kept, and where it costs
+    :data:`GOOD_COST` or more there, in all; the best few are kept. A neighbour's plane
     is judged in the sources that the neighbour kept: the pixel's own may be those where the surface
     is hidden. A winner with other sources is judged in all of them again.
 
@@ -149,11 +153,20 @@ def sweep(
         best, chosen, judge = ZERO, 0, True
         for step in range(len(neighbours) + REFINEMENTS + 2):
             if judge:
+                known = 0 if fresh or step > 0 else int(best_sources[row, column])
+                total = ZERO
                 for s in range(count):
-                    costs[s] = view_cost(
-                        s, u, v, w, a, b, maps, back_maps, quads, sizes, bases, stride,
-                        inverse_depths, geometric, table, found, mean, variance,
-                    )  # fmt: skip
+                    costs[s] = WORST_COST
+                for others in range(2):
+                    if others == 1 and known != 0 and total < GOOD_COST * F32(kept):
+                        break
+                    for s in range(count):
+                        if (known >> s) & 1 != others:
+                            costs[s] = view_cost(
+                                s, u, v, w, a, b, maps, back_maps, quads, sizes, bases, stride,
+                                inverse_depths, geometric, table, found, mean, variance,
+                            )  # fmt: skip
+                            total += costs[s]
                 chosen, total = 0, ZERO
                 for _ in range(kept):
                     least = -1

@@ -30,6 +30,7 @@ from .losses.multi_view import (
     merge_gradients,
     multi_view_losses,
 )
+from .losses.opacity_prior import add_opacity_prior
 from .schedule import Schedule
 from .state import TrainingState
 from .windows import Window, windows
@@ -159,6 +160,11 @@ class Stepper:
                 seen, adam.array("log_scales"), image.screen.boxes, size_px,
                 self.settings.overlap_price,
             )  # fmt: skip
+        opacity_weight = schedule.opacity_weight(iteration)
+        if opacity_weight > 0.0 and state.model_selection.chose("dense_start"):
+            size_px = (sample.camera.width, sample.camera.height)
+            logits = adam.array("opacity_logits")
+            add_opacity_prior(seen, logits, image.screen.boxes, size_px, opacity_weight)
         if other is not None:
             seen = merge_gradients(seen, other, len(adam), threads=self.threads, store=self.store)
         if gathers:

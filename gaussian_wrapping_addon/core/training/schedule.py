@@ -132,6 +132,10 @@ class Schedule:
         """Return the weight of the depths that stereo confirmed; they count with the depth loss."""
         return self.settings.lambda_depth_prior if self.uses_depth(iteration) else 0.0
 
+    def opacity_weight(self, iteration: int) -> float:
+        """Return the weight of the opacity prior; it counts with the depth loss."""
+        return self.settings.lambda_opacity if self.uses_depth(iteration) else 0.0
+
     def compares_views(self, iteration: int) -> bool:
         """Tell whether the multi-view terms are evaluated in this iteration."""
         begin, end = self._at(self.settings.depth_from), self._at(self.settings.multi_view_until)

@@ -8,7 +8,14 @@ import pytest
 
 from gaussian_wrapping_addon.core.stereo.matching_cost import WORST_COST
 from gaussian_wrapping_addon.core.stereo.matching_level import MatchingLevel
-from tests.core.stereo.textured_plane import level_of, plane_photos, true_planes
+from gaussian_wrapping_addon.core.stereo.sweep import GOOD_COST
+from tests.core.stereo.textured_plane import (
+    cameras,
+    grey_photo,
+    level_of,
+    plane_photos,
+    true_planes,
+)
 
 INSIDE = (slice(8, 40), slice(12, 56))
 """Pixels whose windows other photos show."""
@@ -98,3 +105,37 @@ def test_one_source_is_enough_to_find_planes() -> None:
     for turn in range(3):
         level.sweep(1, turn, 0, fresh=True)
     assert share_right(level) > 0.7
+
+
+def level_with_kept_sources(kept_photos: str) -> MatchingLevel:
+    """Return true planes whose pixels of photo 2 kept the sources 0 and 1, of these photos."""
+    given = cameras(5)
+    photos = [grey_photo(camera) for camera in given]
+    random = np.random.default_rng(4)
+    for k in (0, 1):
+        noisy = photos[k] + random.normal(0.0, 5.0, photos[k].shape)
+        changed = noisy if kept_photos == "noisy" else random.uniform(0, 255, noisy.shape)
+        photos[k] = np.clip(changed, 0, 255).astype(np.uint8)
+    level = level_of(photos, given)
+    level.planes_of(2)[:] = true_planes(given[2])
+    level._best_sources[2][:] = 0b0011
+    level.sweep(2, 0, 0)
+    return level
+
+
+SHOWN = (slice(12, 36), slice(26, 38))
+"""Pixels whose windows all five photos show."""
+
+
+def test_sources_that_were_good_enough_are_kept() -> None:
+    """Unless a neighbour hands on better ones: pixels at the border had to look for others."""
+    level = level_with_kept_sources("noisy")
+    kept = (level._best_sources[2] == 0b0011)[SHOWN]
+    assert kept.mean() > 0.1  # judged in all sources, a noisy one is hardly ever among the best
+    assert level.costs[2][SHOWN][kept].max() < GOOD_COST
+
+
+def test_other_sources_are_asked_where_those_that_were_kept_do_not_match() -> None:
+    level = level_with_kept_sources("others")
+    assert (level._best_sources[2] == 0b1100)[SHOWN].mean() > 0.9
+    assert np.median(level.costs[2][SHOWN]) < 0.05

@@ -239,6 +239,18 @@ def test_training_more_twice_equals_once(tmp_path: Path) -> None:
     assert_same(twice, last.gaussians)
 
 
+def test_without_a_dense_start_photos_alone_decide_on_opacities(tmp_path: Path) -> None:
+    """Gaussians are not in the right places yet: opaque ones would hide what has to move."""
+    scene, photos = sphere_scene(views=9, size_px=24)
+    found = []
+    for weight in (0.0, 1.0):
+        folder = tmp_path / str(weight)
+        folder.mkdir()
+        settings = dataclasses.replace(SETTINGS, dense_start="off", lambda_opacity=weight)
+        found.append(train(scene, photos, settings, folder, Progress(), seed=1, threads=1))
+    assert_same(found[0].gaussians, found[1].gaussians)
+
+
 def test_windows_and_neighbours_resume_bit_for_bit(tmp_path: Path) -> None:
     """Neighbours bring Gaussians that the window has culled: memory of other views is no state."""
     scene, photos = sphere_scene(views=30, size_px=40)

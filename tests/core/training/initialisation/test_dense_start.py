@@ -228,6 +228,24 @@ def stopping_at(iteration: int) -> Progress:
     return Progress("train", look, lambda: bool(reached))
 
 
+def test_the_opacity_prior_leaves_fewer_half_transparent_gaussians(tmp_path: Path) -> None:
+    scene, photos = ball_scene()
+    few = dataclasses.replace(scene, views=scene.views[3:8])
+    own = PhotosInMemory(few, photos.photos[3:8])
+    settings = dataclasses.replace(SETTINGS, dense_start="on", iterations=60, depth_from=0.1)
+    shares, psnr = [], []
+    for weight in (0.0, settings.lambda_opacity):
+        folder = tmp_path / str(weight)
+        folder.mkdir()
+        asked = dataclasses.replace(settings, lambda_opacity=weight)
+        result = trainer.train(few, own, asked, folder, Progress(), threads=1)
+        opacity = result.gaussians.log_opacities().exp().numpy()
+        shares.append(float((opacity[opacity > 0.2] < 0.8).mean()))
+        psnr.append(result.history[-1]["psnr"])
+    assert shares[1] < 0.7 * shares[0]
+    assert psnr[1] > psnr[0] - 0.5
+
+
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_resumed_training_holds_the_same_depths(tmp_path: Path, lost: bool) -> None:
     """Bit for bit, also where the file of the depths is lost and they are made again."""
