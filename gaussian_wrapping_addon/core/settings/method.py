@@ -238,6 +238,16 @@ class MethodSettings:
         paper=0.05,
         since="0.2.0",
     )
+    free_views: int = _constant(
+        2,
+        "--free-views",
+        "After a dense start, Gaussians that so many photos see through are removed at intervals; "
+        "0 removes none.",
+        Range(0, 1000),
+        unit="photos",
+        paper=0,
+        since="0.2.0",
+    )
     overlap_price: float = _constant(
         2e-5,
         "--overlap-price",

@@ -79,6 +79,9 @@ class DepthMap:
     """(h, w, 3) uint8."""
     mask: np.ndarray | None
     """(h, w) bool, true where the photo counts."""
+    free: np.ndarray | None = None
+    """(h, w) float32 z-depth of parts without texture but for their borders, 0 elsewhere: the
+    photo shows nothing before it. ``None`` until such parts were looked for."""
 
 
 def estimate_depth_maps(

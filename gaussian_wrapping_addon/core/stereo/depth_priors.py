@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Confirmed depths of the photos, kept for the training that started on them."""
+"""What stereo knows of the photos' depths, kept for the training that started on them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ and there training finds the surface better than windows do."""
 
 @dataclass(frozen=True)
 class DepthPrior:
-    """Confirmed depths of planes in one photo."""
+    """What is known of the depths of one photo."""
 
     camera: Camera
     """Of this size, scene frame."""
@@ -35,10 +35,17 @@ class DepthPrior:
     """(h, w) float32 z-depth, scene units; 0 where nothing is confirmed or planar."""
     confidence: np.ndarray
     """(h, w) float32 in [0, 1]; 0 where nothing is confirmed."""
+    known: np.ndarray
+    """(h, w) float32 confirmed z-depth, of planes or not; 0 where nothing is confirmed."""
+    free: np.ndarray
+    """(h, w) float32 z-depth before which the photo shows nothing; 0 where that is not known."""
+
+
+_LAYERS = ("depth", "confidence", "known", "free")
 
 
 def priors_of(views: Sequence[int], depth_maps: Sequence[DepthMap]) -> dict[int, DepthPrior]:
-    """Return the priors of views, by view: the confirmed depths of planes."""
+    """Return the priors of views, by view."""
     priors = {}
     for view, found in zip(views, depth_maps, strict=True):
         plane = planar_pixels(found)
@@ -46,6 +53,8 @@ def priors_of(views: Sequence[int], depth_maps: Sequence[DepthMap]) -> dict[int,
             found.camera,
             np.where(plane, found.depth, np.float32(0)),
             np.where(plane, found.confidence, np.float32(0)),
+            np.where(found.confidence > 0, found.depth, np.float32(0)),
+            np.zeros_like(found.depth) if found.free is None else found.free,
         )
     return priors
 
@@ -73,7 +82,7 @@ def save_priors(folder: Path, priors: Mapping[int, DepthPrior], key: str) -> Non
     """Write ``depth_priors.npz`` into a folder; ``key`` names what they were made from."""
     arrays = {"key": np.array(key)}
     for view, prior in priors.items():
-        arrays[f"depth.{view}"], arrays[f"confidence.{view}"] = prior.depth, prior.confidence
+        arrays |= {f"{layer}.{view}": getattr(prior, layer) for layer in _LAYERS}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_bytes(folder / FILE_NAME, buffer.getvalue())
@@ -100,17 +109,17 @@ def load_priors(
             if str(arrays["key"]) != key:
                 return None
             return {
-                view: _prior(camera, arrays[f"depth.{view}"], arrays[f"confidence.{view}"])
+                view: _prior(camera, [arrays[f"{layer}.{view}"] for layer in _LAYERS])
                 for view, camera in cameras.items()
             }
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile):
         return None
 
 
-def _prior(camera: Camera, depth: np.ndarray, confidence: np.ndarray) -> DepthPrior:
-    good = depth.dtype == confidence.dtype == np.float32 and depth.shape == confidence.shape
-    if not (good and depth.ndim == 2 and np.isfinite(depth).all()):
-        raise ValueError("not (h, w) float32 depths and confidences")
-    if depth.shape != (camera.height, camera.width):
-        raise ValueError(f"depths are {depth.shape}, the photo is matched at another size")
-    return DepthPrior(camera, depth, confidence)
+def _prior(camera: Camera, layers: Sequence[np.ndarray]) -> DepthPrior:
+    for layer in layers:
+        if not (layer.dtype == np.float32 and layer.ndim == 2 and np.isfinite(layer).all()):
+            raise ValueError("not (h, w) float32 depths and confidences")
+        if layer.shape != (camera.height, camera.width):
+            raise ValueError(f"depths are {layer.shape}, the photo is matched at another size")
+    return DepthPrior(camera, *layers)

@@ -17,6 +17,7 @@ from ..progress import Progress
 from .cancellation import cancellable
 from .density.contribution import contributions, needed_by_a_view, prune_contributors
 from .density.density_control import densify_and_prune, reset_opacity
+from .density.free_space import contradicted
 from .density.wrapping import WrapView, normal_errors, start_orientation, wrap
 from .iteration import Stepper, may_wrap
 from .live_view import divisor_for
@@ -99,6 +100,8 @@ class Rounds:
         if schedule.prunes(iteration):
             self._prune(state)
             changed = True
+        if changed:
+            self._empty_free_space(state)
         if schedule.decides_wrapping(iteration):
             self._decide_wrapping(state)
         if schedule.wraps(iteration) and may_wrap(schedule, state):
@@ -168,6 +171,14 @@ class Rounds:
         )
         gone = prune_contributors(state.adam, needed)
         _logger.info("iteration %d: pruned %d Gaussians", state.iteration, gone)
+
+    def _empty_free_space(self, state: TrainingState) -> None:
+        """Remove the Gaussians in space that photos see through, where that is known."""
+        priors, least_views = self.stepper.priors, self.settings.free_views
+        if priors and least_views:
+            inside = contradicted(state.adam.array("means"), priors, least_views)
+            gone = prune_contributors(state.adam, ~inside)
+            _logger.info("iteration %d: %d Gaussians in free space", state.iteration, gone)
 
     def _normal_errors(self, state: TrainingState) -> np.ndarray:
         views = self._views(self.settings.wrap_divisor)

@@ -334,7 +334,7 @@ class _Trainer:
         )
 
     def _uses_priors(self) -> bool:
-        return self.settings.lambda_depth_prior > 0.0
+        return self.settings.lambda_depth_prior > 0.0 or self.settings.free_views > 0
 
     def _saved_priors(
         self, state: TrainingState, key: str, progress: Progress

@@ -30,14 +30,21 @@ def exact_prior():
 
 def test_what_is_saved_is_loaded_bit_for_bit(tmp_path: Path) -> None:
     camera, found = exact_prior()
-    priors = priors_of([VIEW], [found])
+    priors = priors_of([VIEW], [dataclasses.replace(found, free=2.0 * found.depth)])
     save_priors(tmp_path, priors, "key")
     loaded = load_priors(tmp_path, {VIEW: camera}, "key")
     assert loaded is not None
     assert list(loaded) == [VIEW]
     assert np.array_equal(loaded[VIEW].depth, priors[VIEW].depth)
     assert np.array_equal(loaded[VIEW].confidence, priors[VIEW].confidence)
+    assert np.array_equal(loaded[VIEW].known, np.where(found.confidence > 0, found.depth, 0))
+    assert np.array_equal(loaded[VIEW].free, 2.0 * found.depth)
     assert loaded[VIEW].camera == camera
+
+
+def test_without_parts_that_have_no_texture_nothing_is_known_to_be_free() -> None:
+    _, found = exact_prior()
+    assert not priors_of([VIEW], [found])[VIEW].free.any()
 
 
 def test_other_keys_views_and_sizes_are_not_loaded(tmp_path: Path) -> None:

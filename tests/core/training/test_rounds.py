@@ -16,6 +16,7 @@ from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.gaussians.model import OrientedGaussians
 from gaussian_wrapping_addon.core.progress import Progress
 from gaussian_wrapping_addon.core.settings import TrainingSettings
+from gaussian_wrapping_addon.core.stereo.depth_priors import DepthPrior
 from gaussian_wrapping_addon.core.training.iteration import Stepper, is_oriented
 from gaussian_wrapping_addon.core.training.rounds import Rounds
 from gaussian_wrapping_addon.core.training.schedule import Schedule
@@ -123,6 +124,34 @@ def test_growth_off_keeps_the_number_of_gaussians() -> None:
         rounds.after_step(state)
         assert len(state.adam) == len(before)
     assert not rounds.schedule.compact  # no footprint regulariser either
+
+
+@pytest.mark.parametrize(("free_views", "left"), [(2, 0), (0, 1)])
+def test_density_control_empties_the_space_that_photos_see_through(
+    free_views: int, left: int
+) -> None:
+    """A Gaussian away from the sphere, where some photos show what is far in its pixel."""
+    scene, photos = sphere_scene(views=8, size_px=24)
+    settings = dataclasses.replace(SETTINGS, growth="on", free_views=free_views)
+    rounds, place = rounds_of(scene, photos, settings), np.array([[1.15, 1.15, 0.0]])
+    for view in rounds.views:
+        camera = photos.camera(view, 1)
+        nothing = np.zeros((camera.height, camera.width), np.float32)
+        free = nothing.copy()
+        column, row = camera.project(place)[0][0].astype(int)
+        if 0 <= column < camera.width and 0 <= row < camera.height:
+            free[row, column] = 1e6
+        rounds.stepper.priors[view] = DepthPrior(camera, nothing, nothing, nothing, free)
+    start = sphere_gaussians()
+    means = start.means.clone()
+    means[0] = torch.from_numpy(place[0].astype(np.float32))
+    state = TrainingState.start(start.replaced(means=means), 0)
+    rounds.filter(state)
+    before = len(state.adam)
+    state.iteration = next(i for i in range(60) if rounds.schedule.densifies(i))
+    rounds.after_step(state)
+    assert (np.linalg.norm(state.adam.array("means"), axis=1) > 1.5).sum() == left
+    assert len(state.adam) > 0.9 * before
 
 
 def test_growth_on_and_auto_change_the_number() -> None:

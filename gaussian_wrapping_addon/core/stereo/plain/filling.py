@@ -357,4 +357,6 @@ class _Filled:
             depth_map, depth=depth, normal=normal, confidence=confidence,
             agreeing=np.where(far, np.uint8(0), agreeing),
             cost=np.where(far, WORST_COST, depth_map.cost),
+            free=behind.depths[view, : camera.height, : camera.width]
+            * (np.float32(1) if depth_map.mask is None else depth_map.mask),
         )  # fmt: skip

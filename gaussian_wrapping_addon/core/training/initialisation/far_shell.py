@@ -24,7 +24,7 @@ OPEN_SHARE = 0.75
 REACH_FACTOR = 4.0
 """Radius of the shell over the distance of the farthest points but one in a hundred."""
 
-LEAST_REACH = 10.0 * tolerances.SCENE_RADIUS
+LEAST_REACH = tolerances.FAR_RADIUS
 """Smallest radius: the cameras lie within a tenth of it."""
 
 BEHIND_COST = 0.7

@@ -104,6 +104,18 @@ def test_a_rod_before_the_wall_stays_and_the_wall_goes_on_beside_it() -> None:
         assert np.abs(before.depth[beside] / depth[beside] - 1.0).min() > KEPT_SHARE
 
 
+def test_photos_see_freely_to_the_wall() -> None:
+    for camera, found in zip(
+        cameras(), fill_plain_parts(depth_maps(), sparse_points(), Progress()), strict=True
+    ):
+        depth, part, _ = traced(camera)
+        wall = (part == WALL) & (found.free > 0)
+        assert wall[(part == WALL) & ~near(part != WALL, 6)].mean() > 0.9
+        assert np.abs(found.free[wall] / depth[wall] - 1.0).max() < KEPT_SHARE
+        assert not found.free[(part == FLOOR) | (part == PICTURE)].any()
+    assert depth_maps()[0].free is None
+
+
 def test_what_windows_see_before_the_sky_is_left_out() -> None:
     """A mast rises into the sky; windows beside it give the sky its depth."""
     top = np.array([[0.0, 1.5, 1.2]])
@@ -139,6 +151,7 @@ def test_masked_pixels_are_not_filled() -> None:
     ):
         assert np.array_equal(after.depth[:, :70], before.depth[:, :70])
         assert np.array_equal(after.confidence[:, :70], before.confidence[:, :70])
+        assert not after.free[:, :70].any()
 
 
 def test_textured_photos_stay_as_they_are_but_for_what_nothing_confirms() -> None:

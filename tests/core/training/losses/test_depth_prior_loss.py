@@ -26,7 +26,7 @@ def prior_of(camera: Camera, seed: int = 0) -> DepthPrior:
     depth = random.uniform(1.5, 2.5, shape).astype(np.float32)
     confidence = random.uniform(0.1, 1.0, shape).astype(np.float32)
     depth[random.random(shape) < 0.2] = 0.0
-    return DepthPrior(camera, depth, confidence)
+    return DepthPrior(camera, depth, confidence, depth, np.zeros_like(depth))
 
 
 def camera() -> Camera:
