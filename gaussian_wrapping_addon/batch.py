@@ -58,10 +58,12 @@ def console_entry() -> int:
 
 
 def _log_to_terminal() -> None:
+    from .core.log_lines import LineFormatter
+
     if _logger.handlers:
         return
     handler = logging.StreamHandler(sys.stdout)
-    handler.setFormatter(logging.Formatter("%(message)s"))
+    handler.setFormatter(LineFormatter("%(message)s"))
     _logger.addHandler(handler)
     _logger.setLevel(logging.INFO)
     _logger.propagate = False

@@ -36,9 +36,7 @@ class Parser(ArgumentParser):
     def error(self, message: str) -> NoReturn:
         from ..core.errors import UsageError
 
-        raise UsageError(
-            f"{message}.", f"Usage: {self.format_usage().split('usage: ')[-1].strip()}"
-        )
+        raise UsageError(f"{message}.", f"Usage: {' '.join(self.format_usage().split()[1:])}")
 
 
 def build_parser(program: str = "batch.py") -> Parser:

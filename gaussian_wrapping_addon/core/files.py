@@ -13,6 +13,7 @@ from typing import Any
 from . import limits
 from .errors import ParseError
 from .names import is_reserved_name
+from .regular_files import open_regular, read_bounded
 
 
 def write_json(path: Path, values: Any) -> None:
@@ -24,7 +25,7 @@ def write_bytes(path: Path, data: bytes) -> None:
     """Write bytes atomically: to a temporary file beside the target, which then replaces it."""
     partial = path.with_name(f"{path.name}.writing.{uuid.uuid4().hex[:8]}")
     try:
-        with partial.open("wb") as stream:
+        with partial.open("xb") as stream:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
@@ -43,7 +44,7 @@ def overwrite_json(path: Path, values: Any) -> None:
     Not atomic; padded with blanks if the previous content was longer.
     """
     data = json.dumps(values, allow_nan=False).encode()
-    with path.open("r+b") as stream:
+    with open_regular(path, "r+b") as stream:
         stream.write(data.ljust(os.fstat(stream.fileno()).st_size))
         stream.flush()
         os.fsync(stream.fileno())
@@ -63,23 +64,28 @@ def finite_json(values: Any) -> Any:
     return values
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, *, most_bytes: int | None = None, follow_links: bool = True) -> Any:
     """Read JSON with limits on size and depth; NaN and infinities are rejected.
+
+    Parameters
+    ----------
+    most_bytes : int, optional
+        Default: ``limits.MAX_JSON_BYTES``.
+    follow_links : bool
+        Whether the path may be a link; not for files of job folders.
 
     Raises
     ------
     ParseError
-        Names the line, or the limit that was exceeded.
+        Names the line, or the limit that was exceeded; or it is not a regular file.
     """
-    size_bytes = path.stat().st_size
-    if size_bytes > limits.MAX_JSON_BYTES:
-        raise ParseError(path, "whole file", f"{size_bytes} bytes are too many.", "Split it.")
+    data = read_bounded(path, most_bytes or limits.MAX_JSON_BYTES, follow_links=follow_links)
 
     def refuse(name: str) -> Any:
         raise ValueError(f"{name} is not a number")
 
     try:
-        values = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=refuse)
+        values = json.loads(data.decode("utf-8-sig"), parse_constant=refuse)
     except json.JSONDecodeError as error:
         raise ParseError(
             path, f"line {error.lineno}", f"not JSON: {error.msg}.", "Export the file again."

@@ -18,6 +18,7 @@ from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, unwrit
 from ..processes.helper_process import child_command
 from ..processes.spawn import kill_group, spawn
 from ..processes.worker_environment import ready_worker
+from ..regular_files import open_regular, touch_regular
 from .stages.oom_retry import killed_hint, killed_mesh_hint
 from .store.job_file import JobFile, read_job, reject_region_conflicts, write_job
 from .store.job_folder import JobFolder, JobStatus, process_alive
@@ -138,6 +139,7 @@ class JobClient:
             raise UsageError(
                 f"{folder} holds no job.", "Choose the folder given as --out, or press Find Job."
             )
+        target.check_entries()
         if target.locked():
             raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
         return cls._launch(target, python, keep_running)
@@ -147,7 +149,7 @@ class JobClient:
         with _writing(target.root):
             target.cancel_path.unlink(missing_ok=True)
             target.write_status(JobStatus(heartbeat_s=time.time()))
-            output = (target.root / "worker-output.txt").open("wb")
+            output = open_regular(target.output_path, "wb")
         parent = "0" if keep_running else str(os.getpid())
         with output:
             command = child_command(
@@ -228,19 +230,25 @@ class JobClient:
     def output_tail(self) -> str:
         """Return the last line that the worker wrote to stdout and stderr."""
         try:
-            with (self.folder.root / "worker-output.txt").open("rb") as output:
+            with open_regular(self.folder.output_path) as output:
                 length = output.seek(0, os.SEEK_END)
                 output.seek(max(length - OUTPUT_TAIL_BYTES, 0))
                 data = output.read(OUTPUT_TAIL_BYTES)
-        except OSError:
+        except (OSError, ParseError):
             return ""
         lines = data.decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else ""
 
     def cancel(self) -> None:
-        """Ask the worker to stop; it stops within about two seconds and keeps a checkpoint."""
+        """Ask the worker to stop; it stops within about two seconds and keeps a checkpoint.
+
+        Raises
+        ------
+        ParseError
+            ``cancel`` in the job folder is a link or another thing that is not a file.
+        """
         with contextlib.suppress(OSError):
-            self.folder.cancel_path.touch()
+            touch_regular(self.folder.cancel_path)
 
     def kill(self) -> None:
         """End the worker and its helpers: terminate, wait two seconds, kill.

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import math
 import os
@@ -25,8 +26,10 @@ from ..errors import (
     WrapError,
     unwritable_error,
 )
+from ..log_lines import LineFormatter, one_line
 from ..processes.helper_process import kill_helpers
 from ..progress import COMPILING, ProgressEvent
+from ..regular_files import open_regular
 from .store.job_file import read_job
 from .store.job_folder import JobFolder, JobStatus, process_start_ticks
 from .store.rollback import discard_rollback, roll_back
@@ -133,14 +136,23 @@ def _merged(known: dict[str, float], news: dict[str, float]) -> dict[str, float]
     return {**known, **{name: value for name, value in news.items() if math.isfinite(value)}}
 
 
-def _log_to(path: Path) -> None:
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+class _LogFile(logging.FileHandler):
+    """A log that is a regular file and nothing else."""
+
+    def _open(self) -> io.TextIOWrapper:
+        stream = open_regular(Path(self.baseFilename), "ab")
+        return io.TextIOWrapper(stream, encoding="utf-8", errors="backslashreplace")
+
+
+def _log_to(path: Path) -> logging.Handler:
+    handler = _LogFile(path, encoding="utf-8")
+    handler.setFormatter(LineFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     root = logging.getLogger()
     root.addHandler(handler)
     root.setLevel(logging.INFO)
     for noisy in ("numba", "PIL", "matplotlib", "trimesh"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
+    return handler
 
 
 def parent_to_watch(caller: str) -> int:
@@ -168,7 +180,13 @@ def main(arguments: list[str]) -> int:
     """
     folder = JobFolder(Path(arguments[0]))
     parent = parent_to_watch(arguments[1] if len(arguments) > 1 else "0")
-    _log_to(folder.log_path)
+    try:
+        folder.check_entries()
+        _log_to(folder.log_path)
+    except WrapError as refused:
+        # Nothing of the folder is touched, its log and status included.
+        sys.stderr.write(f"{one_line(str(refused))}\n")
+        return refused.exit_code
     reporter = _Reporter(
         folder,
         JobStatus(state="RUNNING", pid=os.getpid(), pid_started=process_start_ticks(os.getpid())),
@@ -184,7 +202,7 @@ def main(arguments: list[str]) -> int:
     except WrapError as refused:
         # Another worker owns the folder: leave its status and its lock alone.
         _logger.error("%s", refused)
-        sys.stderr.write(f"{refused}\n")
+        sys.stderr.write(f"{one_line(str(refused))}\n")
         return refused.exit_code
     try:
         reporter.write()

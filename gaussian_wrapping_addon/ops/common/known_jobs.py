@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Job folders used on this machine, so that a .blend from elsewhere opens none.
 
-A .blend file names its job folder. It may come from the internet, so the folder is read without
-confirmation only if it lies beside the file or was used on this machine before.
+A .blend file names its job folder. It may come from the internet, and the folder beside it with it:
+the folder is read without confirmation only if it was used on this machine before.
 """
 
 from __future__ import annotations
@@ -43,13 +43,8 @@ def is_trusted(folder: Path) -> bool:
     """Return whether a folder named by the open file may be read without confirmation."""
     if is_remote(folder):
         return False
-    absolute = folder.resolve()
-    if str(absolute) in _session or str(absolute) in _stored():
-        return True
-    if not bpy.data.filepath:
-        return False
-    beside = Path(bpy.data.filepath).resolve().parent
-    return beside != Path(beside.anchor) and absolute.is_relative_to(beside)
+    absolute = str(folder.resolve())
+    return absolute in _session or absolute in _stored()
 
 
 def is_remote(folder: Path) -> bool:

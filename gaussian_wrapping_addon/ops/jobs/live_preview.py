@@ -18,6 +18,7 @@ from typing import Any
 import bpy.utils.previews
 import numpy as np
 
+from ...core.regular_files import read_bounded
 from ..common.background import Lane, Task
 
 _logger = logging.getLogger(__name__)
@@ -145,7 +146,7 @@ def _read(folder: Path, known: Stamp | None) -> _Read | None:
     stamp = newest_picture(folder)
     if stamp is None or stamp == known or stamp[2] > MAX_BYTES:
         return None
-    data = Path(stamp[0]).read_bytes()  # not mapped: the file may be replaced meanwhile
+    data = read_bounded(Path(stamp[0]), MAX_BYTES)  # not mapped: the file may be replaced meanwhile
     pixels = np.load(io.BytesIO(data), allow_pickle=False)
     if not isinstance(pixels, np.ndarray):
         raise ValueError(f"{stamp[0]} holds several arrays")

@@ -19,6 +19,7 @@ from ...core.dataset.similarity import Similarity
 from ...core.errors import DatasetError, ParseError
 from ...core.files import read_json
 from ...core.regions.region_file import read_region_file
+from ...core.regular_files import reject_foreign_entries
 from ...core.settings import MAX_LODS
 from ...core.texture.files.file_checks import SINGLE_MAX, atlas_file, validate_face_atlas
 from .report_data import figures_of_report
@@ -96,7 +97,7 @@ def read_result(folder: Path) -> ResultFiles:
     Raises
     ------
     DatasetError
-        The folder is not a result folder, or contains no region.
+        The folder is not a result folder, contains no region, or holds links.
     ParseError
         A file is invalid; names file and position.
     """
@@ -106,6 +107,7 @@ def read_result(folder: Path) -> ResultFiles:
         raise DatasetError(
             f"{folder} holds no scene.json.", "Choose the folder named result of a finished job."
         )
+    reject_foreign_entries(folder)
     cameras, world_from_scene, radius = _scene(scene_path)
     regions = tuple(
         _region(path.parent) for path in sorted(folder.glob("*/mesh.npz")) if path.is_file()

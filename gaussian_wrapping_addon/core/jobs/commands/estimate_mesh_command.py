@@ -59,6 +59,7 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     folder = JobFolder(Path(request["out"]))
     if not folder.is_job():
         raise UsageError(f"{folder.root} holds no job.", "Choose the folder given as --out.")
+    folder.check_entries()
     meshing = from_json(MeshingSettings, request["meshing"], "meshing")
     threads = int(request["threads"]) or default_threads()
     if request["region"] not in AUTOMATIC_REGIONS:

@@ -212,6 +212,7 @@ def job_mesh(folder: Path, region: str | None) -> Path:
         raise UsageError(
             f"{folder.name} is not a job folder.", "Give the folder of --out, or a mesh file."
         )
+    JobFolder(folder).check_entries()
     found = {path.parent.name: path for path in sorted(folder.glob("result/*/mesh.ply"))}
     if not found:
         raise DatasetError(f"The job {folder.name} has no mesh yet.", "Resume it first.")
@@ -240,6 +241,7 @@ def job_cameras(folder: Path) -> list[Camera]:
     from ...dataset.camera import Camera
     from ...dataset.similarity import Similarity
 
+    JobFolder(folder).check_entries()
     path = JobFolder(folder).result / "scene.json"
     if not path.is_file():
         raise DatasetError(f"The job {folder.name} has no {path.name} yet.", "Resume it first.")

@@ -23,6 +23,7 @@ from ...errors import DatasetError, ParseError, UsageError
 from ...export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
 from ...files import read_json, write_bytes
 from ...names import SPLAT_STEM, file_stems
+from ...regular_files import reject_foreign_entries
 from ...texture.files.file_checks import atlas_file
 from ..store.job_folder import MARKER
 from ..store.sidecar import write_sidecar
@@ -83,10 +84,11 @@ def result_of(folder: Path) -> Path:
     UsageError
         The folder is neither.
     DatasetError
-        The job has no result yet.
+        The job has no result yet, or its folder holds links.
     """
     for path in (folder / "result", folder):
         if (path / "scene.json").is_file():
+            reject_foreign_entries(folder)
             return path.resolve()
     if (folder / MARKER).exists():
         raise DatasetError(f"The job {folder} has no result yet.", "Resume it first.")

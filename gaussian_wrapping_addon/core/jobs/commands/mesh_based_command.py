@@ -111,6 +111,7 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
     from ...dataset.scene_file import SCENE_NAME, load_saved_scene
 
     job = JobFolder(folder)
+    job.check_entries()
     again = "Export the job again with resume."
     paths = job.result / "scene.json", job.result / "report.json"
     for path in paths:

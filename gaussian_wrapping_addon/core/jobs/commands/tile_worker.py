@@ -49,6 +49,7 @@ def work_on_tiles(folder: JobFolder, threads: int, wait_s: float) -> int:
     if not folder.is_job():
         raise UsageError(f"{folder.root} is not a job folder.", "Give the --out of a job.")
     until_s = time.monotonic() + wait_s
+    folder.check_entries()
     progress = Progress("mesh", None, folder.cancel_path.exists)
     while not (lists := unfinished_tile_lists(folder)):
         progress.check()

@@ -10,6 +10,9 @@ import logging
 import os
 from pathlib import Path
 
+from ... import limits
+from ...regular_files import read_bounded
+
 _logger = logging.getLogger("gaussian_wrapping")
 
 NAME = "scene.blend"
@@ -19,7 +22,10 @@ EARLIER = "scene.blend1"
 
 def result_state(result: Path) -> dict[str, bytes]:
     """Return the content of each region's figures file, by region: it identifies a result."""
-    return {path.parent.name: path.read_bytes() for path in sorted(result.glob("*/figures.json"))}
+    return {
+        path.parent.name: read_bounded(path, limits.MAX_JSON_BYTES)
+        for path in sorted(result.glob("*/figures.json"))
+    }
 
 
 def back_up_stale_blend(result: Path, before: dict[str, bytes]) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -207,9 +208,9 @@ def reject_folder_conflicts(result: Path, folders: dict[str, str]) -> None:
 
 def read_job(path: Path) -> JobFile:
     """Read ``job.json``."""
-    if not path.is_file():
+    if not os.path.lexists(path):
         raise UsageError(f"{path} does not exist.", "Choose a folder in which a job was started.")
-    return JobFile.from_json(read_json(path))
+    return JobFile.from_json(read_json(path, follow_links=False))
 
 
 def write_job(path: Path, job: JobFile) -> None:

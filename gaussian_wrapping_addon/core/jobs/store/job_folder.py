@@ -13,8 +13,10 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from ... import limits
 from ...errors import DISK_FULL_ERRNOS, ParseError, UsageError, unwritable_error
 from ...files import overwrite_json, read_json, write_json
+from ...regular_files import read_bounded, reject_foreign_entries, touch_regular
 
 STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
 ACTIVE_STATES = ("NEW", "RUNNING", "CANCELLING")
@@ -142,6 +144,10 @@ def _alive_windows(pid: int) -> bool:
     return code.value == still_active
 
 
+def _read_small(path: Path) -> Any:
+    return read_json(path, most_bytes=limits.MAX_STATUS_BYTES, follow_links=False)
+
+
 @dataclass(frozen=True)
 class JobFolder:
     """Paths of a job folder; access to its status and lock."""
@@ -162,6 +168,11 @@ class JobFolder:
     def log_path(self) -> Path:
         """``log.txt``."""
         return self.root / "log.txt"
+
+    @property
+    def output_path(self) -> Path:
+        """``worker-output.txt``; what the worker wrote to stdout and stderr."""
+        return self.root / "worker-output.txt"
 
     @property
     def cancel_path(self) -> Path:
@@ -190,6 +201,8 @@ class JobFolder:
         ------
         UsageError
             The path is a file, or a folder with other content.
+        DatasetError
+            It holds links or other entries that no job makes, see :meth:`check_entries`.
         ResourceError
             It cannot be written.
         """
@@ -197,14 +210,29 @@ class JobFolder:
             raise UsageError(f"{self.root} is a file.", "Choose a folder for the results.")
         try:
             self.root.mkdir(parents=True, exist_ok=True)
-            if not (self.root / MARKER).exists() and any(self.root.iterdir()):
+            if not os.path.lexists(self.root / MARKER) and any(self.root.iterdir()):
                 raise UsageError(
                     f"{self.root} holds other files.", "Choose a new or empty folder for results."
                 )
-            (self.root / MARKER).touch()
+            touch_regular(self.root / MARKER)
             self.stages.mkdir(exist_ok=True)
         except OSError as error:
             raise unwritable_error(self.root, error) from None
+        self.check_entries()
+
+    def check_entries(self) -> None:
+        """Raise unless everything in the folder is a regular file or a folder, at any depth.
+
+        Before any command reads or writes more than the status: the folder may come from elsewhere,
+        and a link in it would lead writes and deletions out of it. The folder itself may be reached
+        through links.
+
+        Raises
+        ------
+        DatasetError
+            Names the entry.
+        """
+        reject_foreign_entries(self.root)
 
     def is_job(self) -> bool:
         """Whether a job was started here."""
@@ -227,7 +255,7 @@ class JobFolder:
 
     def _read_file(self) -> JobStatus:
         try:
-            return JobStatus.from_json(read_json(self.status_path))
+            return JobStatus.from_json(_read_small(self.status_path))
         except (OSError, ParseError, TypeError, ValueError):
             return JobStatus()
 
@@ -281,7 +309,11 @@ class JobFolder:
 
     def _drop_stale_lock(self) -> None:
         try:
-            content = self.lock_path.read_bytes()
+            content: bytes | None = read_bounded(self.lock_path, limits.MAX_STATUS_BYTES)
+        except ParseError:
+            if self.lock_path.is_dir():
+                return
+            content = None  # a link or a pipe: no process of ours holds it
         except OSError:
             return
         owner = self._lock_owner()
@@ -293,7 +325,7 @@ class JobFolder:
         except FileNotFoundError:
             return
         try:
-            if aside.read_bytes() != content:
+            if content is not None and aside.read_bytes() != content:
                 # Another process has taken the lock over meanwhile: restore it.
                 os.link(aside, self.lock_path)
         except FileExistsError:
@@ -305,7 +337,7 @@ class JobFolder:
 
     def _lock_owner(self) -> tuple[int, int] | None:
         try:
-            owner = read_json(self.lock_path)
+            owner = _read_small(self.lock_path)
             return int(owner["pid"]), int(owner["started"])
         except (OSError, ParseError, KeyError, TypeError, ValueError):
             return None

@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from ...regular_files import is_real_folder
+
 _logger = logging.getLogger(__name__)
 
 NEW = ".new"
@@ -60,12 +62,14 @@ def new_result(result: Path, last: tuple[str, ...] = ()) -> Iterator[Path]:
 def recover(result: Path) -> None:
     """Undo an interrupted swap: restore the earlier files and remove the new ones."""
     earlier = result / EARLIER
-    if earlier.is_dir():
+    if is_real_folder(earlier):
         _logger.warning("an earlier export was interrupted; the previous result is restored")
         for path in sorted(earlier.iterdir()):
             _remove(result / path.name)
             os.replace(path, result / path.name)
         earlier.rmdir()
+    elif os.path.lexists(earlier):
+        _remove(earlier)  # not ours: its content is not a result
     _remove(result / NEW)
 
 
@@ -98,7 +102,7 @@ def _swap(new: Path, result: Path, last: tuple[str, ...]) -> None:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
+    if is_real_folder(path):
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)

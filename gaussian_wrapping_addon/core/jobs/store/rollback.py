@@ -16,6 +16,7 @@ from typing import Any
 
 from ...errors import ParseError, UsageError
 from ...files import read_json, write_json
+from ...regular_files import is_real_folder
 from .job_file import JobFile, read_job, write_job
 from .job_folder import JobFolder, JobStatus
 from .result_swap import recover
@@ -82,10 +83,11 @@ def roll_back(folder: JobFolder) -> JobStatus | None:
     except (UsageError, TypeError, ValueError):
         return None
     known = set(saved["stages"])
-    for stage in (*folder.stages.glob("mesh-*"), *folder.stages.glob("texture-*")):
-        if stage.name not in known and read_done(stage) is None:
+    begun = [path for name in ("mesh-*", "texture-*") for path in folder.stages.glob(name)]
+    for stage in begun if is_real_folder(folder.stages) else ():
+        if is_real_folder(stage) and stage.name not in known and read_done(stage) is None:
             shutil.rmtree(stage, ignore_errors=True)
-    if folder.result.is_dir():
+    if is_real_folder(folder.result):
         recover(folder.result)
     write_job(folder.job_path, job)
     discard_rollback(folder)
@@ -100,7 +102,7 @@ def _without_error(status: JobStatus) -> JobStatus:
 
 def _read(path: Path) -> dict[str, Any] | None:
     try:
-        values = read_json(path)
+        values = read_json(path, follow_links=False)
     except (OSError, ParseError):
         return None
     wanted = {"job": dict, "status": dict, "stages": list}
