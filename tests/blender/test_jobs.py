@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -10,7 +11,7 @@ import signal
 import stat
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -385,7 +386,7 @@ def test_another_blender_finds_the_job_and_offers_its_result(
     assert "Import Finished Result" not in draw(train_panel.GWRAP_PT_train).texts
 
 
-def test_a_project_folder_that_was_moved_finds_its_job(
+def test_a_project_folder_that_was_moved_asks_before_its_job_is_read(
     photos: Path, tmp_path: Path, worker: object
 ) -> None:
     project = tmp_path / "project"
@@ -396,8 +397,48 @@ def test_a_project_folder_that_was_moved_finds_its_job(
     job_timer.forget_all()
     os.rename(project, tmp_path / "moved")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved" / "work.blend"))
+    assert watched_jobs.jobs == {}, "a downloaded folder beside a file looks the same"
+    assert "gwrap.find_job" in draw(train_panel.GWRAP_PT_train).operators
+    bpy.ops.gwrap.find_job(directory=str(tmp_path / "moved" / "job"))
+    assert status().state == "DONE"  # type: ignore[attr-defined]
+    job_timer.forget_all()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved" / "work.blend"))
     assert status().state == "DONE"  # type: ignore[attr-defined]
     assert Path(bpy.context.scene.gwrap.job_folder) == tmp_path / "moved" / "job"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no named pipes in folders")
+@pytest.mark.parametrize("asked", [False, True])
+@pytest.mark.parametrize("name", ["status.json", "lock.json", "job-finished.json", "job.json"])
+def test_opening_a_file_never_waits_for_a_pipe_in_the_folder_beside_it(
+    photos: Path, tmp_path: Path, worker: object, name: str, asked: bool
+) -> None:
+    bpy.context.scene.gwrap.output = str(tmp_path / "job")
+    start_wrap(photos)
+    wait_for("DONE")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
+    job_timer.forget_all()
+    (tmp_path / "job" / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / "job" / name)
+    if not asked:
+        known_jobs._session.clear()  # another person's machine
+    begun_s = time.monotonic()
+    with alarm(5):
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "work.blend"))
+        assert (watched_jobs.jobs != {}) == asked
+        job_timer.poll_jobs()
+        draw(train_panel.GWRAP_PT_train)
+    assert time.monotonic() - begun_s < 4.0
+
+
+@contextlib.contextmanager
+def alarm(seconds: int) -> Iterator[None]:
+    """End this process, rather than hang, where a pipe is opened and nobody writes to it."""
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
 
 
 def test_a_job_whose_folder_was_deleted_is_told_and_forgotten(
