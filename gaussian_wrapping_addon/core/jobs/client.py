@@ -16,12 +16,13 @@ from pathlib import Path
 
 from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, unwritable_error
 from ..processes.helper_process import child_command
+from ..processes.process_identity import process_alive
 from ..processes.spawn import kill_group, spawn
 from ..processes.worker_environment import ready_worker
 from ..regular_files import open_regular, touch_regular
 from .stages.oom_retry import killed_hint, killed_mesh_hint
 from .store.job_file import JobFile, read_job, reject_region_conflicts, write_job
-from .store.job_folder import JobFolder, JobStatus, process_alive
+from .store.job_folder import JobFolder, JobStatus
 from .store.rollback import save_rollback
 
 WORKER_MODULE = "jobs.worker"
@@ -150,10 +151,12 @@ class JobClient:
             target.cancel_path.unlink(missing_ok=True)
             target.write_status(JobStatus(heartbeat_s=time.time()))
             output = open_regular(target.output_path, "wb")
-        parent = "0" if keep_running else str(os.getpid())
         with output:
             command = child_command(
-                WORKER_MODULE, str(target.root), parent, python=python or worker_python()
+                WORKER_MODULE,
+                str(target.root),
+                "0" if keep_running else "1",
+                python=python or worker_python(),
             )
             process = spawn(command, stdout=output, stderr=subprocess.STDOUT)
         return cls(target, process)

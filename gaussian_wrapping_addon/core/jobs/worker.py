@@ -28,10 +28,11 @@ from ..errors import (
 )
 from ..log_lines import LineFormatter, one_line
 from ..processes.helper_process import kill_helpers
+from ..processes.process_identity import Caller, process_start_ticks
 from ..progress import COMPILING, ProgressEvent
 from ..regular_files import open_regular
 from .store.job_file import read_job
-from .store.job_folder import JobFolder, JobStatus, process_start_ticks
+from .store.job_folder import JobFolder, JobStatus
 from .store.rollback import discard_rollback, roll_back
 
 _logger = logging.getLogger(__name__)
@@ -88,11 +89,11 @@ class _Reporter:
         """Whether a cancel file exists or the process was asked to terminate."""
         return self.stop_requested or self.folder.cancel_path.exists()
 
-    def keep_heartbeat(self, parent: int) -> None:
-        """Write the heartbeat; request a stop when the parent has ended. Runs in a thread."""
+    def keep_heartbeat(self, caller: Caller | None) -> None:
+        """Write the heartbeat; request a stop when the caller has ended. Runs in a thread."""
         requested_s = math.inf
         while not self._stop.wait(PARENT_POLL_S):
-            if parent and os.getppid() != parent:
+            if caller is not None and caller.ended():
                 self.stop_requested = True
             if self.cancelled():
                 requested_s = min(requested_s, time.monotonic())
@@ -155,15 +156,6 @@ def _log_to(path: Path) -> logging.Handler:
     return handler
 
 
-def parent_to_watch(caller: str) -> int:
-    """Return the id of the process whose end stops the worker, 0 for none.
-
-    The id given by the caller only tells whether there is one: where Python is started through a
-    launcher (``python.exe`` of a virtual environment on Windows), the launcher is the parent.
-    """
-    return os.getppid() if int(caller) else 0
-
-
 def _roll_back(folder: JobFolder) -> JobStatus | None:
     """Restore the folder after a failed mesh; the failure is reported all the same."""
     try:
@@ -174,12 +166,12 @@ def _roll_back(folder: JobFolder) -> JobStatus | None:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the job of ``arguments = [folder, caller's pid or 0]``; return the exit code.
+    """Run the job of ``arguments = [folder, "1" or "0"]``; return the exit code.
 
-    With 0 the worker continues when its parent ends.
+    With ``"0"`` the worker continues when its caller ends.
     """
     folder = JobFolder(Path(arguments[0]))
-    parent = parent_to_watch(arguments[1] if len(arguments) > 1 else "0")
+    caller = Caller() if arguments[1:2] not in ([], ["0"]) else None
     try:
         folder.check_entries()
         _log_to(folder.log_path)
@@ -206,7 +198,7 @@ def main(arguments: list[str]) -> int:
         return refused.exit_code
     try:
         reporter.write()
-        threading.Thread(target=reporter.keep_heartbeat, args=(parent,), daemon=True).start()
+        threading.Thread(target=reporter.keep_heartbeat, args=(caller,), daemon=True).start()
         from .runner import run_job
 
         run_job(folder, read_job(folder.job_path), reporter.event, reporter.cancelled)

@@ -14,6 +14,7 @@ from pathlib import Path
 from ..errors import WrapError
 from .helper_process import emit
 from .peak_memory import own_peak_bytes
+from .process_identity import Caller
 
 _PARENT_POLL_S = 1.0
 
@@ -25,9 +26,9 @@ def main(arguments: list[str]) -> int:
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
-    parent = os.getppid()
+    caller = Caller()
     _request_parent_death_signal()
-    threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
+    threading.Thread(target=_exit_with_caller, args=(caller,), daemon=True).start()
     try:
         package = __name__.rpartition(".processes.")[0]
         importlib.import_module(f"{package}.{module}").main(folder)
@@ -50,8 +51,8 @@ def _request_parent_death_signal() -> None:
     ctypes.CDLL(None).prctl(set_parent_death_signal, int(signal.SIGKILL), 0, 0, 0)
 
 
-def _exit_with_parent(parent: int) -> None:
-    """Exit when the parent has ended: a helper must not outlive its worker."""
-    while os.getppid() == parent:
+def _exit_with_caller(caller: Caller) -> None:
+    """Exit when the worker has ended: a helper must not outlive it."""
+    while not caller.ended():
         time.sleep(_PARENT_POLL_S)
     os._exit(1)

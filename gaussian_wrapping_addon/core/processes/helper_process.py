@@ -27,6 +27,7 @@ from .. import limits
 from ..errors import DatasetError, ResourceError, WorkerError
 from ..progress import Progress
 from .peak_memory import record_helper_peak
+from .process_identity import caller_option
 from .spawn import kill_group, spawn
 from .worker_environment import PACKAGES_OPTION, interpreter_of
 
@@ -51,7 +52,8 @@ def child_command(module: str, *arguments: str, python: str | None = None) -> li
         interpreter, packages = interpreter_of(python)
     else:
         interpreter, packages = sys.executable, str(sys._xoptions.get(PACKAGES_OPTION) or "")
-    options = ["-X", f"{PACKAGES_OPTION}={packages}"] if packages else []
+    options = ["-X", caller_option()]
+    options += ["-X", f"{PACKAGES_OPTION}={packages}"] if packages else []
     return [interpreter, "-I", *options, "-u", str(entry), module, *arguments]
 
 

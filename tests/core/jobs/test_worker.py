@@ -19,9 +19,9 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, 
 from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     JobFolder,
     JobStatus,
+    process_alive,
     process_start_ticks,
 )
-from gaussian_wrapping_addon.core.jobs.worker import parent_to_watch
 from gaussian_wrapping_addon.core.processes.helper_process import child_command
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings
 
@@ -148,9 +148,81 @@ def test_a_worker_that_may_not_lock_leaves_the_owner_alone(tmp_path: Path) -> No
         owner.kill()
 
 
-def test_the_parent_that_is_watched_may_be_a_launcher() -> None:
-    assert parent_to_watch("0") == 0
-    assert parent_to_watch(str(os.getppid() + 1)) == os.getppid()
+# A worker that starts late and works until it is told to stop.
+LATE = """
+import sys, time
+time.sleep({late_s})
+sys.path[:0] = {path!r}
+from gaussian_wrapping_addon.core.errors import Cancelled
+from gaussian_wrapping_addon.core.jobs import runner, worker
+def run_job(folder, job, event, cancelled):
+    end_s = time.monotonic() + 8.0
+    while not cancelled() and time.monotonic() < end_s:
+        time.sleep(0.05)
+    if cancelled():
+        raise Cancelled()
+runner.run_job, worker.PARENT_POLL_S = run_job, 0.05
+sys.exit(worker.main(sys.argv[1:]))
+"""
+CALLER = """
+import os, sys, time
+sys.path[:0] = {path!r}
+from pathlib import Path
+from gaussian_wrapping_addon.core.jobs import client
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
+from gaussian_wrapping_addon.core.settings import JobSettings
+real = client.child_command
+def child_command(module, *arguments, python=None):
+    command = real(module, *arguments, python=python)
+    return [*command[: command.index("-u")], "-c", {late!r}, *arguments]
+client.child_command = child_command
+root = Path(sys.argv[1])
+job = make_job("wrap", root / "photos", JobSettings())
+started = client.JobClient.start(root / "out", job, python=sys.executable, keep_running={keep})
+sys.stdout.write(str(started._process.pid))
+sys.stdout.flush()
+time.sleep({alive_s})
+os.kill(os.getpid(), 9)
+"""
+
+
+def abandon_worker(root: Path, *, late_s: float, alive_s: float, keep: bool) -> int:
+    """Start a worker from a process that is killed; return the worker's pid."""
+    (root / "photos").mkdir()
+    late = LATE.format(late_s=late_s, path=sys.path)
+    text = CALLER.format(path=sys.path, late=late, keep=keep, alive_s=alive_s)
+    done = subprocess.run(
+        [sys.executable, "-c", text, str(root)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    return int(done.stdout)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="a caller is killed by a signal")
+@pytest.mark.parametrize(("late_s", "alive_s"), [(0.4, 0.0), (0.0, 0.05), (0.0, 0.6)])
+def test_a_worker_ends_with_its_caller_even_if_that_dies_first(
+    tmp_path: Path, late_s: float, alive_s: float
+) -> None:
+    pid = abandon_worker(tmp_path, late_s=late_s, alive_s=alive_s, keep=False)
+    end_s = time.monotonic() + 4.0
+    while process_alive(pid, 0) and time.monotonic() < end_s:
+        time.sleep(0.02)
+    assert not process_alive(pid, 0), "an orphan works on"
+    folder = JobFolder(tmp_path / "out")
+    assert folder.read_status().state == "CANCELLED"
+    assert not folder.locked()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="a caller is killed by a signal")
+def test_a_worker_that_was_told_to_continue_outlives_its_caller(tmp_path: Path) -> None:
+    pid = abandon_worker(tmp_path, late_s=0.0, alive_s=0.0, keep=True)
+    folder = JobFolder(tmp_path / "out")
+    end_s = time.monotonic() + 5.0
+    while folder.read_status().state != "RUNNING" and time.monotonic() < end_s:
+        time.sleep(0.02)
+    time.sleep(0.3)  # several polls
+    assert folder.read_status().state == "RUNNING"
+    os.kill(pid, signal.SIGKILL)
 
 
 def test_a_worker_behind_a_launcher_is_not_stopped(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ pid = os.getpid()
 status = JobStatus(state="RUNNING", pid=pid, pid_started=process_start_ticks(pid))
 reporter = worker._Reporter(folder, status)
 reporter.write()
-threading.Thread(target=reporter.keep_heartbeat, args=(0,), daemon=True).start()
+threading.Thread(target=reporter.keep_heartbeat, args=(None,), daemon=True).start()
 time.sleep(60)
 """
 

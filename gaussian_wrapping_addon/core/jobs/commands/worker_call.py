@@ -21,6 +21,7 @@ from ...errors import (
     unwritable_error,
 )
 from ...processes.helper_process import emit
+from ...processes.process_identity import Caller
 from ...report_warning import ReportWarning
 
 PARENT_POLL_S = 1.0
@@ -31,10 +32,9 @@ def run_command(
 ) -> int:
     """Emit the lines and warnings of ``work`` as they come, or its error; return the exit code.
 
-    The process ends when its parent does.
+    The process ends when its caller does.
     """
-    # getppid() instead of the caller's id: a launcher of Python may stand in between.
-    threading.Thread(target=exit_with_parent, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=exit_with_caller, args=(Caller(),), daemon=True).start()
     try:
         for line in work():
             if isinstance(line, ReportWarning):
@@ -63,8 +63,8 @@ def run_command(
     return EXIT_DONE
 
 
-def exit_with_parent(parent: int) -> None:
-    """End this process when its parent has ended: nothing reads the output any more."""
-    while os.getppid() == parent:
+def exit_with_caller(caller: Caller) -> None:
+    """End this process when its caller has ended: nothing reads the output any more."""
+    while not caller.ended():
         time.sleep(PARENT_POLL_S)
     os._exit(EXIT_CANCELLED)

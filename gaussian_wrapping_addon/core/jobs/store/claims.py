@@ -25,8 +25,8 @@ from typing import Any
 
 from ...errors import ParseError
 from ...files import read_json
+from ...processes.process_identity import process_alive, process_start_ticks
 from ...progress import Progress
-from .job_folder import process_alive, process_start_ticks
 
 _logger = logging.getLogger(__name__)
 

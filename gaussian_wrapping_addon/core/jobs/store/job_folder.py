@@ -8,7 +8,6 @@ stop), ``stages/<name>-<hash>/`` (``done.json`` last), ``result/``.
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 from ... import limits
 from ...errors import DISK_FULL_ERRNOS, ParseError, UsageError, unwritable_error
 from ...files import overwrite_json, read_json, write_json
+from ...processes.process_identity import process_alive, process_start_ticks
 from ...regular_files import read_bounded, reject_foreign_entries, touch_regular
 
 STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
@@ -94,54 +94,6 @@ def _is_kind(name: str, value: Any) -> bool:
     if name == "figures":
         return isinstance(value, dict) and all(_is_kind("fraction", v) for v in value.values())
     return isinstance(value, str) and (name != "state" or value in STATES)
-
-
-def process_start_ticks(pid: int) -> int:
-    """Return the start time of a process in system ticks; 0 if unknown."""
-    if not sys.platform.startswith("linux"):
-        return 0
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return 0
-    # The command name, in parentheses, may contain spaces; field 22 is the start time.
-    return int(text.rsplit(")", 1)[1].split()[19])
-
-
-def process_alive(pid: int, started: int) -> bool:
-    """Tell whether the process started at ``started`` still runs (a zombie does not)."""
-    if pid <= 0:
-        return False
-    if sys.platform.startswith("linux"):
-        try:
-            text = Path(f"/proc/{pid}/stat").read_text()
-        except OSError:
-            return False
-        state = text.rsplit(")", 1)[1].split()[0]
-        return state not in ("Z", "X") and (not started or process_start_ticks(pid) == started)
-    if sys.platform == "win32":
-        return _alive_windows(pid)
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def _alive_windows(pid: int) -> bool:
-    import ctypes
-
-    query_limited_information, still_active = 0x1000, 259
-    kernel32 = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
-    handle = kernel32.OpenProcess(query_limited_information, False, pid)
-    if not handle:
-        return False
-    code = ctypes.c_ulong()
-    kernel32.GetExitCodeProcess(handle, ctypes.byref(code))
-    kernel32.CloseHandle(handle)
-    return code.value == still_active
 
 
 def _read_small(path: Path) -> Any:

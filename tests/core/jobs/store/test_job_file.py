@@ -191,7 +191,7 @@ def test_a_region_that_is_no_file_is_told_by_all_commands(
     region: str,
     message: str,
 ) -> None:
-    monkeypatch.setattr(worker_call, "exit_with_parent", lambda _parent: None)
+    monkeypatch.setattr(worker_call, "exit_with_caller", lambda _caller: None)
     path = str(tmp_path / region)
     with pytest.raises(DatasetError, match=message):
         make_job("mesh", tmp_path, JobSettings(regions=(path,)))
