@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ..core.jobs.client import JobClient
     from ..core.jobs.store.job_file import JobFile
+    from ..core.jobs.store.job_folder import JobStatus
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -56,16 +57,7 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
             # Not after a failure: the status of a rolled-back job shows 100 %.
             if status.stage and due and news != shown and not failed:
                 shown_s, shown = now_s, news
-                left = (
-                    "" if status.seconds_left is None else f" · {_span(status.seconds_left)} left"
-                )
-                _logger.info(
-                    "[%5.1f %%] %-7s %s%s",
-                    100 * status.fraction,
-                    status.stage,
-                    status.message,
-                    left,
-                )
+                _logger.info("%s", progress_line(status))
             if not status.active:
                 break
             if interrupted_s and now_s - interrupted_s > CANCEL_WAIT_S:
@@ -117,6 +109,12 @@ def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Names
     for line in headline(read_json(result / "report.json")):
         _logger.info("  %s", line)
     return 0
+
+
+def progress_line(status: JobStatus) -> str:
+    """Return how far a job is, in one line."""
+    left = "" if status.seconds_left is None else f" · {_span(status.seconds_left)} left"
+    return f"[{100 * status.fraction:5.1f} %] {status.stage:<7} {status.message}{left}"
 
 
 def _span(seconds: float) -> str:

@@ -9,6 +9,7 @@ from typing import NoReturn
 from .check_commands import add_check, add_doctor
 from .evaluate_command import add_evaluate
 from .export_command import add_export
+from .job_commands import add_cancel, add_status
 from .meshing_commands import add_estimate_mesh, add_mesh, add_work_tiles
 from .setup_command import add_set_up_worker
 from .training_commands import add_continue_training, add_estimate, add_resume, add_wrap
@@ -18,6 +19,8 @@ _COMMANDS = (
     add_mesh,
     add_continue_training,
     add_resume,
+    add_status,
+    add_cancel,
     add_estimate_mesh,
     add_work_tiles,
     add_export,

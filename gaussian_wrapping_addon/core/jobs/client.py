@@ -37,6 +37,7 @@ CODE_WAIT_S = 0.5
 longer."""
 KILL_GRACE_S = 2.0
 KILL_POLL_S = 0.05
+RUNNING_HINT = "Wait for it, or stop it: cancel DIR on the command line, Cancel in Blender."
 STAGES_AFTER_TRAINING = ("mesh", "texture", "export")
 """Stages of a job whose training is finished."""
 
@@ -123,7 +124,7 @@ class JobClient:
             )
         target.create()
         if target.locked():
-            raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
+            raise UsageError(f"A job is running in {folder}.", RUNNING_HINT)
         reject_region_conflicts(target.result, job)
         with _writing(target.root):
             save_rollback(target, job)
@@ -142,7 +143,7 @@ class JobClient:
             )
         target.check_entries()
         if target.locked():
-            raise UsageError(f"A job is running in {folder}.", "Cancel it or wait for it.")
+            raise UsageError(f"A job is running in {folder}.", RUNNING_HINT)
         return cls._launch(target, python, keep_running)
 
     @classmethod
