@@ -54,6 +54,8 @@ def code_of(words: str) -> int:
         "evaluate empty --truth mesh.off",
         "estimate-mesh --out empty",
         "work-tiles empty",
+        "status empty",
+        "cancel empty",
         "set-up-worker --dry-run --to trained",
         "set-up-worker --dry-run --to file",
         "set-up-worker --to new --find-links file",
