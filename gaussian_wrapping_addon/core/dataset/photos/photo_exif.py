@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .image_formats import open_image
+
 _EXIF_FOLDER = 0x8769
 _MAKE, _MODEL, _LENS = 0x010F, 0x0110, 0xA434
 _FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
@@ -31,7 +33,7 @@ def read_lens_exif(path: Path, width: int, height: int) -> LensExif:
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             exif = image.getexif()
             tags: dict[int, Any] = {**exif, **exif.get_ifd(_EXIF_FOLDER)}
     except (OSError, ValueError, SyntaxError, TypeError, KeyError, Image.DecompressionBombError):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...errors import DatasetError
+from .image_formats import open_image
 from .photo_header import PhotoHeader, read_photo_header
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def _open(path: Path) -> Image.Image:
         with warnings.catch_warnings():
             # Pillow warns at its own, smaller size; ours was checked on the header.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(path)
+            image = open_image(path)
             image.load()
     except UnidentifiedImageError:
         raise DatasetError(f"{path.name} is not a photo that can be read.", _ANOTHER) from None

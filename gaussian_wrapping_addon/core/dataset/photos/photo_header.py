@@ -15,6 +15,7 @@ from typing import IO
 
 from ... import limits
 from ...errors import DatasetError
+from .image_formats import open_image
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 
@@ -163,12 +164,12 @@ def _read_other(path: Path) -> PhotoHeader | None:
     except ImportError:
         return None
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             width, height = image.size
             if image.format == "TIFF":  # Pillow turns these upright itself, size included
                 return PhotoHeader(width, height)
             orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
     except (UnidentifiedImageError, Image.DecompressionBombError):
-        raise ValueError("no image format that is known") from None
+        raise ValueError("it is no JPEG, PNG, TIFF, WebP or BMP") from None
     valid = isinstance(orientation, int) and 1 <= orientation <= 8
     return PhotoHeader(width, height, int(orientation) if valid else 1)

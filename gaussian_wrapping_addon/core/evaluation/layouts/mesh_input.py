@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...dataset.photos.image_formats import forbid_ghostscript
 from ...dataset.readers.point_file import read_point_ply
 from ...errors import ParseError, WorkerError
 from ...ply.header import read_ply_header
@@ -58,7 +59,9 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
             "The worker's Python lacks trimesh, which reads meshes.",
             "pip install -r requirements-worker.txt there.",
         ) from None
-    options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+    forbid_ghostscript()  # a GLB holds its textures, which trimesh opens in any format
+    textured = path.suffix.lower() in (".obj", ".ply")
+    options: dict[str, Any] = {"skip_materials": True} if textured else {}
     try:
         loaded: Any = trimesh.load(path, process=False, force="mesh", **options)
         vertices = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)

@@ -18,6 +18,7 @@ import numpy as np
 
 from ...dataset.frames.file_frame import FileFrame, file_offset
 from ...dataset.frames.placement_file import FILE_NAME, read_placement
+from ...dataset.photos.image_formats import open_image
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError, ParseError, UsageError
 from ...export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
@@ -279,7 +280,7 @@ def _image(path: Path) -> Image:
     from PIL import Image
 
     try:
-        return Image.open(path).convert("RGB")
+        return open_image(path).convert("RGB")
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise ParseError(
             path, "whole file", f"not an image ({error}).", "Mesh the region again."

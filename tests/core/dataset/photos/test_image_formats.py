@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Images are opened in the formats of photos only, whatever their names say."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import EpsImagePlugin, Image
+
+from gaussian_wrapping_addon.core.dataset.photos.image_formats import IMAGE_FORMATS
+from gaussian_wrapping_addon.core.dataset.photos.photo_exif import read_lens_exif
+from gaussian_wrapping_addon.core.dataset.photos.photo_file import read_mask, read_photo
+from gaussian_wrapping_addon.core.dataset.photos.photo_header import read_photo_header
+from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
+from gaussian_wrapping_addon.core.evaluation.layouts.mesh_input import read_mesh
+from gaussian_wrapping_addon.core.jobs.commands import export_files
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="Ghostscript is stood for by a script")
+
+PACKAGE = Path(__file__).resolve().parents[4] / "gaussian_wrapping_addon"
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n(x) run\nshowpage\n%%EOF\n"
+
+
+@pytest.fixture
+def ghostscript(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Put a Ghostscript on the path; the file returned exists once it was started."""
+    started = tmp_path / "started"
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "gs").write_text(f"#!/bin/sh\n: > '{started}'\n")
+    (tmp_path / "bin" / "gs").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=os.pathsep)
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
+    return started
+
+
+def test_the_fixture_would_see_ghostscript(tmp_path: Path, ghostscript: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(EPS)
+    with (
+        pytest.raises(OSError, match=r"identify|open|No such"),
+        Image.open(tmp_path / "a.jpg") as image,
+    ):
+        image.load()
+    assert ghostscript.exists()
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif"])
+def test_postscript_named_as_a_photo_starts_nothing(
+    tmp_path: Path, name: str, ghostscript: Path
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(EPS)
+    for read in (read_photo_header, read_photo, read_mask):
+        with pytest.raises(DatasetError, match=name):
+            read(path)
+    for image in (export_files._image, export_files._png):
+        with pytest.raises(ParseError, match=name):
+            image(path)
+    read_lens_exif(path, 8, 8)
+    assert not ghostscript.exists()
+
+
+@pytest.mark.parametrize("format", IMAGE_FORMATS)
+def test_all_formats_of_photos_are_read(tmp_path: Path, format: str) -> None:
+    path = tmp_path / "a.jpg"  # the content counts
+    Image.fromarray(np.full((9, 12, 3), 200, np.uint8)).save(path, format=format)
+    assert abs(int(read_photo(path).color.mean()) - 200) < 3
+
+
+def test_a_jpeg_of_several_pictures_is_read(tmp_path: Path) -> None:
+    """As telephones and stereo cameras write them."""
+    path = tmp_path / "a.jpg"
+    first, second = (Image.new("RGB", (12, 9), (value, 9, 9)) for value in (200, 50))
+    first.save(path, format="MPO", save_all=True, append_images=[second])
+    assert abs(int(read_photo(path).color[..., 0].mean()) - 200) < 3
+
+
+@pytest.mark.parametrize("format", ["GIF", "PPM", "TGA"])
+def test_other_formats_are_refused_by_name(tmp_path: Path, format: str) -> None:
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (8, 8)).save(path, format=format)
+    with pytest.raises(DatasetError, match=r"a\.jpg"):
+        read_photo(path)
+
+
+def glb_with_texture(texture: bytes) -> bytes:
+    """Return a triangle with UVs and an embedded texture."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32).tobytes()
+    uvs = np.zeros((3, 2), np.float32).tobytes()
+    faces = np.array([0, 1, 2, 0], np.uint16).tobytes()
+    body, views = b"", []
+    for part in (points, uvs, faces, texture):
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(part)})
+        body += part + b"\0" * (-len(part) % 4)
+    values = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0, 1]}],
+        "nodes": [{"mesh": 0}, {"mesh": 0}],
+        "meshes": [
+            {"primitives": [
+                {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
+            ]}
+        ],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "textures": [{"source": 0}],
+        "images": [{"bufferView": 3, "mimeType": "image/png"}],
+        "buffers": [{"byteLength": len(body)}],
+        "bufferViews": views,
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2"},
+            {"bufferView": 2, "componentType": 5123, "count": 3, "type": "SCALAR"},
+        ],
+    }  # fmt: skip
+    text = json.dumps(values).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+@pytest.mark.parametrize("suffix", ["glb", "ply"])
+def test_the_texture_of_a_mesh_to_evaluate_starts_nothing(
+    tmp_path: Path, ghostscript: Path, suffix: str
+) -> None:
+    if suffix == "glb":
+        (tmp_path / "a.glb").write_bytes(glb_with_texture(EPS))
+    else:
+        head = "ply\nformat ascii 1.0\ncomment TextureFile a.eps\nelement vertex 3\n"
+        head += "".join(f"property float {name}\n" for name in ("x", "y", "z", "s", "t"))
+        head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        (tmp_path / "a.ply").write_text(head + "0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n")
+        (tmp_path / "a.eps").write_bytes(EPS)
+    if suffix == "glb":  # trimesh cannot leave its textures out
+        with pytest.raises(ParseError, match=r"a\.glb.*Ghostscript"):
+            read_mesh(tmp_path / "a.glb")
+    else:
+        assert len(read_mesh(tmp_path / "a.ply")[1]) == 1
+    assert not ghostscript.exists()
+    assert not EpsImagePlugin.has_ghostscript(), "a later look at the texture would start it"
+
+
+def test_pillow_opens_files_in_one_place_only() -> None:
+    places = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in PACKAGE.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and node.func.attr == "open"
+        and getattr(node.func.value, "id", "") in ("Image", "PIL")
+    }
+    assert places == {"core/dataset/photos/image_formats.py"}
