@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .. import limits
+from ..array_file import read_arrays
 from ..errors import DatasetError, ParseError
 from ..files import read_json, write_bytes, write_json
 from ..report_warning import read_warnings
@@ -21,6 +21,8 @@ from .similarity import Similarity
 VERSION = 1
 SCENE_NAME = "scene.json"
 POINTS_NAME = "points.npz"
+MOST_POINTS_BYTES = 27 * limits.MAX_POINTS + 4096
+"""Largest ``points.npz`` when unpacked: 24 bytes of position and 3 of colour a point, headers."""
 _AGAIN = "Run the cameras stage again."
 
 
@@ -42,7 +44,7 @@ def load_saved_scene(folder: Path) -> Scene:
     Raises
     ------
     ParseError
-        A file is missing, truncated or of another version.
+        A file is missing, damaged or of another version.
     DatasetError
         A photo no longer exists.
     """
@@ -113,16 +115,10 @@ def _written(path: Path, folder: Path | None) -> str:
 
 
 def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size_bytes = sum(entry.file_size for entry in archive.infolist())
-        # 24 bytes of position and 3 of colour a point, and two headers.
-        if size_bytes > 27 * limits.MAX_POINTS + 4096:
-            raise ParseError(path, "whole file", "there are too many points.", _AGAIN)
-        with np.load(path, allow_pickle=False) as arrays:
-            points, colors = arrays["points"], arrays["point_colors"]
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ParseError(path, "whole file", f"cannot be read ({error}).", _AGAIN) from None
+    arrays = read_arrays(
+        path, ("points", "point_colors"), most_bytes=MOST_POINTS_BYTES, hint=_AGAIN
+    )
+    points, colors = arrays["points"], arrays["point_colors"]
     good = (
         points.dtype == np.float64
         and colors.dtype == np.uint8

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..array_file import read_arrays
 from ..errors import ParseError
 from ..files import write_bytes
 from .model import OrientedGaussians
@@ -32,17 +33,15 @@ def load_gaussians(path: Path) -> OrientedGaussians:
     Raises
     ------
     ParseError
-        An array is missing, of the wrong shape, or not finite.
+        The file is damaged, or an array is missing, of the wrong shape, or not finite.
     """
     hint = "Delete the folder and run the job again."
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            loaded = {name: arrays[name] for name in (*_SHAPES, "sh")}
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise ParseError(path, "whole file", f"not a Gaussian file ({error}).", hint) from None
-    count = len(loaded["means"])
+    loaded = read_arrays(path, (*_SHAPES, "sh"), hint=hint)
+    count = loaded["means"].shape[:1]
     for name, array in loaded.items():
-        good = array.shape[1:] == _SHAPES[name] if name != "sh" else array.ndim == 3
-        if not good or len(array) != count or not np.isfinite(array).all():
+        good = array.dtype.kind == "f" and (
+            array.shape[1:] == _SHAPES[name] if name != "sh" else array.ndim == 3
+        )
+        if not good or array.shape[:1] != count or not np.isfinite(array).all():
             raise ParseError(path, name, "wrong shape or non-finite values.", hint)
     return OrientedGaussians(**{name: torch.from_numpy(array) for name, array in loaded.items()})

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..array_file import read_arrays
 from ..errors import ParseError
 from ..files import write_bytes
 from .surface_mesh import SurfaceMesh
@@ -23,12 +24,11 @@ def save_mesh(path: Path, mesh: SurfaceMesh) -> None:
 
 
 def load_mesh(path: Path) -> SurfaceMesh:
-    """Read a file of :func:`save_mesh`; :class:`ParseError` if it is none."""
+    """Read a file of :func:`save_mesh`; :class:`ParseError` if it is damaged or none."""
+    hint = "Delete the folder and run again."
+    arrays = read_arrays(path, ("vertices", "faces", "provenance"), hint=hint)
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            provenance = json.loads(arrays["provenance"].tobytes())
-            return SurfaceMesh(arrays["vertices"], arrays["faces"], None, provenance)
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise ParseError(
-            path, "whole file", f"not a mesh file ({error}).", "Delete the folder and run again."
-        ) from None
+        provenance = json.loads(arrays["provenance"].tobytes())
+        return SurfaceMesh(arrays["vertices"], arrays["faces"], None, provenance)
+    except (ValueError, TypeError) as error:
+        raise ParseError(path, "whole file", f"not a mesh file ({error}).", hint) from None

@@ -35,8 +35,9 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     DatasetError, ParseError
         The input cannot be used.
     """
+    from ...array_file import is_whole
     from ...dataset.loading.load import load_scene
-    from ...dataset.scene_file import save_scene
+    from ...dataset.scene_file import MOST_POINTS_BYTES, POINTS_NAME, SCENE_NAME, save_scene
     from .splat_scene import is_splat, make_splat_scene
 
     source = Path(job.source)
@@ -68,7 +69,11 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
             "facts": scene.facts,
         }
 
-    return run_stage(folder.stages, "cameras", key, progress, work)
+    def whole(stage_folder: Path) -> bool:
+        points = stage_folder / POINTS_NAME
+        return (stage_folder / SCENE_NAME).is_file() and is_whole(points, MOST_POINTS_BYTES)
+
+    return run_stage(folder.stages, "cameras", key, progress, work, whole=whole)
 
 
 def _cameras_of_finished_training(folder: JobFolder, job: JobFile) -> Stage | None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from ...array_file import is_whole
 from ...errors import MeshingError
 from ...progress import Progress
 from ..store.job_file import JobFile
@@ -127,4 +128,8 @@ def run_mesh(
             "estimate": expected,
         }
 
-    return run_stage(folder.stages, f"mesh-{name}", key, progress, work)
+    def whole(stage_folder: Path) -> bool:
+        dense = stage_folder / DENSE_MESH
+        return is_whole(stage_folder / "mesh.npz") and (not dense.exists() or is_whole(dense))
+
+    return run_stage(folder.stages, f"mesh-{name}", key, progress, work, whole=whole)

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from ...array_file import is_whole
 from ...export_formats import RESULT_FORMATS
 from ...progress import Progress
 from ...settings import to_json
@@ -94,4 +95,7 @@ def run_texture(
         return {"texture": textured.statistics, "mesh_rendering": rendering}
 
     formats = json.dumps(sorted(job.settings.export))
-    return run_stage(folder.stages, f"texture-{name}", stage_key(key, formats), progress, work)
+    return run_stage(
+        folder.stages, f"texture-{name}", stage_key(key, formats), progress, work,
+        whole=lambda stage_folder: is_whole(stage_folder / "files" / "mesh.npz"),
+    )  # fmt: skip

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ...array_file import is_whole
 from ...errors import DatasetError
 from ...progress import COMPILING, Progress
 from ...report_warning import ReportWarning
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
     from ...training.result import TrainingResult
 
 _logger = logging.getLogger(__name__)
+
+GAUSSIANS_NAME = "gaussians.npz"
+"""In a training stage: the trained Gaussians, which all later stages read."""
 
 
 def start_fingerprint(path: str) -> list[Any]:
@@ -102,7 +106,10 @@ def run_training(
             raise
         return {**done, "lineage": lineage(base_key, extra)}
 
-    return run_stage(folder.stages, "train", key, progress, work)
+    def whole(stage_folder: Path) -> bool:
+        return is_whole(stage_folder / GAUSSIANS_NAME)
+
+    return run_stage(folder.stages, "train", key, progress, work, whole=whole)
 
 
 def _train(
@@ -133,7 +140,7 @@ def _train(
         attempt, job.settings.training, stage_folder, lambda: remove_checkpoints(stage_folder)
     )
     result = trained.result
-    save_gaussians(stage_folder / "gaussians.npz", result.gaussians)
+    save_gaussians(stage_folder / GAUSSIANS_NAME, result.gaussians)
     measured = {figure.name: figure.psnr for figure in result.held_out}
     shown = [
         (index, scene.views[index].camera.name, measured[scene.views[index].camera.name])

@@ -25,6 +25,7 @@ _logger = logging.getLogger(__name__)
 # whatever the number of their cameras; with another number of their own they cannot.
 STAGE_VERSIONS = {"cameras": 2, "train": 6, "mesh": 11, "texture": 11}
 
+DONE_NAME = "done.json"
 HASH_CHARACTERS = 12
 INPUT_SUFFIXES = (
     ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".bin", ".txt", ".json", ".ply",
@@ -75,7 +76,7 @@ def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
 
 def read_done(folder: Path) -> dict[str, Any] | None:
     """Return the content of ``done.json``, or ``None`` where the stage is not finished."""
-    path = folder / "done.json"
+    path = folder / DONE_NAME
     if not path.is_file():
         return None
     try:
@@ -91,6 +92,8 @@ def run_stage(
     key: str,
     progress: Progress,
     work: Callable[[Path, Progress], dict[str, Any]],
+    *,
+    whole: Callable[[Path], bool] = Path.is_dir,
 ) -> Stage:
     """Run a stage, or re-use its finished folder.
 
@@ -105,9 +108,16 @@ def run_stage(
     work : callable
         Works in the folder; returns the content of ``done.json``. The folder of an interrupted
         run is passed as it is, so that training finds its checkpoints.
+    whole : callable
+        Tells whether a finished folder still holds what later stages read; without, or damaged,
+        the stage is done again.
     """
     folder = stages / f"{name}-{key}"
     done = read_done(folder)
+    if done is not None and not whole(folder):
+        _logger.warning("%s is damaged or incomplete: the stage is done again", folder.name)
+        (folder / DONE_NAME).unlink()
+        done = None
     if done is not None:
         _logger.info("stage %s is finished already (%s)", name, folder.name)
         progress.update(1.0, f"{name}: finished before")
@@ -125,7 +135,7 @@ def run_stage(
         "processor_seconds": round(processor_s, 3),
         "finished_unix_s": round(time.time(), 1),
     }
-    write_json(folder / "done.json", done)
+    write_json(folder / DONE_NAME, done)
     progress.update(1.0, f"{name}: finished")
     return Stage(name, key, folder, done, False)
 

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...array_file import read_arrays
 from ...errors import ParseError
 from ...files import read_json, write_bytes, write_json
 from ...regions.convex_region import Region
@@ -25,6 +28,12 @@ from .tiling import Tiling
 
 LIST_NAME = "tiles.json"
 VERSION = 1
+_PLAN_ARRAYS = (
+    "vertices", "faces", "fillers", "region", "cap_points", "cap_normals", "cap_radii",
+    "cap_priority", "spacing_points", "spacing_radii",
+)  # fmt: skip
+_CLOUD_ARRAYS = ("points", "normals", "kind", "radius", "radii", "notes", "figures")
+_AGAIN = "Delete this file and resume: it is made again."
 
 
 def points_path(folder: Path, tile: int) -> Path:
@@ -100,32 +109,32 @@ def load_plan(folder: Path) -> tuple[TilePlan, dict[str, Any]]:
         values = read_json(path)
         if values["version"] != VERSION:
             raise ParseError(path, "version", "is not known.", "Mesh the region again.")
-        with np.load(folder / "plan.npz", allow_pickle=False) as arrays:
-            plan = TilePlan(
-                Region(str(values["region"]), arrays["region"]),
-                CandidateSurface(
-                    arrays["vertices"], arrays["faces"], int(values["gaussians"]),
-                    int(values["pivots"]),
-                ),
-                float(values["area"]),
-                Spacing(
-                    arrays["spacing_points"], arrays["spacing_radii"], float(values["radius"]),
-                    float(values["limited"]),
-                ),
-                Tiling.from_json(values["splits"]),
-                arrays["fillers"],
-                float(values["ball"]),
-                Caps(
-                    arrays["cap_points"], arrays["cap_normals"], arrays["cap_radii"],
-                    arrays["cap_priority"],
-                ),
-                int(values["seed"]),
-                read_warnings(values["notes"]),
-                float(values["edge_length"]),
-                int(values["target"]),
-                float(values["share"]),
-                int(values["sightings"]),
-            )  # fmt: skip
+        arrays = read_arrays(folder / "plan.npz", _PLAN_ARRAYS, hint="Mesh the region again.")
+        plan = TilePlan(
+            Region(str(values["region"]), arrays["region"]),
+            CandidateSurface(
+                arrays["vertices"], arrays["faces"], int(values["gaussians"]),
+                int(values["pivots"]),
+            ),
+            float(values["area"]),
+            Spacing(
+                arrays["spacing_points"], arrays["spacing_radii"], float(values["radius"]),
+                float(values["limited"]),
+            ),
+            Tiling.from_json(values["splits"]),
+            arrays["fillers"],
+            float(values["ball"]),
+            Caps(
+                arrays["cap_points"], arrays["cap_normals"], arrays["cap_radii"],
+                arrays["cap_priority"],
+            ),
+            int(values["seed"]),
+            read_warnings(values["notes"]),
+            float(values["edge_length"]),
+            int(values["target"]),
+            float(values["share"]),
+            int(values["sightings"]),
+        )  # fmt: skip
         return plan, dict(values["origin"])
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ParseError(path, "whole file", f"{error}.", "Mesh the region again.") from None
@@ -137,9 +146,8 @@ def save_points(path: Path, cloud: SurfacePoints) -> None:
 
 
 def load_points(path: Path) -> SurfacePoints:
-    """Read the points of a tile."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return _cloud_of(arrays)
+    """Read the points of a tile; :class:`ParseError` where the file is damaged."""
+    return _cloud_of(path, read_arrays(path, _CLOUD_ARRAYS, hint=_AGAIN))
 
 
 def save_gathered(path: Path, gathered: GatheredPoints) -> None:
@@ -148,9 +156,9 @@ def save_gathered(path: Path, gathered: GatheredPoints) -> None:
 
 
 def load_gathered(path: Path) -> GatheredPoints:
-    """Read the points of all tiles."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return GatheredPoints(_cloud_of(arrays), arrays["shifted"], arrays["inner"])
+    """Read the points of all tiles; :class:`ParseError` where the file is damaged."""
+    arrays = read_arrays(path, (*_CLOUD_ARRAYS, "shifted", "inner"), hint=_AGAIN)
+    return GatheredPoints(_cloud_of(path, arrays), arrays["shifted"], arrays["inner"])
 
 
 def save_faces(path: Path, part: TileFaces) -> None:
@@ -162,11 +170,11 @@ def save_faces(path: Path, part: TileFaces) -> None:
 
 
 def load_faces(path: Path) -> TileFaces:
-    """Read the faces of a tile."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return TileFaces(
-            arrays["faces"], arrays["border"], arrays["solid"], json.loads(str(arrays["figures"]))
-        )
+    """Read the faces of a tile; :class:`ParseError` where the file is damaged."""
+    arrays = read_arrays(path, ("faces", "border", "solid", "figures"), hint=_AGAIN)
+    with _damaged(path):
+        figures = json.loads(str(arrays["figures"]))
+    return TileFaces(arrays["faces"], arrays["border"], arrays["solid"], figures)
 
 
 def _of_cloud(cloud: SurfacePoints) -> dict[str, np.ndarray]:
@@ -181,12 +189,21 @@ def _of_cloud(cloud: SurfacePoints) -> dict[str, np.ndarray]:
     }
 
 
-def _cloud_of(arrays: Any) -> SurfacePoints:
-    return SurfacePoints(
-        arrays["points"], arrays["normals"], arrays["kind"], arrays["radii"],
-        float(arrays["radius"]), read_warnings(json.loads(str(arrays["notes"]))),
-        json.loads(str(arrays["figures"])),
-    )  # fmt: skip
+def _cloud_of(path: Path, arrays: dict[str, np.ndarray]) -> SurfacePoints:
+    with _damaged(path):
+        return SurfacePoints(
+            arrays["points"], arrays["normals"], arrays["kind"], arrays["radii"],
+            float(arrays["radius"]), read_warnings(json.loads(str(arrays["notes"]))),
+            json.loads(str(arrays["figures"])),
+        )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _damaged(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        raise ParseError(path, "whole file", f"{error}.", _AGAIN) from None
 
 
 def _save(path: Path, **arrays: np.ndarray) -> None:

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A finished stage whose files are cut, changed or gone is done again; others are re-used."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core.dataset import scene_file
+from gaussian_wrapping_addon.core.dataset.loading import load
+from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians, save_gaussians
+from gaussian_wrapping_addon.core.jobs.runner import STAGE_VERSIONS
+from gaussian_wrapping_addon.core.jobs.stages import training_stage
+from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
+from gaussian_wrapping_addon.core.jobs.stages.mesh_stage import DENSE_MESH, run_mesh
+from gaussian_wrapping_addon.core.jobs.stages.texture_stage import run_texture
+from gaussian_wrapping_addon.core.jobs.stages.training_stage import run_training
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage, read_done
+from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh, save_mesh
+from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.settings import MeshingSettings
+from tests.core.jobs.finished_sphere import write_cube, write_finished_sphere
+
+
+def cut(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def turn_a_bit(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+damaged = pytest.mark.parametrize("damage", [cut, turn_a_bit, Path.unlink])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> JobFolder:
+    return write_finished_sphere(tmp_path)
+
+
+def run(folder: JobFolder) -> tuple[JobFile, Stage, Stage]:
+    """Run the first two stages."""
+    job = read_job(folder.job_path)
+    cameras = run_cameras(folder, job, Progress(), threads=1)
+    trained = run_training(
+        folder, job, cameras, Progress(), version=STAGE_VERSIONS["train"], threads=1
+    )
+    return job, cameras, trained
+
+
+@damaged
+def test_damaged_cameras_are_loaded_again(
+    folder: JobFolder, damage: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, cameras, _ = run(folder)
+    scene = scene_file.load_saved_scene(cameras.folder)
+    monkeypatch.setattr(load, "load_scene", lambda *_, **__: scene)
+    damage(cameras.folder / scene_file.POINTS_NAME)
+    _, again, trained = run(folder)
+    assert (cameras.reused, again.reused, trained.reused) == (True, False, True)
+    assert np.array_equal(scene_file.load_saved_scene(again.folder).points, scene.points)
+
+
+@damaged
+def test_a_damaged_training_is_trained_again(
+    folder: JobFolder, damage: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, _, trained = run(folder)
+    path = trained.folder / training_stage.GAUSSIANS_NAME
+    gaussians = load_gaussians(path)
+
+    def train(stage_folder: Path, *_: object) -> dict[str, Any]:
+        save_gaussians(stage_folder / training_stage.GAUSSIANS_NAME, gaussians)
+        return {}
+
+    monkeypatch.setattr(training_stage, "_train", train)
+    damage(path)
+    _, cameras, again = run(folder)
+    assert (trained.reused, cameras.reused, again.reused) == (True, True, False)
+    assert np.array_equal(load_gaussians(path).means, gaussians.means)
+    assert run(folder)[2].reused
+
+
+@damaged
+@pytest.mark.parametrize("name", ["mesh.npz", DENSE_MESH])
+def test_a_damaged_mesh_is_made_again(
+    folder: JobFolder, name: str, damage: Callable[[Path], None]
+) -> None:
+    if name == DENSE_MESH and damage is Path.unlink:
+        pytest.skip("a mesh that was not decimated has none")
+    earlier, cameras, trained = run(folder)
+    path = write_cube(folder.root / "ball.json")
+    meshing = MeshingSettings(
+        method="pivots", pivots=2, pivot_samples="none", min_component_share=0.0
+    )
+    settings = dataclasses.replace(earlier.settings, meshing=meshing, regions=(str(path),))
+    job = make_job("mesh", Path(earlier.source), settings)
+
+    def mesh() -> Stage:
+        return run_mesh(folder, job, str(path), "ball", cameras, trained, Progress(), threads=1)
+
+    made = mesh()
+    first = load_mesh(made.folder / "mesh.npz")
+    if name == DENSE_MESH:
+        save_mesh(made.folder / name, SurfaceMesh(first.vertices, first.faces))
+    assert mesh().reused
+    damage(made.folder / name)
+    assert not mesh().reused
+    assert np.array_equal(load_mesh(made.folder / "mesh.npz").vertices, first.vertices)
+
+
+@damaged
+def test_a_damaged_textured_mesh_is_made_again(
+    folder: JobFolder, damage: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class BegunAgainError(Exception):
+        pass
+
+    def begin(_: Path) -> None:
+        raise BegunAgainError
+
+    monkeypatch.setattr(scene_file, "load_saved_scene", begin)  # what the work begins with
+    job, cameras, trained = run(folder)
+    meshed = Stage("mesh-ball", "key", folder.stages / "mesh-ball-key", {}, True)
+
+    def texture() -> Stage:
+        return run_texture(folder, job, "ball", cameras, trained, meshed, Progress(), threads=1)
+
+    with pytest.raises(BegunAgainError):
+        texture()
+    (stage,) = folder.stages.glob("texture-ball-*")
+    (stage / "files").mkdir()
+    save_mesh(stage / "files" / "mesh.npz", SurfaceMesh(np.eye(3), np.array([[0, 1, 2]])))
+    write_json(stage / "done.json", {"seconds": 1.0})
+    assert texture().reused
+    damage(stage / "files" / "mesh.npz")
+    with pytest.raises(BegunAgainError):
+        texture()
+    assert read_done(stage) is None
