@@ -49,6 +49,7 @@ def add_export(commands: Commands) -> None:
 def _export(options: Namespace) -> int:
     from ..core.errors import UsageError
     from ..core.export_formats import BLENDER_FORMATS, EXPORT_FORMATS
+    from ..core.files import real_path
     from ..core.jobs.client import worker_python
     from ..core.jobs.commands.export_files import result_of
     from ..core.jobs.commands.run_in_worker import run_in_worker
@@ -69,7 +70,7 @@ def _export(options: Namespace) -> int:
             "Run blender --background -P batch.py -- export ..., pip install bpy, or omit the"
             " format.",
         )
-    result, out = result_of(options.job), options.out.resolve()
+    result, out = result_of(options.job), real_path(options.out)
     own = [f for f in formats if f not in BLENDER_FORMATS]
     if own:
         request = {

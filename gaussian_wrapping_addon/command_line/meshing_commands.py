@@ -32,6 +32,7 @@ def add_mesh(commands: Commands) -> None:
 
 
 def _mesh(options: Namespace) -> int:
+    from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.store.continue_training import no_finished_training
     from ..core.jobs.store.job_file import make_job
@@ -39,7 +40,7 @@ def _mesh(options: Namespace) -> int:
     from ..core.jobs.store.rollback import finished_job
     from ..core.jobs.store.stage_folder import read_done
 
-    folder = JobFolder(options.out.resolve())
+    folder = JobFolder(real_path(options.out))
     earlier = finished_job(folder)
     if not any(read_done(path) for path in folder.stages.glob("train-*")):
         raise no_finished_training(options.out)
@@ -61,6 +62,7 @@ def add_estimate_mesh(commands: Commands) -> None:
 
 
 def _estimate_mesh(options: Namespace) -> int:
+    from ..core.files import real_path
     from ..core.jobs.client import worker_python
     from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.names import AUTOMATIC_REGIONS
@@ -70,8 +72,8 @@ def _estimate_mesh(options: Namespace) -> int:
     JobSettings(meshing=meshing, threads=options.threads).validated()
     region = options.region
     request = {
-        "out": str(options.out.resolve()),
-        "region": region if region in AUTOMATIC_REGIONS else str(Path(region).resolve()),
+        "out": str(real_path(options.out)),
+        "region": region if region in AUTOMATIC_REGIONS else str(real_path(region)),
         "meshing": to_json(meshing),
         "threads": options.threads,
     }
@@ -98,6 +100,7 @@ def add_work_tiles(commands: Commands) -> None:
 
 def _work_tiles(options: Namespace) -> int:
     from ..core.errors import UsageError
+    from ..core.files import real_path
     from ..core.jobs.client import worker_python
     from ..core.jobs.commands.run_in_worker import run_in_worker
     from ..core.settings import JobSettings
@@ -106,7 +109,7 @@ def _work_tiles(options: Namespace) -> int:
     if not 0 <= options.wait <= MAX_WAIT_S:
         raise UsageError("--wait is out of range.", f"Give from 0 to {MAX_WAIT_S:.0f} seconds.")
     request = {
-        "out": str(options.out.resolve()), "threads": options.threads, "wait_s": options.wait,
+        "out": str(real_path(options.out)), "threads": options.threads, "wait_s": options.wait,
     }  # fmt: skip
     return run_in_worker(
         request, python=worker_python(), module="jobs.commands.tile_worker", what="work on tiles"

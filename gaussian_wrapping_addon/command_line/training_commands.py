@@ -62,12 +62,13 @@ def add_continue_training(commands: Commands) -> None:
 
 
 def _continue_training(options: Namespace) -> int:
+    from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.store.continue_training import continue_training_job
     from ..core.jobs.store.job_folder import JobFolder
     from ..core.jobs.store.rollback import finished_job
 
-    folder = JobFolder(options.out.resolve())
+    folder = JobFolder(real_path(options.out))
     job = continue_training_job(folder, finished_job(folder), options.iterations)
     require_bpy(job, options)
     return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
@@ -84,11 +85,12 @@ def add_resume(commands: Commands) -> None:
 
 
 def _resume(options: Namespace) -> int:
+    from ..core.files import real_path
     from ..core.jobs.client import JobClient, worker_python
     from ..core.jobs.store.job_file import read_job
     from ..core.jobs.store.job_folder import JobFolder
 
-    job = read_job(JobFolder(options.out.resolve()).job_path)
+    job = read_job(JobFolder(real_path(options.out)).job_path)
     require_bpy(job, options)
     if options.max_gaussians is None:
         return follow(JobClient.resume(options.out, python=worker_python()), job, options)

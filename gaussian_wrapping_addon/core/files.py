@@ -109,6 +109,14 @@ def _check_depth(path: Path, values: Any, depth: int) -> None:
             _check_depth(path, child, depth + 1)
 
 
+def real_path(path: str | Path) -> Path:
+    """Return an absolute path with its links followed as far as they lead; never raises for them.
+
+    ``Path.resolve`` raises a RuntimeError for links in a circle before Python 3.13.
+    """
+    return Path(os.path.realpath(path))
+
+
 def resolve_inside(root: Path, name: str) -> Path | None:
     """Return the path of ``name`` under ``root``, or ``None`` if the name is unsafe.
 
@@ -124,6 +132,6 @@ def resolve_inside(root: Path, name: str) -> Path | None:
     if any(is_reserved_name(part) for part in parts):
         return None
     path = root.joinpath(*parts)
-    if not path.resolve().is_relative_to(root.resolve()):
+    if not real_path(path).is_relative_to(real_path(root)):
         return None
     return path

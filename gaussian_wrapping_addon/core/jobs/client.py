@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, unwritable_error
+from ..files import real_path
 from ..processes.helper_process import child_command
 from ..processes.process_identity import process_alive
 from ..processes.spawn import kill_group, spawn
@@ -116,7 +117,7 @@ class JobClient:
         keep_running : bool
             Whether the worker continues when this process ends.
         """
-        target = JobFolder(folder.resolve())
+        target = JobFolder(real_path(folder))
         source = Path(job.source)
         if source.is_dir() and target.root.is_relative_to(source):
             raise UsageError(
@@ -136,7 +137,7 @@ class JobClient:
         cls, folder: Path, *, python: str | None = None, keep_running: bool = False
     ) -> JobClient:
         """Start a worker for the job in ``folder``; finished stages are re-used."""
-        target = JobFolder(folder.resolve())
+        target = JobFolder(real_path(folder))
         if not target.is_job():
             raise UsageError(
                 f"{folder} holds no job.", "Choose the folder given as --out, or press Find Job."
@@ -165,7 +166,7 @@ class JobClient:
     @classmethod
     def attach(cls, folder: Path) -> JobClient:
         """Watch a job started by another process."""
-        target = JobFolder(folder.resolve())
+        target = JobFolder(real_path(folder))
         if not target.is_job():
             raise UsageError(f"{folder} holds no job.", "Choose a job folder.")
         return cls(target, None)

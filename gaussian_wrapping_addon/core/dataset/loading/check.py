@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from ...errors import DatasetError, WrapError
+from ...files import real_path
 from ...limits import MIN_IMAGES
 from ...ply.table import vertex_layout
 from ..frames.normalisation import find_scene_frame
@@ -49,7 +50,7 @@ def check_input(source: Path) -> list[Finding]:
     """
     findings: list[Finding] = []
     try:
-        source = Path(source).resolve()
+        source = real_path(source)
         kind = source_kind(source)
         findings.append(
             Finding(

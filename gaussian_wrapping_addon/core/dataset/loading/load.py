@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import DatasetError
+from ...files import real_path
 from ...limits import MIN_IMAGES
 from ...progress import Progress
 from ...report_warning import LEFT_OUT_HINT, ReportWarning
@@ -65,8 +66,8 @@ def load_scene(
     DatasetError, ParseError
         The input cannot be used; names the problem and its location.
     """
-    source = Path(source).resolve()
-    work_folder = Path(work_folder).resolve()
+    source = real_path(source)
+    work_folder = real_path(work_folder)
     kind = source_kind(source)
     work_folder.mkdir(parents=True, exist_ok=True)
     progress.update(0.0, "reading the input")

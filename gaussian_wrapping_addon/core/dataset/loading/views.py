@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -278,7 +279,7 @@ def _find_mask(
     mask_path = None
     if posed.mask_name is not None:
         mask_path = resolve_inside(kind.folder, posed.mask_name)
-        if mask_path is None or not mask_path.is_file():
+        if mask_path is None or not os.path.isfile(mask_path):
             mask_path = None
             with notes.lock:
                 notes.wrong_masks.append(f"{posed.mask_name} is missing")

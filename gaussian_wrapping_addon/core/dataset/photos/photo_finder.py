@@ -109,7 +109,7 @@ class PhotoIndex:
         """Return the photo of ``name``; looser rules apply only if they give one candidate."""
         for root in self.roots:
             path = resolve_inside(root, name)
-            if path is not None and path.is_file():
+            if path is not None and os.path.isfile(path):
                 return Match(path, "exact")
         clean = str(PurePosixPath(name.replace("\\", "/")))
         keys = _keys(clean)
@@ -147,7 +147,7 @@ def find_mask(mask_roots: list[Path], name: str) -> Path | None:
     for root in mask_roots:
         for candidate in mask_candidates(name):
             path = resolve_inside(root, candidate)
-            if path is not None and path.is_file():
+            if path is not None and os.path.isfile(path):
                 return path
     return None
 

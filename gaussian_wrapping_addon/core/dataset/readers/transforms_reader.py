@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ def read_transforms(path: Path) -> SourceModel:
     if unsafe:
         text = (
             f"{len(unsafe)} frames were left out because their file_path leads outside the "
-            f"folder: {', '.join(unsafe[:3])}."
+            f"folder or is too long: {', '.join(unsafe[:3])}."
         )
         warnings.append(ReportWarning("frames-outside-folder", text, LEFT_OUT_HINT))
     if repeated:
@@ -241,7 +242,7 @@ def _start_points(
     if name is None:
         return nothing
     found = resolve_inside(path.parent, name) if isinstance(name, str) and name else None
-    if found is None or not found.is_file():
+    if found is None or not os.path.isfile(found):
         warnings.append(
             ReportWarning(
                 "point-file-missing",

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...errors import DatasetError
+from ...files import real_path
 from ...report_warning import ReportWarning
 from ..store.job_file import JobFile
 from .worker_call import run_command
@@ -78,7 +79,7 @@ def input_facts(source: Path) -> SceneFacts:
     from ...training.cost.training_estimate import SceneFacts
     from ..stages.splat_scene import MAX_START_POINTS
 
-    kind = source_kind(source.resolve())
+    kind = source_kind(real_path(source))
     if kind.kind == SPLAT:
         header = read_splat_header(source)
         views = FAR_VIEWS + NEAR_VIEWS

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import DatasetError, ParseError, SettingError, UsageError
-from ...files import read_json, write_json
+from ...files import read_json, real_path, write_json
 from ...names import AUTOMATIC_REGIONS, region_name, region_names
 from ...regions.region_file import parse_region_file, read_region_body
 from ...settings import JobSettings, MeshingSettings, from_json, to_json
@@ -114,7 +114,7 @@ def make_job(
             lengths |= {region: own[region]} if region in own else {}
             continue
         path = Path(region)
-        name = str(path.resolve())
+        name = str(real_path(path))
         bodies[name] = read_region_body(path)
         parse_region_file(bodies[name], path)
         names.append(name)
@@ -133,9 +133,9 @@ def make_job(
         settings,
         training=training,
         regions=tuple(names),
-        start_splat=str(Path(start).resolve()) if start else "",
+        start_splat=str(real_path(start)) if start else "",
     )
-    return JobFile(command, str(source.resolve()), settings, bodies, lengths)
+    return JobFile(command, str(real_path(source)), settings, bodies, lengths)
 
 
 def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:
