@@ -94,8 +94,8 @@ def read_transforms(path: Path) -> SourceModel:
         photos.append(PosedPhoto(name, lens, pose, mask, angle_x))
     if unsafe:
         text = (
-            f"{len(unsafe)} frames were left out because their file_path leads outside the "
-            f"folder or is too long: {', '.join(unsafe[:3])}."
+            f"{len(unsafe)} frames were left out because their file_path is too long or leads "
+            f"outside the folder: {', '.join(unsafe[:3])}."
         )
         warnings.append(ReportWarning("frames-outside-folder", text, LEFT_OUT_HINT))
     if repeated:
