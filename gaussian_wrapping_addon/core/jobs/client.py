@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import json
 import os
 import signal
 import subprocess
@@ -14,12 +15,21 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import EXIT_RESOURCES, ParseError, UsageError, WorkerError, unwritable_error
+from ..errors import (
+    EXIT_CANCELLED,
+    EXIT_OTHER,
+    EXIT_RESOURCES,
+    ParseError,
+    UsageError,
+    WorkerError,
+    unwritable_error,
+)
 from ..files import real_path
 from ..processes.helper_process import child_command
 from ..processes.process_identity import process_alive
 from ..processes.spawn import kill_group, spawn
 from ..processes.worker_environment import ready_worker
+from ..processes.worker_requirements import not_started
 from ..regular_files import open_regular, touch_regular
 from .stages.oom_retry import killed_hint, killed_mesh_hint
 from .store.job_file import JobFile, read_job, reject_region_conflicts, write_job
@@ -28,7 +38,7 @@ from .store.rollback import save_rollback
 
 WORKER_MODULE = "jobs.worker"
 PYTHON_VARIABLE = "GAUSSIAN_WRAPPING_PYTHON"
-OUTPUT_TAIL_BYTES = 2000
+OUTPUT_TAIL_BYTES = 16_000
 KILLED_CODES = (-9, 137)
 """Exit codes of a process ended by SIGKILL, directly or under a shell, as by the kernel when memory
 runs out."""
@@ -39,6 +49,7 @@ longer."""
 KILL_GRACE_S = 2.0
 KILL_POLL_S = 0.05
 RUNNING_HINT = "Wait for it, or stop it: cancel DIR on the command line, Cancel in Blender."
+PYTHON_HINT = "Check the worker's Python: batch.py doctor, or Check Worker in the preferences."
 STAGES_AFTER_TRAINING = ("mesh", "texture", "export")
 """Stages of a job whose training is finished."""
 
@@ -154,13 +165,14 @@ class JobClient:
             target.write_status(JobStatus(heartbeat_s=time.time()))
             output = open_regular(target.output_path, "wb")
         with output:
+            chosen = python or worker_python()
             command = child_command(
-                WORKER_MODULE,
-                str(target.root),
-                "0" if keep_running else "1",
-                python=python or worker_python(),
+                WORKER_MODULE, str(target.root), "0" if keep_running else "1", python=chosen
             )
-            process = spawn(command, stdout=output, stderr=subprocess.STDOUT)
+            try:
+                process = spawn(command, stdout=output, stderr=subprocess.STDOUT)
+            except OSError as error:
+                raise not_started(chosen, error) from None
         return cls(target, process)
 
     @classmethod
@@ -202,6 +214,10 @@ class JobClient:
             if status.state == "NEW" and self._process is None and not self.folder.locked():
                 return self._failed(status, "The worker did not start.")
             return status
+        if EXIT_OTHER <= code <= EXIT_CANCELLED and (told := self._refusal()):
+            return replace(
+                status, state="FAILED", error=told.message, hint=told.hint, exit_code=code
+            )
         if status.active or status.state == "LOST":
             if code in KILLED_CODES:
                 return self._killed(status)
@@ -224,25 +240,39 @@ class JobClient:
         kept = job.command == "mesh" and (self.folder.result / "report.json").is_file()
         return replace(failed, hint=killed_mesh_hint(job.settings.meshing, kept=kept))
 
+    def _refusal(self) -> WorkerError | None:
+        """Return the error of a worker that could not begin; the job's status is not of it."""
+        for line in reversed(self._output_lines()):
+            with contextlib.suppress(ValueError, RecursionError):
+                values = json.loads(line)
+                if isinstance(values, dict) and values.get("error"):
+                    return WorkerError(str(values["error"]), str(values.get("hint", "")))
+        return None
+
     def _failed(self, status: JobStatus, error: str) -> JobStatus:
+        log = self.folder.log_path.name
+        begun = status.state != "NEW"
         return replace(
             status,
-            state="FAILED" if status.state == "NEW" else "LOST",
+            state="LOST" if begun else "FAILED",
             error=error,
-            hint=f"See {self.folder.log_path.name} in the job folder, then resume.",
+            hint=f"See {log} in the job folder, then resume." if begun else PYTHON_HINT,
         )
 
     def output_tail(self) -> str:
         """Return the last line that the worker wrote to stdout and stderr."""
+        lines = self._output_lines()
+        return lines[-1] if lines else ""
+
+    def _output_lines(self) -> list[str]:
         try:
             with open_regular(self.folder.output_path) as output:
                 length = output.seek(0, os.SEEK_END)
                 output.seek(max(length - OUTPUT_TAIL_BYTES, 0))
                 data = output.read(OUTPUT_TAIL_BYTES)
         except (OSError, ParseError):
-            return ""
-        lines = data.decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else ""
+            return []
+        return data.decode(errors="replace").strip().splitlines()
 
     def cancel(self) -> None:
         """Ask the worker to stop; it stops within about two seconds and keeps a checkpoint.

@@ -9,7 +9,6 @@ import logging
 import math
 import os
 import signal
-import sys
 import threading
 import time
 from dataclasses import asdict, replace
@@ -26,9 +25,10 @@ from ..errors import (
     WrapError,
     unwritable_error,
 )
-from ..log_lines import LineFormatter, one_line
-from ..processes.helper_process import kill_helpers
+from ..log_lines import LineFormatter
+from ..processes.helper_process import emit, kill_helpers
 from ..processes.process_identity import Caller, process_start_ticks
+from ..processes.worker_requirements import missing_package
 from ..progress import COMPILING, ProgressEvent
 from ..regular_files import open_regular
 from .store.job_file import read_job
@@ -177,7 +177,7 @@ def main(arguments: list[str]) -> int:
         _log_to(folder.log_path)
     except WrapError as refused:
         # Nothing of the folder is touched, its log and status included.
-        sys.stderr.write(f"{one_line(str(refused))}\n")
+        emit(error=refused.message, hint=refused.hint)
         return refused.exit_code
     reporter = _Reporter(
         folder,
@@ -194,7 +194,7 @@ def main(arguments: list[str]) -> int:
     except WrapError as refused:
         # Another worker owns the folder: leave its status and its lock alone.
         _logger.error("%s", refused)
-        sys.stderr.write(f"{one_line(str(refused))}\n")
+        emit(error=refused.message, hint=refused.hint)
         return refused.exit_code
     try:
         reporter.write()
@@ -220,6 +220,14 @@ def main(arguments: list[str]) -> int:
         else:
             code, state = EXIT_OTHER, "FAILED"
             error, hint = f"Unexpected {type(failure).__name__}: {failure}", BUG_HINT
+    except ImportError as failure:
+        _logger.exception("a package is missing")
+        missing = missing_package(failure)
+        code, state = EXIT_OTHER, "FAILED"
+        error = f"Unexpected {type(failure).__name__}: {failure}"
+        hint = BUG_HINT
+        if missing is not None:
+            error, hint = missing.message, missing.hint
     except MemoryError:
         _logger.exception("out of memory")
         code, state = EXIT_RESOURCES, "FAILED"

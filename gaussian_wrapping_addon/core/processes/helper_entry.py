@@ -15,6 +15,7 @@ from ..errors import WrapError
 from .helper_process import emit
 from .peak_memory import own_peak_bytes
 from .process_identity import Caller
+from .worker_requirements import missing_package
 
 _PARENT_POLL_S = 1.0
 
@@ -35,6 +36,12 @@ def main(arguments: list[str]) -> int:
     except WrapError as error:
         emit(error=error.message, hint=error.hint)
         return error.exit_code
+    except ImportError as error:
+        missing = missing_package(error)
+        if missing is None:
+            raise
+        emit(error=missing.message, hint=missing.hint)
+        return missing.exit_code
     finally:
         emit(peak_bytes=own_peak_bytes())
     return 0

@@ -4,7 +4,7 @@
 A helper is a module with ``main(folder)``; it reads ``task.json`` and arrays in the folder, writes
 its results there, and reports on stdout, one JSON object per line:
 ``{"fraction": 0.5, "message": "..."}``. A typed failure is ``{"error": "...", "hint": "..."}``
-followed by exit code 3. The last line of every helper that exits normally is
+followed by its exit code. The last line of every helper that exits normally is
 ``{"peak_bytes": ...}``, its peak memory.
 """
 
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from .. import limits
-from ..errors import DatasetError, ResourceError, WorkerError
+from ..errors import EXIT_OTHER, DatasetError, ResourceError, WorkerError
 from ..progress import Progress
 from .peak_memory import record_helper_peak
 from .process_identity import caller_option
@@ -88,11 +88,12 @@ def run_helper(
     Cancelled
         The user asked to stop; the helper has been ended.
     DatasetError
-        The helper reported a typed failure.
+        The helper reported another typed failure.
     ResourceError
         The deadline passed.
     WorkerError
-        The helper crashed; the message names the signal and the end of its output.
+        The helper crashed, and the message names the signal and the end of its output; or the
+        worker's Python lacks a package.
     """
     command = child_command("processes.helper_entry", module, str(folder), str(memory_bytes or 0))
     process = spawn(command)
@@ -137,7 +138,8 @@ def run_helper(
             reader.join(1.0)
     code = process.returncode
     if failure:
-        raise DatasetError(str(failure["error"]), str(failure.get("hint", "")))
+        kind = WorkerError if code == EXIT_OTHER else DatasetError
+        raise kind(str(failure["error"]), str(failure.get("hint", "")))
     if code != 0:
         reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
         raise WorkerError(f"{module} {reason}: {' | '.join(output_tail)[-500:]}", "See the log.")

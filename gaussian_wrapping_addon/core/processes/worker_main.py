@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import json
 import re
 import sys
 from pathlib import Path
 
 _PACKAGE = "gaussian_wrapping_addon"
+_OLDEST = (3, 11)
+"""Oldest version of Python that can read the package."""
 
 
 def _add_packages() -> None:
@@ -37,6 +40,32 @@ def _load_package() -> None:
     spec.loader.exec_module(module)
 
 
+def _main(module: str, arguments: list[str]) -> int:
+    if sys.version_info[:2] < _OLDEST:
+        return _refuse(
+            f"The worker's Python, {sys.executable}, is version {sys.version.split()[0]}.",
+            "Version {}.{} or later is needed: press Set Up Worker, run batch.py set-up-worker, or "
+            "name another Python.".format(*_OLDEST),
+        )
+    _add_packages()
+    _load_package()
+    try:
+        called = importlib.import_module(f"{_PACKAGE}.core.{module}").main
+    except ImportError as error:
+        named = importlib.import_module(f"{_PACKAGE}.core.processes.worker_requirements")
+        missing = named.missing_package(error)
+        if missing is None:
+            raise
+        return _refuse(missing.message, missing.hint)
+    return int(called(arguments))
+
+
+def _refuse(error: str, hint: str) -> int:
+    """Report an error as commands, helpers and workers do: one JSON line on stdout."""
+    sys.stdout.write(json.dumps({"error": error, "hint": hint}) + "\n")
+    return 1
+
+
 if __name__ == "__main__":
     if len(sys.argv) < 2 or not re.fullmatch(r"[a-z_]+(\.[a-z_]+)*", sys.argv[1]):
         sys.exit(2)
@@ -44,6 +73,4 @@ if __name__ == "__main__":
     sys.path[:] = [
         p for p in sys.path if p and Path(p).resolve() != Path(__file__).resolve().parent
     ]
-    _add_packages()
-    _load_package()
-    sys.exit(importlib.import_module(f"{_PACKAGE}.core.{sys.argv[1]}").main(sys.argv[2:]))
+    sys.exit(_main(sys.argv[1], sys.argv[2:]))

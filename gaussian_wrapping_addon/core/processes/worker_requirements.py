@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Read the pinned packages of ``requirements-worker.txt``."""
+"""The pinned packages of ``requirements-worker.txt``, and errors of a worker's Python."""
 
 from __future__ import annotations
 
 import operator
 import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import UsageError
+from ..errors import UsageError, WorkerError
 
 FILE_NAME = "requirements-worker.txt"
 _LINE = re.compile(r"^([A-Za-z0-9][\w.-]*)[^\S\n]*([^#;\n]*)", re.MULTILINE)
@@ -71,3 +72,23 @@ def read_requirements(path: Path) -> list[Requirement]:
     if not found:
         raise UsageError(f"{path} names no package.", "Give a list of packages.")
     return found
+
+
+def missing_package(error: ImportError) -> WorkerError | None:
+    """Return the error of a Python that lacks a package, or ``None`` for a fault of our own."""
+    if (error.name or "").partition(".")[0] in ("", __name__.partition(".")[0]):
+        return None
+    return WorkerError(
+        f"The worker's Python, {sys.executable}, lacks a package, or has it in another version: "
+        f"{error}.",
+        "Press Set Up Worker, run batch.py set-up-worker, or install requirements-worker.txt with "
+        "its pip. batch.py doctor checks it.",
+    )
+
+
+def not_started(python: str, error: OSError) -> WorkerError:
+    """Return the error of a worker's Python that the system does not start."""
+    return WorkerError(
+        f"The worker's Python, {python}, does not run: {error.strerror or error}.",
+        "Press Set Up Worker, run batch.py set-up-worker, or name another Python.",
+    )

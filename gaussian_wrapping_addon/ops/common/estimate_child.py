@@ -11,6 +11,7 @@ from typing import Any
 
 from ...core.errors import WorkerError
 from ...core.processes.spawn import kill_group, spawn
+from ...core.processes.worker_requirements import not_started
 from .background import Lane
 
 _endings = Lane()
@@ -41,9 +42,7 @@ def run_child(
     try:
         process = spawn(command)
     except OSError as error:
-        raise WorkerError(
-            f"{command[0]} does not run: {error}.", "Choose another Python."
-        ) from None
+        raise not_started(command[0], error) from None
     if not on_start(process):
         kill_group(process)
     try:

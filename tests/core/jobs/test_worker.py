@@ -142,7 +142,7 @@ def test_a_worker_that_may_not_lock_leaves_the_owner_alone(tmp_path: Path) -> No
             child_command("jobs.worker", str(folder.root), "0"), capture_output=True, check=False
         )
         assert done.returncode == 2
-        assert str(owner.pid).encode() in done.stderr
+        assert str(owner.pid).encode() in done.stdout
         assert folder.status_path.read_bytes() == before
         assert read_json(folder.lock_path) == lock
         owner.kill()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.metadata
 import json
@@ -17,7 +18,7 @@ from ...errors import EXIT_BAD_DATA, EXIT_DONE, WorkerError, WrapError
 from ...machine import total_memory_bytes
 from ...processes.helper_process import child_command, emit
 from ...processes.spawn import run_to_end
-from ...processes.worker_requirements import read_requirements, requirements_file
+from ...processes.worker_requirements import not_started, read_requirements, requirements_file
 
 MIN_PYTHON = (3, 11)
 MIN_MEMORY_BYTES = 4 * 2**30
@@ -136,17 +137,22 @@ def diagnose_worker(python: str) -> list[Diagnosis]:
     try:
         command = child_command("jobs.commands.doctor", python=python)
         _, output, error_output = run_to_end(command, DOCTOR_DEADLINE_S)
-    except (OSError, subprocess.TimeoutExpired) as error:
+    except OSError as error:
+        raise not_started(python, error) from None
+    except subprocess.TimeoutExpired:
         raise WorkerError(
-            f"{python} does not run: {error}.", "Press Set Up Worker, or choose another Python."
+            f"{python} does not answer.", "Press Set Up Worker, or choose another Python."
         ) from None
     findings: list[Diagnosis] = []
     for line in output.splitlines():
         try:
             values: Any = json.loads(line)
-            findings.append(Diagnosis(**values))
-        except (ValueError, TypeError):
+        except ValueError:
             continue
+        if isinstance(values, dict) and "error" in values:
+            raise WorkerError(str(values["error"]), str(values.get("hint", "")))
+        with contextlib.suppress(TypeError):
+            findings.append(Diagnosis(**values))
     if not findings:
         error_lines = error_output.strip().splitlines()
         raise WorkerError(

@@ -16,6 +16,7 @@ from typing import Any
 from ...errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER, WorkerError
 from ...processes.helper_process import child_command
 from ...processes.spawn import kill_group, spawn
+from ...processes.worker_requirements import not_started
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -50,14 +51,15 @@ def run_in_worker(
         try:
             process = spawn(child_command(module, text, python=python), stderr=error_file)
         except OSError as error:
-            raise WorkerError(
-                f"{python} does not run: {error}.", "Choose another Python."
-            ) from None
-        error_shown = False
+            raise not_started(python, error) from None
+        understood = error_shown = False
         try:
             assert process.stdout is not None
             for raw in process.stdout:
-                error_shown = _log_line(raw) or error_shown
+                values = _parse(raw)
+                if values is not None:
+                    understood = _log_line(values) or understood
+                    error_shown = error_shown or "error" in values
             code = process.wait()
         except KeyboardInterrupt:
             _logger.info("cancelled")
@@ -65,7 +67,7 @@ def run_in_worker(
         finally:
             kill_group(process)
         if code not in (EXIT_DONE, *range(EXIT_OTHER, EXIT_CANCELLED + 1)) or (
-            code and not error_shown
+            not error_shown if code else not understood
         ):
             error_file.seek(max(0, error_file.seek(0, os.SEEK_END) - ERROR_TAIL_BYTES))
             error_lines = error_file.read().decode(errors="replace").strip().splitlines()
@@ -77,21 +79,24 @@ def run_in_worker(
         return code
 
 
-def _log_line(raw: bytes) -> bool:
-    """Log one line of the child; tell whether it was an error."""
+def _parse(raw: bytes) -> dict[str, Any] | None:
     try:
         values = json.loads(raw)
-    except ValueError:
-        return False
-    if not isinstance(values, dict):
-        return False
+    except (ValueError, RecursionError):
+        return None
+    return values if isinstance(values, dict) else None
+
+
+def _log_line(values: dict[str, Any]) -> bool:
+    """Log one line of the child; tell whether it was one of the protocol."""
     if "error" in values:
         _logger.error("error: %s", f"{values['error']} {values.get('hint', '')}".strip())
-        return True
-    if "warning" in values:
+    elif "warning" in values:
         _logger.info("warning: %s", values["warning"])
     elif "line" in values:
         _logger.info("%s", values["line"])
     elif "message" in values:
         _logger.info("[%5.1f %%] %s", 100 * float(values.get("fraction", 0)), values["message"])
-    return False
+    else:
+        return False
+    return True

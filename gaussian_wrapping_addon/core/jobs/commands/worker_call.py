@@ -22,6 +22,7 @@ from ...errors import (
 )
 from ...processes.helper_process import emit
 from ...processes.process_identity import Caller
+from ...processes.worker_requirements import missing_package
 from ...report_warning import ReportWarning
 
 PARENT_POLL_S = 1.0
@@ -48,11 +49,11 @@ def run_command(
         emit(error="Not enough memory.", hint=memory_hint)
         return EXIT_RESOURCES
     except ImportError as error:
-        emit(
-            error=f"The worker's Python lacks a package: {error}.",
-            hint="Press Set Up Worker, or run pip install -r requirements-worker.txt with it.",
-        )
-        return EXIT_OTHER
+        missing = missing_package(error)
+        if missing is None:
+            raise
+        emit(error=missing.message, hint=missing.hint)
+        return missing.exit_code
     except OSError as error:
         if error.errno in DISK_FULL_ERRNOS:
             full = unwritable_error(error.filename or "a file", error)

@@ -74,7 +74,7 @@ def work(folder: JobFolder) -> None:
     command = child_command("jobs.worker", str(folder.root), "0")
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     if ended.returncode:
-        raise DatasetError(ended.stderr)
+        raise DatasetError(ended.stdout)
 
 
 @pytest.mark.parametrize("use", [start, resume, work])
