@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import DatasetError
+from ..pycolmap_import import import_pycolmap
 from ..readers.source_model import LensCamera
 
 _MAX_SLOPE = math.tan(math.radians(65.0))
@@ -75,7 +76,7 @@ def sampling_map(camera: LensCamera, pinhole: LensCamera) -> np.ndarray:
 
 
 def _native(camera: LensCamera) -> Any:
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     return pycolmap.Camera(
         model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)

@@ -14,6 +14,7 @@ import numpy as np
 from ...errors import DatasetError
 from ...files import read_json
 from ...processes.helper_process import emit
+from ..pycolmap_import import import_pycolmap
 
 DEFAULT_FOCAL_FACTORS = (1.2, 0.85, 1.7, 2.5)
 """Focal lengths over the long side to try if EXIF gives none, the most common first."""
@@ -32,7 +33,7 @@ _EXTRACT_END, _MATCH_END = 0.5, 0.85
 
 def main(folder: Path) -> None:
     """Run the task of ``folder``."""
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     pycolmap.logging.minloglevel = 1
     task = read_json(folder / "task.json")
@@ -44,7 +45,7 @@ def main(folder: Path) -> None:
 
 
 def _solve(folder: Path, task: dict[str, Any]) -> None:
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     database = folder / "database.db"
     guessed: list[int] = []
@@ -99,7 +100,7 @@ def _extract(
     threads: int,
     max_features: int,
 ) -> None:
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
@@ -139,7 +140,7 @@ def _extract(
 
 
 def _match(folder: Path, database: Path, task: dict[str, Any]) -> None:
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
@@ -167,7 +168,7 @@ def _match(folder: Path, database: Path, task: dict[str, Any]) -> None:
 
 
 def _mapping_options(seed: int) -> Any:
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     options = pycolmap.IncrementalPipelineOptions()
     for part in (options, options.mapper, options.triangulation):
@@ -180,7 +181,7 @@ def _mapping_options(seed: int) -> Any:
 
 def _map(folder: Path, database: Path, task: dict[str, Any], total: int, *, lenient: bool) -> Any:
     """Return the largest reconstruction, or ``None``."""
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     options = _mapping_options(task["seed"])
     options.min_model_size = 3
@@ -211,7 +212,7 @@ def _map(folder: Path, database: Path, task: dict[str, Any], total: int, *, leni
 
 
 def _triangulate(folder: Path, task: dict[str, Any]) -> None:
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     database = folder / "database.db"
     photos_of_lens: dict[tuple[float, ...], list[str]] = {}
