@@ -7,11 +7,16 @@ commands and their options are in ``command_line/``.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import logging
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .core.log_lines import TerminalHandler
 
 _logger = logging.getLogger("gaussian_wrapping")
 
@@ -21,12 +26,28 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
 
     ``program`` is the name shown in help and usage.
     """
+    from .core.errors import EXIT_DONE, EXIT_RESOURCES
+
+    terminal = _log_to_terminal()
+    try:
+        code = _run(arguments, program)
+    except SystemExit as ended:  # of --help, after its text
+        code = ended.code if isinstance(ended.code, int) else EXIT_DONE
+    lost = None if terminal is None else terminal.lost()
+    if lost is None:
+        return code
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        reason = lost.strerror or str(lost)
+        sys.stderr.write(f"error: The output cannot be written: {reason}.\n")
+    return code or EXIT_RESOURCES
+
+
+def _run(arguments: list[str], program: str) -> int:
     from .command_line.options.option_names import with_option_name
     from .command_line.parser import build_parser
     from .core.errors import DISK_FULL_ERRNOS, EXIT_OTHER, SettingError, WrapError, unwritable_error
     from .core.processes.worker_environment import interpreter_of, ready_worker
 
-    _log_to_terminal()
     try:
         options = build_parser(program).parse_args(arguments)
         return int(options.run(options))
@@ -57,16 +78,19 @@ def console_entry() -> int:
     return main(sys.argv[1:], "gaussian-wrapping")
 
 
-def _log_to_terminal() -> None:
-    from .core.log_lines import LineFormatter
+def _log_to_terminal() -> TerminalHandler | None:
+    """Show what the commands log; return the handler, or None if another one does."""
+    from .core.log_lines import LineFormatter, TerminalHandler
 
     if _logger.handlers:
-        return
-    handler = logging.StreamHandler(sys.stdout)
+        first = _logger.handlers[0]
+        return first if isinstance(first, TerminalHandler) else None
+    handler = TerminalHandler(sys.stdout)
     handler.setFormatter(LineFormatter("%(message)s"))
     _logger.addHandler(handler)
     _logger.setLevel(logging.INFO)
     _logger.propagate = False
+    return handler
 
 
 def _arguments(argv: list[str]) -> list[str]:

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import logging
 from argparse import ArgumentParser
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from .check_commands import add_check, add_doctor
 from .evaluate_command import add_evaluate
@@ -13,6 +14,8 @@ from .job_commands import add_cancel, add_status
 from .meshing_commands import add_estimate_mesh, add_mesh, add_work_tiles
 from .setup_command import add_set_up_worker
 from .training_commands import add_continue_training, add_estimate, add_resume, add_wrap
+
+_logger = logging.getLogger("gaussian_wrapping")
 
 _COMMANDS = (
     add_wrap,
@@ -40,6 +43,16 @@ class Parser(ArgumentParser):
         from ..core.errors import UsageError
 
         raise UsageError(f"{message}.", f"Usage: {' '.join(self.format_usage().split()[1:])}")
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Write help as the commands write: ``argparse`` fails on ASCII and hides full disks."""
+        from ..core.log_lines import TerminalHandler
+
+        for handler in _logger.handlers:
+            if isinstance(handler, TerminalHandler):
+                handler.write(message)
+                return
+        super()._print_message(message, file)
 
 
 def build_parser(program: str = "batch.py") -> Parser:

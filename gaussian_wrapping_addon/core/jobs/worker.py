@@ -144,6 +144,9 @@ class _LogFile(logging.FileHandler):
         stream = open_regular(Path(self.baseFilename), "ab")
         return io.TextIOWrapper(stream, encoding="utf-8", errors="backslashreplace")
 
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - a name of logging
+        """Say nothing: on a full disk the job ends with an error of its own, see ``main``."""
+
 
 def _log_to(path: Path) -> logging.Handler:
     handler = _LogFile(path, encoding="utf-8")
