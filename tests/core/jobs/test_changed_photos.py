@@ -8,9 +8,13 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.dataset.loading import load
+from gaussian_wrapping_addon.core.dataset.scene import Scene
+from gaussian_wrapping_addon.core.dataset.scene_file import save_scene
+from gaussian_wrapping_addon.core.dataset.similarity import Similarity
 from gaussian_wrapping_addon.core.errors import DatasetError
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs import runner
@@ -46,6 +50,8 @@ def folder(tmp_path: Path, job: JobFile) -> JobFolder:
         job.settings.seed,
     )  # fmt: skip
     finish(folder, f"cameras-{key}", 1.0)
+    scene = Scene((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), Similarity())
+    save_scene(scene, folder.stages / f"cameras-{key}")
     finish(folder, f"train-{training_keys(runner.STAGE_VERSIONS['train'], key, job)[0]}", 2.0)
     return folder
 
