@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 MAX_IMAGES = 100_000
+MAX_SOURCE_FILES = 1_000_000
+"""Files of any kind below the folder of the photos."""
 MAX_POINTS = 50_000_000
 MAX_GAUSSIANS = 20_000_000
 MAX_IMAGE_PIXELS = 100_000_000

@@ -154,6 +154,7 @@ class JobClient:
                 f"{folder} holds no job.", "Choose the folder given as --out, or press Find Job."
             )
         target.check_entries()
+        read_job(target.job_path)  # refused here rather than by the worker
         if target.locked():
             raise UsageError(f"A job is running in {folder}.", RUNNING_HINT)
         return cls._launch(target, python, keep_running)

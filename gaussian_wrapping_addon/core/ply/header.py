@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import ParseError
+from ..regular_files import open_regular
 
 MAX_HEADER_BYTES = 64 * 1024
 
@@ -69,7 +70,7 @@ def read_ply_header(path: Path, hint: str) -> PlyHeader:
         The file is no PLY, or a header line is invalid; names the line.
     """
     try:
-        with path.open("rb") as stream:
+        with open_regular(path, follow_links=True) as stream:
             head = stream.read(MAX_HEADER_BYTES)
     except OSError as error:
         raise ParseError(path, "whole file", f"cannot be read: {error.strerror}.", hint) from None

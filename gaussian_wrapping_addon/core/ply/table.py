@@ -9,6 +9,7 @@ import numpy as np
 
 from .. import limits
 from ..errors import ParseError
+from ..regular_files import open_regular
 from .header import LIST, PlyHeader
 
 
@@ -71,7 +72,7 @@ def read_vertices(
     """
     layout = vertex_layout(path, header, hint, most)
     vertex, text = header.elements[0], header.encoding == "ascii"
-    with path.open("rb") as stream:
+    with open_regular(path, follow_links=True) as stream:
         stream.seek(header.begin)
         if not text:
             return np.fromfile(stream, layout, vertex.count)

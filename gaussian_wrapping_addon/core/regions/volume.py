@@ -48,9 +48,11 @@ def flat_region_error(name: str) -> MeshingError:
 
 
 def _is_thick(vertices: np.ndarray) -> bool:
-    diagonal = float(np.linalg.norm(vertices.max(0) - vertices.min(0)))
+    low, high = vertices.min(0), vertices.max(0)
+    diagonal = float(np.linalg.norm(high - low))
     if diagonal <= 0.0:
         return False
-    centred = vertices - vertices.mean(0)  # (n, 3)
-    widths = np.linalg.svd(centred / diagonal, compute_uv=False)  # (3,)
-    return bool(widths[2] / np.sqrt(len(centred)) >= FLAT_SHARE)
+    # Rounded as where the hull is made: far from the origin, rounding alone makes bodies flat.
+    scaled = (vertices - (low + high) / 2) / diagonal  # (n, 3)
+    widths = np.linalg.svd(scaled - scaled.mean(0), compute_uv=False)  # (3,)
+    return bool(widths[2] / np.sqrt(len(scaled)) >= FLAT_SHARE)

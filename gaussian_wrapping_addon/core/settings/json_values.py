@@ -53,7 +53,10 @@ def from_json(kind: type, values: Any, location: str = "settings") -> Any:
         if dataclasses.is_dataclass(wanted):
             arguments[name] = from_json(typing.cast(type, wanted), value, where)
         elif wanted is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-            arguments[name] = float(value)
+            try:
+                arguments[name] = float(value)
+            except OverflowError:
+                raise UsageError(f"{where} is too large.", "Give a smaller number.") from None
         elif wanted in (int, str) and type(value) is wanted:
             arguments[name] = value
         elif typing.get_origin(wanted) is tuple and isinstance(value, (list, tuple)):

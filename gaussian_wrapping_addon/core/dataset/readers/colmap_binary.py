@@ -15,6 +15,7 @@ import numpy as np
 
 from ... import limits
 from ...errors import ParseError
+from ...regular_files import open_regular
 from ...report_warning import ReportWarning
 from .source_model import LENS_NAMES, LENS_PARAMETERS, LensCamera
 
@@ -66,7 +67,8 @@ class _Cursor:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            self.data = path.read_bytes()
+            with open_regular(path, follow_links=True) as stream:
+                self.data = stream.read()
         except OSError as error:
             raise ParseError(
                 path, "whole file", f"cannot be read: {error.strerror}.", _AGAIN

@@ -11,6 +11,7 @@ import numpy as np
 
 from ... import limits
 from ...errors import ParseError
+from ...regular_files import open_regular
 from ...report_warning import ReportWarning
 from .colmap_binary import RawImage, RawPoints, add_camera
 from .source_model import LENS_PARAMETERS, LensCamera
@@ -23,7 +24,7 @@ _NUMERIC = re.compile(r"[+-]?[0-9.]+([eE][+-]?[0-9]+)?")
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield (line number, text without its end); comments are left out, empty lines are not."""
     try:
-        stream = path.open("rb")
+        stream = open_regular(path, follow_links=True)
     except OSError as error:
         raise ParseError(path, "whole file", f"cannot be read: {error.strerror}.", _AGAIN) from None
     with stream:

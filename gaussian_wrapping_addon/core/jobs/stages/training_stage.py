@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import stat
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -46,17 +47,19 @@ def start_fingerprint(path: str) -> list[Any]:
     Raises
     ------
     DatasetError
-        The file does not exist.
+        The file does not exist, or is a pipe or a device.
     """
     if not path:
         return []
+    hint = "Put the file back, or start the job without it."
     try:
         state = Path(path).stat()
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise DatasetError(
-            f"The start splat {path} cannot be read: {error.strerror}.",
-            "Put the file back, or start the job without it.",
+            f"The start splat {path} cannot be read: {getattr(error, 'strerror', error)}.", hint
         ) from None
+    if not stat.S_ISREG(state.st_mode):
+        raise DatasetError(f"The start splat {path} is not a regular file.", hint)
     return [path, state.st_size, state.st_mtime_ns]
 
 

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from ...errors import DatasetError, ParseError, SettingError, UsageError
@@ -62,7 +62,7 @@ class JobFile:
         Raises
         ------
         UsageError
-            An entry is missing, unknown, of the wrong type or out of range.
+            An entry is missing, unknown, of the wrong type or out of range; a region is invalid.
         """
         wanted = {"schema_version", "command", "source", "settings", "region_bodies"}
         if not isinstance(values, dict) or set(values) - {"edge_lengths"} != wanted:
@@ -77,6 +77,8 @@ class JobFile:
         if not isinstance(values["region_bodies"], dict):
             raise UsageError("job.json: region_bodies must be an object.", "Start the job again.")
         settings = from_json(JobSettings, values["settings"]).validated()
+        _check_source(values["source"])
+        _check_bodies(settings, values["region_bodies"])
         lengths = _checked_lengths(values.get("edge_lengths", {}), settings.regions)
         return cls(values["command"], values["source"], settings, values["region_bodies"], lengths)
 
@@ -102,6 +104,7 @@ def make_job(
         regions have the same name.
     """
     settings = settings.validated()
+    _check_source(str(real_path(source)))
     own = _checked_lengths(dict(edge_lengths or {}), settings.regions)
     lengths: dict[str, float] = {}
     if not source.exists():
@@ -136,6 +139,41 @@ def make_job(
         start_splat=str(real_path(start)) if start else "",
     )
     return JobFile(command, str(real_path(source)), settings, bodies, lengths)
+
+
+def _check_source(source: str) -> None:
+    """Raise for a source that would be the working directory or a whole disk."""
+    path = PurePath(source)
+    if "\0" in source or path == PurePath(path.anchor):
+        raise UsageError(
+            f"{source!r} cannot be the source of a job.", "Give the folder of the photos."
+        )
+
+
+def _check_bodies(settings: JobSettings, bodies: dict[str, Any]) -> None:
+    """Raise for regions of a job file that no stage could use."""
+    missing = set(settings.regions) - set(AUTOMATIC_REGIONS) - set(bodies)
+    if missing:
+        raise UsageError(f"job.json holds no region {min(missing)!r}.", "Start the job again.")
+    _check_regions(bodies)
+    if settings.training.focus:
+        try:
+            weighted = json.loads(settings.training.focus)
+        except (ValueError, RecursionError):
+            weighted = None
+        if not isinstance(weighted, list) or not weighted:
+            raise UsageError(
+                "job.json: settings.training.focus is no list of regions.", "Start the job again."
+            )
+        _check_regions({f"focus[{number}]": body for number, body in enumerate(weighted)})
+
+
+def _check_regions(bodies: dict[str, Any]) -> None:
+    for name, body in bodies.items():
+        try:
+            parse_region_file(body, Path(name))
+        except ParseError as error:
+            raise UsageError(f"job.json: {error.message}", "Start the job again.") from None
 
 
 def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:

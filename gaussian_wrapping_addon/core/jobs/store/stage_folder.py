@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...errors import ParseError
+from ... import limits
+from ...errors import DatasetError, ParseError
 from ...files import read_json, write_json
 from ...progress import Progress
 from .job_folder import MARKER
@@ -55,13 +56,25 @@ def source_fingerprint(source: Path) -> list[tuple[str, int, int]]:
     """List the files of an input with size and modification time, for :func:`stage_key`.
 
     Photos are not read: size and time detect a change, as in build systems.
+
+    Raises
+    ------
+    DatasetError
+        The folder holds too many files to be a set of photos, such as a whole disk.
     """
     if source.is_file() and source.suffix.lower() == ".ply":
         state = source.stat()
         return [(source.name, state.st_size, state.st_mtime_ns)]
     root = source if source.is_dir() else source.parent
     found = []
+    seen = 0
     for folder, subfolders, names in os.walk(root):
+        seen += len(names)
+        if seen > limits.MAX_SOURCE_FILES:
+            raise DatasetError(
+                f"{root} holds more than {limits.MAX_SOURCE_FILES} files.",
+                "Give the folder of the photos alone.",
+            )
         if MARKER in names:
             subfolders.clear()  # a job folder beside a transforms.json is not input
             continue

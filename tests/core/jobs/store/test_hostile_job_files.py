@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Entries of job.json that no job of ours holds are refused before a worker starts."""
+
+from __future__ import annotations
+
+import copy
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core import limits
+from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
+from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.jobs.client import JobClient
+from gaussian_wrapping_addon.core.jobs.stages.training_stage import start_fingerprint
+from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
+from gaussian_wrapping_addon.core.ply.header import read_ply_header
+from gaussian_wrapping_addon.core.regions.region import parse_region
+from gaussian_wrapping_addon.core.regions.region_file import parse_region_file, region_to_json
+from gaussian_wrapping_addon.core.settings import JobSettings
+
+FLAT = {
+    "class_name": "GaussianWrappingBoundingVolume", "version": 1,
+    "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        ("settings.training.densify_every", 0, "from 1 to 1000000"),
+        ("settings.training.focus", "{", "no list of regions"),
+        ("settings.training.focus", "[" * 5000, "no list of regions"),
+        ("settings.training.focus", "[]", "no list of regions"),
+        ("settings.training.focus", "[1]", "focus.0., top level: is not an object"),
+        pytest.param("settings.meshing.edge_length", 10**400, "too large", id="edge_length"),
+        ("settings.regions", ["/nowhere/x.json"], "holds no region"),
+        ("region_bodies", {"/tmp/x.json": {"a": 1}}, "x.json, class_name"),
+        ("region_bodies", {"/tmp/x.json": FLAT}, "is flat"),
+        ("source", "/", "cannot be the source"),
+        ("source", "", "cannot be the source"),
+        ("source", "a\0b", "cannot be the source"),
+    ],
+)
+def test_a_job_file_from_elsewhere_is_refused(
+    tmp_path: Path, place: str, value: Any, said: str
+) -> None:
+    (tmp_path / "photos").mkdir()
+    folder = JobFolder(tmp_path / "out")
+    folder.create()
+    values = copy.deepcopy(make_job("wrap", tmp_path / "photos", JobSettings()).to_json())
+    *parents, last = place.split(".")
+    entry = values
+    for name in parents:
+        entry = entry[name]
+    entry[last] = value
+    with pytest.raises(UsageError, match=said):
+        JobFile.from_json(values)
+    if value != 10**400:
+        write_json(folder.job_path, values)
+        with pytest.raises(UsageError, match=said):
+            read_job(folder.job_path)
+
+
+def test_a_bad_job_file_is_refused_before_a_worker_starts(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    folder = JobFolder(tmp_path / "out")
+    folder.create()
+    values = make_job("wrap", tmp_path / "photos", JobSettings()).to_json()
+    write_json(folder.job_path, {**values, "source": "/"})
+    with pytest.raises(UsageError, match="cannot be the source"):
+        JobClient.resume(folder.root, python="no Python is started")
+    assert not folder.status_path.exists()
+
+
+def test_a_whole_disk_is_no_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UsageError, match="cannot be the source"):
+        make_job("wrap", Path(tmp_path.anchor), JobSettings())
+    monkeypatch.setattr(limits, "MAX_SOURCE_FILES", 3)
+    for number in range(3):
+        (tmp_path / f"{number}.bak").touch()
+    assert source_fingerprint(tmp_path)
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "4.bak").touch()
+    with pytest.raises(DatasetError, match="more than 3 files"):
+        source_fingerprint(tmp_path)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has neither")
+def test_devices_and_pipes_are_no_splats(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.ply")
+    for path in (Path("/dev/zero"), tmp_path / "pipe.ply"):
+        with pytest.raises(DatasetError, match="not a regular file"):
+            start_fingerprint(str(path))
+        with pytest.raises(ParseError, match="not a regular file"):
+            read_ply_header(path, "")
+    with pytest.raises(DatasetError, match="cannot be read"):
+        start_fingerprint(str(tmp_path / "none.ply"))
+
+
+def test_what_a_region_file_passes_is_a_region(tmp_path: Path) -> None:
+    """Far from the origin a body is flat by rounding alone: said when the file is read."""
+    random = np.random.default_rng(0)
+    refused = 0
+    for _ in range(300):
+        offset = random.normal(size=3) * 10.0 ** random.integers(-3, 11)
+        size = np.abs(offset).max() * 10.0 ** random.uniform(-16.5, -12.0)
+        body = region_to_json("x", offset + size * random.normal(size=(8, 3)))
+        try:
+            parse_region_file(body, tmp_path / "x.json")
+        except ParseError:
+            refused += 1
+        else:
+            assert parse_region(body, tmp_path / "x.json").volume > 0.0
+    assert 5 < refused < 290
