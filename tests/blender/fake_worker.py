@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A worker that obeys the job folder protocol without torch; ``GW_FAKE`` says how it behaves.
 
-Run as ``PYTHON ... jobs.worker FOLDER PARENT`` in place of the worker's Python,
+Run as ``PYTHON ... jobs.worker FOLDER 1`` in place of the worker's Python,
 or as ``... jobs.estimate REQUEST``, which answers ``GW_ANSWER``.
 """
 
@@ -24,6 +24,7 @@ from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     JobStatus,
     process_start_ticks,
 )
+from gaussian_wrapping_addon.core.processes.process_identity import Caller
 from tests.blender.synthetic_result import npy_bytes, write_region_result, write_result
 
 LIVE = {
@@ -48,7 +49,7 @@ def main() -> int:
     if sys.argv[-2] == "jobs.commands.estimate_command":
         return estimate()
     folder = JobFolder(Path(sys.argv[-2]))
-    parent = int(sys.argv[-1])
+    caller = Caller() if sys.argv[-1] != "0" else None
     mode = os.environ.get("GW_FAKE", "quick")
 
     def say(state: str, fraction: float, **more: object) -> None:
@@ -87,8 +88,8 @@ def main() -> int:
         time.sleep(0.02)
         if not folder.root.is_dir():
             return 1  # as the real worker, which cannot write its status
-        # As the real worker: it does not outlive its parent, unless it was told to.
-        if folder.cancel_path.exists() or (parent and os.getppid() != parent):
+        # As the real worker: it does not outlive its caller, unless it was told to.
+        if folder.cancel_path.exists() or (caller and caller.ended()):
             say("CANCELLED", 0.25, hint="Resume continues from the last checkpoint.")
             folder.unlock()
             return 5

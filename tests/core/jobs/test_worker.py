@@ -23,6 +23,7 @@ from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     process_start_ticks,
 )
 from gaussian_wrapping_addon.core.processes.helper_process import child_command
+from gaussian_wrapping_addon.core.processes.process_identity import CALLER_OPTION
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings
 
 BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"
@@ -243,8 +244,10 @@ def test_a_worker_behind_a_launcher_is_not_stopped(tmp_path: Path) -> None:
         "runner.run_job, worker.PARENT_POLL_S = run_job, 0.05\n"
         "sys.exit(worker.main(sys.argv[1:]))\n"
     )
-    caller = str(os.getppid())  # not the worker's parent, which is this process
-    done = subprocess.run([sys.executable, "-c", script, str(target.root), caller], check=False)
+    pid = os.getppid()  # not the worker's parent, which is this process
+    caller = f"{CALLER_OPTION}={pid}:{process_start_ticks(pid)}"
+    command = [sys.executable, "-X", caller, "-c", script, str(target.root), "1"]
+    done = subprocess.run(command, check=False)
     assert (done.returncode, target.read_status().state) == (0, "DONE")
 
 
