@@ -18,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import bpy
 
 import gaussian_wrapping_addon
+from gaussian_wrapping_addon.ops.common import known_jobs
 from gaussian_wrapping_addon.ops.jobs import job_attach, watched_jobs
 from gaussian_wrapping_addon.ops.worker import preferred_worker
 from gaussian_wrapping_addon.ui.training import train_panel
@@ -69,6 +70,8 @@ def reopen(blend: Path) -> None:
 
 def main() -> int:
     deed, blend, photos = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
+    # An installed extension keeps this list in a folder of its own; the wheel has none.
+    known_jobs._list_path = lambda: blend.with_name("known_jobs.json")
     gaussian_wrapping_addon.register()
     try:
         if deed == "reopen":
