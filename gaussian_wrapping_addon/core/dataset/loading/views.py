@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DatasetError
-from ...files import resolve_inside
 from ...imaging.bicubic import sample_bicubic
 from ...kernels.parallel import default_threads
 from ...progress import Progress
@@ -28,7 +27,7 @@ from ..photos.photo_file import (
     write_mask,
     write_photo,
 )
-from ..photos.photo_finder import PhotoIndex, find_mask
+from ..photos.photo_finder import PhotoIndex, find_mask, resolve_photo
 from ..photos.photo_header import PhotoHeader
 from ..poses.pose_solver import check_unreadable_share
 from ..readers.source_kind import SourceKind
@@ -278,7 +277,7 @@ def _find_mask(
     """Return the (h, w) bool mask of a photo, of exactly its size, or ``None``."""
     mask_path = None
     if posed.mask_name is not None:
-        mask_path = resolve_inside(kind.folder, posed.mask_name)
+        mask_path = resolve_photo(kind.folder, posed.mask_name)
         if mask_path is None or not os.path.isfile(mask_path):
             mask_path = None
             with notes.lock:

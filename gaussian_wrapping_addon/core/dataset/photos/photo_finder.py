@@ -74,6 +74,19 @@ def photo_root(source: Path) -> Path:
     return source
 
 
+def resolve_photo(root: Path, name: str) -> Path | None:
+    """Return the path of a photo or mask of a data set, or ``None`` if the name is unsafe.
+
+    As :func:`~...files.resolve_inside`, but the folders of photos and masks themselves may be
+    links: people keep photos on another disk.
+    """
+    path = resolve_inside(root, name)
+    folder, _, rest = name.replace("\\", "/").partition("/")
+    if path is None and rest and folder.lower() in (*PHOTO_FOLDERS, *MASK_FOLDERS):
+        path = resolve_inside(root / folder, rest)
+    return path
+
+
 @dataclass(frozen=True)
 class Match:
     """A found photo, and how: ``"exact"``, ``"case"``, ``"extension"`` or ``"folder"``."""
@@ -108,7 +121,7 @@ class PhotoIndex:
     def find(self, name: str) -> Match | None:
         """Return the photo of ``name``; looser rules apply only if they give one candidate."""
         for root in self.roots:
-            path = resolve_inside(root, name)
+            path = resolve_photo(root, name)
             if path is not None and os.path.isfile(path):
                 return Match(path, "exact")
         clean = str(PurePosixPath(name.replace("\\", "/")))
@@ -146,7 +159,7 @@ def find_mask(mask_roots: list[Path], name: str) -> Path | None:
     """Return the mask of photo ``name``: ``x.jpg.png``, ``x.png`` or the same name."""
     for root in mask_roots:
         for candidate in mask_candidates(name):
-            path = resolve_inside(root, candidate)
+            path = resolve_photo(root, candidate)
             if path is not None and os.path.isfile(path):
                 return path
     return None

@@ -11,8 +11,8 @@ import numpy as np
 
 from ... import limits
 from ...errors import DatasetError, ParseError
-from ...files import resolve_inside
 from ...report_warning import LEFT_OUT_HINT, ReportWarning
+from ..photos.photo_finder import resolve_photo
 from ..quaternion import rotation_from_quaternion
 from . import colmap_binary, colmap_text
 from .colmap_binary import RawImage, RawPoints
@@ -231,7 +231,7 @@ def is_safe_name(root: Path, name: str) -> bool:
         return (
             name.strip() not in ("", ".")
             and len(name.encode(errors="surrogateescape")) <= limits.MAX_NAME_BYTES
-            and resolve_inside(root, name) is not None
+            and resolve_photo(root, name) is not None
         )
     except (OSError, ValueError):
         return False
