@@ -32,6 +32,9 @@ SURROUNDINGS_RATIO = 3.0
 """If the radius of :data:`WHOLE_SHARE` is more than this many times that of :data:`MIDDLE_SHARE`,
 the splat has surroundings, and this ratio limits the radius that the cameras cover."""
 
+MAX_RADIUS = 1e15
+"""Of half of the Gaussians: beyond it, float32 holds no scene."""
+
 NO_PHOTOS_WARNING = (
     "A splat without photos is wrapped from virtual views around its middle: surroundings and "
     "rooms seen from inside are not covered, and errors of the splat remain."
@@ -63,7 +66,7 @@ def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
     Raises
     ------
     DatasetError
-        All Gaussians are transparent or coincide.
+        All Gaussians are transparent or coincide, or they are scattered without bounds.
     """
     opaque = opacities >= MIN_OPACITY
     if not opaque.any():
@@ -73,17 +76,20 @@ def splat_extent(means: np.ndarray, opacities: np.ndarray) -> SplatExtent:
         )
     points = np.asarray(means, np.float64)[opaque]
     weights = np.asarray(opacities, np.float64)[opaque]
-    first = points[0]  # subtract first: coordinates may be huge
-    local = points - first
-    center = np.array([_quantile(local[:, k], weights, 0.5) for k in range(3)])
-    distance = np.linalg.norm(local - center, axis=1)
+    center = np.array([_quantile(points[:, k], weights, 0.5) for k in range(3)])
+    with np.errstate(over="ignore"):  # some may lie as far away as numbers go
+        distance = np.linalg.norm(points - center, axis=1)
     middle = _quantile(distance, weights, MIDDLE_SHARE)
     whole = _quantile(distance, weights, WHOLE_SHARE)
     if not whole > 0.0:
         raise DatasetError("All Gaussians of the splat coincide.", "Export it again.")
+    if not middle < MAX_RADIUS:
+        raise DatasetError(
+            "The Gaussians of the splat are scattered too far for one scene.", "Export it again."
+        )
     has_surroundings = middle > 0.0 and whole > SURROUNDINGS_RATIO * middle
     radius = SURROUNDINGS_RATIO * middle if has_surroundings else whole
-    return SplatExtent(center + first, float(radius), bool(has_surroundings))
+    return SplatExtent(center, float(radius), bool(has_surroundings))
 
 
 def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:

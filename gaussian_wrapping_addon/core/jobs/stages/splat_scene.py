@@ -60,7 +60,7 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
     from ...render.render import render
     from ...render.types.options import RenderOptions
     from ...training.initialisation.splat_start import baked, fit_filter
-    from ...training.initialisation.splat_transform import transform_gaussians
+    from ...training.initialisation.splat_transform import transform_gaussians, within_reach
 
     progress.update(0.0, "reading the splat")
     splat = read_foreign_splat(source)
@@ -70,7 +70,8 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
     file_cameras = cameras_on_spheres(extent)
     scene_from_world = scene_frame(file_cameras)
     cameras = [camera.moved(scene_from_world) for camera in file_cameras]
-    gaussians = fit_filter(transform_gaussians(world, scene_from_world), cameras, threads=threads)
+    moved, _ = within_reach(transform_gaussians(world, scene_from_world))  # training warns of it
+    gaussians = fit_filter(moved, cameras, threads=threads)
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     options = RenderOptions(depth=False, threads=threads)
@@ -82,7 +83,8 @@ def make_splat_scene(source: Path, folder: Path, progress: Progress, *, threads:
         path = images / camera.name
         write_bytes(path, _png(color))
         views.append(View(camera, path))
-    near = np.linalg.norm(means - extent.center, axis=1) <= extent.radius
+    with np.errstate(over="ignore"):
+        near = np.linalg.norm(means - extent.center, axis=1) <= extent.radius
     chosen = np.nonzero((opacities >= MIN_START_OPACITY) & near)[0]
     chosen = chosen[:: max(1, -(-len(chosen) // MAX_START_POINTS))]
     colors = np.clip(0.5 + SH_C0 * world.sh[chosen, 0].numpy(), 0.0, 1.0)  # (m, 3)

@@ -26,7 +26,7 @@ from ...render.types.options import RenderOptions
 from ...report_warning import ReportWarning
 from ...settings import TrainingSettings
 from ..density.orientation import orient
-from .splat_transform import transform_gaussians, with_degree
+from .splat_transform import transform_gaussians, with_degree, within_reach
 
 ITERATIONS_SHARE = 0.3
 """Share of the preset's iterations: positions and colours exist, shapes and orientations do not."""
@@ -123,10 +123,10 @@ def start_from_splat(
     progress.check()
     # Rotations do not mix degrees: truncate before rotating.
     wanted = with_degree(baked(splat.gaussians), settings.sh_degree)
-    moved = transform_gaussians(wanted, scene.world_from_scene.inverse())
+    moved, far = within_reach(transform_gaussians(wanted, scene.world_from_scene.inverse()))
     cameras = [photos.camera(i, 1) for i in view_indices]
     gaussians = fit_filter(moved, cameras, variance_px=settings.filter_variance, threads=threads)
-    warnings, facts = list(splat.warnings), dict(splat.facts)
+    warnings, facts = [*splat.warnings, *far], dict(splat.facts)
     if len(gaussians) > settings.max_gaussians:
         text = (
             f"The splat has {len(gaussians)} Gaussians; the {settings.max_gaussians} with the "

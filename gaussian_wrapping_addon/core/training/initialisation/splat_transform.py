@@ -12,9 +12,13 @@ from torch import Tensor
 
 from ...dataset.loading.splat_cameras import fibonacci_directions
 from ...dataset.quaternion import quaternion_from_rotation
+from ...dataset.scene import usable_points
 from ...dataset.similarity import Similarity
+from ...errors import DatasetError
 from ...gaussians.model import OrientedGaussians
 from ...render.reference.reference_projection import harmonics_basis
+from ...report_warning import LEFT_OUT_HINT, ReportWarning
+from ...tolerances import POINT_REACH, SCENE_RADIUS
 
 _DIRECTIONS = 64
 """Directions for the fit of rotated harmonics; 16 would do, more are better conditioned."""
@@ -52,6 +56,32 @@ def transform_gaussians(
         orientation=torch.cat([direction, wide["orientation"][:, 3:]], dim=1),
         filter_3d=wide["filter_3d"] * similarity.scale,
     )
+
+
+def within_reach(
+    gaussians: OrientedGaussians,
+) -> tuple[OrientedGaussians, list[ReportWarning]]:
+    """Leave out Gaussians of the scene frame that are too far away to be trained.
+
+    Raises
+    ------
+    DatasetError
+        None is left.
+    """
+    near = usable_points(gaussians.means.detach().numpy())
+    if near.all():
+        return gaussians, []
+    if not near.any():
+        raise DatasetError(
+            "All Gaussians of the splat are far away from the cameras.",
+            "Give the camera poses that the splat was trained with, or wrap the splat alone.",
+        )
+    text = (
+        f"{int((~near).sum())} of {len(near)} Gaussians of the splat were left out: they are "
+        f"farther away than {POINT_REACH / SCENE_RADIUS:.0f} scene radii."
+    )
+    kept = torch.from_numpy(np.flatnonzero(near))
+    return gaussians.select(kept), [ReportWarning("gaussians-far-away", text, LEFT_OUT_HINT)]
 
 
 def _rotated(quats: Tensor, turn: np.ndarray) -> Tensor:

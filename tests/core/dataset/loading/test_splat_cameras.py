@@ -66,6 +66,23 @@ def test_surroundings_do_not_push_the_cameras_out() -> None:
     assert extent.radius < 5.0
 
 
+@pytest.mark.parametrize("where", [1e30, -3e38, 1e300])
+@pytest.mark.parametrize("row", [0, 250, 499])
+def test_one_gaussian_as_far_away_as_numbers_go_changes_nothing(row: int, where: float) -> None:
+    points = fibonacci_directions(500) + np.array([1000.0, 20.0, 0.0])
+    opacities = np.full(500, 0.9)
+    alone = splat_extent(np.delete(points, row, 0), opacities[1:])
+    points[row] = where
+    extent = splat_extent(points, opacities)
+    assert extent.center == pytest.approx(alone.center, abs=0.02)
+    assert extent.radius == pytest.approx(alone.radius, rel=0.01)
+
+
+def test_gaussians_scattered_without_bounds_are_refused() -> None:
+    with pytest.raises(DatasetError, match="scattered too far"):
+        splat_extent(1e200 * fibonacci_directions(50), np.ones(50))
+
+
 def test_transparent_and_collapsed_splats_are_refused() -> None:
     with pytest.raises(DatasetError, match="transparent"):
         splat_extent(fibonacci_directions(50), np.zeros(50))

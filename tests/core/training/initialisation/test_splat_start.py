@@ -197,3 +197,28 @@ def test_a_splat_in_another_frame_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="does not match") as caught:
         start_from_splat(path, scene, photos, range(9), SETTINGS, Progress(), threads=1)
     assert "camera poses" in caught.value.hint
+
+
+@pytest.mark.parametrize("where", [1e30, 1e300])
+def test_gaussians_out_of_reach_are_left_out(tmp_path: Path, where: float) -> None:
+    shell, _ = shell_of_discs(400)
+    scene, photos = _scene(shell)
+    columns = splat_columns(transform_gaussians(shell, WORLD_FROM_SCENE))
+    columns["x"] = columns["x"].astype(np.float64)
+    columns["x"][0] = where
+    path = write_ply(tmp_path / "a.ply", columns, kinds=dict.fromkeys(columns, "f8"))
+    start = start_from_splat(path, scene, photos, range(9), SETTINGS, Progress(), threads=1)
+    assert len(start.gaussians) == 399
+    assert all(bool(tensor.isfinite().all()) for _, tensor in start.gaussians.tensors())
+    (warning,) = [w for w in start.warnings if w.code == "gaussians-far-away"]
+    assert warning.text.startswith("1 of 400 Gaussians of the splat were left out")
+
+
+def test_a_splat_that_is_far_away_altogether_is_refused(tmp_path: Path) -> None:
+    shell, _ = shell_of_discs(50)
+    scene, photos = _scene(shell)
+    columns = splat_columns(transform_gaussians(shell, WORLD_FROM_SCENE))
+    columns["x"] = columns["x"] + 1e20
+    path = write_ply(tmp_path / "a.ply", columns)
+    with pytest.raises(DatasetError, match="far away from the cameras"):
+        start_from_splat(path, scene, photos, range(9), SETTINGS, Progress(), threads=1)
