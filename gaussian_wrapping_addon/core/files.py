@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
+import re
+import time
 import uuid
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,6 +18,9 @@ from .errors import ParseError
 from .names import is_reserved_name
 from .regular_files import open_regular, read_bounded
 
+_PARTIAL = ".writing."
+"""In the names of files that are being written: the target's name, this, and eight hex digits."""
+
 
 def write_json(path: Path, values: Any) -> None:
     """Write JSON atomically: a reader sees the old file or the new one."""
@@ -23,7 +29,7 @@ def write_json(path: Path, values: Any) -> None:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write bytes atomically: to a temporary file beside the target, which then replaces it."""
-    partial = path.with_name(f"{path.name}.writing.{uuid.uuid4().hex[:8]}")
+    partial = path.with_name(f"{path.name}{_PARTIAL}{uuid.uuid4().hex[:8]}")
     try:
         with partial.open("xb") as stream:
             stream.write(data)
@@ -36,6 +42,22 @@ def write_bytes(path: Path, data: bytes) -> None:
         raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def remove_partial_files(root: Path) -> None:
+    """Remove what :func:`write_bytes` of killed processes left anywhere in a folder.
+
+    Files written to within :data:`limits.PARTIAL_FILE_S` stay: another process, perhaps on another
+    machine, may be at work on them. What cannot be removed stays as well.
+    """
+    written_before_s = time.time() - limits.PARTIAL_FILE_S
+    for folder, _, names in os.walk(root):
+        for name in names:
+            if re.search(rf"{re.escape(_PARTIAL)}[0-9a-f]{{8}}$", name):
+                with contextlib.suppress(OSError):
+                    path = Path(folder, name)
+                    if os.lstat(path).st_mtime < written_before_s:
+                        path.unlink()
 
 
 def overwrite_json(path: Path, values: Any) -> None:

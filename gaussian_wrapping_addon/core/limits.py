@@ -30,6 +30,8 @@ RENDER_BUDGET_BYTES = 512 * 1024 * 1024
 Gaussians train at 1600 x 1200 pixels within 4 GB."""
 
 HELPER_DEADLINE_S = 3600.0
+PARTIAL_FILE_S = 60.0
+"""Time after the last write to a temporary file until it counts as left by a killed process."""
 CANCEL_ALONE_S = 7.0
 """Time after which a cancelled worker exits if its main thread does not poll for cancellation."""
 CANCEL_GRACE_S = 9.0

@@ -10,7 +10,13 @@ import pytest
 
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.errors import ParseError
-from gaussian_wrapping_addon.core.files import finite_json, read_json, resolve_inside, write_json
+from gaussian_wrapping_addon.core.files import (
+    finite_json,
+    read_json,
+    remove_partial_files,
+    resolve_inside,
+    write_json,
+)
 
 
 def test_what_is_not_finite_becomes_null(tmp_path: Path) -> None:
@@ -61,6 +67,34 @@ def test_a_failed_write_keeps_the_old_file_and_leaves_nothing(tmp_path: Path) ->
         write_json(path, {"x": float("nan")})
     assert read_json(path) == {"x": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def killed_while_writing(path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Write as a process that is killed before it replaces the file; return what it leaves."""
+    with monkeypatch.context() as killed:
+        for call in (os.replace, Path.unlink):
+            owner = os if call is os.replace else Path
+            killed.setattr(owner, call.__name__, lambda *_, **__: None)
+        write_json(path, {"x": 1})
+    (left,) = path.parent.glob(f"{path.name}.writing.*")
+    return left
+
+
+def test_what_killed_processes_left_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "job" / "stages").mkdir(parents=True)
+    old = killed_while_writing(tmp_path / "job" / "stages" / "done.json", monkeypatch)
+    fresh = killed_while_writing(tmp_path / "job" / "status.json", monkeypatch)
+    outside = killed_while_writing(tmp_path / "other.json", monkeypatch)
+    mine = tmp_path / "job" / "a.writing.me"
+    mine.touch()
+    for path in (old, outside, mine):
+        os.utime(path, (1.0, 1.0))
+    if os.name != "nt":
+        (tmp_path / "job" / "link").symlink_to(tmp_path)
+    remove_partial_files(tmp_path / "job")
+    assert [path.exists() for path in (old, fresh, outside, mine)] == [False, True, True, True]
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from ..errors import (
     WrapError,
     unwritable_error,
 )
+from ..files import remove_partial_files
 from ..log_lines import LineFormatter
 from ..processes.helper_process import emit, kill_helpers
 from ..processes.process_identity import Caller, process_start_ticks
@@ -200,6 +201,7 @@ def main(arguments: list[str]) -> int:
         emit(error=refused.message, hint=refused.hint)
         return refused.exit_code
     try:
+        remove_partial_files(folder.root)
         reporter.write()
         threading.Thread(target=reporter.keep_heartbeat, args=(caller,), daemon=True).start()
         from .runner import run_job
@@ -253,5 +255,6 @@ def main(arguments: list[str]) -> int:
         last = {k: v for k, v in asdict(earlier).items() if k != "heartbeat_s"}
         last["put_back"] = True
     reporter.write(**{**last, "error": error, "hint": hint, "exit_code": code})
+    remove_partial_files(folder.root)
     folder.unlock()
     return code

@@ -55,6 +55,20 @@ def test_a_killed_worker_is_lost_and_says_the_signal(tmp_path: Path) -> None:
     assert "--max-gaussians 48000" in status.hint  # 0.6 of the default's 80 000
 
 
+def test_a_worker_removes_what_killed_ones_left(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    source.mkdir()
+    folder = JobFolder(tmp_path / "out")
+    folder.create()
+    left = folder.stages / "train-a" / "gaussians.npz.writing.0123abcd"
+    left.parent.mkdir()
+    left.touch()
+    os.utime(left, (1.0, 1.0))
+    JobClient.start(folder.root, make_job("wrap", source, JobSettings())).wait(60)
+    assert not left.exists()
+    assert not list(folder.root.rglob("*.writing.*"))
+
+
 @pytest.mark.parametrize(
     ("command", "stage", "result", "meshing", "wanted", "unwanted"),
     [
