@@ -45,7 +45,7 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
 def _run(arguments: list[str], program: str) -> int:
     from .command_line.options.option_names import with_option_name
     from .command_line.parser import build_parser
-    from .core.errors import DISK_FULL_ERRNOS, EXIT_OTHER, SettingError, WrapError, unwritable_error
+    from .core.errors import EXIT_OTHER, SettingError, WrapError, known_error
     from .core.processes.worker_environment import interpreter_of, ready_worker
 
     try:
@@ -65,10 +65,10 @@ def _run(arguments: list[str], program: str) -> int:
         _logger.error("error: This Python lacks %s. Use another Python: %s", error.name, worker)
         return EXIT_OTHER
     except OSError as error:
-        if error.errno in DISK_FULL_ERRNOS:
-            full = unwritable_error(error.filename or "A file", error)
-            _logger.error("error: %s", full)
-            return full.exit_code
+        known = known_error(error)
+        if known is not None:
+            _logger.error("error: %s", known)
+            return known.exit_code
         _logger.error("error: %s", error)
         return EXIT_OTHER
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,13 +11,21 @@ import pytest
 
 from gaussian_wrapping_addon import batch
 from gaussian_wrapping_addon.core.dataset.loading import check
-from gaussian_wrapping_addon.core.errors import EXIT_BAD_DATA, EXIT_RESOURCES, EXIT_USAGE
+from gaussian_wrapping_addon.core.errors import (
+    EXIT_BAD_DATA,
+    EXIT_RESOURCES,
+    EXIT_USAGE,
+    ResourceError,
+    UsageError,
+)
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, write_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER
+from gaussian_wrapping_addon.core.jobs.store.job_folder import MARKER, JobFolder
 from gaussian_wrapping_addon.core.settings import JobSettings
 
+LONG = "x" * 300
+"""Longer than a name may be on any system."""
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 
 
@@ -64,6 +73,37 @@ def code_of(words: str) -> int:
 def test_a_folder_that_is_no_job(place: Path, words: str) -> None:
     assert code_of(words) == EXIT_USAGE
     assert list((place / "empty").iterdir()) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows says that such a path does not exist")
+@pytest.mark.parametrize(
+    "words",
+    [
+        f"status {LONG}",
+        f"cancel {LONG}",
+        f"resume {LONG}",
+        f"export {LONG} --out new",
+        f"estimate-mesh --out {LONG}",
+        f"work-tiles {LONG}",
+        f"estimate {LONG}",
+        f"wrap photos --out new --no-blend --region {LONG}.json",
+        f"wrap photos --out new --no-blend --start-splat {LONG}.ply",
+        f"wrap {LONG} --out new --no-blend",
+    ],
+)
+def test_a_path_that_no_system_stores(
+    place: Path, words: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert code_of(words) == EXIT_USAGE
+    (said,) = caplog.messages
+    assert "xxx" in said
+    assert len(said) < 400 or "does not exist" in said
+    assert not (place / "new").exists()
+
+
+def test_a_job_folder_that_no_system_stores(place: Path) -> None:
+    with pytest.raises((UsageError, ResourceError), match=r"xxx\.\.\. is longer|cannot be written"):
+        JobFolder(place / LONG).create()
 
 
 @pytest.mark.parametrize(

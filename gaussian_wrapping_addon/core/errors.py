@@ -16,6 +16,9 @@ EXIT_CANCELLED = 5
 DISK_FULL_ERRNOS = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
 """Error numbers of a full disk or an exhausted quota."""
 
+SHOWN_PATH = 80
+"""Characters of an over-long path that a message shows."""
+
 
 class WrapError(Exception):
     """Base of all errors that are shown to users.
@@ -120,6 +123,22 @@ def unwritable_error(path: str | Path, error: OSError) -> ResourceError:
         f"{path} cannot be written: {error.strerror or error}.",
         "Check that the folder exists, is not read-only, and that the disk has room.",
     )
+
+
+def known_error(error: OSError, path: str | Path = "") -> WrapError | None:
+    """Return what users are told where the system refuses a path or is full; ``None`` otherwise.
+
+    ``path`` is used where the error names none.
+    """
+    named = str(error.filename or path)
+    if error.errno in DISK_FULL_ERRNOS:
+        return unwritable_error(named or "A file", error)
+    if error.errno == errno.ENAMETOOLONG:
+        return UsageError(
+            f"The path {named[:SHOWN_PATH]}... is longer than this system stores.",
+            "Use shorter names.",
+        )
+    return None
 
 
 class DeviceError(WrapError):

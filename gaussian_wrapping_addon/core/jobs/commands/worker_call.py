@@ -12,13 +12,12 @@ import time
 from collections.abc import Callable, Iterable
 
 from ...errors import (
-    DISK_FULL_ERRNOS,
     EXIT_CANCELLED,
     EXIT_DONE,
     EXIT_OTHER,
     EXIT_RESOURCES,
     WrapError,
-    unwritable_error,
+    known_error,
 )
 from ...processes.helper_process import emit
 from ...processes.process_identity import Caller
@@ -55,10 +54,10 @@ def run_command(
         emit(error=missing.message, hint=missing.hint)
         return missing.exit_code
     except OSError as error:
-        if error.errno in DISK_FULL_ERRNOS:
-            full = unwritable_error(error.filename or "a file", error)
-            emit(error=full.message, hint=full.hint)
-            return full.exit_code
+        known = known_error(error)
+        if known is not None:
+            emit(error=known.message, hint=known.hint)
+            return known.exit_code
         emit(error=f"{error}.", hint="Check the path and its permissions.")
         return EXIT_OTHER
     return EXIT_DONE

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ... import limits
-from ...errors import DISK_FULL_ERRNOS, ParseError, UsageError, unwritable_error
+from ...errors import DISK_FULL_ERRNOS, ParseError, UsageError, known_error, unwritable_error
 from ...files import overwrite_json, read_json, write_json
 from ...processes.process_identity import process_alive, process_start_ticks
 from ...regular_files import read_bounded, reject_foreign_entries, touch_regular
@@ -152,15 +152,15 @@ class JobFolder:
         Raises
         ------
         UsageError
-            The path is a file, or a folder with other content.
+            The path is a file, a folder with other content, or too long.
         DatasetError
             It holds links or other entries that no job makes, see :meth:`check_entries`.
         ResourceError
             It cannot be written.
         """
-        if self.root.exists() and not self.root.is_dir():
-            raise UsageError(f"{self.root} is a file.", "Choose a folder for the results.")
         try:
+            if self.root.exists() and not self.root.is_dir():
+                raise UsageError(f"{self.root} is a file.", "Choose a folder for the results.")
             self.root.mkdir(parents=True, exist_ok=True)
             if not os.path.lexists(self.root / MARKER) and any(self.root.iterdir()):
                 raise UsageError(
@@ -169,7 +169,7 @@ class JobFolder:
             touch_regular(self.root / MARKER)
             self.stages.mkdir(exist_ok=True)
         except OSError as error:
-            raise unwritable_error(self.root, error) from None
+            raise known_error(error, self.root) or unwritable_error(self.root, error) from None
         self.check_entries()
 
     def check_entries(self) -> None:
