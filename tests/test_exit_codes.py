@@ -92,10 +92,12 @@ def test_a_folder_that_is_no_job(place: Path, words: str) -> None:
     ],
 )
 def test_a_path_that_no_system_stores(
-    place: Path, words: str, caplog: pytest.LogCaptureFixture
+    place: Path, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(batch._logger, "error", lambda text, *values: told.append(text % values))
     assert code_of(words) == EXIT_USAGE
-    (said,) = caplog.messages
+    (said,) = told
     assert "xxx" in said
     assert len(said) < 400 or "does not exist" in said
     assert not (place / "new").exists()

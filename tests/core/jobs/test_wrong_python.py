@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import stat
 import sys
@@ -84,11 +83,14 @@ def test_a_missing_module_of_our_own_is_no_missing_package(tmp_path: Path) -> No
 @posix
 @pytest.mark.parametrize("missing", ["numpy", "numba"])
 def test_a_command_names_the_package_that_is_missing(
-    tmp_path: Path, missing: str, caplog: pytest.LogCaptureFixture
+    tmp_path: Path,
+    missing: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    caplog.set_level(logging.INFO, "gaussian_wrapping")
+    told: list[str] = []
+    monkeypatch.setattr(calls._logger, "error", lambda text, *values: told.append(text % values))
     assert estimate(tmp_path, without(tmp_path, missing)) == EXIT_OTHER
-    (said,) = caplog.messages
+    (said,) = told
     assert "lacks a package" in said
     assert missing in said
 
