@@ -22,7 +22,7 @@ from ..stereo.depth_priors import DepthPrior
 from .appearance.background import background_gradient, composited, draw_background
 from .appearance.photo_exposure import exposure_rate
 from .losses.depth_prior_loss import depth_prior_loss
-from .losses.footprint_regulariser import add_footprint_regulariser
+from .losses.footprint_regulariser import add_footprint_regulariser, footprint_shares
 from .losses.losses import color_loss, normal_losses
 from .losses.multi_view import (
     MultiViewOptions,
@@ -154,17 +154,17 @@ class Stepper:
             raise NotFinite()
         seen = image.backward(gradients)
         # Before merging the other view's gradients: culled Gaussians have no boxes in this view.
-        if self.schedule.compact and self.settings.overlap_price > 0.0:
-            size_px = (sample.camera.width, sample.camera.height)
-            add_footprint_regulariser(
-                seen, adam.array("log_scales"), image.screen.boxes, size_px,
-                self.settings.overlap_price,
-            )  # fmt: skip
+        price = self.settings.overlap_price if self.schedule.compact else 0.0
         opacity_weight = schedule.opacity_weight(iteration)
-        if opacity_weight > 0.0 and state.model_selection.chose("dense_start"):
+        if not state.model_selection.chose("dense_start"):
+            opacity_weight = 0.0
+        if price > 0.0 or opacity_weight > 0.0:
             size_px = (sample.camera.width, sample.camera.height)
-            logits = adam.array("opacity_logits")
-            add_opacity_prior(seen, logits, image.screen.boxes, size_px, opacity_weight)
+            shares = footprint_shares(image.screen.boxes[seen.ids], size_px)
+            if price > 0.0:
+                add_footprint_regulariser(seen, adam.array("log_scales"), shares, price)
+            if opacity_weight > 0.0:
+                add_opacity_prior(seen, adam.array("opacity_logits"), shares, opacity_weight)
         if other is not None:
             seen = merge_gradients(seen, other, len(adam), threads=self.threads, store=self.store)
         if gathers:
