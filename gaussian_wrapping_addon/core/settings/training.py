@@ -215,6 +215,25 @@ class TrainingSettings(MethodSettings):
         ),
         since="0.2.0",
     )
+    refine_poses: str = setting(
+        "auto",
+        help="Camera poses are refined while training. auto: after a dense start, and kept if the "
+        "photos move them by half a pixel or so; off: poses stay as given.",
+        presets={"paper": "off"},
+        check=Choices(SELECTION_MODES),
+        model_selection=True,
+        option=Option("--refine-poses", help="camera poses refined while training"),
+        panel=PanelProperty(
+            "Refine Cameras",
+            "Move each photo's camera by fractions of a pixel to where its photo fits best",
+            items=_selection(
+                "Where photos show that the given cameras are inexact",
+                "Always refine; the frame of all cameras together stays",
+                "Take the cameras as they are given",
+            ),
+        ),
+        since="0.2.0",
+    )
     region_weight: float = setting(
         1.0,
         help="Gaussians inside the job's regions count this many times where their number is "

@@ -31,6 +31,8 @@ from .losses.multi_view import (
     multi_view_losses,
 )
 from .losses.opacity_prior import add_opacity_prior
+from .poses.camera_poses import pose_rate_px
+from .poses.pose_gradient import pose_gradient
 from .schedule import Schedule
 from .state import TrainingState
 from .windows import Window, windows
@@ -165,6 +167,8 @@ class Stepper:
                 add_footprint_regulariser(seen, adam.array("log_scales"), shares, price)
             if opacity_weight > 0.0:
                 add_opacity_prior(seen, adam.array("opacity_logits"), shares, opacity_weight)
+        if state.poses is not None and schedule.refines_poses(iteration):
+            self._step_pose(state, sample, seen)
         if other is not None:
             seen = merge_gradients(seen, other, len(adam), threads=self.threads, store=self.store)
         if gathers:
@@ -190,6 +194,20 @@ class Stepper:
         share = AVERAGE_SHARE if state.error_average > 0.0 else 1.0
         state.error_average += share * (mean_squared - state.error_average)
         state.loss_average += share * (value - state.loss_average)
+
+    def _step_pose(
+        self, state: TrainingState, sample: _Sample, gradients: VisibleGradients
+    ) -> None:
+        """Move the photo's camera; at the end of an epoch take out what all cameras share."""
+        adam, poses = state.adam, state.poses
+        assert poses is not None
+        pose = np.asarray(sample.camera.cam_from_world, np.float64)
+        by_pose = pose_gradient(pose, gradients, adam.array("means"), adam.array("quats"))
+        rate_px = pose_rate_px(state.iteration, self.settings.iterations, len(self.views))
+        whole = self.photos.camera(sample.view, 1)
+        poses.step(sample.view, whole, by_pose, state.rate_factor * rate_px)
+        if not state.order:
+            poses.anchor()
 
     def _draw_sample(self, state: TrainingState) -> _Sample:
         view = state.next_view(self.views)

@@ -109,6 +109,7 @@ def _train(
     stage_folder: Path, job: JobFile, cameras: Stage, progress: Progress, threads: int
 ) -> dict[str, Any]:
     from ...dataset.photos.photo_store import PhotoStore
+    from ...dataset.refined_scene import load_refined_scene, save_poses
     from ...dataset.scene_file import load_saved_scene
     from ...dataset.view_split import held_out_views
     from ...evaluation.report.pictures import write_held_out
@@ -134,6 +135,9 @@ def _train(
     )
     result = trained.result
     save_gaussians(stage_folder / "gaussians.npz", result.gaussians)
+    if result.poses is not None:
+        save_poses(stage_folder, result.poses)
+        scene = load_refined_scene(cameras.folder, stage_folder)
     measured = {figure.name: figure.psnr for figure in result.held_out}
     shown = [
         (index, scene.views[index].camera.name, measured[scene.views[index].camera.name])
