@@ -99,27 +99,23 @@ class CameraPoses:
         self.refined[view] = pose
 
     def anchor(self) -> None:
-        """Take out the motion and the scale that the refined poses have in common.
+        """Take out what the refined poses have in common, to first order.
 
-        To first order: the mean rotation, and the similarity without rotation that brings the
-        centres closest to those of the given poses.
+        In world coordinates: the mean rotation, and the similarity without rotation that brings
+        the centres closest to those of the given poses. In camera coordinates: the mean motion.
+        Photos hardly tell that one either: if all cameras around a thing look up a little, the
+        thing can move up instead.
         """
         if not self.active:
             return
-        given, refined = self.given[self.trained], self.refined[self.trained]
-        turns = np.einsum("nij,nik->njk", refined[:, :, :3], given[:, :, :3])
-        common = Rotation.from_rotvec(Rotation.from_matrix(turns).as_rotvec().mean(0)).as_matrix()
-        rotations = refined[:, :, :3] @ common
-        centers, wanted = (
-            -np.einsum("nji,nj->ni", r, t)
-            for r, t in ((rotations, refined[:, :, 3]), (given[:, :, :3], given[:, :, 3]))
-        )
-        middle, about = wanted.mean(0), centers - centers.mean(0)
-        spread = float((about**2).sum())
-        scale = float((about * (wanted - middle)).sum()) / spread if spread > 0.0 else 1.0
-        centers = middle + scale * about
-        moved = np.einsum("nij,nj->ni", rotations, -centers)
-        self.refined[self.trained] = np.concatenate([rotations, moved[:, :, None]], 2)
+        given = self.given[self.trained]
+        refined = _without_common_motion(given, self.refined[self.trained])
+        turns = np.einsum("nij,nkj->nik", refined[:, :, :3], given[:, :, :3])
+        alike = Rotation.from_rotvec(-Rotation.from_matrix(turns).as_rotvec().mean(0)).as_matrix()
+        shifts = refined[:, :, 3] - np.einsum("nij,nj->ni", turns, given[:, :, 3])
+        refined = alike @ refined
+        refined[:, :, 3] -= shifts.mean(0)
+        self.refined[self.trained] = refined
 
     def give_up(self) -> None:
         """Go back to the given poses, and keep them."""
@@ -185,3 +181,19 @@ class CameraPoses:
             own[...] = values
         poses.active = bool(arrays["active"])
         return poses
+
+
+def _without_common_motion(given: np.ndarray, refined: np.ndarray) -> np.ndarray:
+    """Return poses without the rotation, shift and scale of the world that they share."""
+    turns = np.einsum("nij,nik->njk", refined[:, :, :3], given[:, :, :3])
+    common = Rotation.from_rotvec(Rotation.from_matrix(turns).as_rotvec().mean(0)).as_matrix()
+    rotations = refined[:, :, :3] @ common
+    centers, wanted = (
+        -np.einsum("nji,nj->ni", r, t)
+        for r, t in ((rotations, refined[:, :, 3]), (given[:, :, :3], given[:, :, 3]))
+    )
+    middle, about = wanted.mean(0), centers - centers.mean(0)
+    spread = float((about**2).sum())
+    scale = float((about * (wanted - middle)).sum()) / spread if spread > 0.0 else 1.0
+    moved = np.einsum("nij,nj->ni", rotations, -(middle + scale * about))
+    return np.concatenate([rotations, moved[:, :, None]], 2)

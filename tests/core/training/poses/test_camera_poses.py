@@ -79,6 +79,19 @@ def test_what_all_cameras_share_is_taken_out(size: float) -> None:
     assert (found.refined[0] != found.given[0]).any()  # not a training view: left alone
 
 
+@pytest.mark.parametrize("axis", range(6))
+def test_what_all_cameras_do_alike_in_their_own_frames_is_taken_out(axis: int) -> None:
+    found, motion = poses(), 1e-3 * np.eye(6)[axis]
+    turn = Rotation.from_rotvec(motion[:3]).as_matrix()
+    for view in found.trained:
+        found.refined[view] = turn @ found.given[view]
+        found.refined[view, :, 3] += motion[3:]
+    before = shifts(found)[1:]
+    for _ in range(6):  # one after each epoch; what is shared in the world goes first
+        found.anchor()
+    assert shifts(found)[1:].max() < 0.1 * before.max()
+
+
 def test_what_is_each_cameras_own_stays() -> None:
     found, random = poses(), np.random.default_rng(2)
     for view in found.trained:

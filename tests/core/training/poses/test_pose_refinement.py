@@ -55,7 +55,7 @@ def test_cameras_a_pixel_off_come_back(tmp_path: Path) -> None:
     assert np.median(errors_px(given, scene)) > 0.9
     assert found.poses is not None
     assert np.median(errors_px(found.poses, scene)) < 0.5
-    assert found.history[-1]["psnr"] > 33.0  # 25.6 dB with the poses that were given
+    assert found.history[-1]["psnr"] > 31.0  # 25.6 dB with the poses that were given
     assert found.model_selection.chose("refine_poses")
 
 
