@@ -218,7 +218,7 @@ class TrainingSettings(MethodSettings):
     refine_poses: str = setting(
         "auto",
         help="Camera poses are refined while training. auto: after a dense start, and kept if the "
-        "photos move them by half a pixel or so; off: poses stay as given.",
+        "photos move them clearly; off: poses stay as given.",
         presets={"paper": "off"},
         check=Choices(SELECTION_MODES),
         model_selection=True,

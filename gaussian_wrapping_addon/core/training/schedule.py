@@ -54,9 +54,9 @@ POSES_FROM = 0.05
 """Fraction of the iterations from which camera poses are refined: before, colours still change
 more than a pixel's shift would change them."""
 
-POSES_DECIDED_AT = 0.5
-"""Fraction of the iterations at which poses that hardly moved go back to those given: most of the
-motion is done, and the Gaussians can follow."""
+POSES_DECIDED_AT = 0.35
+"""Fraction of the iterations at which poses that hardly moved go back to those given: the larger
+part of the motion is done, and the Gaussians can follow."""
 
 FIRST_BUDGET = 5000
 """Smallest budget of Gaussians."""

@@ -12,8 +12,8 @@ from ...dataset.scene import Scene
 from ..poses.camera_poses import LEAST_VIEWS, CameraPoses
 from .model_selection import Decision, ModelSelection, decide
 
-LEAST_SHIFT_PX = 0.4
-"""Median shift from which given poses count as inexact. Noise alone moves exact ones by 0.2."""
+LEAST_SHIFT_PX = 0.25
+"""Median shift from which given poses count as inexact. Noise alone moves exact ones by 0.12."""
 
 
 def start_poses(
