@@ -370,6 +370,7 @@ def test_every_decision_is_written_down_and_can_be_overridden(tmp_path: Path) ->
     scene, photos = sphere_scene(views=9, size_px=24)
     names = {
         "full_size", "exposure", "multi_view", "harmonics", "wrapping", "growth", "dense_start",
+        "refine_poses",
     }  # fmt: skip
     settings = dataclasses.replace(SETTINGS, densify_until=0.9)
     result = train(scene, photos, settings, tmp_path, Progress(), threads=1)
