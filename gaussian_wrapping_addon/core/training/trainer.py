@@ -57,9 +57,6 @@ REPORT_EVERY = 10
 DETAIL_PHOTOS = 8
 """Number of photos, evenly spread, whose detail is measured."""
 
-SET = "Not measured: decided by the settings."
-"""Evidence of decisions that the settings take."""
-
 RESTART_RATE = 0.5
 """Factor on the learning rates after a restart."""
 
@@ -285,7 +282,7 @@ class _Trainer:
     def _initial(self, key: str, progress: Progress) -> tuple[OrientedGaussians, Decision]:
         """Return the Gaussians at dense or sparse points, and why."""
         small, scene = self.schedule.divisor(0), self._start_scene()
-        decision = Decision("dense_start", "off", "off", SET, measured=False)
+        decision = Decision.by_settings("dense_start", "off")
         if self.settings.dense_start != "off":
             start = dense_start(
                 scene, self.photos, self.views, self.settings.dense_start, progress.span(0.0, 0.0),
@@ -389,14 +386,11 @@ class _Trainer:
                 )
             )
         if settings.wrapping != "auto":
-            word = settings.wrapping
             model_selection = model_selection.with_decision(
-                Decision("wrapping", word, word, SET, measured=False)
+                Decision.by_settings("wrapping", settings.wrapping)
             )
         if settings.growth == "off":
-            model_selection = model_selection.with_decision(
-                Decision("growth", "off", "off", SET, measured=False)
-            )
+            model_selection = model_selection.with_decision(Decision.by_settings("growth", "off"))
         state.model_selection = model_selection
 
     def _restart(

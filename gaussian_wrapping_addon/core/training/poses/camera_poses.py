@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ... import tolerances
 from ...dataset.camera import Camera
+from ..optimizer.photo_adam import PhotoAdam, photo_rate
 
 TRAVEL_PX = 4.0
 """Total of a photo's steps over a training at the first rate; the rate falls, and steps waver, so
@@ -30,15 +31,20 @@ LAST_SHARE = 0.05
 LEAST_VIEWS = 4
 """Training photos below which poses stay as given: their common motion would be most of it."""
 
-BETAS = (0.9, 0.99)
 EPSILON = 1e-20
+"""Of Adam; gradients are far smaller than those of Gaussians."""
 
 
 def pose_rate_px(iteration: int, iterations: int, photos: int) -> float:
     """Return the learning rate of an iteration: how far a step moves the image, in pixels."""
-    turns = max(1.0, iterations / max(1, photos))
-    first = min(LARGEST_RATE_PX, max(SMALLEST_RATE_PX, TRAVEL_PX / turns))
-    return first * LAST_SHARE ** min(1.0, iteration / max(1, iterations))
+    return photo_rate(
+        iteration,
+        iterations,
+        photos,
+        travel=TRAVEL_PX,
+        bounds=(SMALLEST_RATE_PX, LARGEST_RATE_PX),
+        last_share=LAST_SHARE,
+    )
 
 
 class CameraPoses:
@@ -58,13 +64,11 @@ class CameraPoses:
         self.active = len(self.trained) >= LEAST_VIEWS
         """Whether steps move poses."""
         self.refined = self.given.copy()
-        count = len(self.given)
-        self.first, self.second = np.zeros((count, 6)), np.zeros((count, 6))
-        self.steps = np.zeros(count, np.int64)
+        self.adam = PhotoAdam(len(self.given), 6, np.float64, EPSILON)
 
     def camera(self, view: int, camera: Camera) -> Camera:
         """Return a photo's camera with its refined pose."""
-        if self.steps[view] == 0:
+        if self.adam.steps[view] == 0:
             return camera
         return dataclasses.replace(camera, cam_from_world=self.refined[view])
 
@@ -84,15 +88,9 @@ class CameraPoses:
         if not self.active:
             return
         unit = np.repeat([1.0, tolerances.SCENE_RADIUS], 3)
-        gradient = gradient * unit  # translations in multiples of that distance
-        self.steps[view] += 1
-        self.first[view] += (1.0 - BETAS[0]) * (gradient - self.first[view])
-        self.second[view] += (1.0 - BETAS[1]) * (gradient**2 - self.second[view])
-        step = int(self.steps[view])
-        mean = self.first[view] / (1.0 - BETAS[0] ** step)
-        size = np.sqrt(self.second[view] / (1.0 - BETAS[1] ** step)) + EPSILON
-        focal_px = max(camera.fx, camera.fy)
-        motion = -(rate_px / focal_px) * mean / size * unit
+        rate = rate_px / max(camera.fx, camera.fy)
+        # Translations in multiples of that distance.
+        motion = -self.adam.step(view, gradient * unit, rate) * unit
         turn = Rotation.from_rotvec(motion[:3]).as_matrix()
         pose = turn @ self.refined[view]
         pose[:, 3] += motion[3:]
@@ -121,11 +119,11 @@ class CameraPoses:
         """Go back to the given poses, and keep them."""
         self.active = False
         self.refined[...] = self.given
-        self.steps[...] = 0
+        self.adam.steps[...] = 0
 
     def moved(self) -> np.ndarray | None:
         """Return a copy of the (n, 3, 4) refined poses, or ``None`` if they are those given."""
-        return self.refined.copy() if self.active and self.steps.any() else None
+        return self.refined.copy() if self.active and self.adam.steps.any() else None
 
     def shifts_px(self, cameras: Mapping[int, Camera], points: np.ndarray) -> np.ndarray:
         """Return how far refined poses move what the given ones show.
@@ -160,9 +158,8 @@ class CameraPoses:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of all arrays, by name."""
-        names = ("given", "refined", "trained", "first", "second", "steps")
-        arrays = {name: getattr(self, name).copy() for name in names}
-        return {**arrays, "active": np.array(self.active)}
+        arrays = {name: getattr(self, name).copy() for name in ("given", "refined", "trained")}
+        return arrays | self.adam.to_arrays() | {"active": np.array(self.active)}
 
     @classmethod
     def restore(cls, arrays: dict[str, np.ndarray]) -> CameraPoses:
@@ -174,11 +171,10 @@ class CameraPoses:
             An array is missing or has the wrong shape.
         """
         poses = cls(arrays["given"], arrays["trained"].tolist())
-        for name in ("refined", "first", "second", "steps"):
-            values, own = arrays[name], getattr(poses, name)
-            if values.shape != own.shape:
-                raise ValueError(f"camera poses: {name} has the shape {values.shape}")
-            own[...] = values
+        if arrays["refined"].shape != poses.refined.shape:
+            raise ValueError(f"camera poses: refined has the shape {arrays['refined'].shape}")
+        poses.refined[...] = arrays["refined"]
+        poses.adam.load(arrays)
         poses.active = bool(arrays["active"])
         return poses
 
