@@ -169,7 +169,7 @@ def test_other_words_are_refused(arguments: tuple[str, str]) -> None:
 def test_model_selection_has_an_option_each() -> None:
     assert MODEL_SELECTION == (
         "harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size",
-        "dense_start",
+        "dense_start", "refine_poses",
     )  # fmt: skip
     for name in MODEL_SELECTION:
         assert option_of(f"training.{name}") == "--" + name.replace("_", "-")

@@ -113,8 +113,9 @@ def test_every_declared_property_is_there_and_drawn() -> None:
 @pytest.mark.usefixtures("addon")
 def test_full_size_is_chosen_with_the_other_parts_of_the_model() -> None:
     names = [field.name for field in draw(train_advanced_panel.GWRAP_PT_train_advanced).fields]
-    assert names[:7] == [
+    assert names[:8] == [
         "harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size", "dense_start",
+        "refine_poses",
     ]  # fmt: skip
     assert property_at("training.full_size").default == "AUTO"
     assert declared("training.full_size").from_panel("AUTO") == "auto"

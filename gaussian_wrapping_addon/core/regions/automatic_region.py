@@ -7,6 +7,7 @@ import logging
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..dataset.camera import Camera
 from ..dataset.scene import Scene
@@ -40,6 +41,16 @@ HEAD_TAIL_DIVISOR = 5.0
 ROTATED_GAIN = 0.9
 """A rotated box is preferred only below this share of the axis-aligned box's footprint."""
 
+APART_SHARE = 0.4
+"""Photos look at no one thing if the middles of half of them pass their common point by more than
+this share of the cameras' spread: 0.02 to 0.22 around things, 0.6 and more inside rooms, along
+streets, and in parallel rows."""
+
+SURROUNDINGS_REACH = 3.0
+"""Reach of what such photos show, in median distances of points from the nearest camera."""
+
+SURROUNDINGS_MIN_VIEWS = 3
+
 WHOLE_TAIL_SHARE = 0.005
 WHOLE_MIN_ALPHA = 0.1
 WHOLE_MIN_VIEWS = 2
@@ -53,6 +64,8 @@ def automatic_region(scene: Scene) -> Region:
     Sparse points are weighted by the share of views whose frame contains them and by their
     closeness to the point where the middles of the photos converge, in units of the frame size
     there; the box spans robust quantiles of the weight. Outlying cameras and points have no weight.
+    Photos that look at no one thing, as inside a room or in a row, get a box around all near points
+    that several of them show.
 
     Parameters
     ----------
@@ -73,6 +86,12 @@ def automatic_region(scene: Scene) -> Region:
     focus, distance = _focus(cameras, scene.points)
     frame_size = distance * _half_frame(cameras)  # half of the frame's short side at the focus
     points = scene.points[np.isfinite(scene.points).all(1)] if len(scene.points) else scene.points
+    if not _look_at_one_thing(cameras, focus):
+        near = _surroundings(points, cameras)
+        if len(near) >= MIN_POINTS:
+            weight = _thinned(near, VOXEL_SHARE * frame_size)
+            if (weight > WEIGHT_THAT_COUNTS).sum() >= MIN_POINTS:
+                return _box_around("auto", near, weight, TAIL_SHARE, PADDING_SHARE)
     if len(points) >= MIN_POINTS:
         seen = _views_of(points, cameras) / len(cameras)  # (n,) share of views
         support = _ramp(seen / max(seen.max(), 1e-12)) * _thinned(points, VOXEL_SHARE * frame_size)
@@ -158,6 +177,29 @@ def _focus(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, f
     if in_front.mean() < 0.5:  # outward-facing cameras: use the points in front of them
         focus = np.median(prior, 0)
     return focus, float(np.median(np.linalg.norm(focus - centers, axis=1)))
+
+
+def _look_at_one_thing(cameras: Sequence[Camera], focus: np.ndarray) -> bool:
+    """Tell whether the middles of the photos meet at a point."""
+    centers = np.array([c.center for c in cameras])  # (c, 3)
+    gazes = np.array([c.gaze for c in cameras])  # (c, 3)
+    gazes /= np.linalg.norm(gazes, axis=1, keepdims=True)
+    to_focus = focus - centers
+    missed = to_focus - (to_focus * gazes).sum(1, keepdims=True) * gazes
+    spread = np.median(np.linalg.norm(centers - centers.mean(0), axis=1))
+    return bool(np.median(np.linalg.norm(missed, axis=1)) <= APART_SHARE * spread)
+
+
+def _surroundings(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the (n, 3) points that several photos show and that are not far beyond the others."""
+    if len(points) == 0:
+        return points
+    centers = np.array([c.center for c in cameras])  # (c, 3)
+    seen = points[_views_of(points, cameras) >= min(SURROUNDINGS_MIN_VIEWS, len(cameras))]
+    if len(seen) == 0:
+        return seen
+    distance = cKDTree(centers).query(seen)[0]  # (n,)
+    return seen[distance <= SURROUNDINGS_REACH * np.median(distance)]
 
 
 def _median_depth(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:

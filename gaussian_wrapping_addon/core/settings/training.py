@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from .checks import Choices, Range
 from .choices import MASK_MODES, SELECTION_MODES
@@ -14,9 +15,38 @@ _COUNT = Range(1, 10**6)
 _SECONDS = Range(0.0, words="a number of seconds, 0 or more")
 
 
-def _selection(automatic: str, on: str, off: str) -> tuple[Item, ...]:
-    """Return the entries Auto, On and Off with their tooltips."""
-    return (Item("auto", "Auto", automatic), Item("on", "On", on), Item("off", "Off", off))
+def _model_selection(
+    *,
+    help: str,
+    paper: str,
+    option: Option,
+    label: str,
+    tooltip: str,
+    auto: str,
+    on: str,
+    off: str,
+    since: str = "",
+) -> Any:
+    """Declare whether a part of the model is used: ``"auto"``, ``"on"`` or ``"off"``.
+
+    Parameters
+    ----------
+    paper : str
+        Value in the preset of that name.
+    label, tooltip : str
+        Of the property in the panel; `auto`, `on` and `off` are the tooltips of its entries.
+    """
+    items = (Item("auto", "Auto", auto), Item("on", "On", on), Item("off", "Off", off))
+    return setting(
+        "auto",
+        help=help,
+        check=Choices(SELECTION_MODES),
+        presets={"paper": paper},
+        option=option,
+        panel=PanelProperty(label, tooltip, items=items),
+        model_selection=True,
+        since=since,
+    )
 
 
 @dataclass(frozen=True)
@@ -86,133 +116,96 @@ class TrainingSettings(MethodSettings):
         unit="photos",
         option=Option("--holdout", "N", "hold out each n-th photo for measuring; 0 holds out none"),
     )
-    harmonics: str = setting(
-        "auto",
+    harmonics: str = _model_selection(
         help="View-dependent colour. auto: only degrees that lower the error of held-out photos; "
         "on: all of them; off: degree 0.",
-        presets={"paper": "on"},
-        check=Choices(SELECTION_MODES),
-        model_selection=True,
+        paper="on",
         option=Option("--harmonics", help="colour that depends on the direction"),
-        panel=PanelProperty(
-            "Reflections",
-            "Colours that change with the viewing direction: gloss, metal, glass",
-            items=_selection(
-                "Only as much as lowers the error of held-out photos",
-                "As much as the preset allows, whether it helps or not",
-                "One colour from all directions; fastest, right for matte surfaces",
-            ),
-        ),
+        label="Reflections",
+        tooltip="Colours that change with the viewing direction: gloss, metal, glass",
+        auto="Only as much as lowers the error of held-out photos",
+        on="As much as the preset allows, whether it helps or not",
+        off="One colour from all directions; fastest, right for matte surfaces",
     )
-    exposure: str = setting(
-        "auto",
+    exposure: str = _model_selection(
         help="Gain and offset per photo.",
-        presets={"paper": "off"},
-        check=Choices(SELECTION_MODES),
-        model_selection=True,
+        paper="off",
         option=Option("--exposure", help="gain and offset per photo"),
-        panel=PanelProperty(
-            "Exposure",
-            "Brightness and tint that differ from photo to photo",
-            items=_selection(
-                "Where the same points differ in brightness from photo to photo",
-                "Always learn a brightness and a tint for each photo",
-                "All photos were taken with the same settings and light",
-            ),
-        ),
+        label="Exposure",
+        tooltip="Brightness and tint that differ from photo to photo",
+        auto="Where the same points differ in brightness from photo to photo",
+        on="Always learn a brightness and a tint for each photo",
+        off="All photos were taken with the same settings and light",
     )
-    multi_view: str = setting(
-        "auto",
+    multi_view: str = _model_selection(
         help="Loss terms that compare neighbouring photos.",
-        presets={"paper": "on"},
-        check=Choices(SELECTION_MODES),
-        model_selection=True,
+        paper="on",
         option=Option("--multi-view", help="terms that compare neighbouring photos"),
-        panel=PanelProperty(
-            "Compare Photos",
-            "Check each surface in neighbouring photos while training (multi-view terms)",
-            items=_selection(
-                "Where photos have neighbours with nearly the same view",
-                "Always compare; slower, gives smoother and more accurate surfaces",
-                "Never compare; faster",
-            ),
-        ),
+        label="Compare Photos",
+        tooltip="Check each surface in neighbouring photos while training (multi-view terms)",
+        auto="Where photos have neighbours with nearly the same view",
+        on="Always compare; slower, gives smoother and more accurate surfaces",
+        off="Never compare; faster",
     )
-    wrapping: str = setting(
-        "auto",
+    wrapping: str = _model_selection(
         help="Orientation of the Gaussians, its loss, and clones of opposite orientation.",
-        presets={"paper": "on"},
-        check=Choices(SELECTION_MODES),
-        model_selection=True,
+        paper="on",
         option=Option("--wrapping", help="orientation, and clones of opposite orientation"),
-        panel=PanelProperty(
-            "Wrap Thin Parts",
-            "Learn orientations, and give thin parts a front and a back",
-            items=_selection(
-                "Where the normals still show errors, such as on thin parts",
-                "Always; thin parts such as wires, spokes and leaves get a front and a back",
-                "Never; faster, but thin parts may be lost",
-            ),
-        ),
+        label="Wrap Thin Parts",
+        tooltip="Learn orientations, and give thin parts a front and a back",
+        auto="Where the normals still show errors, such as on thin parts",
+        on="Always; thin parts such as wires, spokes and leaves get a front and a back",
+        off="Never; faster, but thin parts may be lost",
     )
-    growth: str = setting(
-        "auto",
+    growth: str = _model_selection(
         help="Densification. auto: it stops where more Gaussians gain little, and Gaussians that "
         "contribute little are kept small (`overlap_price`) and pruned (`prune_share`); on: only "
         "the cap stops it; off: none are added.",
-        presets={"paper": "on"},
-        check=Choices(SELECTION_MODES),
-        model_selection=True,
+        paper="on",
         option=Option(
             "--growth", help="more Gaussians: while they lower the error, up to the cap, or none"
         ),
-        panel=PanelProperty(
-            "Add Gaussians",
-            "Whether more Gaussians are added where detail is missing",
-            items=_selection(
-                "Add Gaussians while they lower the error",
-                "Add Gaussians up to the limit",
-                "Keep the number that training starts with",
-            ),
-        ),
+        label="Add Gaussians",
+        tooltip="Whether more Gaussians are added where detail is missing",
+        auto="Add Gaussians while they lower the error",
+        on="Add Gaussians up to the limit",
+        off="Keep the number that training starts with",
     )
-    full_size: str = setting(
-        "auto",
+    full_size: str = _model_selection(
         help="Training image size. auto: photos that show nothing finer than half their size are "
         "trained on at half size; on: always full size; off: half size.",
-        presets={"paper": "on"},
-        check=Choices(SELECTION_MODES),
-        model_selection=True,
+        paper="on",
         option=Option(
             "--full-size", help="photos at their full size, also where half size shows as much"
         ),
-        panel=PanelProperty(
-            "Full Photo Size",
-            "Train on photos at their full size, within the limit below",
-            items=_selection(
-                "At half size where the photos show nothing finer",
-                "Always at full size, even where half size shows as much",
-                "Always at half size; faster, with less memory",
-            ),
-        ),
+        label="Full Photo Size",
+        tooltip="Train on photos at their full size, within the limit below",
+        auto="At half size where the photos show nothing finer",
+        on="Always at full size, even where half size shows as much",
+        off="Always at half size; faster, with less memory",
     )
-    dense_start: str = setting(
-        "auto",
+    dense_start: str = _model_selection(
         help="Initial Gaussians from stereo matching of the photos. auto: where other photos "
         "confirm the depth of enough pixels; off: from the sparse points alone.",
-        presets={"paper": "off"},
-        check=Choices(SELECTION_MODES),
-        model_selection=True,
+        paper="off",
         option=Option("--dense-start", help="initial Gaussians from stereo matching of the photos"),
-        panel=PanelProperty(
-            "Dense Start",
-            "Match neighbouring photos before training, and start on the surfaces found",
-            items=_selection(
-                "Where neighbouring photos show the same surfaces",
-                "On whatever surfaces matching finds",
-                "Start from the sparse points alone",
-            ),
-        ),
+        label="Dense Start",
+        tooltip="Match neighbouring photos before training, and start on the surfaces found",
+        auto="Where neighbouring photos show the same surfaces",
+        on="On whatever surfaces matching finds",
+        off="Start from the sparse points alone",
+        since="0.2.0",
+    )
+    refine_poses: str = _model_selection(
+        help="Camera poses are refined while training. auto: after a dense start, and kept if the "
+        "photos move them clearly; off: poses stay as given.",
+        paper="off",
+        option=Option("--refine-poses", help="camera poses refined while training"),
+        label="Refine Cameras",
+        tooltip="Move each photo's camera by fractions of a pixel to where its photo fits best",
+        auto="Where photos show that the given cameras are inexact",
+        on="Always refine; the frame of all cameras together stays",
+        off="Take the cameras as they are given",
         since="0.2.0",
     )
     region_weight: float = setting(

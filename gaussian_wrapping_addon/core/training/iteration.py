@@ -22,7 +22,7 @@ from ..stereo.depth_priors import DepthPrior
 from .appearance.background import background_gradient, composited, draw_background
 from .appearance.photo_exposure import exposure_rate
 from .losses.depth_prior_loss import depth_prior_loss
-from .losses.footprint_regulariser import add_footprint_regulariser
+from .losses.footprint_regulariser import add_footprint_regulariser, footprint_shares
 from .losses.losses import color_loss, normal_losses
 from .losses.multi_view import (
     MultiViewOptions,
@@ -31,6 +31,8 @@ from .losses.multi_view import (
     multi_view_losses,
 )
 from .losses.opacity_prior import add_opacity_prior
+from .poses.camera_poses import pose_rate_px
+from .poses.pose_gradient import pose_gradient
 from .schedule import Schedule
 from .state import TrainingState
 from .windows import Window, windows
@@ -154,17 +156,19 @@ class Stepper:
             raise NotFinite()
         seen = image.backward(gradients)
         # Before merging the other view's gradients: culled Gaussians have no boxes in this view.
-        if self.schedule.compact and self.settings.overlap_price > 0.0:
-            size_px = (sample.camera.width, sample.camera.height)
-            add_footprint_regulariser(
-                seen, adam.array("log_scales"), image.screen.boxes, size_px,
-                self.settings.overlap_price,
-            )  # fmt: skip
+        price = self.settings.overlap_price if self.schedule.compact else 0.0
         opacity_weight = schedule.opacity_weight(iteration)
-        if opacity_weight > 0.0 and state.model_selection.chose("dense_start"):
+        if not state.model_selection.chose("dense_start"):
+            opacity_weight = 0.0
+        if price > 0.0 or opacity_weight > 0.0:
             size_px = (sample.camera.width, sample.camera.height)
-            logits = adam.array("opacity_logits")
-            add_opacity_prior(seen, logits, image.screen.boxes, size_px, opacity_weight)
+            shares = footprint_shares(image.screen.boxes[seen.ids], size_px)
+            if price > 0.0:
+                add_footprint_regulariser(seen, adam.array("log_scales"), shares, price)
+            if opacity_weight > 0.0:
+                add_opacity_prior(seen, adam.array("opacity_logits"), shares, opacity_weight)
+        if state.poses is not None and schedule.refines_poses(iteration):
+            self._step_pose(state, sample, seen)
         if other is not None:
             seen = merge_gradients(seen, other, len(adam), threads=self.threads, store=self.store)
         if gathers:
@@ -190,6 +194,20 @@ class Stepper:
         share = AVERAGE_SHARE if state.error_average > 0.0 else 1.0
         state.error_average += share * (mean_squared - state.error_average)
         state.loss_average += share * (value - state.loss_average)
+
+    def _step_pose(
+        self, state: TrainingState, sample: _Sample, gradients: VisibleGradients
+    ) -> None:
+        """Move the photo's camera; at the end of an epoch take out what all cameras share."""
+        adam, poses = state.adam, state.poses
+        assert poses is not None
+        pose = np.asarray(sample.camera.cam_from_world, np.float64)
+        by_pose = pose_gradient(pose, gradients, adam.array("means"), adam.array("quats"))
+        rate_px = pose_rate_px(state.iteration, self.settings.iterations, len(self.views))
+        whole = self.photos.camera(sample.view, 1)
+        poses.step(sample.view, whole, by_pose, state.rate_factor * rate_px)
+        if not state.order:
+            poses.anchor()
 
     def _draw_sample(self, state: TrainingState) -> _Sample:
         view = state.next_view(self.views)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Live view of a running training: a preview picture and the PSNR of held-out photos.
+"""Preview picture of a running training; metrics of held-out photos, during it and at the end.
 
 Nothing here affects a training's result: the renderer is a separate one, no random numbers are
 drawn, and the clock only decides when to update.
@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +18,14 @@ import numpy as np
 from ..dataset.photo_source import PhotoSource
 from ..files import write_bytes
 from ..gaussians.model import OrientedGaussians
-from ..imaging.view_metrics import psnr
+from ..imaging.lpips import lpips_if_ready
+from ..imaging.view_metrics import psnr, score_images
+from ..progress import Progress
 from ..render.projection.projection import RawArrays
 from ..render.types.options import RenderOptions
 from ..render.view_renderer import ViewRenderer
 from ..settings import TrainingSettings
+from .result import HeldOutMetrics
 
 _logger = logging.getLogger(__name__)
 
@@ -40,6 +43,8 @@ BEST_PSNR = 100.0
 """PSNR of identical images, dB: keeps means finite."""
 
 GAP_PX = 4
+
+TOO_SMALL = "The photos are too small for LPIPS."
 
 Correction = Callable[[np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
 """Maps a (h, w, 3) render to the exposure of a (h, w, 3) uint8 photo, within a mask."""
@@ -233,3 +238,42 @@ def png(picture: np.ndarray) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(picture)).save(stream, format="PNG", compress_level=1)
     return stream.getvalue()
+
+
+def held_out_metrics(
+    gaussians: OrientedGaussians,
+    photos: PhotoSource,
+    names: Mapping[int, str],
+    progress: Progress,
+    *,
+    threads: int,
+    exposure_correction: Correction | None = None,
+) -> tuple[list[HeldOutMetrics], str]:
+    """Return the metrics of held-out photos, and the reason if they have no LPIPS.
+
+    Parameters
+    ----------
+    names : mapping of int to str
+        Names of the held-out views.
+    exposure_correction : callable, optional
+        Where exposures are modelled: fits that of each half of a photo on the other half, as it
+        was never trained.
+    """
+    figures = []
+    lpips, reason = lpips_if_ready() if names else (None, "")
+    options = RenderOptions(depth=False, threads=threads)
+    raw, renderer = RawArrays.from_gaussians(gaussians), ViewRenderer()
+    for view, name in names.items():
+        progress.update(1.0, f"measuring {name}")
+        mask = photos.mask(view, 1)
+        if mask is not None and not mask.any():
+            continue
+        photo = photos.photo(view, 1)
+        image = renderer.render(raw, photos.camera(view, 1), options).color
+        if exposure_correction is not None:
+            image = exposure_correction(image, photo, mask)
+        scores = score_images(image, photo, mask, lpips=lpips, threads=threads)
+        figures.append(HeldOutMetrics(name, scores.psnr, scores.ssim, scores.lpips))
+    if not figures or any(figure.lpips is not None for figure in figures):
+        return figures, ""
+    return figures, reason or TOO_SMALL

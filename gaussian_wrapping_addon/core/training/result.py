@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from ..gaussians.model import OrientedGaussians
 from ..report_warning import ReportWarning
 from .selection.model_selection import ModelSelection
@@ -49,6 +51,8 @@ class TrainingResult:
     """Decisions on the model (the report's key ``decisions``)."""
     exposure_fitted: bool = False
     """Whether held-out photos were measured after an exposure fitted crosswise on their halves."""
+    poses: np.ndarray | None = None
+    """(views, 3, 4) refined ``cam_from_world`` of all views, or ``None`` where those given hold."""
 
     @property
     def held_out_psnr(self) -> float:

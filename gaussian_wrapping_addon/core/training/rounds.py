@@ -25,6 +25,7 @@ from .schedule import Schedule
 from .selection.harmonics_selection import select_harmonics
 from .selection.harmonics_trial import TrialView
 from .selection.model_selection import select_wrapping
+from .selection.pose_selection import select_poses
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
@@ -102,6 +103,8 @@ class Rounds:
             changed = True
         if changed:
             self._empty_free_space(state)
+        if schedule.decides_poses(iteration):
+            self._decide_poses(state)
         if schedule.decides_wrapping(iteration):
             self._decide_wrapping(state)
         if schedule.wraps(iteration) and may_wrap(schedule, state):
@@ -135,6 +138,13 @@ class Rounds:
             variance_px=self.settings.filter_variance,
             threads=self.threads,
         )
+
+    def _decide_poses(self, state: TrainingState) -> None:
+        if state.poses is None or self.settings.refine_poses != "auto":
+            return
+        cameras = {view: self.photos.camera(view, 1) for view in self.views}
+        decision = select_poses(state.poses, cameras, state.adam.array("means"))
+        state.model_selection = state.model_selection.with_decision(decision)
 
     def _densify(self, state: TrainingState) -> None:
         """Densify and prune; stop densifying for good once growth no longer pays."""

@@ -50,6 +50,14 @@ TRY_HARMONICS_AT = (0.4, 0.5, 0.6)
 """Fractions of the iterations at which the next degree is tried: after shapes and
 view-independent colours have converged, and early enough for the degree to be trained."""
 
+POSES_FROM = 0.05
+"""Fraction of the iterations from which camera poses are refined: before, colours still change
+more than a pixel's shift would change them."""
+
+POSES_DECIDED_AT = 0.35
+"""Fraction of the iterations at which poses that hardly moved go back to those given: the larger
+part of the motion is done, and the Gaussians can follow."""
+
 FIRST_BUDGET = 5000
 """Smallest budget of Gaussians."""
 
@@ -135,6 +143,14 @@ class Schedule:
     def opacity_weight(self, iteration: int) -> float:
         """Return the weight of the opacity prior; it counts with the depth loss."""
         return self.settings.lambda_opacity if self.uses_depth(iteration) else 0.0
+
+    def refines_poses(self, iteration: int) -> bool:
+        """Tell whether this iteration moves its camera: not before colours have settled."""
+        return not self.refines and iteration >= self._at(POSES_FROM)
+
+    def decides_poses(self, iteration: int) -> bool:
+        """Tell whether the photos decide about camera poses after this iteration."""
+        return not self.refines and iteration == max(1, self._at(POSES_DECIDED_AT))
 
     def compares_views(self, iteration: int) -> bool:
         """Tell whether the multi-view terms are evaluated in this iteration."""

@@ -14,6 +14,7 @@ from ..report_warning import ReportWarning, read_warnings
 from .appearance.photo_exposure import Exposure
 from .density.density_control import DensityStatistics
 from .optimizer.adam import TRAINED, Adam
+from .poses.camera_poses import CameraPoses
 from .selection.growth_selection import ErrorHistory
 from .selection.model_selection import ModelSelection
 
@@ -44,6 +45,8 @@ class TrainingState:
     """Decisions so far; stored under the key ``needs``."""
     exposure: Exposure | None = None
     """Per-photo exposures; ``None`` where they are not modelled."""
+    poses: CameraPoses | None = None
+    """Refined poses of the cameras; ``None`` where they stay as given."""
     error_history: ErrorHistory = field(default_factory=ErrorHistory)
     """Per-view errors from which growth is decided; stored under the prefix ``visits.``."""
     warnings: list[ReportWarning] = field(default_factory=list)
@@ -83,6 +86,8 @@ class TrainingState:
             arrays[f"statistics.{name}"] = getattr(self.statistics, name).copy()
         if self.exposure is not None:
             arrays |= {f"exposure.{k}": v for k, v in self.exposure.to_arrays().items()}
+        if self.poses is not None:
+            arrays |= {f"poses.{k}": v for k, v in self.poses.to_arrays().items()}
         return arrays | {f"visits.{k}": v for k, v in self.error_history.to_arrays().items()}
 
     def to_json(self) -> dict[str, Any]:
@@ -146,6 +151,8 @@ class TrainingState:
         state.warnings = list(read_warnings(values["warnings"]))
         exposure = _part(arrays, "exposure.")
         state.exposure = Exposure.restore(exposure) if exposure else None
+        poses = _part(arrays, "poses.")
+        state.poses = CameraPoses.restore(poses) if poses else None
         state.error_history = ErrorHistory.restore(_part(arrays, "visits."))
         return state
 

@@ -18,12 +18,8 @@ from ..dataset.view_split import FEW_PHOTOS, held_out_views, training_views
 from ..errors import Cancelled, DatasetError, WrapError
 from ..gaussians.initialisation import initial_gaussians
 from ..gaussians.model import OrientedGaussians
-from ..imaging.lpips import lpips_if_ready
-from ..imaging.view_metrics import score_images
 from ..kernels.parallel import default_threads
 from ..progress import Progress
-from ..render.projection.projection import RawArrays
-from ..render.types.options import RenderOptions
 from ..report_warning import ReportWarning
 from ..settings import TrainingSettings
 from ..stereo.depth_maps import matching_divisor
@@ -36,14 +32,16 @@ from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from .initialisation.dense_start import dense_start, matched_photos, on_planes
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
-from .live_view import Correction, LiveView, evenly_spaced, measure_held_out
+from .live_view import Correction, LiveView, evenly_spaced, held_out_metrics, measure_held_out
 from .losses.neighbours import NeighbourLimits, find_neighbours
-from .result import HeldOutMetrics, TrainingResult
+from .poses.posed_photos import PosedPhotos
+from .result import TrainingResult
 from .rounds import Inside, Rounds
 from .schedule import SMALLEST_SIDE_PX, Schedule
 from .selection.exposure_selection import select_exposure
 from .selection.image_size_selection import photo_detail, select_image_size
 from .selection.model_selection import Decision, ModelSelection, decide, select_multi_view
+from .selection.pose_selection import start_poses
 from .state import TrainingState
 
 _logger = logging.getLogger(__name__)
@@ -58,11 +56,6 @@ REPORT_EVERY = 10
 
 DETAIL_PHOTOS = 8
 """Number of photos, evenly spread, whose detail is measured."""
-
-SET = "Not measured: decided by the settings."
-"""Evidence of decisions that the settings take."""
-
-TOO_SMALL = "The photos are too small for LPIPS."
 
 RESTART_RATE = 0.5
 """Factor on the learning rates after a restart."""
@@ -151,7 +144,8 @@ class _Trainer:
         if start_splat is not None:
             settings = wrapping_settings(settings)
         self.scene, self.settings = scene, settings
-        self.photos = CancellablePhotos(photos, progress or Progress())
+        self.posed = PosedPhotos(photos)
+        self.photos = CancellablePhotos(self.posed, progress or Progress())
         self.folder, self.seed, self.threads = folder, seed, threads
         self.start_splat, self.inside = start_splat, inside
         self.held_out = held_out_views(scene, settings.holdout_every)
@@ -166,9 +160,9 @@ class _Trainer:
         self.neighbours = {v: numbers[near] for v, near in zip(self.views, found, strict=True)}
         self.image_decision, finest = self._image_size(side_px)
         self.schedule = Schedule(settings, side_px, finest, start_splat is not None)
-        self.stepper = Stepper(photos, self.schedule, self.views, self.neighbours, threads)
+        self.stepper = Stepper(self.posed, self.schedule, self.views, self.neighbours, threads)
         self.live_figures: dict[str, float] = {}
-        self.live = LiveView(photos, self.held_out, folder, settings, threads)
+        self.live = LiveView(self.posed, self.held_out, folder, settings, threads)
 
     def _image_size(self, side_px: int) -> tuple[Decision, int]:
         """Decide whether to train at full or half size."""
@@ -196,6 +190,7 @@ class _Trainer:
         else:
             _logger.info("resuming at iteration %d", state.iteration)
             self.stepper.priors = self._saved_priors(state, key, progress)
+        self.posed.poses = state.poses
         begun_s = saved_s = time.monotonic()
         spent_s, begun_at = state.seconds, state.iteration
         snapshot = (state.to_arrays(), state.to_json())
@@ -237,7 +232,11 @@ class _Trainer:
         save_checkpoint(self.folder, state, key)
         gaussians = self._finished(rounds, state, progress)
         self.live.update(gaussians, state.iteration, self._correction(state), force=True)
-        held_out, lpips_note = self._measure(gaussians, state, progress)
+        names = {view: self.scene.views[view].camera.name for view in self.held_out}
+        held_out, lpips_note = held_out_metrics(
+            gaussians, self.photos, names, progress,
+            threads=self.threads, exposure_correction=self._correction(state),
+        )  # fmt: skip
         return TrainingResult(
             gaussians,
             total,
@@ -248,6 +247,7 @@ class _Trainer:
             lpips_note,
             state.model_selection,
             state.exposure is not None,
+            None if state.poses is None else state.poses.moved(),
         )
 
     def _start(self, rounds: Rounds, key: str, progress: Progress) -> TrainingState:
@@ -273,13 +273,16 @@ class _Trainer:
         self._select_model(state)
         if decision is not None:
             state.model_selection = state.model_selection.with_decision(decision)
+        state.poses, state.model_selection = start_poses(
+            self.settings.refine_poses, self.scene, self.views, state.model_selection
+        )
         rounds.filter(state)
         return state
 
     def _initial(self, key: str, progress: Progress) -> tuple[OrientedGaussians, Decision]:
         """Return the Gaussians at dense or sparse points, and why."""
         small, scene = self.schedule.divisor(0), self._start_scene()
-        decision = Decision("dense_start", "off", "off", SET, measured=False)
+        decision = Decision.by_settings("dense_start", "off")
         if self.settings.dense_start != "off":
             start = dense_start(
                 scene, self.photos, self.views, self.settings.dense_start, progress.span(0.0, 0.0),
@@ -383,14 +386,11 @@ class _Trainer:
                 )
             )
         if settings.wrapping != "auto":
-            word = settings.wrapping
             model_selection = model_selection.with_decision(
-                Decision("wrapping", word, word, SET, measured=False)
+                Decision.by_settings("wrapping", settings.wrapping)
             )
         if settings.growth == "off":
-            model_selection = model_selection.with_decision(
-                Decision("growth", "off", "off", SET, measured=False)
-            )
+            model_selection = model_selection.with_decision(Decision.by_settings("growth", "off"))
         state.model_selection = model_selection
 
     def _restart(
@@ -406,6 +406,7 @@ class _Trainer:
         _logger.warning("non-finite values at iteration %d: going back", state.iteration)
         restored = TrainingState.restore(snapshot[0], snapshot[1])
         restored.restarts = state.restarts + 1
+        self.posed.poses = restored.poses
         restored.rate_factor = state.rate_factor * RESTART_RATE
         restored.order = []
         restored.random = np.random.Generator(np.random.PCG64([self.seed, 3]))
@@ -466,31 +467,3 @@ class _Trainer:
             f"{speed:.1f} it/s",
             **figures,
         )
-
-    def _measure(
-        self, gaussians: OrientedGaussians, state: TrainingState, progress: Progress
-    ) -> tuple[list[HeldOutMetrics], str]:
-        """Return the metrics of the held-out photos, and the reason if they have no LPIPS.
-
-        Where exposures are modelled, the exposure of each half of a photo is fitted on the other
-        half, as it was never trained.
-        """
-        figures = []
-        lpips, reason = lpips_if_ready() if self.held_out else (None, "")
-        options = RenderOptions(depth=False, threads=self.threads)
-        raw, correction = RawArrays.from_gaussians(gaussians), self._correction(state)
-        for view in self.held_out:
-            progress.update(1.0, f"measuring {self.scene.views[view].camera.name}")
-            mask = self.photos.mask(view, 1)
-            if mask is not None and not mask.any():
-                continue
-            camera, photo = self.photos.camera(view, 1), self.photos.photo(view, 1)
-            image = self.stepper.renderer.render(raw, camera, options).color
-            if correction is not None:
-                image = correction(image, photo, mask)
-            scores = score_images(image, photo, mask, lpips=lpips, threads=self.threads)
-            name = self.scene.views[view].camera.name
-            figures.append(HeldOutMetrics(name, scores.psnr, scores.ssim, scores.lpips))
-        if not figures or any(figure.lpips is not None for figure in figures):
-            return figures, ""
-        return figures, reason or TOO_SMALL

@@ -39,6 +39,7 @@ _DECISIONS = {
     "growth": "Add Gaussians",
     "full_size": "Photo Size",
     "dense_start": "Dense Start",
+    "refine_poses": "Refine Cameras",
 }
 """Labels of what was decided, as the panel Training has them."""
 

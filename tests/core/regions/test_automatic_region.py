@@ -97,6 +97,49 @@ def test_forward_facing_scene_takes_the_well_seen_part() -> None:
     assert high[1] - low[1] < 1.5
 
 
+ROOM = np.array([3.0, 2.0, 1.2])
+"""Half of the size of a room around the origin."""
+
+
+def room_points(rng: np.random.Generator, count: int = 4000) -> np.ndarray:
+    """Return points on the walls, the floor and the ceiling."""
+    points = rng.uniform(-1.0, 1.0, (count, 3))
+    axis = rng.integers(0, 3, count)
+    points[np.arange(count), axis] = np.sign(points[np.arange(count), axis])
+    return points * ROOM
+
+
+def test_photos_from_inside_get_the_room_and_not_the_air_in_its_middle() -> None:
+    rng = np.random.default_rng(5)
+    angles = np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    cameras = []
+    for number, angle in enumerate(angles):
+        eye = 0.5 * ROOM * [np.cos(angle), np.sin(angle), 0.0]
+        aim = ROOM * [np.cos(2.0 * angle + 1.0), np.sin(2.0 * angle + 1.0), 0.0]
+        cameras.append(look_at(eye, 1.5 * aim + [0.01, 0, 0], f"{number}", 640, 480, 400.0))
+    walls = room_points(rng)
+    through_window = rng.normal(size=(60, 3)) * 3.0 + [80.0, 0.0, 0.0]
+    region = automatic_region(scene_of(cameras, np.concatenate([walls, through_window])))
+    assert region.contains(walls).mean() > 0.95
+    assert not region.contains(through_window).any()
+    assert region.volume < 3.0 * 8.0 * ROOM.prod()
+
+
+def test_photos_in_a_parallel_row_get_all_that_they_show() -> None:
+    rng = np.random.default_rng(6)
+    cameras = [
+        look_at(np.array([x, 0.0, 0.0]), np.array([x, 10.0, 0.0]), f"{k}", 640, 480, 620.0)
+        for k, x in enumerate(np.linspace(-0.6, 0.6, 7))
+    ]
+    depth = rng.uniform(3.0, 6.0, 3000)
+    shown = np.stack(
+        [rng.uniform(-0.45, 0.45, 3000) * depth, depth, rng.uniform(-0.35, 0.35, 3000) * depth], 1
+    )
+    region = automatic_region(scene_of(cameras, shown))
+    assert region.contains(shown).mean() > 0.95
+    assert region.volume < 3.0 * np.ptp(shown, axis=0).prod()
+
+
 @pytest.mark.parametrize("count", [0, 5])
 def test_without_points_the_axes_decide(count: int) -> None:
     points = np.random.default_rng(4).normal(size=(count, 3)) * 0.1

@@ -20,9 +20,8 @@ from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.render.view_renderer import ViewRenderer
 from gaussian_wrapping_addon.core.settings import TrainingSettings
-from gaussian_wrapping_addon.core.training import iteration, rounds, trainer
+from gaussian_wrapping_addon.core.training import iteration, live_view, rounds, trainer
 from gaussian_wrapping_addon.core.training.result import TrainingResult
-from gaussian_wrapping_addon.core.training.state import TrainingState
 from gaussian_wrapping_addon.core.training.trainer import train
 from tests.core.training.small_scene import PhotosInMemory, sphere_gaussians, sphere_scene
 
@@ -95,18 +94,19 @@ class _LikenessOfSize:
     ("found", "value", "note"),
     [
         ((_LikenessOfSize(24), ""), 0.25, ""),
-        ((_LikenessOfSize(25), ""), None, trainer.TOO_SMALL),
+        ((_LikenessOfSize(25), ""), None, live_view.TOO_SMALL),
         ((None, "The weights are not here."), None, "The weights are not here."),
     ],
 )
 def test_held_out_photos_get_a_likeness_or_the_reason_why_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: tuple, value: float | None, note: str
+    monkeypatch: pytest.MonkeyPatch, found: tuple, value: float | None, note: str
 ) -> None:
     scene, photos = sphere_scene(views=9, size_px=24)
-    monkeypatch.setattr(trainer, "lpips_if_ready", lambda: found)
-    run = trainer._Trainer(scene, photos, SETTINGS, tmp_path, 0, 1)
-    state = TrainingState.start(sphere_gaussians(), 0)
-    figures, said = run._measure(sphere_gaussians(), state, Progress())
+    monkeypatch.setattr(live_view, "lpips_if_ready", lambda: found)
+    names = {view: scene.views[view].camera.name for view in (0, 8)}
+    figures, said = live_view.held_out_metrics(
+        sphere_gaussians(), photos, names, Progress(), threads=1
+    )
     values = TrainingResult(sphere_gaussians(), 1, (), tuple(figures), 1.0, (), said).to_json()
     assert len(values["held_out"]) == 2
     assert said == values.get("lpips_note", "") == note
@@ -370,6 +370,7 @@ def test_every_decision_is_written_down_and_can_be_overridden(tmp_path: Path) ->
     scene, photos = sphere_scene(views=9, size_px=24)
     names = {
         "full_size", "exposure", "multi_view", "harmonics", "wrapping", "growth", "dense_start",
+        "refine_poses",
     }  # fmt: skip
     settings = dataclasses.replace(SETTINGS, densify_until=0.9)
     result = train(scene, photos, settings, tmp_path, Progress(), threads=1)

@@ -15,6 +15,7 @@ _TITLES = {
     "growth": "Number of Gaussians",
     "full_size": "Size of the training images",
     "dense_start": "Start on surfaces found by matching photos",
+    "refine_poses": "Camera poses refined",
 }
 """Title of each choice, in an artist's words."""
 
@@ -24,6 +25,7 @@ _EFFECTS = {
     "multi_view": '"on" or "off"',
     "wrapping": '"on" or "off"',
     "full_size": '"on" trains at full size up to `max_image_px`; "off" at half of it',
+    "refine_poses": '"on" refines them in any case; "off" takes them as given',
     "dense_start": '"on" starts on whatever is found; "off" starts from the sparse points',
     "growth": '"on" lets the number grow up to `max_gaussians`; "off" adds none',
 }

@@ -108,6 +108,7 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
     ParseError
         A file is not in the format that jobs write.
     """
+    from ...dataset.refined_scene import with_poses
     from ...dataset.scene_file import SCENE_NAME, load_saved_scene
 
     job = JobFolder(folder)
@@ -118,10 +119,9 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
         if not path.is_file():
             raise DatasetError(f"The job {folder.name} has no {path.name} yet.", "Resume it first.")
     try:
-        shown = [
-            {key: value for key, value in entry.items() if key != "photo"}
-            for entry in read_json(paths[0])["cameras"]
-        ]
+        summary = read_json(paths[0])
+        shown, frame = list(summary["cameras"]), summary["world_from_scene"]
+        lenses = [_lens(entry) for entry in shown]
         held_out = [str(entry["name"]) for entry in read_json(paths[1])["training"]["held_out"]]
     except (KeyError, TypeError, AttributeError) as error:
         raise ParseError(paths[0], "cameras", f"not as expected ({error}).", again) from None
@@ -129,12 +129,33 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
         if not (stage / SCENE_NAME).is_file():
             continue
         # Photos may have been added since: only the stage with the result's own cameras counts.
-        if [entry.get("camera") for entry in read_json(stage / SCENE_NAME)["views"]] == shown:
-            return load_saved_scene(stage), held_out
+        # Their poses may be refined; the frame and all else is the stage's.
+        saved = read_json(stage / SCENE_NAME)
+        if saved["world_from_scene"] == frame and lenses == [
+            _lens(entry["camera"]) for entry in saved["views"]
+        ]:
+            poses = _poses(shown, paths[0], again)
+            return with_poses(load_saved_scene(stage), poses), held_out
     raise DatasetError(
         f"The photos that the result of {folder.name} was made from are no longer in its stages.",
         "Resume the job, or give the photos with --cameras.",
     )
+
+
+def _lens(entry: Any) -> dict[str, Any]:
+    """Return a camera's entry without its pose and photo."""
+    return {k: v for k, v in dict(entry).items() if k not in ("photo", "cam_from_world")}
+
+
+def _poses(shown: list[dict[str, Any]], path: Path, hint: str) -> np.ndarray:
+    """Return (n, 3, 4) float64."""
+    import numpy as np
+
+    try:
+        poses = [entry["cam_from_world"] for entry in shown]
+        return np.array(poses, np.float64).reshape(len(shown), 3, 4)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ParseError(path, "cameras", f"not as expected ({error}).", hint) from None
 
 
 def table(values: dict[str, Any]) -> list[str]:

@@ -43,14 +43,14 @@ def export_results(
     summary : dict
         Measurements of the whole job, from the runner.
     """
-    from ...dataset.scene_file import load_saved_scene
+    from ...dataset.refined_scene import load_refined_scene
     from ...gaussians.gaussian_file import load_gaussians
     from ...gaussians.splat_ply import write_splat_ply
 
     with new_result(folder.result, last=REPORTS) as new:
         progress.update(0.1, "writing the scene")
-        write_scene_summary(new / "scene.json", cameras)
-        scene = load_saved_scene(cameras.folder)
+        scene = load_refined_scene(cameras.folder, trained.folder)
+        write_scene_summary(new / "scene.json", scene)
         gaussians = load_gaussians(trained.folder / "gaussians.npz")
         write_splat_ply(new / "gaussians.ply", gaussians, scene.world_from_scene)
         for index, (name, meshed, textured) in enumerate(regions):

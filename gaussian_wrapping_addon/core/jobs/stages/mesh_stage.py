@@ -51,7 +51,7 @@ def run_mesh(
         import numpy as np
 
         from ...dataset.frames.scene_grid import snapped_length
-        from ...dataset.scene_file import load_saved_scene
+        from ...dataset.refined_scene import load_refined_scene
         from ...field.depth_samples import DepthSamples, sample_depth_maps
         from ...field.vector_field import VectorField
         from ...gaussians.gaussian_file import load_gaussians
@@ -69,7 +69,7 @@ def run_mesh(
             tiles_origin,
         )
 
-        scene = load_saved_scene(cameras.folder)
+        scene = load_refined_scene(cameras.folder, trained.folder)
         gaussians = load_gaussians(trained.folder / "gaussians.npz")
         arrays = gaussians.arrays()
         region, world_region = requested_region(request, body, scene, arrays)

@@ -290,7 +290,7 @@ def work_on_tile_list(
     ParseError, DatasetError
         A stage named by the list is not in the job folder.
     """
-    from ...dataset.scene_file import load_saved_scene
+    from ...dataset.refined_scene import load_refined_scene
     from ...field.vector_field import VectorField
     from ...files import resolve_inside
     from ...gaussians.gaussian_file import load_gaussians
@@ -306,7 +306,7 @@ def work_on_tile_list(
     if None in stage_folders:
         raise MeshingError("The tile list names no stages of this job.", "Mesh the region again.")
     cameras, training = (stage for stage in stage_folders if stage is not None)
-    scene = load_saved_scene(cameras)
+    scene = load_refined_scene(cameras, training)
     gaussians = load_gaussians(training / "gaussians.npz")
     arrays = gaussians.arrays()
     settings = from_json(JobSettings, origin.get("settings"), "settings").validated()

@@ -4,17 +4,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ...files import write_json
-from ..store.stage_folder import Stage
+
+if TYPE_CHECKING:
+    from ...dataset.scene import Scene
 
 
-def write_scene_summary(path: Path, cameras: Stage) -> None:
+def write_scene_summary(path: Path, scene: Scene) -> None:
     """Write ``result/scene.json``, the cameras and frame for Blender (docs/architecture.md)."""
-    from ...dataset.scene_file import load_saved_scene
     from ...tolerances import SCENE_RADIUS
 
-    scene = load_saved_scene(cameras.folder)
     write_json(
         path,
         {

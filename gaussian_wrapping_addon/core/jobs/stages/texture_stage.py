@@ -41,7 +41,7 @@ def run_texture(
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         from ...dataset.photo_source import PhotoSource
         from ...dataset.photos.photo_store import PhotoStore
-        from ...dataset.scene_file import load_saved_scene
+        from ...dataset.refined_scene import load_refined_scene
         from ...evaluation.views.photo_comparison import compare_with_photos
         from ...evaluation.views.preview import write_preview
         from ...files import read_json
@@ -54,7 +54,7 @@ def run_texture(
         from ...texture.texture_mesh import texture_mesh
         from .region_meshing import free_bytes
 
-        scene = load_saved_scene(cameras.folder)
+        scene = load_refined_scene(cameras.folder, trained.folder)
         photos = PhotoStore(scene, MAX_IMAGE_SIDE_PX)
         mesh = load_mesh(meshed.folder / "mesh.npz")
         dense_path = meshed.folder / DENSE_MESH

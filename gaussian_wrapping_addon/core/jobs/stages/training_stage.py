@@ -26,7 +26,7 @@ from ..store.continue_training import (
 )
 from ..store.job_file import JobFile
 from ..store.job_folder import JobFolder
-from ..store.stage_folder import Stage, record_interrupted_time, run_stage, stage_key
+from ..store.stage_folder import Stage, read_done, record_interrupted_time, run_stage, stage_key
 from .oom_retry import RETRIES_FILE, train_with_oom_retry
 
 if TYPE_CHECKING:
@@ -39,6 +39,9 @@ _logger = logging.getLogger(__name__)
 
 GAUSSIANS_NAME = "gaussians.npz"
 """In a training stage: the trained Gaussians, which all later stages read."""
+
+REFINED = "poses_refined"
+"""Entry of ``done.json``: whether refined camera poses lie beside the Gaussians."""
 
 
 def start_fingerprint(path: str) -> list[Any]:
@@ -110,7 +113,11 @@ def run_training(
         return {**done, "lineage": lineage(base_key, extra)}
 
     def whole(stage_folder: Path) -> bool:
-        return is_whole(stage_folder / GAUSSIANS_NAME)
+        from ...dataset.refined_scene import POSES_NAME
+
+        done = read_done(stage_folder) or {}
+        names = [GAUSSIANS_NAME, *([POSES_NAME] if done.get(REFINED) else [])]
+        return all(is_whole(stage_folder / name) for name in names)
 
     return run_stage(folder.stages, "train", key, progress, work, whole=whole)
 
@@ -119,6 +126,7 @@ def _train(
     stage_folder: Path, job: JobFile, cameras: Stage, progress: Progress, threads: int
 ) -> dict[str, Any]:
     from ...dataset.photos.photo_store import PhotoStore
+    from ...dataset.refined_scene import load_refined_scene, save_poses
     from ...dataset.scene_file import load_saved_scene
     from ...dataset.view_split import held_out_views
     from ...evaluation.report.pictures import write_held_out
@@ -144,6 +152,9 @@ def _train(
     )
     result = trained.result
     save_gaussians(stage_folder / GAUSSIANS_NAME, result.gaussians)
+    if result.poses is not None:
+        save_poses(stage_folder, result.poses)
+        scene = load_refined_scene(cameras.folder, stage_folder)
     measured = {figure.name: figure.psnr for figure in result.held_out}
     shown = [
         (index, scene.views[index].camera.name, measured[scene.views[index].camera.name])
@@ -152,7 +163,7 @@ def _train(
     ]
     photos = PhotoStore(scene, trained.settings.max_image_px)
     pictures = write_held_out(result.gaussians, photos, shown, stage_folder, threads=threads)
-    done = result.to_json()
+    done = {**result.to_json(), REFINED: result.poses is not None}
     earlier = [warning.to_json() for warning in (*warnings, *trained.warnings)]
     done["warnings"] = [*earlier, *done["warnings"]]
     return {

@@ -53,7 +53,7 @@ class PackedPhotos:
 
     def asked(self) -> np.ndarray:
         """Return (m,) int64 numbers of the photos to ask."""
-        return np.unique(np.linspace(0, len(self.cameras) - 1, MOST_ASKED).round().astype(np.int64))
+        return photos_asked(len(self.cameras))
 
     def counts(
         self, view: int, pixels: np.ndarray, inverse_depths: np.ndarray,
@@ -92,6 +92,11 @@ class PackedPhotos:
     def with_depths(self, depths: np.ndarray) -> PackedPhotos:
         """Return the same photos with other known depths."""
         return PackedPhotos(self.cameras, self.projections, self.sizes, depths, self.images)
+
+
+def photos_asked(count: int) -> np.ndarray:
+    """Return (m,) int64: which of so many photos are asked, a regular choice."""
+    return np.linspace(0, count - 1, min(MOST_ASKED, count)).round().astype(np.int64)
 
 
 def packed(depth_maps: Sequence[DepthMap], random: np.random.Generator) -> PackedPhotos:
@@ -163,4 +168,13 @@ def _ratio(
     return np.median(np.log(there / color[inside][agree]), axis=0)
 
 
-__all__ = ["AGREEING", "ALIKE", "NEARER", "THROUGH", "PackedPhotos", "Votes", "packed"]
+__all__ = [
+    "AGREEING",
+    "ALIKE",
+    "NEARER",
+    "THROUGH",
+    "PackedPhotos",
+    "Votes",
+    "packed",
+    "photos_asked",
+]

@@ -27,6 +27,7 @@ import numpy as np
 from ...errors import UsageError
 from ...kernels.array_store import ArrayStore
 from ...kernels.parallel import default_threads, even_bounds, run_chunks
+from ..optimizer.photo_adam import PhotoAdam, photo_rate
 from .exposure_kernels import apply_rows, backward_rows
 
 SRGB_PEDESTAL = 0.055
@@ -53,10 +54,6 @@ MAX_LOG_GAIN = 1.5
 """Bound of the log gains; larger ones stem from photos without content, not from exposure."""
 MAX_OFFSET = 1.0
 
-BETAS = (0.9, 0.99)
-"""Decay rates of Adam. A photo has only some dozens of steps in a short run, and its gradient, a
-mean over all its pixels, has little noise, so that a shorter memory than 0.999 works better."""
-
 EPSILON = 1e-15
 
 _NO_ALPHA = {np.dtype(t): np.zeros((0, 0), t) for t in (np.float32, np.float64)}
@@ -68,9 +65,14 @@ def exposure_rate(iteration: int, iterations: int, photos: int) -> float:
     Never below :data:`REFERENCE_RATE` nor above :data:`LARGEST_RATE` at the start; then log-linear
     to :data:`LAST_SHARE` of that.
     """
-    turns = max(1.0, iterations / max(1, photos))
-    first = min(LARGEST_RATE, max(REFERENCE_RATE, TRAVEL / turns))
-    return first * LAST_SHARE ** min(1.0, iteration / max(1, iterations))
+    return photo_rate(
+        iteration,
+        iterations,
+        photos,
+        travel=TRAVEL,
+        bounds=(REFERENCE_RATE, LARGEST_RATE),
+        last_share=LAST_SHARE,
+    )
 
 
 class Exposure:
@@ -104,9 +106,7 @@ class Exposure:
             )
         self.values = np.zeros((count, 6), np.float32)
         """Log gains of red, green, blue, then offsets at :data:`PIVOT`; display values."""
-        self.first = np.zeros((count, 6), np.float32)
-        self.second = np.zeros((count, 6), np.float32)
-        self.steps = np.zeros(count, np.int64)
+        self.adam = PhotoAdam(count, 6, np.float32, EPSILON)
         self.gradient = np.zeros(6)
         """Gradient of the last backward pass, for the next step; not part of the state."""
         self._store = ArrayStore()
@@ -206,14 +206,7 @@ class Exposure:
         """
         if not np.isfinite(self.gradient).all():
             return
-        self.steps[view] += 1
-        taken = int(self.steps[view])
-        gradient = self.gradient.astype(np.float32)
-        self.first[view] += np.float32(1.0 - BETAS[0]) * (gradient - self.first[view])
-        self.second[view] += np.float32(1.0 - BETAS[1]) * (gradient**2 - self.second[view])
-        mean = self.first[view].astype(np.float64) / (1.0 - BETAS[0] ** taken)
-        size = np.sqrt(self.second[view].astype(np.float64) / (1.0 - BETAS[1] ** taken))
-        self.values[view] -= (rate * mean / (size + EPSILON)).astype(np.float32)
+        self.values[view] -= self.adam.step(view, self.gradient, rate).astype(np.float32)
         self.pin()
 
     def pin(self) -> None:
@@ -237,8 +230,8 @@ class Exposure:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of the arrays that the next iteration depends on, by name."""
-        names = ("values", "first", "second", "steps", "trained")
-        return {name: getattr(self, name).copy() for name in names}
+        own: dict[str, np.ndarray] = {"values": self.values.copy(), "trained": self.trained.copy()}
+        return own | self.adam.to_arrays()
 
     @classmethod
     def restore(cls, arrays: dict[str, np.ndarray]) -> Exposure:
@@ -256,11 +249,11 @@ class Exposure:
         ):
             raise ValueError("the trained views of the exposures are not among the scene's")
         made = cls(count, trained.tolist())
-        for name in ("values", "first", "second", "steps"):
-            like, array = getattr(made, name), arrays[name]
-            if array.shape != like.shape or array.dtype != like.dtype:
-                raise ValueError(f"{name} of the exposures: {array.dtype} {array.shape}")
-            setattr(made, name, array.copy())
+        values = arrays["values"]
+        if values.shape != made.values.shape or values.dtype != made.values.dtype:
+            raise ValueError(f"values of the exposures: {values.dtype} {values.shape}")
+        made.values[...] = values
+        made.adam.load(arrays)
         return made
 
     @staticmethod

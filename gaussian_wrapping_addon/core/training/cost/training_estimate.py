@@ -56,7 +56,7 @@ thread, 40 000 Gaussians, 4000 pixels)."""
 MATCHING_PIXEL_S = 6e-6
 """Per pixel of all photos at the size at which they are matched for a dense start: 7.6 us of one
 thread (35 photos of 320 x 240 px, benchmarks/scenes wheel) on two threads, and 2 us for planes
-through plain parts (0.5 to 4.3 us on 15 scenes of benchmarks/zoo)."""
+through plain parts (0.8 to 5.1 us on 15 scenes of benchmarks/zoo)."""
 
 MATCHING_PIXEL_BYTES = 200
 """Per such pixel: planes, costs, and the points that are fused."""

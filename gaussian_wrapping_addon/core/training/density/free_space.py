@@ -9,15 +9,8 @@ import numpy as np
 
 from ... import tolerances
 from ...stereo.depth_priors import DepthPrior
-
-BEFORE_SHARE = 0.03
-"""A Gaussian lies before a free depth if that is larger by this share at least."""
-
-AGREEING_SHARE = 0.02
-"""Largest relative difference of its depth and a confirmed one that agrees."""
-
-MOST_ASKED = 40
-"""Photos asked; a regular choice of more."""
+from ...stereo.plain.evidence import photos_asked
+from ...stereo.plain.evidence_kernels import AGREEING_SHARE, THROUGH_SHARE
 
 
 def contradicted(
@@ -43,14 +36,13 @@ def contradicted(
     means = np.asarray(means, np.float64)
     through, agreeing = (np.zeros(len(means), np.int32) for _ in range(2))
     views = sorted(priors)
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(MOST_ASKED, len(views))).astype(np.int64))
-    for prior in (priors[views[k]] for k in chosen):
+    for prior in (priors[views[k]] for k in photos_asked(len(views))):
         pixels, depth = prior.camera.project(means)
         size = (prior.camera.width, prior.camera.height)
         shown = np.flatnonzero((depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1))
         column, row = pixels[shown].astype(np.int64).T
         own = depth[shown]
-        through[shown] += prior.free[row, column] > (1.0 + BEFORE_SHARE) * own
+        through[shown] += prior.free[row, column] > (1.0 + THROUGH_SHARE) * own
         agreeing[shown] += np.abs(prior.known[row, column] - own) < AGREEING_SHARE * own
     near = np.linalg.norm(means, axis=1) < tolerances.FAR_RADIUS
     return near & (through >= least_views) & (through > agreeing)

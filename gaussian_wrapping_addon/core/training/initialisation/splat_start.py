@@ -71,6 +71,7 @@ def wrapping_settings(settings: TrainingSettings) -> TrainingSettings:
         settings,
         iterations=max(1, round(ITERATIONS_SHARE * settings.iterations)),
         growth="off",
+        refine_poses="off",
         full_size="on",
         prune_share=0.0,
         depth_from=0.0,

@@ -12,11 +12,7 @@ FAINT, SURE = 0.2, 0.5
 
 
 def add_opacity_prior(
-    gradients: VisibleGradients,
-    opacity_logits: np.ndarray,
-    boxes: np.ndarray,
-    size_px: tuple[int, int],
-    weight: float,
+    gradients: VisibleGradients, opacity_logits: np.ndarray, shares: np.ndarray, weight: float
 ) -> float:
     """Add the gradient of ``-weight`` times the mean prior of the Gaussians over a pixel.
 
@@ -31,10 +27,9 @@ def add_opacity_prior(
         asks about.
     opacity_logits : (n,) float32
         Raw, of all Gaussians.
-    boxes : (n, 4) float32
-        Footprints on the screen: x0, y0, x1, y1 in pixels.
-    size_px : (int, int)
-        Width and height of the image; area outside it does not count.
+    shares : (v,) float32
+        Shares of the image in the footprints of the Gaussians that the gradient belongs to
+        (:func:`~.footprint_regulariser.footprint_shares`).
     weight : float
         Setting ``lambda_opacity``.
 
@@ -44,13 +39,9 @@ def add_opacity_prior(
         Mean over the pixels of the sum over Gaussians of ``4 k(o)``, where ``k`` is the integral
         of a ramp from 0 at :data:`FAINT` to 1 at :data:`SURE`.
     """
-    ids = gradients.ids
-    width, height = size_px
-    box = np.clip(boxes[ids], 0.0, np.array([width, height, width, height], np.float32))  # (v, 4)
-    area = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])  # (v,)
-    area *= gradients.opacity_logits != 0.0  # the optimizer takes a 0 for a Gaussian not seen
-    area /= np.float32(width * height)
-    opacity = 1.0 / (1.0 + np.exp(-opacity_logits[ids]))
+    # The optimizer takes a 0 for a Gaussian not seen.
+    area = shares * (gradients.opacity_logits != 0.0)
+    opacity = 1.0 / (1.0 + np.exp(-opacity_logits[gradients.ids]))
     ramp = np.clip((opacity - FAINT) / (SURE - FAINT), 0.0, 1.0)
     gradients.opacity_logits[...] -= 4.0 * weight * area * ramp * opacity * (1.0 - opacity)
     integral = 0.5 * (SURE - FAINT) * ramp**2 + np.maximum(opacity - SURE, 0.0)

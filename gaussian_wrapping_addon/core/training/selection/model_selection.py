@@ -55,6 +55,11 @@ class Decision:
                 f"Give one of {', '.join(SELECTION_MODES)}.",
             )
 
+    @classmethod
+    def by_settings(cls, name: str, word: str) -> Decision:
+        """Return the decision that a setting of ``"on"`` or ``"off"`` takes."""
+        return cls(name, word, word, "Not measured: decided by the settings.", measured=False)
+
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; figures that are not finite are left out."""
         values = dataclasses.asdict(self)

@@ -21,6 +21,7 @@ from tests.core.evaluation.report.report_examples import full_summary
 
 NAMES = (
     "harmonics", "exposure", "multi_view", "wrapping", "growth", "full_size", "dense_start",
+    "refine_poses",
 )  # fmt: skip
 
 

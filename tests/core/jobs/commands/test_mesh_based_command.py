@@ -78,6 +78,22 @@ def test_a_job_is_judged_by_the_photos_that_it_held_out(job: Path, tmp_path: Pat
     assert values["mesh"]["faces"] > 0
 
 
+def test_refined_poses_of_the_result_are_those_that_judge(job: Path) -> None:
+    """The stage of the cameras keeps the poses that were given."""
+    given, _ = job_scene(job)
+    edit(
+        job / "result" / "scene.json",
+        lambda summary: summary["cameras"][3]["cam_from_world"][0].__setitem__(3, 0.125),
+    )
+    found, _ = job_scene(job)
+    assert found.views[3].camera.cam_from_world[0, 3] == 0.125
+    for k in (0, 1, 2, 4):
+        assert found.views[k].camera.to_json() == given.views[k].camera.to_json()
+    edit(job / "result" / "scene.json", lambda summary: summary["cameras"][3].update(fx=1.0))
+    with pytest.raises(DatasetError, match="no longer in its stages"):
+        job_scene(job)
+
+
 def test_a_folder_of_test_photos_is_as_good_as_holding_them_out(job: Path, tmp_path: Path) -> None:
     held = measure(job)
     folder = write_test_folder(job, tmp_path / "test", ["00.jpg"])

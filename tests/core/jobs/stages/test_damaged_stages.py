@@ -12,9 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gaussian_wrapping_addon.core.dataset import scene_file
+from gaussian_wrapping_addon.core.dataset import refined_scene, scene_file
 from gaussian_wrapping_addon.core.dataset.loading import load
-from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.dataset.refined_scene import (
+    POSES_NAME,
+    load_refined_scene,
+    save_poses,
+)
+from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.gaussians.gaussian_file import load_gaussians, save_gaussians
 from gaussian_wrapping_addon.core.jobs.runner import STAGE_VERSIONS
 from gaussian_wrapping_addon.core.jobs.stages import training_stage
@@ -24,7 +29,7 @@ from gaussian_wrapping_addon.core.jobs.stages.texture_stage import run_texture
 from gaussian_wrapping_addon.core.jobs.stages.training_stage import run_training
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-from gaussian_wrapping_addon.core.jobs.store.stage_folder import Stage, read_done
+from gaussian_wrapping_addon.core.jobs.store.stage_folder import DONE_NAME, Stage, read_done
 from gaussian_wrapping_addon.core.mesh.mesh_file import load_mesh, save_mesh
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
 from gaussian_wrapping_addon.core.progress import Progress
@@ -94,6 +99,33 @@ def test_a_damaged_training_is_trained_again(
 
 
 @damaged
+def test_a_training_whose_refined_poses_are_damaged_is_trained_again(
+    folder: JobFolder, damage: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, cameras, trained = run(folder)
+    scene = scene_file.load_saved_scene(cameras.folder)
+    poses = np.array([view.camera.cam_from_world for view in scene.views])
+    done = trained.folder / DONE_NAME
+    write_json(done, {**read_json(done), training_stage.REFINED: True})
+    save_poses(trained.folder, poses)
+    assert run(folder)[2].reused
+
+    gaussians = load_gaussians(trained.folder / training_stage.GAUSSIANS_NAME)
+
+    def train(stage_folder: Path, *_: object) -> dict[str, Any]:
+        save_gaussians(stage_folder / training_stage.GAUSSIANS_NAME, gaussians)
+        save_poses(stage_folder, poses)
+        return {training_stage.REFINED: True}
+
+    monkeypatch.setattr(training_stage, "_train", train)
+    damage(trained.folder / POSES_NAME)
+    again = run(folder)[2]
+    assert not again.reused
+    found = load_refined_scene(cameras.folder, again.folder)
+    assert np.array_equal([view.camera.cam_from_world for view in found.views], poses)
+
+
+@damaged
 @pytest.mark.parametrize("name", ["mesh.npz", DENSE_MESH])
 def test_a_damaged_mesh_is_made_again(
     folder: JobFolder, name: str, damage: Callable[[Path], None]
@@ -128,10 +160,10 @@ def test_a_damaged_textured_mesh_is_made_again(
     class BegunAgainError(Exception):
         pass
 
-    def begin(_: Path) -> None:
+    def begin(*_: Path) -> None:
         raise BegunAgainError
 
-    monkeypatch.setattr(scene_file, "load_saved_scene", begin)  # what the work begins with
+    monkeypatch.setattr(refined_scene, "load_refined_scene", begin)  # what the work begins with
     job, cameras, trained = run(folder)
     meshed = Stage("mesh-ball", "key", folder.stages / "mesh-ball-key", {}, True)
 

@@ -130,11 +130,11 @@ DONE = {"seconds": 1.0, "processor_seconds": 1.0, "finished_unix_s": 5.0, "held_
 def exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Export finished stages whose scene and Gaussians are not looked at."""
     for module, name in (
-        ("dataset.scene_file", "load_saved_scene"),
+        ("dataset.refined_scene", "load_refined_scene"),
         ("gaussians.gaussian_file", "load_gaussians"),
     ):
         scene = SimpleNamespace(world_from_scene=Similarity(1.0, np.eye(3), np.zeros(3)))
-        monkeypatch.setattr(f"gaussian_wrapping_addon.core.{module}.{name}", lambda _, s=scene: s)
+        monkeypatch.setattr(f"gaussian_wrapping_addon.core.{module}.{name}", lambda *_, s=scene: s)
     monkeypatch.setattr(
         "gaussian_wrapping_addon.core.gaussians.splat_ply.write_splat_ply",
         lambda path, *_: path.write_bytes(b"gaussians"),

@@ -173,7 +173,7 @@ def test_one_photo_stays_neutral() -> None:
     render = textured(0).astype(np.float32)
     train(exposure, [render], [(0.7 * render).astype(np.float32)], 0, 20, 20)
     assert np.array_equal(exposure.values, np.zeros((1, 6), np.float32))
-    assert exposure.steps[0] == 20
+    assert exposure.adam.steps[0] == 20
 
 
 def test_black_photos_give_finite_values_within_bounds() -> None:

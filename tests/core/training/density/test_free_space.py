@@ -9,12 +9,12 @@ import pytest
 from gaussian_wrapping_addon.core import tolerances
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.stereo.depth_priors import DepthPrior
-from gaussian_wrapping_addon.core.training.density.free_space import (
+from gaussian_wrapping_addon.core.stereo.plain.evidence import MOST_ASKED
+from gaussian_wrapping_addon.core.stereo.plain.evidence_kernels import (
     AGREEING_SHARE,
-    BEFORE_SHARE,
-    MOST_ASKED,
-    contradicted,
+    THROUGH_SHARE,
 )
+from gaussian_wrapping_addon.core.training.density.free_space import contradicted
 from tests.synthetic import look_at
 
 FLOOR_Z = -2.0
@@ -39,13 +39,13 @@ def floor_depth(camera: Camera) -> np.ndarray:
     return np.where(depth > 0, depth, 0.0).astype(np.float32)
 
 
-def priors(free: int, known: float = 0.0) -> dict[int, DepthPrior]:
-    """Return priors of which the first ones see the floor, and know depths of that share of it."""
+def priors(free: int) -> dict[int, DepthPrior]:
+    """Return priors of which the first ones see the floor; no depth is known."""
     found = {}
     for view, camera in enumerate(cameras()):
-        depth, nothing = floor_depth(camera), np.zeros((60, 80), np.float32)
-        seen = depth if view < free else nothing
-        found[view] = DepthPrior(camera, nothing, nothing, np.float32(known) * depth, seen)
+        known, nothing = (np.zeros((60, 80), np.float32) for _ in range(2))
+        seen = floor_depth(camera) if view < free else nothing
+        found[view] = DepthPrior(camera, nothing, nothing, known, seen)
     return found
 
 
@@ -71,7 +71,7 @@ def test_the_margin_is_that_of_the_depth() -> None:
     given = {0: priors(free=1)[0]}
     ray = (camera.rays() @ camera.rotation)[30, 40]
     whole = float(floor_depth(camera)[30, 40])
-    for share, expected in ((1.0 + 0.5 * BEFORE_SHARE, False), (1.0 + 2.0 * BEFORE_SHARE, True)):
+    for share, expected in ((1.0 + 0.5 * THROUGH_SHARE, False), (1.0 + 2.0 * THROUGH_SHARE, True)):
         point = camera.center + ray * whole / share
         assert contradicted(point[None], given, 1).tolist() == [expected]
 

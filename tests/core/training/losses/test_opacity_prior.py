@@ -13,10 +13,8 @@ from gaussian_wrapping_addon.core.training.losses.opacity_prior import (
     add_opacity_prior,
 )
 
-BOXES = np.array([[0, 0, 10, 10], [-20, 0, 5, 10], [2, 2, 8, 4], [90, 90, 99, 99]], np.float32)
-SIZE_PX = (10, 10)
-SHARES = np.array([1.0, 0.5, 0.12])
-"""Of the image that lie in the first three boxes."""
+SHARES = np.array([1.0, 0.5, 0.12], np.float32)
+"""Of the image in the footprints of the first three Gaussians; the fourth is not seen."""
 
 
 def seen(by_opacity: list[float]) -> VisibleGradients:
@@ -33,14 +31,14 @@ def logits(opacities: list[float]) -> np.ndarray:
 
 
 def prior(raw: np.ndarray) -> float:
-    return add_opacity_prior(seen([1.0, 1.0, 1.0]), raw, BOXES, SIZE_PX, 0.0)
+    return add_opacity_prior(seen([1.0, 1.0, 1.0]), raw, SHARES, 0.0)
 
 
 @pytest.mark.parametrize("opacities", [[0.3, 0.45, 0.6], [0.9, 0.21, 0.99], [0.05, 0.7, 0.5]])
 def test_gradient_is_that_of_the_value(opacities: list[float]) -> None:
     raw, step = logits([*opacities, 0.8]), 0.02
     gradients = seen([0.25, -0.25, 0.125])
-    add_opacity_prior(gradients, raw, BOXES, SIZE_PX, 0.3)
+    add_opacity_prior(gradients, raw, SHARES, 0.3)
     added = gradients.opacity_logits - np.array([0.25, -0.25, 0.125])
     for k in range(3):
         change = np.zeros(4, np.float32)
@@ -52,7 +50,7 @@ def test_gradient_is_that_of_the_value(opacities: list[float]) -> None:
 def test_what_is_opaque_enough_gains_by_more_opacity() -> None:
     gradients = seen([1e-9, 1e-9, 1e-9])
     opacity = np.array([0.5, 0.6, 0.97])
-    add_opacity_prior(gradients, logits([*opacity, 0.5]), BOXES, SIZE_PX, 0.1)
+    add_opacity_prior(gradients, logits([*opacity, 0.5]), SHARES, 0.1)
     expected = -0.4 * SHARES * opacity * (1.0 - opacity)
     assert gradients.opacity_logits == pytest.approx(expected, rel=1e-4)
     assert FAINT < SURE <= 0.5
@@ -60,7 +58,7 @@ def test_what_is_opaque_enough_gains_by_more_opacity() -> None:
 
 def test_faint_gaussians_are_left_to_the_photos() -> None:
     gradients = seen([0.5, -0.5, 0.5])
-    value = add_opacity_prior(gradients, logits([0.02, 0.1, FAINT, 0.9]), BOXES, SIZE_PX, 1.0)
+    value = add_opacity_prior(gradients, logits([0.02, 0.1, FAINT, 0.9]), SHARES, 1.0)
     assert gradients.opacity_logits == pytest.approx([0.5, -0.5, 0.5], abs=1e-6)
     assert value == pytest.approx(0.0, abs=1e-6)
 
@@ -68,6 +66,6 @@ def test_faint_gaussians_are_left_to_the_photos() -> None:
 def test_gaussians_that_no_pixel_asks_about_stay_so() -> None:
     """The optimizer leaves rows alone whose opacity has no gradient."""
     gradients = seen([0.0, 0.5, 0.0])
-    add_opacity_prior(gradients, logits([0.9, 0.9, 0.9, 0.9]), BOXES, SIZE_PX, 1.0)
+    add_opacity_prior(gradients, logits([0.9, 0.9, 0.9, 0.9]), SHARES, 1.0)
     assert gradients.opacity_logits[0] == gradients.opacity_logits[2] == 0.0
     assert gradients.opacity_logits[1] < 0.5
