@@ -23,9 +23,9 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     JobFolder,
     JobStatus,
-    process_alive,
     process_start_ticks,
 )
+from gaussian_wrapping_addon.core.processes.process_identity import process_alive
 from gaussian_wrapping_addon.core.settings import JobSettings
 
 # A worker that works until it is told to stop, and then for ``deaf_s``.

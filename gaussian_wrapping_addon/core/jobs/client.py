@@ -33,7 +33,7 @@ from ..processes.worker_requirements import not_started
 from ..regular_files import open_regular, touch_regular
 from .stages.oom_retry import killed_hint, killed_mesh_hint
 from .store.job_file import JobFile, read_job, reject_region_conflicts, write_job
-from .store.job_folder import JobFolder, JobStatus
+from .store.job_folder import FOREIGN_LOCK_HINT, JobFolder, JobStatus
 from .store.rollback import save_rollback
 
 WORKER_MODULE = "jobs.worker"
@@ -48,7 +48,10 @@ CODE_WAIT_S = 0.5
 longer."""
 KILL_GRACE_S = 2.0
 KILL_POLL_S = 0.05
-RUNNING_HINT = "Wait for it, or stop it: cancel DIR on the command line, Cancel in Blender."
+RUNNING_HINT = (
+    "Wait for it, or stop it: cancel DIR on the command line, Cancel in Blender. "
+    f"{FOREIGN_LOCK_HINT}"
+)
 PYTHON_HINT = "Check the worker's Python: batch.py doctor, or Check Worker in the preferences."
 STAGES_AFTER_TRAINING = ("mesh", "texture", "export")
 """Stages of a job whose training is finished."""

@@ -14,6 +14,8 @@ from pathlib import Path
 CALLER_OPTION = "gwrap_caller"
 """``-X`` option of children: pid and start time of the process that started them."""
 MAX_PID = 2**31 - 1
+FIRST_PID = 1
+"""Of the process that starts all others: it is always alive, and none of ours."""
 
 
 def process_start_ticks(pid: int) -> int:
@@ -38,6 +40,18 @@ def process_alive(pid: int, started: int) -> bool:
     except PermissionError:
         return True
     return True
+
+
+def owner_alive(pid: int, started: int) -> bool:
+    """Tell whether the process that a lock or a status names runs, and can have written it.
+
+    On Linux every process of ours knows its start time: a record without one is of somebody else,
+    and would hold a folder as long as any process has that pid. Elsewhere only the first process of
+    the system is known not to be one of ours.
+    """
+    if sys.platform.startswith("linux"):
+        return started > 0 and process_alive(pid, started)
+    return pid > FIRST_PID and process_alive(pid, started)
 
 
 def _linux_stat(pid: int) -> list[str]:

@@ -19,11 +19,10 @@ from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, 
 from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     JobFolder,
     JobStatus,
-    process_alive,
     process_start_ticks,
 )
 from gaussian_wrapping_addon.core.processes.helper_process import child_command
-from gaussian_wrapping_addon.core.processes.process_identity import CALLER_OPTION
+from gaussian_wrapping_addon.core.processes.process_identity import CALLER_OPTION, process_alive
 from gaussian_wrapping_addon.core.settings import JobSettings, MeshingSettings
 
 BATCH = Path(__file__).resolve().parents[3] / "gaussian_wrapping_addon" / "batch.py"

@@ -17,8 +17,8 @@ from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     MARKER,
     JobFolder,
     JobStatus,
-    process_alive,
 )
+from gaussian_wrapping_addon.core.processes.process_identity import process_alive
 
 DEAF = """
 import os, subprocess, sys, threading, time

@@ -23,8 +23,9 @@ from gaussian_wrapping_addon.core.errors import (
 )
 from gaussian_wrapping_addon.core.jobs import client as job_client
 from gaussian_wrapping_addon.core.jobs.commands.doctor import find_and_diagnose
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus, process_alive
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.core.processes.helper_process import child_command
+from gaussian_wrapping_addon.core.processes.process_identity import process_alive
 from gaussian_wrapping_addon.core.processes.worker_environment import (
     WorkerEnvironment,
     interpreter_of,

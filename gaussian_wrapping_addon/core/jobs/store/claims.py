@@ -25,7 +25,7 @@ from typing import Any
 
 from ...errors import ParseError
 from ...files import read_json
-from ...processes.process_identity import process_alive, process_start_ticks
+from ...processes.process_identity import owner_alive, process_start_ticks
 from ...progress import Progress
 
 _logger = logging.getLogger(__name__)
@@ -122,7 +122,7 @@ class Claims:
             return True  # released just now
         owner = self._owner(path)
         here = owner.get("place") == host_and_pid_namespace()
-        if here and process_alive(int(owner["pid"]), int(owner["started"])):
+        if here and owner_alive(int(owner["pid"]), int(owner["started"])):
             return False
         state = (owner.get("token"), time_ns)
         known, since_s = self._seen.get(name, (None, 0.0))

@@ -15,7 +15,7 @@ from typing import Any
 from ... import limits
 from ...errors import DISK_FULL_ERRNOS, ParseError, UsageError, known_error, unwritable_error
 from ...files import overwrite_json, read_json, write_json
-from ...processes.process_identity import process_alive, process_start_ticks
+from ...processes.process_identity import owner_alive, process_start_ticks
 from ...regular_files import read_bounded, reject_foreign_entries, touch_regular
 
 STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
@@ -98,6 +98,9 @@ def _is_kind(name: str, value: Any) -> bool:
 
 def _read_small(path: Path) -> Any:
     return read_json(path, most_bytes=limits.MAX_STATUS_BYTES, follow_links=False)
+
+
+FOREIGN_LOCK_HINT = "If it is no job of this add-on, delete lock.json there."
 
 
 @dataclass(frozen=True)
@@ -214,7 +217,7 @@ class JobFolder:
     @staticmethod
     def _gone(status: JobStatus) -> bool:
         running = status.state in ("RUNNING", "CANCELLING")
-        return running and not process_alive(status.pid, status.pid_started)
+        return running and not owner_alive(status.pid, status.pid_started)
 
     def write_status(self, status: JobStatus) -> None:
         """Write the status atomically."""
@@ -251,7 +254,7 @@ class JobFolder:
             pid = (self._lock_owner() or (0, 0))[0]
             raise UsageError(
                 f"Process {pid} is working in {self.root}.",
-                "Wait for it, cancel it, or choose another folder.",
+                f"Wait for it, cancel it, or choose another folder. {FOREIGN_LOCK_HINT}",
             ) from None
         except OSError:
             # A file system without hard links (exFAT): renaming is the best available.
@@ -269,7 +272,7 @@ class JobFolder:
         except OSError:
             return
         owner = self._lock_owner()
-        if owner is not None and process_alive(*owner):
+        if owner is not None and owner_alive(*owner):
             return
         aside = self.lock_path.with_name(f"lock.{os.getpid()}.stale")
         try:
@@ -297,7 +300,7 @@ class JobFolder:
     def locked(self) -> bool:
         """Whether a living process holds the folder."""
         owner = self._lock_owner()
-        return owner is not None and process_alive(*owner)
+        return owner is not None and owner_alive(*owner)
 
     def unlock(self) -> None:
         """Release the folder."""

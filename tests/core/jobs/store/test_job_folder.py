@@ -19,9 +19,9 @@ from gaussian_wrapping_addon.core.jobs.store import job_folder
 from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     JobFolder,
     JobStatus,
-    process_alive,
     process_start_ticks,
 )
+from gaussian_wrapping_addon.core.processes.process_identity import process_alive
 
 
 def dead_pid() -> int:
@@ -69,7 +69,7 @@ def test_a_worker_that_ends_between_two_looks_is_not_lost(
         folder.write_status(JobStatus(state="DONE", pid=pid, exit_code=0))
         return False
 
-    monkeypatch.setattr(job_folder, "process_alive", ends_now)
+    monkeypatch.setattr(job_folder, "owner_alive", ends_now)
     assert folder.read_status().state == "DONE"
 
 
@@ -127,8 +127,12 @@ def test_lock_of_a_living_process_is_respected_and_a_stale_one_taken(tmp_path: P
     assert not folder.lock_path.exists()
 
 
-@pytest.mark.parametrize("case", ["dead", "reused", "half", "empty", "other", "clock"])
+@pytest.mark.parametrize(
+    "case", ["dead", "reused", "half", "empty", "other", "clock", "first", "without start"]
+)
 def test_a_stale_lock_is_taken_over(case: str, tmp_path: Path) -> None:
+    if case == "without start" and not sys.platform.startswith("linux"):
+        pytest.skip("only Linux tells when processes began")
     folder = JobFolder(tmp_path)
     here, ticks = os.getppid(), process_start_ticks(os.getppid())
     owner = {
@@ -136,6 +140,8 @@ def test_a_stale_lock_is_taken_over(case: str, tmp_path: Path) -> None:
         "reused": {"pid": here, "started": ticks + 1},
         "clock": {"pid": here, "started": ticks + 10**12},  # it began when the clock was ahead
         "other": {"pid": "me"},
+        "first": {"pid": 1, "started": 0},
+        "without start": {"pid": here, "started": 0},
     }.get(case)
     text = json.dumps(owner) if owner else {"half": '{"pid": 1', "empty": ""}[case]
     folder.lock_path.write_text(text)
@@ -145,6 +151,12 @@ def test_a_stale_lock_is_taken_over(case: str, tmp_path: Path) -> None:
     assert folder.locked()
     assert json.loads(folder.lock_path.read_text())["pid"] == os.getpid()
     assert [p.name for p in tmp_path.iterdir()] == ["lock.json"]
+
+
+def test_a_status_that_names_the_first_process_is_of_no_worker(tmp_path: Path) -> None:
+    folder = JobFolder(tmp_path)
+    folder.write_status(JobStatus("RUNNING", pid=1, pid_started=0))
+    assert folder.read_status().state == "LOST"
 
 
 def test_a_living_owner_keeps_its_lock_whatever_the_clock_says(tmp_path: Path) -> None:
@@ -172,7 +184,7 @@ def test_two_that_take_over_at_once_leave_one(
             write_json(folder.lock_path, {"pid": parent, "started": process_start_ticks(parent)})
         return alive
 
-    monkeypatch.setattr(job_folder, "process_alive", slow)
+    monkeypatch.setattr(job_folder, "owner_alive", slow)
     with pytest.raises(UsageError, match=f"Process {parent} is working"):
         folder.lock()
     assert json.loads(folder.lock_path.read_text())["pid"] == parent
