@@ -58,7 +58,7 @@ class TrainingSettings(MethodSettings):
         help="Training iterations.",
         check=_COUNT,
         unit="iterations",
-        presets={"draft": 1500, "fine": 4000, "paper": 30_000},
+        presets={"draft": 800, "fine": 4000, "paper": 30_000},
         option=Option("--iterations", "N", "training iterations instead of the preset's"),
         panel=PanelProperty(
             "Iterations",

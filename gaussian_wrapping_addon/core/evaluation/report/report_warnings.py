@@ -20,6 +20,10 @@ LOW_COVERAGE = 0.5
 GAP_DB = 20.0 * math.log10(2.0)
 """Held-out photos have more than twice the error of training photos."""
 
+TEXELLESS_SHARE = 0.005
+"""Share of the area in faces smaller than a texel that is worth a warning: scattered slivers take
+the colour of their neighbours."""
+
 MAX_RESIDUAL = 0.25
 """``|v - 0.5|`` beyond which a vertex is nearer to "empty" or "solid" than to the surface."""
 
@@ -199,7 +203,8 @@ def _texture_warnings(texture: dict[str, Any]) -> list[ReportWarning]:
             )
         )
     lost = measured(texture.get("faces_without_texel"))
-    if lost:
+    share = measured(texture.get("area_without_texel_share"))
+    if lost and (share is None or share > TEXELLESS_SHARE):
         text = f"{plural(int(lost), 'face')} smaller than a texel: no texture colour of their own."
         found.append(
             ReportWarning("faces-without-texel", text, "Choose a larger texture or a coarser mesh.")

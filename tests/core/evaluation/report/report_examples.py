@@ -139,7 +139,7 @@ def full_region() -> dict[str, Any]:
             "texels_overlapping": 2,
             "coverage": 0.25,
             "area_seen_share": 0.3,
-            "area_without_texel_share": 0.002,
+            "area_without_texel_share": 0.02,
             "faces_without_texel": 5,
             "views_per_seen_texel": 4.0,
             "unwrap_fallback_reason": "the unwrapper crashed",

@@ -18,6 +18,7 @@ from gaussian_wrapping_addon.core.evaluation.report.markdown import report_markd
 from gaussian_wrapping_addon.core.evaluation.report.report import headline, write_report
 from gaussian_wrapping_addon.core.evaluation.report.report_warnings import (
     FEW_HELD_OUT,
+    TEXELLESS_SHARE,
     collect_warnings,
 )
 from gaussian_wrapping_addon.core.evaluation.report.text import (
@@ -174,8 +175,9 @@ def good() -> dict[str, Any]:
     region["statistics"].update(closed=True, boundary_edges=0)
     region["provenance"].update(notes=[], degenerate_faces_left=0, level_error_p99=0.01)
     region["texture"].update(
-        coverage=0.9, unwrap_fallback_reason="", faces_without_texel=0, texels_overlapping=0
-    )
+        coverage=0.9, unwrap_fallback_reason="", texels_overlapping=0, faces_without_texel=5,
+        area_without_texel_share=0.9 * TEXELLESS_SHARE,
+    )  # fmt: skip
     return report
 
 
@@ -267,7 +269,7 @@ def test_figures_are_where_a_person_looks_for_them(tmp_path: Path) -> None:
         ("Texel density", "8.8 texels per world unit"),
         ("Coverage: seen by photos", "25.0 %"),
         ("Surface area seen by photos", "30.0 %"),
-        ("Area of faces smaller than a texel", "0.2 %"),
+        ("Area of faces smaller than a texel", "2.0 %"),
     ):
         assert row(region, name) == figure
     assert "| p\\|q.jpg | 18.50 dB | 0.4500 | 75.0 % |" in region
