@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import sys
+import threading
 from typing import Any
 
 from ..processes.signal_handlers import kept_signal_handlers
+
+_importing = threading.Lock()
 
 
 def import_pycolmap() -> Any:
@@ -17,10 +20,12 @@ def import_pycolmap() -> Any:
     ImportError
         It is not installed.
     """
-    known = sys.modules.get("pycolmap")
-    if known is not None:
-        return known
-    with kept_signal_handlers():
-        import pycolmap
+    # One thread at a time: another one would take the half imported module, or the handlers that it
+    # has just set for those to keep.
+    with _importing:
+        if "pycolmap" in sys.modules:
+            return sys.modules["pycolmap"]
+        with kept_signal_handlers():
+            import pycolmap
 
-    return pycolmap
+        return pycolmap

@@ -21,16 +21,19 @@ sys.path[:0] = {path!r}
 asked = []
 signal.signal(signal.SIGTERM, lambda *_: asked.append(True))
 signal.signal(signal.SIGINT, lambda *_: asked.append(True))
-if {thread}:
-    thread = threading.Thread(target=load)
+failed = []
+threading.excepthook = failed.append
+threads = [threading.Thread(target=load) for _ in range({threads})]
+for thread in threads:
     thread.start()
+for thread in threads:
     thread.join()
-else:
+if not threads:
     load()
 for number in (signal.SIGTERM, signal.SIGINT):
     os.kill(os.getpid(), number)
     time.sleep(0.05)
-sys.exit(40 + len(asked))
+sys.exit(40 + len(asked) + 10 * len(failed))
 """
 PYCOLMAP = """
 def load():
@@ -49,10 +52,11 @@ def load():
 
 
 @pytest.mark.skipif(os.name == "nt", reason="processes of Windows get no SIGTERM")
-@pytest.mark.parametrize("thread", [False, True])
-@pytest.mark.parametrize("load", [PYCOLMAP, IMPOLITE], ids=["pycolmap", "impolite"])
-def test_the_handlers_of_a_worker_stay(load: str, thread: bool) -> None:
-    code = CODE.format(path=sys.path, load=load, thread=thread)
+@pytest.mark.parametrize(
+    ("load", "threads"), [(PYCOLMAP, 0), (PYCOLMAP, 1), (PYCOLMAP, 4), (IMPOLITE, 0), (IMPOLITE, 1)]
+)
+def test_the_handlers_of_a_worker_stay(load: str, threads: int) -> None:
+    code = CODE.format(path=sys.path, load=load, threads=threads)
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert ended.returncode == 42, ended.stderr.decode()[-2000:]
 
