@@ -7,7 +7,7 @@ import atexit
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -83,3 +83,26 @@ def ended_workers(addon: object, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
             job.client.kill()
             assert not job.client.poll().active, "a worker outlived its test"
     job_timer.forget_all()
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """An empty folder for photos, whose name is not plain ASCII."""
+    folder = tmp_path / "photos of été"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Put the fake in the place of the worker's Python; the value says how it behaves."""
+    from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
+    from tests.blender.job_play import write_fake_python
+
+    monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
+
+    def behave(mode: str) -> None:
+        monkeypatch.setenv("GW_FAKE", mode)
+
+    behave("quick")
+    return behave

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import bpy
+import pytest
 
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobStatus
 from gaussian_wrapping_addon.ops.common import tags
@@ -69,3 +70,30 @@ def play_to_stage(folder: Path, stage: str) -> None:
 def meshes() -> int:
     """Count the meshes that were imported into the open scene."""
     return len(list(tags.objects_of_kind(bpy.context.scene, "mesh")))
+
+
+def status() -> object:
+    """Return what the panel would show of the open scene's job."""
+    return watched_jobs.status_of(bpy.context.scene.gwrap.job_folder)
+
+
+def wait_for(*states: str, clock: Callable[[], float] = time.monotonic) -> None:
+    """Tick until the open scene's job is in one of these states."""
+    end_s = time.monotonic() + 20.0
+    while time.monotonic() < end_s:
+        job_timer.poll_jobs(clock)
+        if status().state in states:  # type: ignore[attr-defined]
+            return
+        time.sleep(0.02)
+    pytest.fail(f"the job is {status()}")
+
+
+def wait_until_it_says_something(folder: Path) -> None:
+    """Tick until the worker has reported."""
+    end_s = time.monotonic() + 20.0
+    while time.monotonic() < end_s:
+        job_timer.poll_jobs()
+        if status().fraction == 0.25:  # type: ignore[attr-defined]
+            return
+        time.sleep(0.02)
+    pytest.fail(f"no word from the worker in {folder}")

@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
 import signal
-import stat
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -22,7 +20,7 @@ import pytest
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
-from gaussian_wrapping_addon.ops.common import background, known_jobs, tags
+from gaussian_wrapping_addon.ops.common import background, tags
 from gaussian_wrapping_addon.ops.jobs import job_attach, job_timer, watched_jobs
 from gaussian_wrapping_addon.ops.worker import preferred_worker
 from gaussian_wrapping_addon.ui.dataset import dataset_panel
@@ -30,63 +28,17 @@ from gaussian_wrapping_addon.ui.meshing import mesh_panel
 from gaussian_wrapping_addon.ui.results import report_panel
 from gaussian_wrapping_addon.ui.training import train_panel
 from tests.blender.fake_layout import draw
+from tests.blender.job_play import (
+    start_wrap,
+    status,
+    wait_for,
+    wait_until_it_says_something,
+)
 from tests.blender.synthetic_result import BOX_SCENE, WORLD_FROM_SCENE
 
 HERE = Path(__file__).parent
 
 pytestmark = pytest.mark.usefixtures("ended_workers")
-
-
-@pytest.fixture
-def photos(tmp_path: Path) -> Path:
-    folder = tmp_path / "photos of été"
-    folder.mkdir()
-    return folder
-
-
-@pytest.fixture
-def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Put the fake in the place of the worker's Python; the value says how it behaves."""
-    script = tmp_path / "fake-python"
-    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{HERE / "fake_worker.py"}" "$@"\n')
-    script.chmod(script.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv(PYTHON_VARIABLE, str(script))
-
-    def behave(mode: str) -> None:
-        monkeypatch.setenv("GW_FAKE", mode)
-
-    behave("quick")
-    return behave
-
-
-def start_wrap(photos: Path) -> None:
-    bpy.context.scene.gwrap.source = str(photos)
-    assert bpy.ops.gwrap.wrap_scene() == {"FINISHED"}
-
-
-def status() -> object:
-    return watched_jobs.status_of(bpy.context.scene.gwrap.job_folder)
-
-
-def wait_for(*states: str, clock: Callable[[], float] = time.monotonic) -> None:
-    """Play the timer, which never fires in background Blender."""
-    end_s = time.monotonic() + 20.0
-    while time.monotonic() < end_s:
-        job_timer.poll_jobs(clock)
-        if status().state in states:  # type: ignore[attr-defined]
-            return
-        time.sleep(0.02)
-    pytest.fail(f"the job is {status()}")
-
-
-def wait_until_it_says_something(folder: Path) -> None:
-    end_s = time.monotonic() + 20.0
-    while time.monotonic() < end_s:
-        job_timer.poll_jobs()
-        if status().fraction == 0.25:  # type: ignore[attr-defined]
-            return
-        time.sleep(0.02)
-    pytest.fail(f"no word from the worker in {folder}")
 
 
 def test_wrap_scene_runs_and_imports(photos: Path, worker: object) -> None:
@@ -346,144 +298,6 @@ def test_import_waits_for_object_mode(photos: Path, worker: Callable[[str], None
     assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1
 
 
-def test_a_file_finds_its_running_job_again(
-    photos: Path, tmp_path: Path, worker: Callable[[str], None]
-) -> None:
-    worker("slow")
-    start_wrap(photos)
-    wait_until_it_says_something(photos)
-    folder = Path(bpy.context.scene.gwrap.job_folder)
-    blend = tmp_path / "work.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(blend))
-    bpy.ops.wm.read_homefile(use_empty=True)
-    (folder / "finish").touch()
-    end_s = time.monotonic() + 20
-    while watched_jobs.jobs[str(folder)].status.state != "DONE" and time.monotonic() < end_s:
-        job_timer.poll_jobs()
-        time.sleep(0.02)
-    assert len(bpy.data.objects) == 0, "another file gets nothing"
-    bpy.ops.wm.open_mainfile(filepath=str(blend))
-    assert status().state == "DONE"  # type: ignore[attr-defined]
-    job_timer.poll_jobs()
-    wait_for("DONE")
-    assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1
-
-
-def test_another_blender_finds_the_job_and_offers_its_result(
-    photos: Path, tmp_path: Path, worker: object
-) -> None:
-    start_wrap(photos)
-    blend = tmp_path / "work.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(blend))
-    wait_for("DONE")
-    job_timer.forget_all()  # as after a crash of Blender
-    bpy.ops.wm.open_mainfile(filepath=str(blend))
-    assert status().state == "DONE"  # type: ignore[attr-defined]
-    assert not job_timer.poll_jobs()
-    assert len(bpy.data.objects) == 0, "opening a file imports nothing by itself"
-    assert "Import Finished Result" in draw(train_panel.GWRAP_PT_train).texts
-    bpy.ops.gwrap.import_result(directory=watched_jobs.result_to_import(bpy.context.scene))
-    assert "Import Finished Result" not in draw(train_panel.GWRAP_PT_train).texts
-
-
-def test_a_project_folder_that_was_moved_asks_before_its_job_is_read(
-    photos: Path, tmp_path: Path, worker: object
-) -> None:
-    project = tmp_path / "project"
-    bpy.context.scene.gwrap.output = str(project / "job")
-    start_wrap(photos)
-    wait_for("DONE")
-    bpy.ops.wm.save_as_mainfile(filepath=str(project / "work.blend"))
-    job_timer.forget_all()
-    os.rename(project, tmp_path / "moved")
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved" / "work.blend"))
-    assert watched_jobs.jobs == {}, "a downloaded folder beside a file looks the same"
-    assert "gwrap.find_job" in draw(train_panel.GWRAP_PT_train).operators
-    bpy.ops.gwrap.find_job(directory=str(tmp_path / "moved" / "job"))
-    assert status().state == "DONE"  # type: ignore[attr-defined]
-    job_timer.forget_all()
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved" / "work.blend"))
-    assert status().state == "DONE"  # type: ignore[attr-defined]
-    assert Path(bpy.context.scene.gwrap.job_folder) == tmp_path / "moved" / "job"
-
-
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no named pipes in folders")
-@pytest.mark.parametrize("asked", [False, True])
-@pytest.mark.parametrize("name", ["status.json", "lock.json", "job-finished.json", "job.json"])
-def test_opening_a_file_never_waits_for_a_pipe_in_the_folder_beside_it(
-    photos: Path, tmp_path: Path, worker: object, name: str, asked: bool
-) -> None:
-    bpy.context.scene.gwrap.output = str(tmp_path / "job")
-    start_wrap(photos)
-    wait_for("DONE")
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
-    job_timer.forget_all()
-    (tmp_path / "job" / name).unlink(missing_ok=True)
-    os.mkfifo(tmp_path / "job" / name)
-    if not asked:
-        known_jobs._session.clear()  # another person's machine
-    begun_s = time.monotonic()
-    with alarm(5):
-        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "work.blend"))
-        assert (watched_jobs.jobs != {}) == asked
-        job_timer.poll_jobs()
-        draw(train_panel.GWRAP_PT_train)
-    assert time.monotonic() - begun_s < 4.0
-
-
-@contextlib.contextmanager
-def alarm(seconds: int) -> Iterator[None]:
-    """End this process, rather than hang, where a pipe is opened and nobody writes to it."""
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-
-
-def test_a_job_whose_folder_was_deleted_is_told_and_forgotten(
-    photos: Path, tmp_path: Path, worker: object
-) -> None:
-    start_wrap(photos)
-    wait_for("DONE")
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
-    job_timer.forget_all()
-    shutil.rmtree(bpy.context.scene.gwrap.job_folder)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "work.blend"))
-    assert "is gone" in draw(train_panel.GWRAP_PT_train).texts
-    assert not bpy.ops.gwrap.resume_job.poll()
-    assert bpy.ops.gwrap.wrap_scene.poll()
-    start_wrap(photos)
-    wait_for("DONE")
-    assert "is gone" not in draw(train_panel.GWRAP_PT_train).texts
-
-
-@pytest.mark.parametrize("stored", ["{job}", "/", "//../../..", r"\\server\share\job", "//x\0y"])
-def test_a_file_from_elsewhere_opens_no_job_unasked(
-    photos: Path, tmp_path: Path, worker: object, stored: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    start_wrap(photos)
-    wait_for("DONE")
-    folder = bpy.context.scene.gwrap.job_folder
-    bpy.context.scene.gwrap.job_folder = stored.format(job=folder)
-    elsewhere = tmp_path / "downloads"
-    elsewhere.mkdir()
-    bpy.ops.wm.save_as_mainfile(filepath=str(elsewhere / "work.blend"))
-    job_timer.forget_all()
-    monkeypatch.setattr(known_jobs, "_session", [])  # another person's machine
-    bpy.ops.wm.open_mainfile(filepath=str(elsewhere / "work.blend"))
-    assert watched_jobs.jobs == {}
-    if bpy.context.scene.gwrap.job_folder:
-        assert "gwrap.find_job" in draw(train_panel.GWRAP_PT_train).operators
-    bpy.ops.gwrap.find_job(directory=folder)
-    assert status().state == "DONE"  # type: ignore[attr-defined]
-
-
-def test_find_job_refuses_other_folders(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="holds no job"):
-        bpy.ops.gwrap.find_job(directory=str(tmp_path))
-
-
 def test_undo_does_not_lose_a_running_job(photos: Path, worker: Callable[[str], None]) -> None:
     worker("slow")
     start_wrap(photos)
@@ -504,26 +318,7 @@ def test_undo_of_an_import_keeps_the_job(photos: Path, worker: object) -> None:
     assert (properties.job_folder, properties.job_command) == (folder, "WRAP")
 
 
-def test_disabling_the_addon_leaves_the_job_to_be_found(
-    photos: Path, tmp_path: Path, worker: Callable[[str], None], addon: ModuleType
-) -> None:
-    worker("slow")
-    start_wrap(photos)
-    wait_until_it_says_something(photos)
-    folder = Path(bpy.context.scene.gwrap.job_folder)
-    client = watched_jobs.jobs[str(folder)].client
-    addon.unregister()
-    assert client.poll().active, "the worker goes on"
-    addon.register()
-    job_attach.attach_later()
-    assert watched_jobs.is_running(bpy.context.scene.gwrap.job_folder)
-    (folder / "finish").touch()
-    wait_for("DONE")
-    assert len(list(tags.objects_of_kind(bpy.context.scene, "mesh"))) == 1
-
-
 def test_a_deleted_job_folder_is_survived(photos: Path, worker: Callable[[str], None]) -> None:
-    import shutil
 
     worker("slow")
     start_wrap(photos)

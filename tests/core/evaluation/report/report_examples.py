@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
+from gaussian_wrapping_addon.core.evaluation.report.report import write_report
 from gaussian_wrapping_addon.core.report_warning import ReportWarning
 
 REGION = "stem_1"
@@ -197,3 +199,25 @@ def write_pictures(result: Path) -> None:
             path.write_text("<svg/>")
         else:
             Image.new("RGB", (4, 4)).save(path)
+
+
+def write(
+    folder: Path, summary: dict[str, Any] | None = None, regions: dict[str, Any] | None = None
+) -> tuple[dict[str, Any], str]:
+    """Write a report; return what both files hold."""
+    summary = full_summary() if summary is None else summary
+    write_report(folder, summary, {REGION: full_region()} if regions is None else regions)
+
+    def refuse(name: str) -> Any:
+        raise AssertionError(name)
+
+    values = json.loads((folder / "report.json").read_text(), parse_constant=refuse)
+    return values, (folder / "report.md").read_text(encoding="utf-8")
+
+
+def section(text: str, heading: str) -> str:
+    """Return the lines below a heading, up to the next of its rank."""
+    rank = heading.split(" ")[0]
+    begin = text.index(f"\n{heading}\n")
+    end = text.find(f"\n{rank} ", begin + len(heading))
+    return text[begin : end if end >= 0 else len(text)]
