@@ -196,6 +196,16 @@ class TrainingSettings(MethodSettings):
         off="Start from the sparse points alone",
         since="0.2.0",
     )
+    match_px: int = setting(
+        640,
+        help="Longest side of photos when they are matched for a dense start; larger ones are "
+        "halved until they fit.",
+        check=Range(32, 4096),
+        unit="pixels",
+        presets={"draft": 320},
+        option=Option("--match-px", "N", "photo size when photos are matched for a dense start"),
+        since="0.2.0",
+    )
     refine_poses: str = _model_selection(
         help="Camera poses are refined while training. auto: after a dense start, and kept if the "
         "photos move them clearly; off: poses stay as given.",

@@ -39,9 +39,6 @@ NEAREST_FACTOR, FARTHEST_FACTOR = 1.5, 0.02
 FEW_POINTS = 20
 """A photo with fewer of them takes the range from all points."""
 
-MATCHED_SIDE_PX = 400
-"""Long side that photos are matched at, at most."""
-
 MOST_PIXELS = 12_000_000
 """Of all photos together at that size; more photos are matched at a smaller one."""
 
@@ -90,6 +87,7 @@ def estimate_depth_maps(
     points: np.ndarray,
     progress: Progress,
     *,
+    side_px: int,
     seed: int = 0,
     threads: int = 0,
 ) -> list[DepthMap]:
@@ -104,6 +102,8 @@ def estimate_depth_maps(
         Sparse points, scene frame: they tell the range of depths and which photos to compare.
     progress : Progress
         Updated after each photo and level; checked for cancellation.
+    side_px : int
+        Longest side at which photos are matched (:func:`least_divisor`).
 
     Returns
     -------
@@ -116,7 +116,7 @@ def estimate_depth_maps(
     full = [photos.camera(view, 1) for view in views]
     if len(views) <= LEAST_SOURCES or len(points) < FEW_POINTS:
         return []
-    fine = matching_divisor(full)
+    fine = matching_divisor(full, side_px)
     if min(min(camera.width, camera.height) for camera in full) < 2 * fine:
         return []
     sources = source_views(full, points)
@@ -300,13 +300,14 @@ def _depth_range(camera: Camera, points: np.ndarray) -> tuple[float, float]:
     return FARTHEST_FACTOR / far, NEAREST_FACTOR / near
 
 
-def matching_divisor(cameras: Sequence[Camera]) -> int:
+def matching_divisor(cameras: Sequence[Camera], most_px: int) -> int:
     """Return the divisor of the size at which photos are matched; ``cameras`` are of divisor 1."""
     side_px = max(max(camera.width, camera.height) for camera in cameras)
-    return least_divisor(side_px, sum(camera.width * camera.height for camera in cameras))
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    return least_divisor(side_px, pixels, most_px)
 
 
-def least_divisor(side_px: float, pixels: float) -> int:
+def least_divisor(side_px: float, pixels: float, most_px: int) -> int:
     """Return the least power of 2 that brings photos below both limits.
 
     Parameters
@@ -314,9 +315,11 @@ def least_divisor(side_px: float, pixels: float) -> int:
     side_px : float
         Long side of the largest photo.
     pixels : float
-        Of all photos together.
+        Of all photos together: divided, at most :data:`MOST_PIXELS`.
+    most_px : int
+        Long side, divided, at most.
     """
     divisor = 1
-    while side_px / divisor > MATCHED_SIDE_PX or pixels / divisor**2 > MOST_PIXELS:
+    while side_px / divisor > most_px or pixels / divisor**2 > MOST_PIXELS:
         divisor *= 2
     return divisor

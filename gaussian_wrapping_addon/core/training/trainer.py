@@ -286,8 +286,8 @@ class _Trainer:
         if self.settings.dense_start != "off":
             start = dense_start(
                 scene, self.photos, self.views, self.settings.dense_start, progress.span(0.0, 0.0),
-                max_gaussians=self.schedule.growth_limit(), sh_degree=self.settings.sh_degree,
-                seed=self.seed, threads=self.threads,
+                side_px=self.settings.match_px, max_gaussians=self.schedule.growth_limit(),
+                sh_degree=self.settings.sh_degree, seed=self.seed, threads=self.threads,
             )  # fmt: skip
             if start.gaussians is not None:
                 if self._uses_priors():
@@ -345,15 +345,17 @@ class _Trainer:
         """Return the confirmed depths of a resumed training; lost ones are made again."""
         if not (state.model_selection.chose("dense_start") and self._uses_priors()):
             return {}
-        divisor = matching_divisor([self.photos.camera(view, 1) for view in self.views])
+        full = [self.photos.camera(view, 1) for view in self.views]
+        divisor = matching_divisor(full, self.settings.match_px)
         cameras = {view: self.photos.camera(view, divisor) for view in self.views}
         priors = load_priors(self.folder, cameras, key)
         if priors is None:
             _logger.info("the confirmed depths are not there: matching the photos again")
             scene, quiet = self._start_scene(), progress.span(0.0, 0.0)
             maps = matched_photos(
-                scene, self.photos, self.views, quiet, seed=self.seed, threads=self.threads
-            )
+                scene, self.photos, self.views, quiet, side_px=self.settings.match_px,
+                seed=self.seed, threads=self.threads,
+            )  # fmt: skip
             priors = priors_of(self.views, on_planes(scene, maps, quiet, seed=self.seed))
             save_priors(self.folder, priors, key)
         return priors

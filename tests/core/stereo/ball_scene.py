@@ -56,12 +56,18 @@ def ball_scene() -> tuple[Scene, PhotosInMemory]:
     return scene, PhotosInMemory(scene, [photograph(camera) for camera in cameras])
 
 
+SIDE_PX = 640
+"""Longest side at which photos are matched: they are smaller."""
+
+
 @functools.cache
 def ball_maps() -> tuple[DepthMap, ...]:
     """Return the depth maps of all photos."""
     scene, photos = ball_scene()
     views = range(len(scene.views))
-    return tuple(estimate_depth_maps(photos, views, scene.points, Progress(), threads=1))
+    return tuple(
+        estimate_depth_maps(photos, views, scene.points, Progress(), side_px=SIDE_PX, threads=1)
+    )
 
 
 def with_photos(

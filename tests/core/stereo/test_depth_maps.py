@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
 from gaussian_wrapping_addon.core.stereo.depth_maps import (
-    MATCHED_SIDE_PX,
     MOST_PIXELS,
     DepthMap,
     _depth_range,
@@ -22,6 +22,7 @@ from gaussian_wrapping_addon.core.stereo.depth_maps import (
 from gaussian_wrapping_addon.core.stereo.matching_cost import WORST_COST
 from gaussian_wrapping_addon.core.stereo.source_views import in_image
 from tests.core.stereo.ball_scene import (
+    SIDE_PX,
     ball_maps,
     ball_scene,
     surface_points,
@@ -34,12 +35,14 @@ from tests.core.training.small_scene import PhotosInMemory
 FEW = range(4, 8)
 """Views of the tests that match again."""
 
+match = functools.partial(estimate_depth_maps, side_px=SIDE_PX)
+
 
 def few_maps(
     photos: PhotosInMemory, *, views: range = FEW, seed: int = 0, threads: int = 1
 ) -> list[DepthMap]:
     points = ball_scene()[0].points
-    return estimate_depth_maps(photos, views, points, Progress(), seed=seed, threads=threads)
+    return match(photos, views, points, Progress(), seed=seed, threads=threads)
 
 
 def errors(depth_maps: list[DepthMap] | tuple[DepthMap, ...]) -> np.ndarray:
@@ -98,12 +101,12 @@ def test_a_mask_excludes_pixels() -> None:
 def test_few_points_few_views_and_tiny_photos_give_nothing() -> None:
     scene, photos = ball_scene()
     assert few_maps(photos, views=range(2)) == []
-    assert estimate_depth_maps(photos, FEW, scene.points[:19], Progress(), threads=1) == []
-    assert estimate_depth_maps(photos, FEW, np.zeros((0, 3)), Progress(), threads=1) == []
+    assert match(photos, FEW, scene.points[:19], Progress(), threads=1) == []
+    assert match(photos, FEW, np.zeros((0, 3)), Progress(), threads=1) == []
     views = tuple(dataclasses.replace(v, camera=v.camera.resized(128, 1)) for v in scene.views[:4])
     flat = dataclasses.replace(scene, views=views)
     lines = PhotosInMemory(flat, [photo[:1] for photo in photos.photos[:4]])
-    assert estimate_depth_maps(lines, range(4), scene.points, Progress(), threads=1) == []
+    assert match(lines, range(4), scene.points, Progress(), threads=1) == []
 
 
 def test_photos_of_one_colour_confirm_nothing() -> None:
@@ -135,7 +138,7 @@ def test_a_view_that_shares_no_points_confirms_and_guesses_nothing() -> None:
     )
     near = scene.points[np.linalg.norm(scene.points, axis=1) < 1.5]
     turned = PhotosInMemory(dataclasses.replace(scene, views=tuple(views)), photos.photos)
-    found = estimate_depth_maps(turned, range(3, 7), near, Progress(), threads=1)
+    found = match(turned, range(3, 7), near, Progress(), threads=1)
     assert not found[0].confidence.any()
     assert not found[0].agreeing.any()
     assert (found[0].cost == WORST_COST).all()
@@ -145,7 +148,7 @@ def test_a_view_that_shares_no_points_confirms_and_guesses_nothing() -> None:
 def test_progress_never_falls_and_ends_at_1() -> None:
     scene, photos = ball_scene()
     events: list[ProgressEvent] = []
-    estimate_depth_maps(photos, FEW, scene.points, Progress("train", events.append), threads=2)
+    match(photos, FEW, scene.points, Progress("train", events.append), threads=2)
     fractions = [event.fraction for event in events]
     assert fractions == sorted(fractions)
     assert fractions[0] > 0.0
@@ -159,7 +162,7 @@ def test_it_can_be_cancelled(threads: int) -> None:
     events: list[ProgressEvent] = []
     progress = Progress("train", events.append, lambda: len(events) >= 3)
     with pytest.raises(Cancelled):
-        estimate_depth_maps(photos, FEW, scene.points, progress, threads=threads)
+        match(photos, FEW, scene.points, progress, threads=threads)
     assert len(events) <= 3 + threads
 
 
@@ -169,14 +172,14 @@ def _camera(width: int, height: int) -> Camera:
 
 @pytest.mark.parametrize(
     ("width", "height", "count", "divisor"),
-    [(400, 300, 10, 1), (401, 300, 10, 2), (300, 1601, 10, 8), (400, 300, 101, 2), (60, 40, 1, 1)],
+    [(640, 480, 10, 1), (641, 480, 10, 2), (300, 2561, 10, 8), (400, 300, 101, 2), (60, 40, 1, 1)],
 )
 def test_both_limits_are_kept_by_the_least_divisor(
     width: int, height: int, count: int, divisor: int
 ) -> None:
-    cameras = [_camera(width, height), *[_camera(min(width, 400), height)] * (count - 1)]
-    assert matching_divisor(cameras) == divisor
-    assert max(width, height) / divisor <= MATCHED_SIDE_PX
+    cameras = [_camera(width, height), *[_camera(min(width, 640), height)] * (count - 1)]
+    assert matching_divisor(cameras, 640) == divisor
+    assert max(width, height) / divisor <= 640
     assert sum(c.width * c.height for c in cameras) / divisor**2 <= MOST_PIXELS
 
 

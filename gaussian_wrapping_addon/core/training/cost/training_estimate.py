@@ -253,7 +253,7 @@ def _matched_pixels(facts: SceneFacts, settings: TrainingSettings) -> float:
         return 0.0
     side = min(facts.long_side_px, settings.max_image_px)
     pixels = facts.photos * _trained_pixels(facts, settings)
-    return pixels / least_divisor(side, pixels) ** 2
+    return pixels / least_divisor(side, pixels, settings.match_px) ** 2
 
 
 def _window(pixels: float, most: int) -> float:

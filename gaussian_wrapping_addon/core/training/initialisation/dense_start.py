@@ -76,6 +76,7 @@ def dense_start(
     setting: str,
     progress: Progress,
     *,
+    side_px: int,
     max_gaussians: int,
     sh_degree: int,
     seed: int,
@@ -92,11 +93,15 @@ def dense_start(
     setting : str
         ``"auto"`` needs :data:`LEAST_CONFIRMED` of the pixels; ``"on"`` takes what there is.
     progress : Progress
+    side_px : int
+        Longest side at which photos are matched.
     max_gaussians : int
         Limit of the growth; the start leaves room below it.
     """
     points, colors = _usable(scene)
-    maps = matched_photos(scene, photos, views, progress, seed=seed, threads=threads)
+    maps = matched_photos(
+        scene, photos, views, progress, side_px=side_px, seed=seed, threads=threads
+    )
     confirmed = _confirmed_share(maps)
     decision = _decision(setting, confirmed, len(maps))
     if decision.chosen != "on":
@@ -133,12 +138,15 @@ def matched_photos(
     views: Sequence[int],
     progress: Progress,
     *,
+    side_px: int,
     seed: int,
     threads: int,
 ) -> list[DepthMap]:
     """Return the depth maps of the training views; empty where there is too little to match."""
     points, _ = _usable(scene)
-    return estimate_depth_maps(photos, views, points, progress, seed=seed, threads=threads)
+    return estimate_depth_maps(
+        photos, views, points, progress, side_px=side_px, seed=seed, threads=threads
+    )
 
 
 def on_planes(

@@ -113,7 +113,8 @@ def test_matching_adds_time_and_memory_once() -> None:
     without = estimate(FACTS, replace(PLAIN, dense_start="off", growth="on"), MACHINE)
     fixed = replace(PLAIN, growth="on")
     whole, later = (estimate(FACTS, fixed, MACHINE, first=first) for first in (0, 1))
-    matched = FACTS.photos * FACTS.pixels / least_divisor(640, FACTS.photos * FACTS.pixels) ** 2
+    pixels = FACTS.photos * FACTS.pixels
+    matched = pixels / least_divisor(640, pixels, fixed.match_px) ** 2
     assert whole.memory_bytes - without.memory_bytes == pytest.approx(
         MATCHING_PIXEL_BYTES * matched, rel=0.01
     )

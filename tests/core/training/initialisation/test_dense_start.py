@@ -29,6 +29,7 @@ from gaussian_wrapping_addon.core.training.initialisation.dense_start import (
 from gaussian_wrapping_addon.core.training.rounds import Rounds
 from gaussian_wrapping_addon.core.training.state import TrainingState
 from tests.core.stereo.ball_scene import (
+    SIDE_PX,
     ball_scene,
     surface_distance,
     true_normals,
@@ -50,7 +51,7 @@ def start(
     own_scene, own_photos = ball_scene()
     return dense_start(
         scene or own_scene, photos or own_photos, FEW, setting, Progress(),
-        max_gaussians=max_gaussians, sh_degree=1, seed=seed, threads=1,
+        side_px=SIDE_PX, max_gaussians=max_gaussians, sh_degree=1, seed=seed, threads=1,
     )  # fmt: skip
 
 
