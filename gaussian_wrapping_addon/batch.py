@@ -12,6 +12,7 @@ import importlib
 import importlib.util
 import logging
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,12 +29,12 @@ def main(arguments: list[str], program: str = "batch.py") -> int:
     """
     from .core.errors import EXIT_DONE, EXIT_RESOURCES
 
-    terminal = _log_to_terminal()
-    try:
-        code = _run(arguments, program)
-    except SystemExit as ended:  # of --help, after its text
-        code = ended.code if isinstance(ended.code, int) else EXIT_DONE
-    lost = None if terminal is None else terminal.lost()
+    with _shown_in_terminal() as terminal:
+        try:
+            code = _run(arguments, program)
+        except SystemExit as ended:  # of --help, after its text
+            code = ended.code if isinstance(ended.code, int) else EXIT_DONE
+    lost = terminal.lost()
     if lost is None:
         return code
     with contextlib.suppress(OSError, ValueError, AttributeError):
@@ -78,19 +79,23 @@ def console_entry() -> int:
     return main(sys.argv[1:], "gaussian-wrapping")
 
 
-def _log_to_terminal() -> TerminalHandler | None:
-    """Show what the commands log; return the handler, or None if another one does."""
+@contextlib.contextmanager
+def _shown_in_terminal() -> Iterator[TerminalHandler]:
+    """Write what the commands log to stdout, and nowhere else, while the block runs."""
     from .core.log_lines import LineFormatter, TerminalHandler
 
-    if _logger.handlers:
-        first = _logger.handlers[0]
-        return first if isinstance(first, TerminalHandler) else None
     handler = TerminalHandler(sys.stdout)
     handler.setFormatter(LineFormatter("%(message)s"))
+    level, propagate = _logger.level, _logger.propagate
     _logger.addHandler(handler)
     _logger.setLevel(logging.INFO)
     _logger.propagate = False
-    return handler
+    try:
+        yield handler
+    finally:
+        _logger.removeHandler(handler)
+        _logger.setLevel(level)
+        _logger.propagate = propagate
 
 
 def _arguments(argv: list[str]) -> list[str]:

@@ -92,12 +92,10 @@ def test_a_folder_that_is_no_job(place: Path, words: str) -> None:
     ],
 )
 def test_a_path_that_no_system_stores(
-    place: Path, words: str, monkeypatch: pytest.MonkeyPatch
+    place: Path, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told: list[str] = []
-    monkeypatch.setattr(batch._logger, "error", lambda text, *values: told.append(text % values))
     assert code_of(words) == EXIT_USAGE
-    (said,) = told
+    (said,) = capsys.readouterr().out.splitlines()
     assert "xxx" in said
     assert len(said) < 400 or "does not exist" in said
     assert not (place / "new").exists()
@@ -205,14 +203,13 @@ def test_a_place_that_cannot_be_written(
 
 
 def test_a_disk_without_room_has_the_same_code_everywhere(
-    place: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def full(*_: object, **__: object) -> Callable[[], None]:
         raise OSError(28, "No space left on device", str(place / "trained" / "job.json"))
 
     monkeypatch.setattr(check, "check_input", full)
-    monkeypatch.setattr(batch._logger, "propagate", True)
-    monkeypatch.setattr(batch._logger, "handlers", [caplog.handler])
     assert code_of("wrap photos --out new --no-blend") == EXIT_RESOURCES
-    assert "job.json" in caplog.text
-    assert "No room" in caplog.text
+    said = capsys.readouterr().out
+    assert "job.json" in said
+    assert "No room" in said

@@ -81,11 +81,7 @@ def start_worker(folder: JobFolder, deaf_s: float = 0.0) -> subprocess.Popen[byt
 
 def said(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
     capsys.readouterr()
-    handlers, batch._logger.handlers = batch._logger.handlers, []  # made for this stdout
-    try:
-        code = batch.main(list(words))
-    finally:
-        batch._logger.handlers = handlers
+    code = batch.main(list(words))
     return code, capsys.readouterr().out
 
 
