@@ -29,6 +29,9 @@ RENDER_BUDGET_BYTES = 512 * 1024 * 1024
 """Memory for lists and gradients of tile intersections in one rendering: with it, a million
 Gaussians train at 1600 x 1200 pixels within 4 GB."""
 
+SHORTEST_EDGE = 1e-30
+"""Of a mesh, in world units. Shorter lengths could become 0 in other units: automatic."""
+
 HELPER_DEADLINE_S = 3600.0
 PARTIAL_FILE_S = 60.0
 """Time after the last write to a temporary file until it counts as left by a killed process."""

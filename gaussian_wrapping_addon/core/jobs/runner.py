@@ -16,6 +16,7 @@ from ..progress import Progress, ProgressEvent
 from ..settings import to_json
 from .stages.cameras_stage import run_cameras
 from .stages.mesh_stage import run_mesh
+from .stages.region_field import reject_short_edges
 from .stages.texture_stage import run_texture
 from .stages.training_stage import run_training
 from .store.job_file import JobFile, reject_region_conflicts
@@ -88,6 +89,7 @@ def run_job(
     cameras = run_cameras(folder, job, progress, threads=threads)
     if cameras.reused:
         overall.skip_to(train_begin)
+    reject_short_edges(job, cameras.folder)
     progress = overall.stage("train", _Span(train_begin, begin))
     trained = run_training(
         folder, job, cameras, progress, version=STAGE_VERSIONS["train"], threads=threads

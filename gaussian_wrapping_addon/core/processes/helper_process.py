@@ -35,7 +35,9 @@ _logger = logging.getLogger(__name__)
 
 _POLL_S = 0.1
 _running: set[subprocess.Popen[bytes]] = set()
-_OUTPUT_TAIL_LINES = 8
+_OUTPUT_TAIL_LINES = 20
+_MAX_SAID = 300
+"""Most characters of a crashed helper's last line in the message."""
 
 
 def child_command(module: str, *arguments: str, python: str | None = None) -> list[str]:
@@ -92,8 +94,8 @@ def run_helper(
     ResourceError
         The deadline passed.
     WorkerError
-        The helper crashed, and the message names the signal and the end of its output; or the
-        worker's Python lacks a package.
+        The helper crashed: the message names the signal and its last line, the log has the end of
+        its output. Or the worker's Python lacks a package.
     """
     command = child_command("processes.helper_entry", module, str(folder), str(memory_bytes or 0))
     process = spawn(command)
@@ -142,7 +144,10 @@ def run_helper(
         raise kind(str(failure["error"]), str(failure.get("hint", "")))
     if code != 0:
         reason = f"was stopped by signal {-code}" if code < 0 else f"ended with code {code}"
-        raise WorkerError(f"{module} {reason}: {' | '.join(output_tail)[-500:]}", "See the log.")
+        for line in output_tail:
+            _logger.error("%s: %s", module, line)
+        last = f": {output_tail[-1][:_MAX_SAID]}" if output_tail else "."
+        raise WorkerError(f"{module} {reason}{last}", "See the log.")
 
 
 def _drain(stream: IO[bytes], name: str, lines: queue.Queue[tuple[str, str]]) -> None:

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-from ..limits import MAX_TILES
+from ..limits import MAX_TILES, SHORTEST_EDGE
 from .checks import Choices, Condition, Range
 from .choices import (
     BOUNDARIES,
@@ -37,12 +36,16 @@ class MeshingSettings:
         help="Target edge length. With adaptive spacing the mesh comes as close to the surface as "
         "a uniform one with such edges, with about half as many vertices. 0 leaves the resolution "
         "to `points`, or to the photos.",
-        check=Range(0.0, math.inf, words="a positive length"),
+        check=Range(
+            SHORTEST_EDGE,
+            zero="automatic",
+            words=f"a positive length of at least {SHORTEST_EDGE:g}",
+        ),
         unit="world units",
         option=Option(
             "--edge-length",
             "X",
-            "target edge length, world units of the input",
+            "target edge length, world units of the input; 0, the default, is automatic",
             scope="method",
             exclusive="resolution",
         ),

@@ -9,10 +9,13 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
 
+from gaussian_wrapping_addon.core.errors import ResourceError, SettingError
+from gaussian_wrapping_addon.core.jobs import runner
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import make_job, read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
@@ -42,7 +45,8 @@ def batch(command: str, sphere: tuple[JobFolder, Path], *more: str) -> tuple[int
 @pytest.mark.parametrize(
     ("length", "code", "words"),
     [("-1", 2, "Give a positive length"), ("nan", 2, "Give a positive length"),
-     ("inf", 2, "Give a positive length"), ("1e-7", 4, "too many")],
+     ("inf", 2, "Give a positive length"), ("1e-320", 2, "Give a positive length"),
+     ("1e-7", 4, "too many")],
 )  # fmt: skip
 def test_impossible_lengths_are_refused_and_nothing_is_left(
     command: str, length: str, code: int, words: str, sphere: tuple[JobFolder, Path]
@@ -55,6 +59,35 @@ def test_impossible_lengths_are_refused_and_nothing_is_left(
     assert "Traceback" not in said
     assert (folder.job_path.read_bytes(), sorted(folder.stages.iterdir())) == before
     assert folder.read_status().state == "DONE"
+
+
+@pytest.mark.parametrize("region", ["auto", "box"])
+def test_impossible_lengths_are_refused_before_the_training(
+    region: str, sphere: tuple[JobFolder, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(*_: object, **__: object) -> NoReturn:
+        raise AssertionError("trained for nothing")
+
+    folder, box = sphere
+    earlier = read_job(folder.job_path)
+    regions = ("auto",) if region == "auto" else (str(box),)
+    settings = replace(earlier.settings, regions=regions)
+    request = "auto" if region == "auto" else str(box)
+    job = make_job("wrap", Path(earlier.source), settings, {request: 1e-8})
+    monkeypatch.setattr(runner, "run_training", train)
+    with pytest.raises(ResourceError, match="too many"):
+        runner.run_job(folder, job, lambda _: None, lambda: False)
+
+
+@pytest.mark.parametrize("length", [0.0, -1.0, 1e-320, float("nan"), float("inf"), True, "1"])
+def test_an_impossible_length_of_a_single_region(
+    length: float, sphere: tuple[JobFolder, Path]
+) -> None:
+    folder, box = sphere
+    earlier = read_job(folder.job_path)
+    settings = replace(earlier.settings, regions=(str(box),))
+    with pytest.raises(SettingError, match="a positive length of at least 1e-30"):
+        make_job("mesh", Path(earlier.source), settings, {str(box): length})
 
 
 def test_no_length_is_the_automatic_one(sphere: tuple[JobFolder, Path]) -> None:

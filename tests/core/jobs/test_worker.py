@@ -14,6 +14,7 @@ import pytest
 
 from gaussian_wrapping_addon.core.errors import EXIT_RESOURCES, ParseError, UsageError
 from gaussian_wrapping_addon.core.files import read_json, write_json
+from gaussian_wrapping_addon.core.jobs import client as client_module
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, write_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import (
@@ -281,12 +282,17 @@ def test_a_bad_region_is_refused_before_anything_starts(tmp_path: Path, body: di
         make_job("wrap", tmp_path / "photos", settings)
 
 
-def test_a_broken_job_file_is_reported_by_the_worker(tmp_path: Path) -> None:
+def test_a_broken_job_file_is_refused_by_the_client_and_by_the_worker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source = tmp_path / "photos"
     source.mkdir()
     client = JobClient.start(tmp_path / "out", make_job("wrap", source, JobSettings()))
     client.wait(60)
     client.folder.job_path.write_text("{}")
+    with pytest.raises(UsageError, match="does not hold the entries of a job"):
+        JobClient.resume(tmp_path / "out")
+    monkeypatch.setattr(client_module, "read_job", lambda _: None)
     status = JobClient.resume(tmp_path / "out").wait(60)
     assert status.state == "FAILED"
     assert status.exit_code == 2

@@ -75,9 +75,13 @@ def test_a_crash_names_the_signal(run) -> None:
         run("crash")
 
 
-def test_an_exception_brings_its_last_words(run) -> None:
-    with pytest.raises(WorkerError, match="unexpected words"):
+def test_an_exception_brings_its_last_words_and_the_log_the_others(
+    run, caplog: pytest.LogCaptureFixture
+) -> None:
+    with pytest.raises(WorkerError, match="unexpected words") as caught:
         run("raises")
+    assert caught.value.message == "raises ended with code 1: RuntimeError: unexpected words"
+    assert "raises: Traceback" in caplog.text
 
 
 def test_noise_on_stdout_is_ignored(run) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,11 +15,15 @@ from ...errors import DatasetError, WrapError
 from ...files import real_path
 from ...limits import MIN_IMAGES
 from ...ply.table import vertex_layout
+from ...report_warning import ReportWarning
 from ..frames.normalisation import find_scene_frame
 from ..photos.photo_finder import PhotoIndex, find_mask, list_photos, photo_root
 from ..photos.photo_header import read_photo_header
 from ..readers.source_kind import SPLAT, SourceKind, read_poses, source_kind
+from ..readers.source_model import PosedPhoto
 from ..readers.splat_header import read_splat_header
+from .lens_fit import MIN_PHOTO_SIDE_PX, fit_lens
+from .sparse_points import points_in_scene
 from .splat_cameras import NO_PHOTOS_HINT, NO_PHOTOS_WARNING
 
 Severity = Literal["error", "warning", "fact"]
@@ -123,10 +128,13 @@ def _check_poses(kind: SourceKind, findings: list[Finding]) -> None:
                 f"{len(missing)} of {len(matches)} photos were not found, such as {missing[0]}.",
             )
         )
-    found = {name: match.path for name, match in matches.items() if match is not None}
-    _check_files(kind, list(found.values()), list(found), findings)
-    rotations = np.array([p.cam_from_world[:, :3] for p in model.photos])
-    translations = np.array([p.cam_from_world[:, 3] for p in model.photos])
+    found: dict[Path, PosedPhoto] = {}
+    for posed in sorted(model.photos, key=lambda one: one.name):
+        if (match := matches[posed.name]) is not None:
+            found.setdefault(match.path, posed)
+    _check_files(kind, list(found), [one.name for one in found.values()], findings, found)
+    rotations = np.array([p.cam_from_world[:, :3] for p in found.values()])
+    translations = np.array([p.cam_from_world[:, 3] for p in found.values()])
     frame = find_scene_frame(rotations, -np.einsum("nji,nj->ni", rotations, translations))
     far = int((~frame.keep).sum())
     if far:
@@ -135,12 +143,25 @@ def _check_poses(kind: SourceKind, findings: list[Finding]) -> None:
         findings.append(
             Finding("warning", "All cameras lie on one line; depth will be inaccurate.")
         )
+    left_out: list[ReportWarning] = []
+    points_in_scene(model.points, model.point_colors, frame.scene_from_world, left_out)
+    findings += [Finding("warning", warning.text, warning.hint) for warning in left_out]
 
 
 def _check_files(
-    kind: SourceKind, photos: list[Path], names: list[str], findings: list[Finding]
+    kind: SourceKind,
+    photos: list[Path],
+    names: list[str],
+    findings: list[Finding],
+    posed: Mapping[Path, PosedPhoto] | None = None,
 ) -> None:
-    """Check that headers are readable, and that photos are large enough and sufficiently many."""
+    """Check that headers are readable, and that photos are large enough and sufficiently many.
+
+    Parameters
+    ----------
+    posed : mapping of Path to PosedPhoto, optional
+        Cameras of the photos, whose sizes must be those of the photos.
+    """
     bad: list[DatasetError] = []
     sizes: Counter[str] = Counter()
     small = unknown = 0
@@ -154,6 +175,14 @@ def _check_files(
             unknown += 1
             continue
         width, height = header.upright_size
+        if min(width, height) < MIN_PHOTO_SIDE_PX:
+            bad.append(
+                DatasetError(f"{path.name} is {width} x {height} pixels.", "Use larger photos.")
+            )
+            continue
+        if posed is not None:
+            prefers_stored = kind.kind == "COLMAP model"
+            fit_lens(posed[path], header, path.name, prefers_stored=prefers_stored)
         sizes[f"{width} x {height}"] += 1
         small += max(width, height) < _MIN_GOOD_SIDE_PX
     good = len(photos) - len(bad)

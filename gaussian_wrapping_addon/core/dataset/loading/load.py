@@ -13,25 +13,19 @@ from ...errors import DatasetError
 from ...files import real_path
 from ...limits import MIN_IMAGES
 from ...progress import Progress
-from ...report_warning import LEFT_OUT_HINT, ReportWarning
-from ...tolerances import POINT_REACH, SCENE_RADIUS
+from ...report_warning import ReportWarning
 from ..camera import Camera
 from ..frames.normalisation import find_scene_frame
-from ..frames.scene_grid import POINT_STEP, snapped, snapped_camera
+from ..frames.scene_grid import snapped_camera
 from ..photos.photo_finder import list_photos, photo_root
 from ..poses.pose_solver import solve_poses
 from ..readers.source_kind import SourceKind, read_poses, source_kind
 from ..readers.source_model import SourceModel
-from ..scene import Scene, View, usable_points
+from ..scene import Scene, View
 from ..similarity import Similarity
-from .start_points import MIN_POINTS, make_start_points
+from .sparse_points import MIN_POINTS, points_in_scene
+from .start_points import make_start_points
 from .views import PreparedView, prepare_views
-
-_ONE_PLACE_REACH = 100.0 * SCENE_RADIUS
-"""Points farther than this are far away for the distances between the cameras."""
-_MIN_NEAR_SHARE = 0.1
-"""Where fewer of the sparse points are nearer, it is not the points that are far: the cameras
-hardly moved."""
 
 
 def load_scene(
@@ -91,7 +85,7 @@ def load_scene(
     views, scene_from_world, frame_facts = _frame(views, warnings)
     facts.update(frame_facts)
     cameras = [snapped_camera(_camera(view).moved(scene_from_world)) for view in views]
-    points, colors = _points(model, scene_from_world, warnings)
+    points, colors = points_in_scene(model.points, model.point_colors, scene_from_world, warnings)
     if len(points) < MIN_POINTS:
         points, colors, facts["start_points"] = make_start_points(
             cameras,
@@ -179,27 +173,3 @@ def _camera(view: PreparedView) -> Camera:
     return Camera(
         view.name, view.pinhole.width, view.pinhole.height, fx, fy, cx, cy, view.cam_from_world
     )
-
-
-def _points(
-    model: SourceModel, scene_from_world: Similarity, warnings: list[ReportWarning]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Transform the input's sparse points to the scene frame's grid; leave out unusable ones."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        points = snapped(scene_from_world.points(model.points.reshape(-1, 3)), POINT_STEP)
-        beyond = ~(np.linalg.norm(points, axis=1) <= _ONE_PLACE_REACH)
-    if len(points) >= MIN_POINTS and beyond.mean() > 1.0 - _MIN_NEAR_SHARE:
-        raise DatasetError(
-            f"{int(beyond.sum())} of {len(points)} sparse points are more than "
-            f"{_ONE_PLACE_REACH / SCENE_RADIUS:.0f} times as far away as the cameras are from each "
-            "other: all photos were taken from nearly one place, so that no depth can be measured.",
-            "Walk around the object while taking photos.",
-        )
-    near = usable_points(points)
-    if not near.all():
-        text = (
-            f"{int((~near).sum())} of {len(near)} sparse points were left out: they are not finite "
-            f"or farther away than {POINT_REACH / SCENE_RADIUS:.0f} scene radii."
-        )
-        warnings.append(ReportWarning("points-far-away", text, LEFT_OUT_HINT))
-    return points[near], model.point_colors[near]

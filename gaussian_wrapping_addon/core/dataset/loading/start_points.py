@@ -15,11 +15,10 @@ from ...report_warning import ReportWarning
 from ...tolerances import NEAR_Z, SCENE_RADIUS
 from ..camera import Camera
 from ..poses.pose_solver import triangulate_points
+from .sparse_points import MIN_POINTS
 
 _logger = logging.getLogger(__name__)
 
-MIN_POINTS = 100
-"""Smallest number of points to start from."""
 RANDOM_POINTS = 20_000
 _ROUNDS = 40
 _MIN_SEEN = 2

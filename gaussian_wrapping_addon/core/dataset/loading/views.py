@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -32,9 +31,9 @@ from ..photos.photo_header import PhotoHeader
 from ..poses.pose_solver import check_unreadable_share
 from ..readers.source_kind import SourceKind
 from ..readers.source_model import LensCamera, PosedPhoto, SourceModel
+from .lens_fit import MIN_PHOTO_SIDE_PX, fit_lens, same_proportions
 from .undistort import pinhole_of, sampling_map
 
-MIN_PHOTO_SIDE_PX = 16
 _MAX_ONE_COLOUR_RANGE = 2
 """Levels of 255 between darkest and brightest pixel up to which a photo counts as of one colour: a
 JPEG of one colour may differ by one, the noise of a camera by more."""
@@ -214,56 +213,6 @@ def _is_plain(photo: DecodedPhoto, header: PhotoHeader) -> bool:
     return photo.plain and header.orientation == 1
 
 
-def fit_lens(
-    posed: PosedPhoto, header: PhotoHeader, file_name: str, *, prefers_stored: bool
-) -> tuple[LensCamera, bool, bool]:
-    """Fit the intrinsics of the input to the size of the photo.
-
-    Returns
-    -------
-    lens : LensCamera
-        Intrinsics for exactly the photo's size.
-    upright : bool
-        Whether the EXIF orientation has to be applied.
-    rescaled : bool
-        Whether the photo is a scaled copy of the one described by the input.
-
-    Raises
-    ------
-    DatasetError
-        The photo's aspect ratio differs from its camera's.
-    """
-    stored, upright = (header.width, header.height), header.upright_size
-    if posed.lens is None:
-        assert posed.angle_x is not None
-        width, height = upright
-        focal = 0.5 * width / math.tan(0.5 * posed.angle_x)
-        lens = LensCamera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
-        return lens, True, False
-    lens = posed.lens
-    choices = [(stored, False), (upright, True)]
-    if not prefers_stored or header.orientation == 1:
-        choices.reverse()
-    for size, turn in choices:
-        if size == (lens.width, lens.height):
-            return lens, turn, False
-    for size, turn in choices:
-        if _same_proportions(size, lens):
-            return lens.resized(*size), turn, True
-    turned = _same_proportions(upright[::-1], lens)
-    raise DatasetError(
-        f"{file_name} is {upright[0]} x {upright[1]} pixels, its camera {lens.width} x "
-        f"{lens.height}" + (": the photo is rotated by 90 degrees." if turned else "."),
-        "Use the photos that the cameras were solved with, or scaled copies of them.",
-    )
-
-
-def _same_proportions(size: tuple[int, int], lens: LensCamera) -> bool:
-    """Whether ``size`` is the camera's size times a factor, up to rounding to whole pixels."""
-    tolerance = lens.width + lens.height
-    return abs(size[0] * lens.height - size[1] * lens.width) < tolerance
-
-
 def _find_mask(
     posed: PosedPhoto,
     path: Path,
@@ -306,7 +255,7 @@ def _resized_mask(mask: np.ndarray, shape: tuple[int, ...], path: Path) -> np.nd
     from PIL import Image
 
     same = LensCamera("SIMPLE_PINHOLE", mask.shape[1], mask.shape[0], (1.0, 0.0, 0.0))
-    if not _same_proportions((shape[1], shape[0]), same):
+    if not same_proportions((shape[1], shape[0]), same):
         raise DatasetError(
             f"Mask {path.name} is {mask.shape[1]} x {mask.shape[0]} pixels, its photo "
             f"{shape[1]} x {shape[0]}."

@@ -17,12 +17,13 @@ if TYPE_CHECKING:
     from ...gaussians.model import GaussianArrays
     from ...regions.convex_region import Region
     from ...settings import MeshingSettings, TrainingSettings
+    from ..store.job_file import JobFile
 
 _logger = logging.getLogger(__name__)
 
 
 def requested_region(
-    request: str, body: Any, scene: Scene, arrays: GaussianArrays
+    request: str, body: Any, scene: Scene, arrays: GaussianArrays | None
 ) -> tuple[Region, Region]:
     """Return the requested region in the scene frame, on its grid, and in the world frame.
 
@@ -35,17 +36,54 @@ def requested_region(
         ``"auto"``, ``"all"`` or the path of a region file.
     body : object
         Content of that file.
+    arrays : GaussianArrays, optional
+        Of the training; only the region ``"all"`` needs them.
     """
     from ...regions.automatic_region import automatic_region, whole_region
     from ...regions.region import parse_region
     from ...regions.scene_region import on_scene_grid, region_in_scene
 
     if request in AUTOMATIC_REGIONS:
-        region = automatic_region(scene) if request == "auto" else whole_region(scene, arrays)
+        if request == "auto":
+            region = automatic_region(scene)
+        else:
+            assert arrays is not None
+            region = whole_region(scene, arrays)
         region = on_scene_grid(region)
         return region, region.transformed(scene.world_from_scene)
     world_region = parse_region(body, Path(request))
     return region_in_scene(world_region, scene.world_from_scene), world_region
+
+
+def reject_short_edges(job: JobFile, cameras: Path) -> None:
+    """Refuse edges far too short for their region, which would else fail after the training.
+
+    The region of all Gaussians is known only then, and is left out.
+
+    Parameters
+    ----------
+    cameras : Path
+        Folder of the finished cameras stage.
+
+    Raises
+    ------
+    ResourceError
+        Names the region.
+    """
+    from ...dataset.scene_file import load_saved_scene
+    from ...meshing.points.resolution import checked_request
+
+    lengths = {
+        request: meshing.edge_length
+        for request in job.settings.regions
+        if (meshing := job.meshing_of(request)).method == "pam" and request != "all"
+    }
+    if not any(lengths.values()):
+        return
+    scene = load_saved_scene(cameras)
+    for request, length in lengths.items():
+        region, _ = requested_region(request, job.region_bodies.get(request), scene, None)
+        checked_request(length / scene.world_from_scene.scale, 0, region)
 
 
 def field_views(scene: Scene, photos: PhotoSource, holdout_every: int, cameras: str) -> list[int]:

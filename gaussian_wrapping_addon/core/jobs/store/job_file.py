@@ -13,6 +13,7 @@ from typing import Any
 
 from ...errors import DatasetError, ParseError, SettingError, UsageError
 from ...files import read_json, real_path, write_json
+from ...limits import SHORTEST_EDGE
 from ...names import AUTOMATIC_REGIONS, region_name, region_names
 from ...regions.region_file import parse_region_file, read_region_body
 from ...settings import JobSettings, MeshingSettings, from_json, to_json
@@ -182,8 +183,9 @@ def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:
         raise UsageError("edge_lengths must name regions of the job.", "Start the job again.")
     for name, value in values.items():
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not number or not math.isfinite(value) or value <= 0:
-            raise SettingError(f"edge_lengths[{name!r}]", "a positive length")
+        if not number or not math.isfinite(value) or value < SHORTEST_EDGE:
+            wanted = f"a positive length of at least {SHORTEST_EDGE:g}"
+            raise SettingError(f"edge_lengths[{name!r}]", wanted)
     return {name: float(value) for name, value in values.items()}
 
 

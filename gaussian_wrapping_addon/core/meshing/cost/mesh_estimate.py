@@ -22,6 +22,7 @@ from ..points.resolution import (
     ResolutionRequest,
     dense_points,
     kept_from_dense,
+    times_longer,
 )
 from ..points.spacing import LONGEST_SHARE
 from ..tiles.plan import TILE_POINTS, WHOLE_POINTS
@@ -143,8 +144,8 @@ class MeshEstimate:
         """Return the hint for a dense mesh of at most this many points."""
         stay = kept_from_dense(dense) if self.adaptive else dense
         before = kept_from_dense(self.dense_low) if self.adaptive else float(self.dense_low)
-        factor = math.ceil(105.0 * math.sqrt(before / max(stay, 1.0))) / 100.0
-        return f"Use edges {factor:.2f} times longer (about {two_digits(int(stay))} points)"
+        factor = times_longer(before, max(stay, 1.0))
+        return f"Use edges {factor} times longer (at most {two_digits_below(int(stay))} points)"
 
 
 def _tile_bytes(points: float) -> float:
@@ -156,6 +157,12 @@ def two_digits(number: int) -> str:
     """Format a number with two significant digits."""
     digits = max(0, len(str(max(number, 1))) - 2)
     return f"{round(number, -digits):_}".replace("_", " ")
+
+
+def two_digits_below(number: int) -> str:
+    """Format a number with two significant digits, the others dropped."""
+    step = 10 ** max(0, len(str(number)) - 2)
+    return two_digits(number // step * step)
 
 
 def box_counting_area(points: np.ndarray) -> float:

@@ -71,10 +71,10 @@ def checked_request(edge_length: float, points: int, region: Region) -> Resoluti
             f"{points} surface points are too many.", f"Ask for {limits.MAX_MESH_POINTS} at most."
         )
     if 0 < edge_length < FINEST_SHARE * region.diagonal:
-        factor = FINEST_SHARE * region.diagonal / edge_length
         raise ResourceError(
             f"Region {region.name!r} is {region.diagonal / edge_length:.2g} edges long: too many.",
-            f"Use edges at least {math.ceil(factor)} times longer, or a smaller region.",
+            "Use edges of a thousandth of the region's diagonal, a smaller region, or leave the "
+            "edge length out.",
         )
     coarsest = COARSEST_SHARE * region.diagonal
     if edge_length > coarsest:
@@ -108,12 +108,17 @@ def check_expected_points(points: float, request: ResolutionRequest) -> None:
         More than ``limits.MAX_MESH_POINTS`` are expected.
     """
     if request.edge_length > 0 and points > limits.MAX_MESH_POINTS:
-        factor = math.sqrt(points / limits.MAX_MESH_POINTS)
+        factor = times_longer(points, limits.MAX_MESH_POINTS)
         raise ResourceError(
             f"This edge length needs about {points:.1e} surface points; "
             f"the limit is {limits.MAX_MESH_POINTS:.0e}.",
-            f"Use edges at least {factor:.2g} times longer, or a smaller region.",
+            f"Use edges {factor} times longer, or a smaller region.",
         )
+
+
+def times_longer(points: float, most: float) -> str:
+    """Return by how much edges must be longer for fewer points: rounded up, with some to spare."""
+    return f"{math.ceil(105.0 * math.sqrt(points / most)) / 100.0:.2f}"
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from gaussian_wrapping_addon.core.errors import (
     ResourceError,
     UsageError,
 )
+from gaussian_wrapping_addon.core.files import read_json
 from gaussian_wrapping_addon.core.gaussians.foreign_splat import read_foreign_splat
 from gaussian_wrapping_addon.core.gaussians.splat_ply import standard_names, write_splat_ply
 from gaussian_wrapping_addon.core.jobs.commands.export_files import (
@@ -43,6 +44,7 @@ from gaussian_wrapping_addon.core.render.render import render
 from gaussian_wrapping_addon.core.render.types.options import RenderOptions
 from gaussian_wrapping_addon.core.settings import JobSettings
 from gaussian_wrapping_addon.core.texture.files.textured_files import write_textured
+from tests.core.jobs.finished_sphere import write_cube
 from tests.core.render.scenes import front_camera, random_gaussians
 from tests.core.texture.files.test_textured_files import UTM, cube
 from tests.core.texture.test_glb_validator import with_maps
@@ -68,8 +70,10 @@ def write_result(job: Path, world_from_scene: Similarity = UTM) -> Path:
     (result / "auto" / "region.json").write_text('{"version": 1, "vertices": []}')
     (result / "auto" / "figures.json").write_text('{"training": "abc"}')
     write_placement(result / "placement.json", PLACEMENT, world_from_scene)
-    settings = replace(JobSettings(), regions=("auto", "/home/me/secret/Head.json"))
-    write_job(job / "job.json", JobFile("wrap", "/home/me/photos", settings))
+    region = "/home/me/secret/Head.json"
+    settings = replace(JobSettings(), regions=("auto", region))
+    body = read_json(write_cube(job.parent / "Head.json"))
+    write_job(job / "job.json", JobFile("wrap", "/home/me/photos", settings, {region: body}))
     return result
 
 

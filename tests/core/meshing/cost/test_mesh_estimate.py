@@ -14,6 +14,7 @@ from gaussian_wrapping_addon.core.meshing.cost.mesh_estimate import (
     box_counting_area,
     estimate_mesh,
     occupied_boundary_area,
+    two_digits_below,
 )
 from gaussian_wrapping_addon.core.meshing.points.resolution import ResolutionRequest
 from gaussian_wrapping_addon.core.meshing.points.spacing import resolved_edges
@@ -150,8 +151,20 @@ def test_adaptive_spacing_counts_the_mesh_from_which_it_selects() -> None:
     estimate_mesh(10.0, 0.0, ResolutionRequest(0.002 * factor, 0), adaptive=True).refuse(
         2 << 30, tiled=True
     )
+    most = refused.value.hint.split("at most ")[1].split(" points")[0]
+    points = int(most.replace(" ", ""))
+    estimate_mesh(10.0, 0.0, ResolutionRequest(0.0, points), adaptive=True).refuse(
+        2 << 30, tiled=True
+    )
     # A number of points may be any that the settings allow: memory decides.
     estimate_mesh(10.0, 0.0, ResolutionRequest(0.0, 5_000_000), adaptive=True).refuse(0, tiled=True)
+
+
+@pytest.mark.parametrize(("number", "said"), [
+    (0, "0"), (7, "7"), (99, "99"), (109, "100"), (2_559_999, "2 500 000"), (999_999, "990 000"),
+])  # fmt: skip
+def test_numbers_that_a_refusal_asks_for_are_rounded_down(number: int, said: str) -> None:
+    assert two_digits_below(number) == said
 
 
 def test_what_cannot_fit_is_refused_with_what_would() -> None:
