@@ -6,6 +6,7 @@ from __future__ import annotations
 from argparse import ArgumentParser
 from typing import NoReturn
 
+from .bake_command import add_bake
 from .check_commands import add_check, add_doctor
 from .evaluate_command import add_evaluate
 from .export_command import add_export
@@ -16,6 +17,7 @@ from .training_commands import add_continue_training, add_estimate, add_resume, 
 _COMMANDS = (
     add_wrap,
     add_mesh,
+    add_bake,
     add_continue_training,
     add_resume,
     add_estimate_mesh,
