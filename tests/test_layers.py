@@ -39,10 +39,11 @@ FOLDERS = (
     "core/evaluation",
     "core/jobs/store", "core/jobs/stages", "core/jobs/baking", "core/jobs",
     "core/jobs/commands", "core/setup",
-    "ops/common", "ops/cameras", "ops/regions", "ops/placement", "ops/results", "ops/export",
+    "ops/common", "ops/cameras", "ops/regions", "ops/placement", "ops/results", "ops/baking",
+    "ops/export",
     "ops/worker", "ops/jobs", "ops/training", "ops/dataset", "ops/meshing", "ops",
     "ui/common", "ui/worker", "ui/jobs", "ui/dataset", "ui/training", "ui/regions", "ui/meshing",
-    "ui/results", "ui/placement", "ui",
+    "ui/baking",    "ui/results", "ui/placement", "ui",
     "command_line/options", "command_line", "",
 )  # fmt: skip
 

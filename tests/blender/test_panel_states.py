@@ -38,7 +38,7 @@ pytestmark = pytest.mark.usefixtures("addon")
 
 PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel)]
 OPERATORS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Operator)]
-ORDER = ["Dataset", "Train", "Region", "Mesh", "Texture", "Result", "Scene Tools"]
+ORDER = ["Dataset", "Train", "Region", "Mesh", "Texture", "Bake", "Result", "Scene Tools"]
 ANSWER = Estimate(
     (
         "3 photos, long side 320 px, camera poses still to be solved",
