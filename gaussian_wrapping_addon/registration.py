@@ -16,13 +16,14 @@ from .ops.common import background
 from .ops.dataset import input_operators
 from .ops.export import export_operators
 from .ops.jobs import job_attach, job_operators, job_timer, live_preview
-from .ops.meshing import region_estimate, region_list_operators
+from .ops.meshing import bake_operators, region_estimate, region_list_operators
 from .ops.placement import placement, placement_operators
 from .ops.regions import region_operators, region_watch
 from .ops.results import import_operators, report_operators
 from .ops.training import training_estimate, training_operators
 from .ops.worker import worker_check_operators, worker_setup, worker_setup_operators
 from .ui import preferences, properties
+from .ui.baking import bake_panel, bake_properties
 from .ui.dataset import dataset_panel
 from .ui.meshing import mesh_panel, texture_panel
 from .ui.placement import scene_panel
@@ -34,6 +35,7 @@ _logger = logging.getLogger(__name__)
 
 CLASSES: Final[tuple[type, ...]] = (
     *training_properties.CLASSES,
+    *bake_properties.CLASSES,
     *properties.CLASSES,
     *region_properties.CLASSES,
     *preferences.CLASSES,
@@ -43,6 +45,7 @@ CLASSES: Final[tuple[type, ...]] = (
     *worker_check_operators.CLASSES,
     *region_operators.CLASSES,
     *region_list_operators.CLASSES,
+    *bake_operators.CLASSES,
     *import_operators.CLASSES,
     *export_operators.CLASSES,
     *camera_operators.CLASSES,
@@ -55,6 +58,7 @@ CLASSES: Final[tuple[type, ...]] = (
     *region_panel.CLASSES,
     *mesh_panel.CLASSES,
     *texture_panel.CLASSES,
+    *bake_panel.CLASSES,
     *result_panel.CLASSES,
     *region_gizmo.CLASSES,
     *report_panel.CLASSES,

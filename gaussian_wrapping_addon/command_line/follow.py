@@ -42,10 +42,22 @@ def require_bpy(job: JobFile, options: Namespace) -> None:
 
 def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
     """Show progress until the worker ends; then write the Blender files. Return the exit code."""
-    from ..core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
+    from ..core.errors import EXIT_DONE
     from ..core.jobs.store.blend_file import result_state
 
     before = result_state(client.folder.result)  # the worker replaces it at its end
+    code = watch(client)
+    if code != EXIT_DONE:
+        return code
+    return _finish(client.folder.result, before, job, options) or EXIT_DONE
+
+
+def watch(client: JobClient) -> int:
+    """Show progress until the worker ends; return the exit code."""
+    from ..core.errors import EXIT_CANCELLED, EXIT_DONE, EXIT_OTHER
+    from ..core.jobs.store.blend_file import result_state
+
+    before = result_state(client.folder.result)
     shown_s, shown, interrupted_s = 0.0, ("", ""), 0.0
     while True:
         try:
@@ -81,7 +93,7 @@ def follow(client: JobClient, job: JobFile, options: Namespace) -> int:
                 client.folder.root,
             )  # fmt: skip
         return status.exit_code or EXIT_OTHER
-    return _finish(client.folder.result, before, job, options) or EXIT_DONE
+    return EXIT_DONE
 
 
 def _finish(result: Path, before: dict[str, bytes], job: JobFile, options: Namespace) -> int:

@@ -7,6 +7,7 @@ import logging
 from argparse import ArgumentParser
 from typing import Any, NoReturn
 
+from .bake_command import add_bake
 from .check_commands import add_check, add_doctor
 from .evaluate_command import add_evaluate
 from .export_command import add_export
@@ -20,6 +21,7 @@ _logger = logging.getLogger("gaussian_wrapping")
 _COMMANDS = (
     add_wrap,
     add_mesh,
+    add_bake,
     add_continue_training,
     add_resume,
     add_status,

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..core.settings import declared
+from .bake_command import follow_bake
 from .common import Commands, add_no_blend, add_out
 from .follow import follow, require_bpy
 from .options.meshing_options import add_method_options, add_region_options, region_settings
@@ -91,6 +92,8 @@ def _resume(options: Namespace) -> int:
     from ..core.jobs.store.job_folder import JobFolder
 
     job = read_job(JobFolder(real_path(options.out)).job_path)
+    if job.bake is not None and options.max_gaussians is None:
+        return follow_bake(JobClient.resume(options.out, python=worker_python()), job)
     require_bpy(job, options)
     if options.max_gaussians is None:
         return follow(JobClient.resume(options.out, python=worker_python()), job, options)
@@ -99,7 +102,7 @@ def _resume(options: Namespace) -> int:
         job.settings.training, max_gaussians=options.max_gaussians, extra_iterations=0
     )
     settings = replace(job.settings, training=training).validated()
-    job = replace(job, command="wrap", settings=settings)
+    job = replace(job, command="wrap", settings=settings, bake=None)
     return follow(JobClient.start(options.out, job, python=worker_python()), job, options)
 
 

@@ -18,6 +18,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from .baking.bake_properties import GWRAP_PG_bake
 from .common.setting_properties import with_settings
 from .regions.region_properties import GWRAP_PG_region
 from .training.training_properties import GWRAP_PG_training
@@ -67,8 +68,10 @@ class GWRAP_PG_scene(bpy.types.PropertyGroup):
     training: PointerProperty(type=GWRAP_PG_training)  # type: ignore[valid-type]
     job_folder: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     job_command: EnumProperty(  # type: ignore[valid-type]
-        items=(("WRAP", "Wrap", ""), ("MESH", "Mesh", "")), options={"HIDDEN"}
+        items=(("WRAP", "Wrap", ""), ("MESH", "Mesh", ""), ("BAKE", "Bake", "")),
+        options={"HIDDEN"},
     )
+    bake: PointerProperty(type=GWRAP_PG_bake)  # type: ignore[valid-type]
     checked_source: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     checked_text: StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     findings: CollectionProperty(type=GWRAP_PG_finding, options={"HIDDEN"})  # type: ignore[valid-type]

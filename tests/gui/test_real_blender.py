@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.blender import synthetic_result
+from tests.blender.ball_job import write_ball_job
 
 from .conftest import REPOSITORY, Visit, colours_of
 
@@ -36,6 +37,15 @@ def test_regions_are_drawn_and_dragged(visit: Visit) -> None:
     synthetic_result.write_result(visit.folder)
     visit.run("drive_regions.py", "--enable-event-simulate", deadline_s=240)
     for name in ("8-regions", "9-dragged"):
+        assert colours_of(visit.folder / f"{name}.png") > 100, f"{name} is (nearly) empty"
+
+
+@pytest.mark.timeout(900)
+def test_photos_are_baked_onto_meshes_of_the_scene(visit: Visit) -> None:
+    """A monkey without UVs, and a ball made lighter, with the real worker."""
+    write_ball_job(visit.folder).root.rename(visit.folder / "ball")
+    visit.run("drive_bake.py", deadline_s=800, GW_GUI_WORKER=sys.executable)
+    for name in ("1-bake", "2-baking", "3-baked", "4-lighter"):
         assert colours_of(visit.folder / f"{name}.png") > 100, f"{name} is (nearly) empty"
 
 

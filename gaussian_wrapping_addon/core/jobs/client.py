@@ -53,8 +53,12 @@ RUNNING_HINT = (
     f"{FOREIGN_LOCK_HINT}"
 )
 PYTHON_HINT = "Check the worker's Python: batch.py doctor, or Check Worker in the preferences."
-STAGES_AFTER_TRAINING = ("mesh", "texture", "export")
+STAGES_AFTER_TRAINING = ("mesh", "texture", "export", "bake")
 """Stages of a job whose training is finished."""
+KILLED_BAKE_HINT = (
+    "Close other programs and resume; or bake again with a smaller --texture-size, or fewer "
+    "--faces. The job's result is unchanged."
+)
 
 
 def worker_python(preference: str = "") -> str:
@@ -239,6 +243,8 @@ class JobClient:
             job = read_job(self.folder.job_path)
         except (UsageError, ParseError, OSError):
             return failed
+        if job.command == "bake":
+            return replace(failed, hint=KILLED_BAKE_HINT)
         if job.command != "mesh" and status.stage not in STAGES_AFTER_TRAINING:
             return replace(failed, hint=killed_hint(job.settings.training))
         kept = job.command == "mesh" and (self.folder.result / "report.json").is_file()

@@ -14,6 +14,7 @@ from ..names import region_names
 from ..processes.peak_memory import peak_memory_bytes
 from ..progress import Progress, ProgressEvent
 from ..settings import to_json
+from .baking.bake_stage import require_training, run_bake
 from .stages.cameras_stage import run_cameras
 from .stages.mesh_stage import run_mesh
 from .stages.region_field import reject_short_edges
@@ -25,6 +26,8 @@ from .store.stage_folder import STAGE_VERSIONS, Stage
 
 # Shares of a job's time, for the overall bar: measured on the demo scene, 2 cores.
 STAGE_SHARES = {"cameras": 0.12, "train": 0.60, "mesh": 0.14, "texture": 0.12, "export": 0.02}
+BAKE_BEGINS = 0.02
+"""Share of the overall bar before the bake stage."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +88,15 @@ def run_job(
 
     train_begin = STAGE_SHARES["cameras"]
     begin = STAGE_SHARES["cameras"] + STAGE_SHARES["train"]
+    if job.command == "bake":  # both are finished
+        train_begin, begin = BAKE_BEGINS / 2, BAKE_BEGINS
     progress = overall.stage("cameras", _Span(0.0, train_begin))
     cameras = run_cameras(folder, job, progress, threads=threads)
     if cameras.reused:
         overall.skip_to(train_begin)
     reject_short_edges(job, cameras.folder)
+    if job.command == "bake":
+        require_training(folder, job, cameras)
     progress = overall.stage("train", _Span(train_begin, begin))
     trained = run_training(
         folder, job, cameras, progress, version=STAGE_VERSIONS["train"], threads=threads
@@ -97,6 +104,11 @@ def run_job(
     if trained.reused:
         overall.skip_to(begin)
 
+    if job.command == "bake":
+        overall.skip_to(begin)
+        progress = overall.stage("bake", _Span(begin, 1.0))
+        run_bake(folder, job, cameras, trained, progress, threads=threads)
+        return
     share = (1.0 - STAGE_SHARES["export"] - begin) / len(names)
     regions: list[tuple[str, Stage, Stage]] = []
     for index, (request, name) in enumerate(zip(job.settings.regions, names, strict=True)):

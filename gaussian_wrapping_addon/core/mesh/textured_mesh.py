@@ -46,6 +46,8 @@ class TexturedMesh:
     """(f,) uint8 the atlas of each face, from 0; None if there is only one."""
     further: tuple[AtlasMaps, ...] = ()
     """Atlases 1, 2, ...: of the same size, with the same maps."""
+    udims: tuple[int, ...] = ()
+    """UDIM number of each atlas, which then names its files; empty for numbered atlases."""
 
     @classmethod
     def of(

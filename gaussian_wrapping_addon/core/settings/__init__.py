@@ -21,6 +21,8 @@ from .choices import (
     SWITCH,
     TEXTURE_SOURCES,
     UNSEEN,
+    UP_AXES,
+    UV_CHOICES,
 )
 from .declaration import Declaration, declarations, with_values
 from .job import JobSettings, declared, preset
@@ -46,6 +48,8 @@ __all__ = [
     "SWITCH",
     "TEXTURE_SOURCES",
     "UNSEEN",
+    "UP_AXES",
+    "UV_CHOICES",
     "Declaration",
     "JobSettings",
     "MeshingSettings",

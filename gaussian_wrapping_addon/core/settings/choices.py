@@ -20,3 +20,7 @@ UNSEEN = ("empty", "occupied")
 FIELD_CAMERAS = ("training", "all")
 MAX_LODS = 8
 TEXTURE_SOURCES = ("photos", "gaussians")
+UV_CHOICES = ("auto", "own", "new")
+"""Of a mesh from elsewhere; ``"auto"``: its own if it has any."""
+UP_AXES = ("auto", "y", "z")
+"""Of a mesh file; ``"auto"``: as the format is exported."""

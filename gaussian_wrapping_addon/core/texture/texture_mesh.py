@@ -27,12 +27,21 @@ from .bake.bake import bake, correction_sample_count, prepare_photos
 from .bake.coverage_statistics import CoverageStatistics
 from .bake.photo_samples import SurfaceArrays, SurfacePoints
 from .cost.texture_memory import fit_into_memory
-from .cost.texture_size import gutter_for, plan_textures, required_side
+from .cost.texture_size import (
+    EXPECTED_UTILISATION,
+    gutter_for,
+    plan_textures,
+    required_side,
+)
 from .detail.detail import bake_detail, merged_statistics, wants_normal_map
+from .unwrap.own_uvs import uv_area
 from .unwrap.stretch import texture_stretch
 from .unwrap.unwrap import Unwrap, unwrap
 
 _logger = logging.getLogger(__name__)
+
+MIN_UV_AREA = 1e-4
+"""Smallest area of existing UVs for which the size of a texture is derived."""
 
 
 def texture_mesh(
@@ -72,7 +81,7 @@ def texture_mesh(
     free_bytes : int
         Available memory; 0 if unknown, then memory is not checked.
     unwrapped : Unwrap, optional
-        Existing UVs to keep; requires a given size.
+        Existing UVs to keep.
 
     Raises
     ------
@@ -91,7 +100,7 @@ def texture_mesh(
         )
     graph = face_graph(mesh.vertices, mesh.faces)
     count = len(scene.views)
-    size_px, atlases, warning = _plan(graph, photos, count, settings, dense, free_bytes)
+    size_px, atlases, warning = _plan(graph, photos, count, settings, dense, free_bytes, unwrapped)
     gutter_px = gutter_for(size_px, settings.gutter_px)
     if unwrapped is None:
         progress.update(0.0, f"unwrapping for {atlases} x {size_px} x {size_px} texels")
@@ -160,16 +169,22 @@ def _plan(
     settings: TextureSettings,
     dense: SurfaceMesh | None,
     free_bytes: int,
+    unwrapped: Unwrap | None,
 ) -> tuple[int, int, ReportWarning | None]:
     """Return side and number of textures, and a warning if memory limits them."""
     detail_points = 0
     if dense is not None and wants_normal_map(settings, is_decimated=True):
         detail_points = len(dense.vertices)
     wanted = required_side(graph, photos, count, detail_points)
-    size_px, atlases = plan_textures(wanted, settings.size_px, settings.max_atlases)
+    if unwrapped is None:
+        size_px, atlases = plan_textures(wanted, settings.size_px, settings.max_atlases)
+    else:
+        wanted *= math.sqrt(EXPECTED_UTILISATION / max(uv_area(unwrapped.corner_uvs), MIN_UV_AREA))
+        size_px, atlases = plan_textures(wanted, settings.size_px, 1)[0], unwrapped.atlases
     size_px, atlases, warning = fit_into_memory(
-        size_px, atlases, len(graph.areas), free_bytes, may_lower=settings.size_px == 0
-    )
+        size_px, atlases, len(graph.areas), free_bytes, may_lower=settings.size_px == 0,
+        may_join=unwrapped is None,
+    )  # fmt: skip
     if warning is not None:
         _logger.warning("%s", warning.text)
     return size_px, atlases, warning

@@ -13,8 +13,8 @@ from ...core.dataset.similarity import Similarity
 from ...core.errors import UsageError
 
 KIND = "gwrap_kind"
-"""``"frame"`` (the parent empty), ``"mesh"``, ``"lod"``, ``"camera"``, ``"region"`` or
-``"point"``."""
+"""``"frame"`` (the parent empty), ``"mesh"``, ``"lod"``, ``"camera"``, ``"region"``,
+``"point"`` or ``"baked"``."""
 RESULT = "gwrap_result"
 """On the frame: the result folder; ``//`` means beside the .blend file."""
 FINGERPRINT = "gwrap_fingerprint"
@@ -30,6 +30,10 @@ LEVEL = "gwrap_level"
 """On levels of detail: 1, 2, ..."""
 STAMP = "gwrap_stamp"
 """On meshes and levels of detail: changes when the mesh file changes."""
+BAKE = "gwrap_bake"
+"""On any mesh object that photos are baked onto: the folder of the bake below ``baked``."""
+BAKE_NOTE = "gwrap_bake_note"
+"""On the same: what the last bake says of itself, for the panel."""
 PHOTO = "gwrap_photo"
 RESOLUTION = "gwrap_resolution_px"
 PIXEL_ASPECT = "gwrap_pixel_aspect"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable
@@ -14,7 +15,10 @@ import bpy
 from ...core import limits
 from ...core.errors import UsageError, WrapError
 from ...core.jobs.client import JobClient
-from ...core.jobs.store.job_folder import JobStatus
+from ...core.jobs.store.job_file import read_job
+from ...core.jobs.store.job_folder import JobFolder, JobStatus
+from ..baking.baked_files import BakedFiles, read_baked
+from ..baking.baked_objects import apply_bake
 from ..common import background, known_jobs, tags
 from ..common.background import Lane, Task
 from ..common.redrawing import redraw
@@ -34,10 +38,26 @@ IMPORT_STAGE = "import"
 _status_reads, _readings = Lane(), Lane()
 
 
-def watch(scene: bpy.types.Scene, folder: Path, client: JobClient, *, imports: bool = True) -> None:
-    """Show a job in a scene and follow it to its end."""
+def watch(
+    scene: bpy.types.Scene,
+    folder: Path,
+    client: JobClient,
+    *,
+    imports: bool = True,
+    target_uid: int = 0,
+) -> None:
+    """Show a job in a scene and follow it to its end.
+
+    Parameters
+    ----------
+    imports : bool
+        Whether its result is wanted in the scene.
+    target_uid : int, optional
+        Session uid of the object that photos are baked onto.
+    """
     known_jobs.remember(folder)
-    watched_jobs.show(scene, folder, WatchedJob(client, client.poll(), scene.session_uid, imports))
+    job = WatchedJob(client, client.poll(), scene.session_uid, imports, target_uid=target_uid)
+    watched_jobs.show(scene, folder, job)
     start_timer()
 
 
@@ -165,16 +185,36 @@ def _bring_in(folder: str, job: WatchedJob) -> None:
         _import(folder, job, scene, reading.result)
 
 
-def _reading(folder: Path) -> Task[ResultFiles]:
-    return _readings.submit(lambda: read_result(folder))
+def _reading(result: Path) -> Task[ResultFiles | BakedFiles]:
+    return _readings.submit(lambda: _read_outcome(result))
+
+
+def _read_outcome(result: Path) -> ResultFiles | BakedFiles:
+    """Read what a finished job has made; runs in a thread."""
+    folder = JobFolder(result.parent)
+    try:
+        bake = read_job(folder.job_path).bake
+    except WrapError:
+        bake = None  # of a job that was made elsewhere, only the result counts
+    if bake is not None:
+        return read_baked(folder.baked / bake.name)
+    return read_result(result)
 
 
 def _import(
-    folder: str, job: WatchedJob, scene: bpy.types.Scene, files: Callable[[], ResultFiles]
+    folder: str,
+    job: WatchedJob,
+    scene: bpy.types.Scene,
+    files: Callable[[], ResultFiles | BakedFiles],
 ) -> None:
     try:
-        import_result(Path(job.status.result), scene, files())
-        _push_undo("Import Wrap Result")
+        found = files()
+        if isinstance(found, BakedFiles):
+            apply_bake(scene, _frame_of(scene, job.client.folder), found, job.target_uid)
+            _push_undo("Bake Photos")
+        else:
+            import_result(Path(job.status.result), scene, found)
+            _push_undo("Import Wrap Result")
     except WrapError as error:
         job.status = replace(job.status, state="FAILED", error=error.message, hint=error.hint)
     except Exception as error:
@@ -185,6 +225,18 @@ def _import(
             error=f"The result could not be imported: {error}",
             hint="See the system console, then try Import Result.",
         )
+
+
+def _frame_of(scene: bpy.types.Scene, folder: JobFolder) -> bpy.types.Object:
+    """Return the frame in a scene of a job's result."""
+    for frame in tags.objects_of_kind(scene, "frame"):
+        with contextlib.suppress(UsageError):
+            if tags.result_folder(frame).resolve() == folder.result.resolve():
+                return frame
+    raise UsageError(
+        f"The scene does not show the result of {folder.root.name}.",
+        "Import it, then press Bake Photos again: what is baked already is used.",
+    )
 
 
 def _push_undo(message: str) -> None:

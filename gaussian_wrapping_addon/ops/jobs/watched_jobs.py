@@ -15,6 +15,7 @@ import bpy
 
 from ...core.jobs.client import JobClient
 from ...core.jobs.store.job_folder import JobStatus
+from ..baking.baked_files import BakedFiles
 from ..common import tags
 from ..common.addon import properties_of
 from ..common.background import Lane, Task
@@ -39,8 +40,10 @@ class WatchedJob:
     """Finished, but Blender's mode does not allow the import."""
     status_read: Task[JobStatus] | None = None
     """Pending read of the job's status from the disk."""
-    reading: Task[ResultFiles] | None = None
+    reading: Task[ResultFiles | BakedFiles] | None = None
     """The result while it is read, until it can be imported."""
+    target_uid: int = 0
+    """Session uid of the object that photos are baked onto; 0 if there is none, or unknown."""
 
     def release(self) -> None:
         """End the thread that kills the worker, if there is one."""
@@ -70,6 +73,7 @@ def show(scene: bpy.types.Scene, folder: Path, job: WatchedJob) -> None:
     earlier = jobs.pop(key, None)
     if earlier is not None:
         earlier.release()
+        job.target_uid = job.target_uid or earlier.target_uid  # resumed
     jobs[key] = job
 
 

@@ -171,7 +171,7 @@ def _scene(path: Path) -> tuple[tuple[tuple[Camera, str], ...], Similarity, floa
 
 def _region(folder: Path) -> RegionResult:
     path = folder / "mesh.npz"
-    vertices, faces, corner_uvs, face_atlas = _mesh(path)
+    vertices, faces, corner_uvs, face_atlas = read_mesh_arrays(path)
     state = path.stat()
     region_path = folder / "region.json"
     if not region_path.is_file():
@@ -183,7 +183,7 @@ def _region(folder: Path) -> RegionResult:
     while (level := folder / f"lod{len(levels) + 1}" / "mesh.npz").is_file():
         if len(levels) == MAX_LODS:
             raise DatasetError(f"{folder} holds too many levels.", "Mesh the region again.")
-        arrays = _mesh(level)
+        arrays = read_mesh_arrays(level)
         textures = _textures(level.parent, arrays[3])
         levels.append(LevelResult(*arrays[:3], *textures, arrays[3]))
     return RegionResult(
@@ -207,7 +207,26 @@ def _textures(
     return albedo, normal_map if normal_map[0].is_file() else ()
 
 
-def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+def read_mesh_arrays(
+    path: Path, *, repair: bool = True
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Read and check ``mesh.npz``.
+
+    Parameters
+    ----------
+    path : Path
+    repair : bool
+        Whether broken faces are left out.
+
+    Returns
+    -------
+    vertices, faces, corner_uvs, face_atlas
+
+    Raises
+    ------
+    ParseError
+        The file is invalid; names the position.
+    """
     hint = "Mesh the region again."
     try:
         with zipfile.ZipFile(path) as archive:
@@ -238,7 +257,7 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | 
             raise ParseError(path, f"{name}[{bad[0]}]", "not a finite number of 32 bits.", hint)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ParseError(path, "faces", "an index is out of range.", hint)
-    sound = sound_faces(faces)
+    sound = sound_faces(faces) if repair else np.ones(len(faces), bool)
     if not sound.all():
         removed = int(np.count_nonzero(~sound))
         _logger.warning("%s: %d broken faces are left out", path, removed)

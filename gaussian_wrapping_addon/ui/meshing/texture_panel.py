@@ -27,7 +27,7 @@ class GWRAP_PT_texture(TabPanel, bpy.types.Panel):
         column = layout.column()
         column.enabled = not watched_jobs.is_running(properties.job_folder)
         draw_settings(column, properties, settings_in("texture"))
-        text = "Applies to the next Wrap Scene or Mesh Region."
+        text = "Applies to the next Wrap Scene, Mesh Region or Bake Photos."
         wrapped_label(layout, text, characters_of(context), icon="INFO")
 
 

@@ -27,8 +27,8 @@ _logger = logging.getLogger(__name__)
 def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads: int) -> Stage:
     """Load the scene, or re-use a finished cameras stage.
 
-    ``mesh`` and ``more`` use the cameras of the finished training even if the photos have changed
-    since, or an earlier version has loaded them.
+    ``mesh``, ``bake`` and ``more`` use the cameras of the finished training even if the photos
+    have changed since, or an earlier version has loaded them.
 
     Raises
     ------
@@ -44,7 +44,10 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
     key = stage_key(
         STAGE_VERSIONS["cameras"], job.source, source_fingerprint(source), job.settings.seed
     )
-    if job.command in ("mesh", "more") and read_done(folder.stages / f"cameras-{key}") is None:
+    if (
+        job.command in ("mesh", "more", "bake")
+        and read_done(folder.stages / f"cameras-{key}") is None
+    ):
         earlier = _cameras_of_finished_training(folder, job)
         if earlier is not None:
             _logger.warning(

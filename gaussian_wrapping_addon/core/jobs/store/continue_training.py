@@ -44,7 +44,7 @@ def continue_training_job(folder: JobFolder, job: JobFile, iterations: int) -> J
     training = job.settings.training
     longer = replace(training, extra_iterations=training.extra_iterations + iterations)
     settings = replace(job.settings, training=longer).validated()
-    return replace(job, command="more", settings=settings)
+    return replace(job, command="more", settings=settings, bake=None)
 
 
 def checkpoints(folder: Path) -> list[Path]:

@@ -17,9 +17,10 @@ from ...limits import SHORTEST_EDGE
 from ...names import AUTOMATIC_REGIONS, region_name, region_names
 from ...regions.region_file import parse_region_file, read_region_body
 from ...settings import JobSettings, MeshingSettings, from_json, to_json
+from .bake_request import BakeRequest
 
 SCHEMA_VERSION = 1
-COMMANDS = ("wrap", "mesh", "more")
+COMMANDS = ("wrap", "mesh", "more", "bake")
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class JobFile:
     edge_lengths: dict[str, float] = field(default_factory=dict)
     """Edge length, world units, of each region that has its own, by the same key. It replaces
     ``settings.meshing``'s edge length or number of points."""
+    bake: BakeRequest | None = None
+    """Of the command ``bake`` only; all else is of the job whose photos are baked."""
 
     def meshing_of(self, request: str) -> MeshingSettings:
         """Return the meshing settings of a region of ``settings.regions``."""
@@ -47,8 +50,10 @@ class JobFile:
         """Return plain JSON values."""
         # Omitted if empty: job files stay as they were before this entry existed.
         own = {"edge_lengths": self.edge_lengths} if self.edge_lengths else {}
+        bake = {"bake": self.bake.to_json()} if self.bake is not None else {}
         return {
             **own,
+            **bake,
             "schema_version": SCHEMA_VERSION,
             "command": self.command,
             "source": self.source,
@@ -66,7 +71,7 @@ class JobFile:
             An entry is missing, unknown, of the wrong type or out of range; a region is invalid.
         """
         wanted = {"schema_version", "command", "source", "settings", "region_bodies"}
-        if not isinstance(values, dict) or set(values) - {"edge_lengths"} != wanted:
+        if not isinstance(values, dict) or set(values) - {"edge_lengths", "bake"} != wanted:
             raise UsageError("job.json does not hold the entries of a job.", "Start the job again.")
         if values["schema_version"] != SCHEMA_VERSION:
             raise UsageError(
@@ -81,7 +86,11 @@ class JobFile:
         _check_source(values["source"])
         _check_bodies(settings, values["region_bodies"])
         lengths = _checked_lengths(values.get("edge_lengths", {}), settings.regions)
-        return cls(values["command"], values["source"], settings, values["region_bodies"], lengths)
+        if (values["command"] == "bake") != ("bake" in values):
+            raise UsageError("job.json names no mesh to bake onto.", "Start the bake again.")
+        bake = BakeRequest.from_json(values["bake"]) if "bake" in values else None
+        bodies = values["region_bodies"]
+        return cls(values["command"], values["source"], settings, bodies, lengths, bake)
 
 
 def make_job(
@@ -175,6 +184,17 @@ def _check_regions(bodies: dict[str, Any]) -> None:
             parse_region_file(body, Path(name))
         except ParseError as error:
             raise UsageError(f"job.json: {error.message}", "Start the job again.") from None
+
+
+def make_bake_job(earlier: JobFile, request: BakeRequest) -> JobFile:
+    """Return the job that bakes the photos of a finished job onto a mesh.
+
+    Raises
+    ------
+    UsageError, DatasetError
+        A setting is out of range, or a file does not exist.
+    """
+    return replace(earlier, command="bake", bake=request.validated())
 
 
 def _checked_lengths(values: Any, regions: Sequence[str]) -> dict[str, float]:

@@ -145,6 +145,11 @@ class JobFolder:
         return self.root / "stages"
 
     @property
+    def baked(self) -> Path:
+        """Folder of the meshes from elsewhere that photos were baked onto."""
+        return self.root / "baked"
+
+    @property
     def result(self) -> Path:
         """Folder of the results."""
         return self.root / "result"

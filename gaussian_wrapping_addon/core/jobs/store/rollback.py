@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Roll a job folder back to its finished job when meshing it again fails.
+"""Roll a job folder back to its finished job when meshing it again, or a bake, fails.
 
-A file beside ``job.json`` keeps the finished job while ``mesh`` runs, and is removed when that is
-done. If ``mesh`` fails, job and status of the finished job are restored and the stages it began
-are removed. A cancelled ``mesh`` can be resumed, as any job.
+A file beside ``job.json`` keeps the finished job while ``mesh`` or ``bake`` runs, and is removed
+when that is done. If it fails, job and status of the finished job are restored and the stages it
+began are removed. A cancelled one can be resumed, as any job.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def save_rollback(folder: JobFolder, job: JobFile) -> None:
     result itself: nothing is saved.
     """
     path = folder.root / NAME
-    if job.command != "mesh":
+    if job.command not in ("mesh", "bake"):
         path.unlink(missing_ok=True)
         return
     status = folder.read_status()
@@ -83,12 +83,15 @@ def roll_back(folder: JobFolder) -> JobStatus | None:
     except (UsageError, TypeError, ValueError):
         return None
     known = set(saved["stages"])
-    begun = [path for name in ("mesh-*", "texture-*") for path in folder.stages.glob(name)]
+    begun = [
+        stage for kind in ("mesh", "texture", "bake") for stage in folder.stages.glob(f"{kind}-*")
+    ]
     for stage in begun if is_real_folder(folder.stages) else ():
         if is_real_folder(stage) and stage.name not in known and read_done(stage) is None:
             shutil.rmtree(stage, ignore_errors=True)
-    if is_real_folder(folder.result):
-        recover(folder.result)
+    for files in (folder.result, folder.baked):
+        if is_real_folder(files):
+            recover(files)
     write_job(folder.job_path, job)
     discard_rollback(folder)
     _logger.info("the job was restored to its state before this mesh")

@@ -30,7 +30,13 @@ def texture_memory_bytes(size_px: int, atlases: int, faces: int) -> int:
 
 
 def fit_into_memory(
-    size_px: int, atlases: int, faces: int, free_bytes: int, *, may_lower: bool
+    size_px: int,
+    atlases: int,
+    faces: int,
+    free_bytes: int,
+    *,
+    may_lower: bool,
+    may_join: bool = True,
 ) -> tuple[int, int, ReportWarning | None]:
     """Return side and number of textures that fit, and a warning if that is less than requested.
 
@@ -44,6 +50,8 @@ def fit_into_memory(
         Available memory; 0 if unknown, then nothing is checked.
     may_lower : bool
         Whether the size may be lowered because it was chosen automatically.
+    may_join : bool
+        Whether there may be fewer textures; otherwise only the size is lowered.
 
     Raises
     ------
@@ -54,7 +62,7 @@ def fit_into_memory(
     if free_bytes == 0 or needed <= free_bytes:
         return size_px, atlases, None
     side, number = size_px, atlases
-    while number > 1 and texture_memory_bytes(side, number, faces) > free_bytes:
+    while may_join and number > 1 and texture_memory_bytes(side, number, faces) > free_bytes:
         number -= 1
     while side // 2 >= MIN_SIZE_PX and texture_memory_bytes(side, number, faces) > free_bytes:
         side //= 2

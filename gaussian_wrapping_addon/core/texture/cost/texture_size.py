@@ -35,10 +35,23 @@ def required_side(
 ) -> float:
     """Return the side in pixels of one texture at about the photos' resolution, without limits.
 
+    That of :func:`side_in_photos`, but it also allows for :data:`TEXELS_PER_FACE`, and for
+    :data:`TEXELS_PER_DETAIL_POINT` of the ``detail_points`` of a normal map. 0 if no photo shows
+    the mesh.
+    """
+    wanted = side_in_photos(graph, photos, count, seed)
+    if wanted == 0.0:
+        return 0.0
+    room = max(TEXELS_PER_FACE * len(graph.areas), TEXELS_PER_DETAIL_POINT * detail_points)
+    return max(wanted, math.sqrt(room / EXPECTED_UTILISATION))
+
+
+def side_in_photos(graph: FaceGraph, photos: PhotoSource, count: int, seed: int = 0) -> float:
+    """Return the side in pixels of one texture that holds what photos show of a mesh.
+
     The footprint of a photo's pixel on the surface is ``z / focal``; each sampled face uses its
     best photo, and the surface the median of the faces (by area). Occlusion is not tested: only the
-    order of magnitude matters. The size also allows for :data:`TEXELS_PER_FACE`, and for
-    :data:`TEXELS_PER_DETAIL_POINT` of the ``detail_points`` of a normal map.
+    order of magnitude matters.
     """
     area = float(graph.areas.sum())
     generator = np.random.default_rng(seed)
@@ -56,10 +69,7 @@ def required_side(
     best = best[np.isfinite(best)]
     if len(best) == 0:
         return 0.0
-    footprint = float(np.median(best))
-    wanted = ENOUGH * math.sqrt(area / EXPECTED_UTILISATION) / footprint
-    room = max(TEXELS_PER_FACE * len(graph.areas), TEXELS_PER_DETAIL_POINT * detail_points)
-    return max(wanted, math.sqrt(room / EXPECTED_UTILISATION))
+    return ENOUGH * math.sqrt(area / EXPECTED_UTILISATION) / float(np.median(best))
 
 
 def _power_of_two(wanted: float) -> int:

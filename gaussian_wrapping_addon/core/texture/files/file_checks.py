@@ -7,7 +7,7 @@ Exporters write NaN silently, and readers of the file then show nothing or crash
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +19,10 @@ SINGLE_MAX = float(np.finfo(np.float32).max)
 """Larger coordinates become infinite in single precision, which most formats use."""
 
 
-def atlas_file(name: str, atlas: int) -> str:
+def atlas_file(name: str, atlas: int, udims: Sequence[int] = ()) -> str:
     """Return the file name of a map: ``albedo.png``, then ``albedo-2.png`` and on.
+
+    With UDIM tiles, ``albedo.1001.png`` and on.
 
     Parameters
     ----------
@@ -28,7 +30,11 @@ def atlas_file(name: str, atlas: int) -> str:
         ``"albedo"``, ``"normal"`` or ``"occlusion"``.
     atlas : int
         From 0.
+    udims : sequence of int, optional
+        UDIM number of each atlas.
     """
+    if udims:
+        return f"{name}.{udims[atlas]}.png"
     return f"{name}-{atlas + 1}.png" if atlas else f"{name}.png"
 
 

@@ -27,6 +27,7 @@ from ...export_formats import RESULT_FORMATS
 from ...files import write_bytes, write_json
 from ...mesh.tangent_frame import shading_normals
 from ...mesh.textured_mesh import TexturedMesh
+from ..unwrap.own_uvs import udim_uvs
 from .file_checks import atlas_file, validate_for_export, write_errors
 from .glb import glb_bytes
 from .mesh_ply import vertex_colors, write_mesh_ply
@@ -123,7 +124,8 @@ def write_textured(
     """Write ``mesh.npz``, ``albedo.png``, ``mesh.ply``, ``transform.json`` and further formats.
 
     ``normal.png`` and ``occlusion.png`` are written if the mesh has these maps; further atlases
-    are ``albedo-2.png`` and on.
+    are ``albedo-2.png`` and on, or ``albedo.1001.png`` and on if the mesh has UDIM tiles. Then the
+    UVs of the OBJ lie in their tiles; those of the other files lie in [0, 1].
 
     Parameters
     ----------
@@ -157,7 +159,7 @@ def write_textured(
     validate_for_export(mesh.vertices, mesh.faces, textured.corner_uvs)
     world = world_from_scene.points(mesh.vertices)
     offset = file_offset(world) if offset is None else offset
-    atlases, face_atlas = textured.atlases, textured.face_atlas
+    atlases, face_atlas, udims = textured.atlases, textured.face_atlas, textured.udims
     images = {
         "albedo": [a.albedo for a in atlases],
         "normal": [a.normal_map for a in atlases if a.normal_map is not None],
@@ -165,6 +167,8 @@ def write_textured(
     }
     pngs = {name: [png_bytes(image) for image in several] for name, several in images.items()}
     arrays = {} if face_atlas is None else {"face_atlas": np.asarray(face_atlas, np.uint8)}
+    if udims:
+        arrays["udims"] = np.asarray(udims, np.int32)
     with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         stream = io.BytesIO()
@@ -178,7 +182,7 @@ def write_textured(
         write_bytes(folder / "mesh.npz", stream.getvalue())
         for name, several in pngs.items():
             for number, data in enumerate(several):
-                write_bytes(folder / atlas_file(name, number), data)
+                write_bytes(folder / atlas_file(name, number, udims), data)
         write_json(
             folder / "transform.json",
             {
@@ -203,9 +207,9 @@ def write_textured(
             folder / "mesh.obj",
             local,
             mesh.faces,
-            textured.corner_uvs,
-            [atlas_file("albedo", number) for number in range(len(atlases))],
-            [atlas_file("normal", number) for number in range(len(images["normal"]))],
+            udim_uvs(textured.corner_uvs, face_atlas, udims) if udims else textured.corner_uvs,
+            [atlas_file("albedo", number, udims) for number in range(len(atlases))],
+            [atlas_file("normal", number, udims) for number in range(len(images["normal"]))],
             face_atlas,
         )
     if "glb" in formats:

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Meshes that Blender hands over to the worker: arrays in world coordinates, in double precision.
+
+Needs numpy only.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import ParseError
+from ...files import write_bytes
+from .mesh_reader import FileMesh
+
+SUFFIX = ".npz"
+MAX_BYTES = 4 * 2**30
+_AGAIN = "Start it again from Blender."
+
+
+def write_handed_over(path: Path, mesh: FileMesh) -> None:
+    """Write a mesh in the world frame of the job's input.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    arrays = {} if mesh.corner_uvs is None else {"corner_uvs": np.asarray(mesh.corner_uvs)}
+    stream = io.BytesIO()
+    np.savez(stream, frame=np.array("world"), vertices=mesh.vertices, faces=mesh.faces, **arrays)
+    write_bytes(path, stream.getvalue())
+
+
+def read_handed_over(path: Path) -> FileMesh:
+    """Read a file of :func:`write_handed_over`.
+
+    Raises
+    ------
+    ParseError
+        It is none, or its mesh has no faces, values that are not finite, or indices out of range.
+    """
+    if not path.is_file():
+        raise ParseError(path, "whole file", "the file does not exist.", _AGAIN)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(item.file_size for item in archive.infolist()) > MAX_BYTES:
+                raise ValueError("too large")
+        with np.load(path, allow_pickle=False) as arrays:
+            if str(arrays["frame"]) != "world":
+                raise ValueError("not in world coordinates")
+            vertices = np.asarray(arrays["vertices"], np.float64)
+            faces = np.asarray(arrays["faces"])
+            uvs = arrays["corner_uvs"].astype(np.float64) if "corner_uvs" in arrays.files else None
+        if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
+            raise ValueError("not lists of triples")
+        if uvs is not None and uvs.shape != (len(faces), 3, 2):
+            raise ValueError("UVs are not those of the faces")
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ParseError(
+            path, "whole file", f"not a mesh handed over by Blender ({error}).", _AGAIN
+        ) from None
+    if len(faces) == 0:
+        raise ParseError(path, "faces", "there are none.", "Choose a mesh with faces.")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ParseError(path, "faces", "an index is out of range.", _AGAIN)
+    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(bad):
+        raise ParseError(
+            path, f"vertex {int(bad[0])}", f"is not finite (as are {len(bad)} in all).",
+            "Delete these vertices, or undo what made them.",
+        )  # fmt: skip
+    return FileMesh(vertices, faces.astype(np.int64), uvs)

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Start a bake: hand a mesh of the scene over to the worker."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+
+from ...core.errors import UsageError, unwritable_error
+from ...core.jobs.client import JobClient, worker_python
+from ...core.jobs.store.bake_request import BakeRequest
+from ...core.jobs.store.continue_training import no_finished_training
+from ...core.jobs.store.job_file import make_bake_job
+from ...core.jobs.store.job_folder import JobFolder
+from ...core.jobs.store.rollback import finished_job
+from ...core.jobs.store.stage_folder import read_done
+from ...core.mesh.exchange.handed_over import write_handed_over
+from ...core.mesh.exchange.mesh_reader import FileMesh
+from ...core.names import file_stem
+from ...core.settings import TextureSettings
+from ..baking.triangulation import Triangulation, triangulation_of, world_mesh
+from ..common import tags
+from ..common.addon import properties_of
+from ..jobs import job_timer, watched_jobs
+from ..jobs.panel_settings import texture_choices
+from ..jobs.scene_folders import job_folder_of
+from ..worker.preferred_worker import WorkerChoice
+
+FOLDER = "handed-over"
+"""Folder of a job with the meshes that Blender has handed over."""
+_UNWRAP = "Unwrap it (U), choose New UVs without modifiers, or apply the modifiers."
+
+
+def bake_target(context: bpy.types.Context) -> bpy.types.Object | None:
+    """Return the active object if photos can be baked onto it."""
+    thing = context.view_layer.objects.active
+    if thing is None or thing.type != "MESH" or tags.kind_of(thing) == "region":
+        return None
+    return thing if thing.select_get() else None
+
+
+def start_bake(
+    scene: bpy.types.Scene, frame: bpy.types.Object, thing: bpy.types.Object, choice: WorkerChoice
+) -> Path:
+    """Bake the photos of a result onto a mesh object; return the job folder.
+
+    Parameters
+    ----------
+    frame : Object
+        The frame of the result.
+    thing : Object
+        Any mesh; it need not belong to the result.
+
+    Raises
+    ------
+    WrapError
+        The mesh cannot be baked onto, or the job has no finished training.
+    """
+    folder = JobFolder(job_folder_of(frame))
+    if watched_jobs.is_running(str(folder.root)):
+        raise UsageError(f"A job is running in {folder.root}.", "Cancel it or wait for it.")
+    earlier = finished_job(folder)
+    if not any(read_done(path) for path in folder.stages.glob("train-*")):
+        raise no_finished_training(folder.root)
+    chosen = properties_of(scene).bake
+    decimates = chosen.retopology == "DECIMATE"
+    triangles = triangulation_of(thing)
+    if not decimates:
+        _refuse_unusable(thing, triangles, chosen.uvs)
+    name = _name(thing, folder, light=decimates)
+    mesh = world_mesh(frame, triangles, with_uvs=chosen.uvs != "NEW" and not decimates)
+    dense = None if decimates or chosen.dense in (None, thing) else chosen.dense
+    request = BakeRequest(
+        mesh=str(_hand_over(folder, name, mesh)),
+        name=name,
+        uvs="auto" if decimates else chosen.uvs.lower(),
+        faces=chosen.faces if decimates else 0,
+        dense=_hand_over_dense(folder, name, frame, dense),
+        texture=_texture(scene, has_dense=dense is not None),
+    )
+    job = make_bake_job(earlier, request)
+    job = replace(job, settings=replace(job.settings, threads=choice.threads))
+    client = JobClient.start(
+        folder.root, job, python=worker_python(choice.python), keep_running=choice.keep_running
+    )
+    if not decimates:
+        thing[tags.BAKE] = name
+    properties_of(scene).job_command = "BAKE"
+    job_timer.watch(scene, folder.root, client, target_uid=thing.session_uid)
+    return folder.root
+
+
+def _refuse_unusable(thing: bpy.types.Object, triangles: Triangulation, uvs: str) -> None:
+    """Refuse before the start what could not be brought back."""
+    if not thing.is_editable or (thing.data is not None and not thing.data.is_editable):
+        raise UsageError(
+            f"{thing.name} is linked from a library.",
+            "Make it local (Object > Relations > Make Local).",
+        )
+    if uvs == "OWN" and triangles.corner_uvs is None:
+        raise UsageError(f"{thing.name} has no UV map.", "Unwrap it (U), or choose New UVs.")
+    makes_uvs = uvs == "NEW" or triangles.corner_uvs is None
+    if makes_uvs and not triangles.is_own:
+        raise UsageError(
+            f"Modifiers of {thing.name} change its faces, and it needs new UVs.", _UNWRAP
+        )
+
+
+def _name(thing: bpy.types.Object, folder: JobFolder, *, light: bool) -> str:
+    """Return the folder of an object's bake: its earlier one, or one that nothing uses."""
+    own = thing.get(tags.BAKE, "")
+    others = {t.get(tags.BAKE) for t in bpy.data.objects if t != thing}
+    stem = file_stem(f"{thing.name} light" if light else thing.name, 0)
+    if light and tags.kind_of(thing) != "baked":
+        lighter = [t for t in bpy.data.objects if tags.kind_of(t) == "baked"]
+        if any(t.get(tags.BAKE) == stem for t in lighter):
+            return stem  # made anew from the same object
+    elif not light and isinstance(own, str) and own and own not in others:
+        return own
+    count, name = 1, stem
+    while name in others or (folder.baked / name).exists():
+        count += 1
+        name = f"{stem}-{count}"
+    return name
+
+
+def _hand_over(folder: JobFolder, name: str, mesh: FileMesh) -> Path:
+    path = folder.root / FOLDER / f"{name}.npz"
+    try:
+        path.parent.mkdir(exist_ok=True)
+        write_handed_over(path, mesh)
+    except OSError as error:
+        raise unwritable_error(path, error) from None
+    return path
+
+
+def _hand_over_dense(
+    folder: JobFolder, name: str, frame: bpy.types.Object, dense: bpy.types.Object | None
+) -> str:
+    if dense is None:
+        return ""
+    mesh = world_mesh(frame, triangulation_of(dense), with_uvs=False)
+    return str(_hand_over(folder, f"{name}-dense", mesh))
+
+
+def _texture(scene: bpy.types.Scene, *, has_dense: bool) -> TextureSettings:
+    """Return the settings of the panel Texture, without levels of detail."""
+    chosen = {path.rpartition(".")[2]: value for path, value in texture_choices(scene).items()}
+    texture = TextureSettings(**{**chosen, "lods": 0})
+    if has_dense and texture.normal_map == "auto":
+        return replace(texture, normal_map="on")
+    return texture
