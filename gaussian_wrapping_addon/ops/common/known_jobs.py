@@ -64,7 +64,7 @@ def _stored() -> list[str]:
     if path is None or not path.is_file():
         return []
     try:
-        values = read_json(path)
+        values = read_json(path, follow_links=True)
     except (OSError, WrapError):
         return []
     return [v for v in values if isinstance(v, str)] if isinstance(values, list) else []
