@@ -17,7 +17,7 @@ from ...core.dataset.camera import Camera
 from ...core.dataset.frames.placement_file import FILE_NAME, read_placement
 from ...core.dataset.similarity import Similarity
 from ...core.errors import DatasetError, ParseError
-from ...core.files import read_json
+from ...core.files import read_json, real_path
 from ...core.regions.region_file import read_region_file
 from ...core.regular_files import reject_foreign_entries
 from ...core.settings import MAX_LODS
@@ -101,7 +101,7 @@ def read_result(folder: Path) -> ResultFiles:
     ParseError
         A file is invalid; names file and position.
     """
-    folder = folder.resolve()
+    folder = real_path(folder)
     scene_path = folder / "scene.json"
     if not scene_path.is_file():
         raise DatasetError(

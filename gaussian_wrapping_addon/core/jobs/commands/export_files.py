@@ -22,7 +22,7 @@ from ...dataset.photos.image_formats import open_image
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError, ParseError, UsageError
 from ...export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
-from ...files import read_json, write_bytes
+from ...files import read_json, real_path, write_bytes
 from ...names import SPLAT_STEM, file_stems
 from ...regular_files import reject_foreign_entries
 from ...texture.files.file_checks import atlas_file
@@ -90,7 +90,7 @@ def result_of(folder: Path) -> Path:
     for path in (folder / "result", folder):
         if (path / "scene.json").is_file():
             reject_foreign_entries(folder)
-            return path.resolve()
+            return real_path(path)
     if (folder / MARKER).exists():
         raise DatasetError(f"The job {folder} has no result yet.", "Resume it first.")
     raise UsageError(f"{folder} holds no job's result.", "Give the folder of a finished job.")
