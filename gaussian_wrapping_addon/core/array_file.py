@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -20,9 +21,13 @@ import numpy as np
 from .errors import ParseError
 from .regular_files import open_regular
 
-DAMAGES = (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError)
+DAMAGES = (
+    ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError,
+    SyntaxError, tokenize.TokenError,
+)  # fmt: skip
 """What zipfile and numpy raise on files that are cut, changed or not theirs. RuntimeError holds
-NotImplementedError: an unknown compression, or an encrypted entry."""
+NotImplementedError: an unknown compression, or an encrypted entry. numpy reads the header of an
+array as Python text."""
 
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -31,7 +36,12 @@ _HEADERS = {
 
 
 def read_arrays(
-    path: Path, names: Iterable[str], *, most_bytes: int | None = None, hint: str = ""
+    path: Path,
+    names: Iterable[str] | None = None,
+    *,
+    optional: Iterable[str] = (),
+    most_bytes: int | None = None,
+    hint: str = "",
 ) -> dict[str, np.ndarray]:
     """Read arrays of a file written by ``numpy.savez``.
 
@@ -39,8 +49,10 @@ def read_arrays(
     ----------
     path : Path
         The file itself, not a link to it.
-    names : iterable of str
-        Arrays that it must hold.
+    names : iterable of str, optional
+        Arrays that it must hold; ``None`` reads all that it holds.
+    optional : iterable of str
+        Arrays that it may hold; the others are not read.
     most_bytes : int, optional
         Largest size of all entries when unpacked; without it compressed entries are refused.
     hint : str
@@ -54,7 +66,9 @@ def read_arrays(
     try:
         with open_regular(path) as stream, zipfile.ZipFile(stream) as archive:
             _check_entries(archive, stream, most_bytes)
-            return {name: _array(archive, f"{name}.npy") for name in names}
+            held = [entry.removesuffix(".npy") for entry in archive.namelist()]
+            wanted = held if names is None else [*names, *(n for n in optional if n in held)]
+            return {name: _array(archive, f"{name}.npy") for name in wanted}
     except OSError as error:
         raise ParseError(
             path, "whole file", f"cannot be read ({error.strerror or error}).", hint

@@ -86,7 +86,7 @@ def finite_json(values: Any) -> Any:
     return values
 
 
-def read_json(path: Path, *, most_bytes: int | None = None, follow_links: bool = True) -> Any:
+def read_json(path: Path, *, most_bytes: int | None = None, follow_links: bool = False) -> Any:
     """Read JSON with limits on size and depth; NaN and infinities are rejected.
 
     Parameters
@@ -94,7 +94,7 @@ def read_json(path: Path, *, most_bytes: int | None = None, follow_links: bool =
     most_bytes : int, optional
         Default: ``limits.MAX_JSON_BYTES``.
     follow_links : bool
-        Whether the path may be a link; not for files of job folders.
+        Whether the path may be a link, as for files that the user has named.
 
     Raises
     ------

@@ -114,6 +114,22 @@ def test_opening_a_file_never_waits_for_a_pipe_in_the_folder_beside_it(
     assert time.monotonic() - begun_s < 4.0
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
+def test_a_file_whose_folders_are_links_in_a_circle_opens(tmp_path: Path, addon: object) -> None:
+    circle = tmp_path / "circle"
+    circle.symlink_to(circle)
+    properties = bpy.context.scene.gwrap
+    properties.source = properties.output = properties.job_folder = str(circle)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
+    job_timer.forget_all()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "work.blend"))
+    assert watched_jobs.jobs == {}
+    draw(train_panel.GWRAP_PT_train)
+    with pytest.raises(RuntimeError, match="circle") as refused:
+        bpy.ops.gwrap.wrap_scene()
+    assert "Traceback" not in str(refused.value)
+
+
 @contextlib.contextmanager
 def alarm(seconds: int) -> Iterator[None]:
     """End this process, rather than hang, where a pipe is opened and nobody writes to it."""

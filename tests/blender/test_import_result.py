@@ -168,6 +168,12 @@ def break_npz(result: Path, **changes: np.ndarray) -> None:
     np.savez(result / "auto" / "mesh.npz", **arrays)
 
 
+def turn_a_bit(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
 def set_scene(result: Path, **changes: object) -> None:
     values = json.loads((result / "scene.json").read_text())
     (result / "scene.json").write_text(json.dumps({**values, **changes}))
@@ -189,9 +195,10 @@ HUGE_UVS = np.full((12, 3, 2), np.inf, np.float32)
         (lambda r: break_npz(r, faces=np.full((12, 3), -1)), "out of range"),
         (lambda r: break_npz(r, faces=np.zeros((0, 3), int)), "corner_uvs|none"),
         (lambda r: break_npz(r, faces=np.zeros((12, 3))), "integers"),
-        (lambda r: break_npz(r, vertices=np.array([None] * 8)), "mesh file"),
-        (lambda r: (r / "auto" / "mesh.npz").write_bytes(b""), "mesh file"),
-        (lambda r: (r / "auto" / "mesh.npz").write_bytes(b"PK\x03\x04junk"), "mesh file"),
+        (lambda r: break_npz(r, vertices=np.array([None] * 8)), r"mesh\.npz.*damaged"),
+        (lambda r: (r / "auto" / "mesh.npz").write_bytes(b""), r"mesh\.npz.*damaged"),
+        (lambda r: (r / "auto" / "mesh.npz").write_bytes(b"PK\x03\x04junk"), r"mesh\.npz.*damaged"),
+        (lambda r: turn_a_bit(r / "auto" / "mesh.npz"), r"mesh\.npz.*damaged"),
         (lambda r: (r / "auto" / "albedo.png").unlink(), "albedo.png"),
         (lambda r: (r / "auto" / "region.json").unlink(), "region.json"),
         (lambda r: (r / "auto" / "region.json").write_text("{}"), "class_name"),

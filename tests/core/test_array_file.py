@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import zipfile
@@ -91,11 +92,50 @@ def test_a_damaged_file_is_not_whole(file: Path, damage: Callable[[Path], None])
     assert not is_whole(file)
 
 
+@pytest.mark.filterwarnings("ignore:Reading `.npy`")
+@pytest.mark.parametrize("compressed", [False, True])
+def test_any_change_is_a_typed_error_or_changes_nothing_that_is_checked(
+    file: Path, compressed: bool
+) -> None:
+    """Changes of the archive, and of the header of an array whose checksum is right."""
+    (np.savez_compressed if compressed else np.savez)(file, a=np.arange(4000.0))
+    most_bytes = 40_000 if compressed else None
+    archive = file.read_bytes()
+    stream = io.BytesIO()
+    np.save(stream, np.arange(40.0))
+    rng = np.random.default_rng(5)
+    for number in range(600):
+        data = bytearray(stream.getvalue() if number % 2 else archive)
+        for _ in range(int(rng.integers(1, 4))):
+            place = int(rng.integers(140 if number % 2 else len(data)))
+            change = int(rng.integers(3))
+            if change == 0:
+                data[place] ^= 1 << int(rng.integers(8))
+            elif change == 1:
+                data[place] = int(rng.choice(list(b"()[]{},':0123456789-<>|OVSUf \n#\"")))
+            else:
+                del data[place : place + int(rng.integers(1, 9))]
+        if number % 2:
+            with zipfile.ZipFile(file, "w") as changed:
+                changed.writestr("a.npy", bytes(data))
+        else:
+            file.write_bytes(data)
+        with contextlib.suppress(ParseError):
+            read_arrays(file, ("a",), most_bytes=most_bytes)
+        with contextlib.suppress(ParseError):
+            is_whole(file, most_bytes)
+
+
 def test_what_was_written_is_read(file: Path) -> None:
     arrays = read_arrays(file, ("a", "b"))
     assert np.array_equal(arrays["a"], np.arange(1000.0))
     assert arrays["b"].dtype == np.int32
     assert np.array_equal(arrays["b"], np.ones((3, 2)))
+
+
+def test_all_arrays_or_those_that_are_there(file: Path) -> None:
+    assert sorted(read_arrays(file)) == ["a", "b"]
+    assert list(read_arrays(file, ("b",), optional=("a", "c"))) == ["b", "a"]
 
 
 def test_compressed_entries_are_read_up_to_a_limit(file: Path) -> None:

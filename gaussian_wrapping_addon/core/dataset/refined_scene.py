@@ -22,8 +22,15 @@ ROTATION_TOLERANCE = 1e-6
 _HINT = "Delete the folder and run the job again."
 
 
-def save_poses(folder: Path, poses: np.ndarray) -> None:
-    """Write (views, 3, 4) float64 ``cam_from_world`` of all views, scene frame."""
+def save_poses(folder: Path, poses: np.ndarray | None) -> None:
+    """Write (views, 3, 4) float64 ``cam_from_world`` of all views, scene frame.
+
+    ``None`` where poses stay as given: those of an interrupted run, perhaps on another device, that
+    had refined them are removed.
+    """
+    if poses is None:
+        (folder / POSES_NAME).unlink(missing_ok=True)
+        return
     stream = io.BytesIO()
     np.savez(stream, cam_from_world=np.asarray(poses, np.float64))
     write_bytes(folder / POSES_NAME, stream.getvalue())

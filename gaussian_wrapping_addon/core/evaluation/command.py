@@ -254,7 +254,7 @@ def _surface(
 
 def _scene_diagonal(path: Path) -> float:
     try:
-        values = read_json(path)
+        values = read_json(path, follow_links=True)
     except OSError as error:
         raise ParseError(
             path, "whole file", f"cannot be read: {error.strerror}.", "Make the scene again."

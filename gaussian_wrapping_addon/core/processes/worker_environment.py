@@ -97,7 +97,7 @@ def venv_python(folder: Path) -> Path:
 
 def _read_object(path: Path, key: str, value: str | None = None) -> dict[str, Any]:
     try:
-        values = read_json(path)
+        values = read_json(path, follow_links=True)
     except (OSError, ParseError):
         return {}
     if not isinstance(values, dict) or key not in values:

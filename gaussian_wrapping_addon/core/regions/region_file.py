@@ -58,7 +58,7 @@ def read_region_body(path: Path) -> Any:
     if not path.is_file():
         raise DatasetError(f"Region file {path} does not exist.", "Check the path.")
     try:
-        return read_json(path)
+        return read_json(path, follow_links=True)
     except OSError as error:
         raise DatasetError(
             f"Region file {path} cannot be read: {error.strerror}.", "Check its permissions."

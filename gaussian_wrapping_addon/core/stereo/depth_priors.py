@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from ..array_file import read_arrays
 from ..dataset.camera import Camera
+from ..errors import ParseError
 from ..files import write_bytes
 from .depth_maps import DepthMap
 
@@ -42,6 +43,8 @@ class DepthPrior:
 
 
 _LAYERS = ("depth", "confidence", "known", "free")
+_MOST_HEADER_BYTES = 1024
+"""Of an array in the file; the key is no longer either."""
 
 
 def priors_of(views: Sequence[int], depth_maps: Sequence[DepthMap]) -> dict[int, DepthPrior]:
@@ -104,15 +107,18 @@ def load_priors(
         ``None`` where the file is missing, damaged or of another key: the priors follow from the
         photos and can be made again.
     """
+    names = ["key", *(f"{layer}.{view}" for view in cameras for layer in _LAYERS)]
+    pixels = sum(camera.width * camera.height for camera in cameras.values())
+    most_bytes = 4 * len(_LAYERS) * pixels + _MOST_HEADER_BYTES * len(names)
     try:
-        with np.load(folder / FILE_NAME, allow_pickle=False) as arrays:
-            if str(arrays["key"]) != key:
-                return None
-            return {
-                view: _prior(camera, [arrays[f"{layer}.{view}"] for layer in _LAYERS])
-                for view, camera in cameras.items()
-            }
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile):
+        arrays = read_arrays(folder / FILE_NAME, names, most_bytes=most_bytes)
+        if str(arrays["key"]) != key:
+            return None
+        return {
+            view: _prior(camera, [arrays[f"{layer}.{view}"] for layer in _LAYERS])
+            for view, camera in cameras.items()
+        }
+    except (ParseError, ValueError):
         return None
 
 

@@ -7,15 +7,16 @@ import hashlib
 import io
 import logging
 import re
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..array_file import read_arrays
 from ..dataset.scene import Scene
 from ..errors import ParseError, UsageError
 from ..files import read_json, write_bytes, write_json
+from ..regular_files import open_regular
 from ..settings import TrainingSettings, key_values
 from .state import TrainingState
 
@@ -27,6 +28,7 @@ KEPT = 2
 
 _NAME = re.compile(r"checkpoint-(\d{1,9})\.json")
 _AGAIN = "Delete the folder and train again."
+_BLOCK_BYTES = 1024 * 1024
 
 
 def fingerprint(
@@ -140,18 +142,13 @@ def _load(path: Path, key: str) -> TrainingState:
 
 
 def _read_arrays(path: Path, sha256: Any) -> dict[str, np.ndarray]:
+    digest = hashlib.sha256()
     try:
-        data = path.read_bytes()
+        with open_regular(path) as stream:
+            while block := stream.read(_BLOCK_BYTES):
+                digest.update(block)
     except OSError as error:
         raise ParseError(path, "whole file", f"cannot be read ({error}).", _AGAIN) from None
-    if hashlib.sha256(data).hexdigest() != sha256:
+    if digest.hexdigest() != sha256:
         raise ParseError(path, "whole file", "truncated or changed.", _AGAIN)
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            # Only stored entries are accepted, so nothing unpacks to more than the file holds.
-            if any(e.compress_type != zipfile.ZIP_STORED for e in archive.infolist()):
-                raise ParseError(path, "whole file", "compressed by another program.", _AGAIN)
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ParseError(path, "whole file", f"holds no arrays ({error}).", _AGAIN) from None
+    return read_arrays(path, hint=_AGAIN)

@@ -13,7 +13,7 @@ from mathutils import Matrix
 
 from ...core.dataset.camera import Camera
 from ...core.errors import DatasetError, UsageError
-from ...core.files import resolve_inside
+from ...core.files import real_path, resolve_inside
 from ..common import known_jobs, tags
 
 SENSOR_MM = 36.0
@@ -130,7 +130,7 @@ def photo_of(thing: bpy.types.Object) -> Path:
     # Photos that had to be straightened lie in a stage of the job.
     last = len(path.parts) - 1 - path.parts[::-1].index(STAGES)
     with contextlib.suppress(UsageError):
-        job = tags.result_folder(frame).resolve().parent
+        job = real_path(tags.result_folder(frame)).parent
         return resolve_inside(job, "/".join(path.parts[last:])) or path
     return path
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import bpy
 
 from ...core.errors import WrapError
-from ...core.files import read_json, write_json
+from ...core.files import read_json, real_path, write_json
 from .addon import addon_package
 
 _logger = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ _session: list[str] = []
 
 def remember(folder: Path) -> None:
     """Record a folder that the user has chosen."""
-    text = str(folder.resolve())
+    text = str(real_path(folder))
     if text in _session:
         return
     _session.append(text)
@@ -43,7 +43,7 @@ def is_trusted(folder: Path) -> bool:
     """Return whether a folder named by the open file may be read without confirmation."""
     if is_remote(folder):
         return False
-    absolute = str(folder.resolve())
+    absolute = str(real_path(folder))
     return absolute in _session or absolute in _stored()
 
 
@@ -64,7 +64,7 @@ def _stored() -> list[str]:
     if path is None or not path.is_file():
         return []
     try:
-        values = read_json(path)
+        values = read_json(path, follow_links=True)
     except (OSError, WrapError):
         return []
     return [v for v in values if isinstance(v, str)] if isinstance(values, list) else []

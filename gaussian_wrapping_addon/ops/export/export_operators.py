@@ -9,6 +9,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ...core.errors import UsageError
 from ...core.export_formats import EXPORT_FORMATS, MESH_FORMATS, PACKABLE_FORMATS
+from ...core.files import real_path
 from ..common import tags
 from ..common.error_reporting import NeedsObjectMode, NeedsResult, OperatorResult, ReportsErrors
 from ..results.materials import images_of
@@ -87,7 +88,7 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
             chosen = [t for t in children if tags.kind_of(t) in kinds]
         request = ObjectExport(
             self.format.lower(),
-            Path(bpy.path.abspath(self.directory)).resolve(),
+            real_path(bpy.path.abspath(self.directory)),
             self.placed,
             self.pack and self.format.lower() in PACKABLE_FORMATS,
         )

@@ -8,6 +8,7 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ...core.errors import UsageError
+from ...core.files import real_path
 from ..common import known_jobs, tags
 from ..common.addon import properties_of
 from ..common.error_reporting import OperatorResult, ReportsErrors
@@ -133,7 +134,7 @@ class GWRAP_OT_find_job(ReportsErrors, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> OperatorResult:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose the folder of a job.")
-        folder = Path(bpy.path.abspath(self.directory)).resolve()
+        folder = real_path(bpy.path.abspath(self.directory))
         status = job_attach.attach(context.scene, folder)
         known_jobs.remember(folder)
         self.report({"INFO"}, f"Found a job: {status.state.lower()}")

@@ -10,6 +10,7 @@ from typing import Any
 import bpy
 
 from ...core.errors import UsageError
+from ...core.files import real_path
 from ...core.settings import Declaration, JobSettings, declarations, preset, with_values
 from ..common import known_jobs
 from ..common.addon import properties_of
@@ -135,7 +136,7 @@ def _splat(stored: str) -> str:
             f"The splat {path} does not exist.",
             "Choose it again in Train, Advanced, or clear the field.",
         )
-    return str(path.resolve())
+    return str(real_path(path))
 
 
 def preset_lines(name: str) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 
 from ...core.errors import UsageError, WrapError
+from ...core.files import real_path
 from ...core.jobs.store.job_file import read_job
 from ...core.jobs.store.job_folder import JobFolder
 from ..common import tags
@@ -24,7 +25,7 @@ def source_of(scene: bpy.types.Scene) -> Path:
     """
     if not properties_of(scene).source:
         raise UsageError("No photo folder is chosen.", "Choose one in Dataset.")
-    return Path(bpy.path.abspath(properties_of(scene).source)).resolve()
+    return real_path(bpy.path.abspath(properties_of(scene).source))
 
 
 def output_of(scene: bpy.types.Scene, source: Path) -> Path:
@@ -45,7 +46,7 @@ def output_of(scene: bpy.types.Scene, source: Path) -> Path:
             f"{base} is a whole disk, which has no folder beside it.",
             "Copy the photos into a folder of their own.",
         )
-    folder = Path(bpy.path.abspath(text)).resolve() if text else base.with_name(f"{base.name}_wrap")
+    folder = real_path(bpy.path.abspath(text)) if text else base.with_name(f"{base.name}_wrap")
     if folder.is_relative_to(base):
         raise UsageError(
             f"{folder} lies inside the photo folder.", "Choose an output folder outside of it."
@@ -65,7 +66,7 @@ def _is_of_other_photos(scene: bpy.types.Scene, source: Path) -> bool:
     if not job.is_job():
         return False
     try:
-        return Path(read_job(job.job_path).source).resolve() != source
+        return real_path(read_job(job.job_path).source) != source
     except WrapError:
         return False
 
@@ -78,7 +79,7 @@ def job_folder_of(frame: bpy.types.Object) -> Path:
     UsageError
         It has been moved or deleted.
     """
-    folder = tags.result_folder(frame).resolve().parent
+    folder = real_path(tags.result_folder(frame)).parent
     if not JobFolder(folder).is_job():
         raise UsageError(
             f"{folder} holds no job.", "Import the result again from where its folder is now."

@@ -17,6 +17,7 @@ from ...core.dataset.frames.placement import check_scale, similarity_of_matrix
 from ...core.dataset.frames.placement_file import FILE_NAME, write_placement
 from ...core.dataset.similarity import Similarity
 from ...core.errors import UsageError
+from ...core.files import real_path
 from ..cameras.camera_objects import cameras_under, scale_display
 from ..common import known_jobs, tags
 from ..regions.region_objects import matrix_of
@@ -117,7 +118,7 @@ def _keep(frame: bpy.types.Object, placement: Similarity) -> str:
     """Write the placement beside the result; the folder is one that a .blend names."""
     lost = "The placement is saved in this .blend file only"
     try:
-        folder = tags.result_folder(frame).resolve()
+        folder = real_path(tags.result_folder(frame))
         world_from_scene = tags.world_from_scene(frame)
     except UsageError as error:
         return f"{lost}: {error}"
@@ -147,7 +148,7 @@ def after_undo(_scene: object = None, _unused: object = None) -> None:
         if tags.kind_of(frame) != "frame" or frame.library is not None or not _written:
             continue
         try:
-            path = tags.result_folder(frame).resolve() / FILE_NAME
+            path = real_path(tags.result_folder(frame)) / FILE_NAME
             world_from_scene = tags.world_from_scene(frame)
         except UsageError:
             continue

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators that import results, open their folder and set their shading."""
 
-from pathlib import Path
 from typing import Final
 
 import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ...core.errors import UsageError
+from ...core.files import real_path
 from ..common import known_jobs, tags
 from ..common.error_reporting import NeedsObjectMode, NeedsResult, OperatorResult, ReportsErrors
 from ..common.mesh_data import mesh_of
@@ -33,7 +33,7 @@ class GWRAP_OT_import_result(NeedsObjectMode, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> OperatorResult:
         if not self.directory:
             raise UsageError("No folder was chosen.", "Choose a job folder or its result folder.")
-        folder = Path(bpy.path.abspath(self.directory)).resolve()
+        folder = real_path(bpy.path.abspath(self.directory))
         if not (folder / "scene.json").exists() and (folder / "result").is_dir():
             folder = folder / "result"
         imported = import_result(folder, context.scene)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from ...core import limits
+from ...core.array_file import read_arrays
 from ...core.dataset.camera import Camera
 from ...core.dataset.frames.placement_file import FILE_NAME, read_placement
 from ...core.dataset.similarity import Similarity
 from ...core.errors import DatasetError, ParseError
-from ...core.files import read_json
+from ...core.files import read_json, real_path
 from ...core.regions.region_file import read_region_file
 from ...core.regular_files import reject_foreign_entries
 from ...core.settings import MAX_LODS
@@ -101,7 +101,7 @@ def read_result(folder: Path) -> ResultFiles:
     ParseError
         A file is invalid; names file and position.
     """
-    folder = folder.resolve()
+    folder = real_path(folder)
     scene_path = folder / "scene.json"
     if not scene_path.is_file():
         raise DatasetError(
@@ -229,18 +229,17 @@ def read_mesh_arrays(
     """
     hint = "Mesh the region again."
     try:
-        with zipfile.ZipFile(path) as archive:
-            claimed_bytes = sum(item.file_size for item in archive.infolist())
-        if claimed_bytes > MAX_MESH_BYTES:
-            raise ValueError(f"{claimed_bytes} bytes are too many")
-        with np.load(path, allow_pickle=False) as arrays:
-            vertices = np.asarray(arrays["vertices"], np.float64)
-            faces = np.asarray(arrays["faces"])
-            corner_uvs = np.asarray(arrays["corner_uvs"], np.float64)
-            face_atlas = arrays["face_atlas"] if "face_atlas" in arrays.files else None
+        arrays = read_arrays(
+            path, ("vertices", "faces", "corner_uvs"), optional=("face_atlas",),
+            most_bytes=MAX_MESH_BYTES, hint=hint,
+        )  # fmt: skip
+        vertices = np.asarray(arrays["vertices"], np.float64)
+        faces = arrays["faces"]
+        corner_uvs = np.asarray(arrays["corner_uvs"], np.float64)
+        face_atlas = arrays.get("face_atlas")
         if face_atlas is not None:
             face_atlas = validate_face_atlas(face_atlas, len(faces))
-    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as error:
+    except (ValueError, TypeError, MemoryError) as error:
         raise ParseError(path, "whole file", f"not a mesh file ({error}).", hint) from None
     if vertices.ndim != 2 or vertices.shape[1:] != (3,):
         raise ParseError(path, "vertices", f"shape {vertices.shape} is not (v, 3).", hint)

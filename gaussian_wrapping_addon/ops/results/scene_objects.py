@@ -10,6 +10,7 @@ from pathlib import Path
 import bpy
 
 from ...core.errors import UsageError
+from ...core.files import real_path
 from ..cameras.camera_objects import create_camera, scale_display
 from ..common import tags
 from ..common.mesh_data import build_mesh, mesh_of
@@ -126,7 +127,7 @@ def _find_frame(files: ResultFiles, scene: bpy.types.Scene) -> bpy.types.Object 
             stored = tags.result_folder(thing)
         except UsageError:
             continue
-        if stored.resolve() == files.folder:
+        if real_path(stored) == files.folder:
             return thing
         if thing.get(tags.FINGERPRINT) == files.fingerprint and not stored.exists():
             moved = thing

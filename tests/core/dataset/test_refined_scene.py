@@ -53,6 +53,8 @@ def test_poses_come_back_and_all_else_stays(saved: Scene, tmp_path: Path) -> Non
         assert one.photo_path == other.photo_path
         assert one.camera.to_json() == other.camera.to_json()
     assert np.array_equal(found.points, saved.points)
+    save_poses(tmp_path / "train", None)  # the training was done again, and refined none
+    assert np.array_equal(poses_of(load_refined_scene(*folders)), poses_of(saved))
 
 
 def test_poses_that_are_none_are_refused(saved: Scene, tmp_path: Path) -> None:

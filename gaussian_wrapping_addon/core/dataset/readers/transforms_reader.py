@@ -60,7 +60,7 @@ def read_transforms(path: Path) -> SourceModel:
     DatasetError
         No usable frame.
     """
-    values = read_json(path)
+    values = read_json(path, follow_links=True)
     if not isinstance(values, dict):
         raise ParseError(path, "top level", "an object was expected.", _AGAIN)
     frames = values.get("frames")

@@ -86,7 +86,7 @@ def read_polygon_volume(path: Path) -> PolygonVolume:
         States the entry: missing, not finite, an unknown axis or version, too few corners.
     """
     try:
-        values = read_json(path)
+        values = read_json(path, follow_links=True)
     except OSError as error:
         raise ParseError(path, "whole file", f"cannot be read: {error.strerror}.", _AGAIN) from None
     if not isinstance(values, dict):

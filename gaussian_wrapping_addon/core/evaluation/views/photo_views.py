@@ -91,7 +91,7 @@ def _scene_of(views: list[View]) -> Scene:
 def _written_views(folder: Path) -> list[View]:
     path = folder / TEST_CAMERAS
     again = "Give a COLMAP project or a transforms.json instead."
-    values = read_json(path)
+    values = read_json(path, follow_links=True)
     entries = values.get("cameras") if isinstance(values, dict) else None
     if not isinstance(entries, list) or not entries:
         raise ParseError(path, "cameras", "a list of cameras was expected.", again)

@@ -47,7 +47,7 @@ def _newest_stage(stages: Path, name: str) -> Path:
 def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     from ...dataset.frames.scene_grid import snapped_length
     from ...dataset.photos.photo_store import PhotoStore
-    from ...dataset.scene_file import load_saved_scene
+    from ...dataset.refined_scene import load_refined_scene
     from ...field.depth_samples import sample_depth_maps
     from ...field.vacancy.vacancy import VacancyField
     from ...gaussians.gaussian_file import load_gaussians
@@ -64,8 +64,9 @@ def _estimate(request: dict[str, Any]) -> list[str | ReportWarning]:
     threads = int(request["threads"]) or default_threads()
     if request["region"] not in AUTOMATIC_REGIONS:
         world_region = read_region(Path(request["region"]))
-    scene = load_saved_scene(_newest_stage(folder.stages, "cameras"))
-    gaussians = load_gaussians(_newest_stage(folder.stages, "train") / "gaussians.npz")
+    trained = _newest_stage(folder.stages, "train")
+    scene = load_refined_scene(_newest_stage(folder.stages, "cameras"), trained)
+    gaussians = load_gaussians(trained / "gaussians.npz")
     arrays = gaussians.arrays()
     if request["region"] not in AUTOMATIC_REGIONS:
         region = region_in_scene(world_region, scene.world_from_scene)

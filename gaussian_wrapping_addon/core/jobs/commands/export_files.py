@@ -8,7 +8,6 @@ line to stdout, in the protocol of :mod:`~.run_in_worker`.
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +15,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...array_file import read_arrays
 from ...dataset.frames.file_frame import FileFrame, file_offset
 from ...dataset.frames.placement_file import FILE_NAME, read_placement
 from ...dataset.photos.image_formats import open_image
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError, ParseError, UsageError
 from ...export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
-from ...files import read_json, write_bytes
+from ...files import read_json, real_path, write_bytes
 from ...names import SPLAT_STEM, file_stems
 from ...regular_files import reject_foreign_entries
 from ...texture.files.file_checks import atlas_file
@@ -90,7 +90,7 @@ def result_of(folder: Path) -> Path:
     for path in (folder / "result", folder):
         if (path / "scene.json").is_file():
             reject_foreign_entries(folder)
-            return path.resolve()
+            return real_path(path)
     if (folder / MARKER).exists():
         raise DatasetError(f"The job {folder} has no result yet.", "Resume it first.")
     raise UsageError(f"{folder} holds no job's result.", "Give the folder of a finished job.")
@@ -185,23 +185,20 @@ def _read_mesh(region: str, level: int, folder: Path, stem: str) -> StoredMesh:
     from ...texture.files.file_checks import validate_face_atlas, validate_for_export
 
     path = folder / "mesh.npz"
+    kinds = {"vertices": "f8", "faces": "i4", "corner_uvs": "f4"}
+    hint = "Mesh the region again."
+    arrays = read_arrays(path, kinds, optional=("face_atlas",), hint=hint)
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            vertices, faces, corner_uvs = (
-                np.asarray(arrays[n], t)
-                for n, t in (("vertices", "f8"), ("faces", "i4"), ("corner_uvs", "f4"))
-            )
-            face_atlas = arrays["face_atlas"] if "face_atlas" in arrays.files else None
+        vertices, faces, corner_uvs = (np.asarray(arrays[n], t) for n, t in kinds.items())
+        face_atlas = arrays.get("face_atlas")
         if face_atlas is not None:
             face_atlas = validate_face_atlas(face_atlas, len(faces))
         if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
             raise ValueError("not lists of triples")
         if corner_uvs.shape != (len(faces), 3, 2):
             raise ValueError("UVs are not those of the faces")
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise ParseError(
-            path, "whole file", f"not a mesh file ({error}).", "Mesh the region again."
-        ) from None
+    except (ValueError, TypeError) as error:
+        raise ParseError(path, "whole file", f"not a mesh file ({error}).", hint) from None
     mesh = StoredMesh(region, level, folder, vertices, faces, corner_uvs, stem, face_atlas)
     validate_for_export(vertices, faces, corner_uvs, name=f"mesh {mesh.stem}")
     return mesh

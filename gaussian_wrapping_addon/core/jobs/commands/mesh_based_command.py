@@ -131,9 +131,13 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
         # Photos may have been added since: only the stage with the result's own cameras counts.
         # Their poses may be refined; the frame and all else is the stage's.
         saved = read_json(stage / SCENE_NAME)
-        if saved["world_from_scene"] == frame and lenses == [
-            _lens(entry["camera"]) for entry in saved["views"]
-        ]:
+        try:
+            same = saved["world_from_scene"] == frame and lenses == [
+                _lens(entry["camera"]) for entry in saved["views"]
+            ]
+        except (KeyError, TypeError, AttributeError):
+            same = False
+        if same:
             poses = _poses(shown, paths[0], again)
             return with_poses(load_saved_scene(stage), poses), held_out
     raise DatasetError(

@@ -7,6 +7,8 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from ...errors import ParseError
+from ...files import read_json
 from ...progress import Progress
 from ..store.continue_training import shorter_training
 from ..store.job_file import JobFile
@@ -73,8 +75,11 @@ def run_cameras(folder: JobFolder, job: JobFile, progress: Progress, *, threads:
         }
 
     def whole(stage_folder: Path) -> bool:
-        points = stage_folder / POINTS_NAME
-        return (stage_folder / SCENE_NAME).is_file() and is_whole(points, MOST_POINTS_BYTES)
+        try:
+            read_json(stage_folder / SCENE_NAME)
+        except (FileNotFoundError, ParseError):
+            return False
+        return is_whole(stage_folder / POINTS_NAME, MOST_POINTS_BYTES)
 
     return run_stage(folder.stages, "cameras", key, progress, work, whole=whole)
 

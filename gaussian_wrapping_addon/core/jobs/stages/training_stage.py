@@ -152,8 +152,8 @@ def _train(
     )
     result = trained.result
     save_gaussians(stage_folder / GAUSSIANS_NAME, result.gaussians)
+    save_poses(stage_folder, result.poses)
     if result.poses is not None:
-        save_poses(stage_folder, result.poses)
         scene = load_refined_scene(cameras.folder, stage_folder)
     measured = {figure.name: figure.psnr for figure in result.held_out}
     shown = [

@@ -270,7 +270,7 @@ def read_job(path: Path) -> JobFile:
     """Read ``job.json``."""
     if not os.path.lexists(path):
         raise UsageError(f"{path} does not exist.", "Choose a folder in which a job was started.")
-    return JobFile.from_json(read_json(path, follow_links=False))
+    return JobFile.from_json(read_json(path))
 
 
 def write_job(path: Path, job: JobFile) -> None:

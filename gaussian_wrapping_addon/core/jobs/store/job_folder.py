@@ -97,7 +97,7 @@ def _is_kind(name: str, value: Any) -> bool:
 
 
 def _read_small(path: Path) -> Any:
-    return read_json(path, most_bytes=limits.MAX_STATUS_BYTES, follow_links=False)
+    return read_json(path, most_bytes=limits.MAX_STATUS_BYTES)
 
 
 FOREIGN_LOCK_HINT = "If it is no job of this add-on, delete lock.json there."

@@ -105,7 +105,7 @@ def _without_error(status: JobStatus) -> JobStatus:
 
 def _read(path: Path) -> dict[str, Any] | None:
     try:
-        values = read_json(path, follow_links=False)
+        values = read_json(path)
     except (OSError, ParseError):
         return None
     wanted = {"job": dict, "status": dict, "stages": list}

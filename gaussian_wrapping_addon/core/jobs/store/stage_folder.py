@@ -93,7 +93,7 @@ def read_done(folder: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        values = read_json(path, follow_links=False)
+        values = read_json(path)
     except (OSError, ParseError):
         return None
     return values if isinstance(values, dict) else None

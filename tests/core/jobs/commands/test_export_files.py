@@ -225,7 +225,13 @@ def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
     (result / "auto" / "albedo.png").write_text("no image")
     with pytest.raises(ParseError, match=r"albedo\.png"):
         exported(good)
-    (result / "auto" / "mesh.npz").write_text("no mesh")
+    mesh = result / "auto" / "mesh.npz"
+    data = bytearray(mesh.read_bytes())
+    data[len(data) // 2] ^= 1
+    mesh.write_bytes(data)
+    with pytest.raises(ParseError, match=r"mesh\.npz.*damaged"):
+        exported(good)
+    mesh.write_text("no mesh")
     with pytest.raises(ParseError, match=r"mesh\.npz"):
         exported(good)
     with pytest.raises(UsageError, match="holds no job's result"):

@@ -66,13 +66,16 @@ def run(folder: JobFolder) -> tuple[JobFile, Stage, Stage]:
 
 
 @damaged
+@pytest.mark.parametrize("name", [scene_file.POINTS_NAME, scene_file.SCENE_NAME])
 def test_damaged_cameras_are_loaded_again(
-    folder: JobFolder, damage: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
+    folder: JobFolder, name: str, damage: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if name == scene_file.SCENE_NAME and damage is turn_a_bit:
+        pytest.skip("a changed digit is still JSON")
     _, cameras, _ = run(folder)
     scene = scene_file.load_saved_scene(cameras.folder)
     monkeypatch.setattr(load, "load_scene", lambda *_, **__: scene)
-    damage(cameras.folder / scene_file.POINTS_NAME)
+    damage(cameras.folder / name)
     _, again, trained = run(folder)
     assert (cameras.reused, again.reused, trained.reused) == (True, False, True)
     assert np.array_equal(scene_file.load_saved_scene(again.folder).points, scene.points)
