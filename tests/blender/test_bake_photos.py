@@ -63,6 +63,8 @@ def test_a_foreign_mesh_without_uvs_gets_uvs_and_texture(job: JobFolder) -> None
     thing = add_ball()
     before = np.array(thing.matrix_world), len(bpy.data.objects)
     assert not thing.data.uv_layers
+    painted = thing.data.color_attributes.new("Painted", "BYTE_COLOR", "CORNER")
+    painted.data.foreach_set("color", np.tile([0.25, 0.5, 1.0, 1.0], len(thing.data.loops)))
     status = press(job)
     assert status.state == "DONE", status.error
     thing = bpy.context.object
@@ -71,6 +73,8 @@ def test_a_foreign_mesh_without_uvs_gets_uvs_and_texture(job: JobFolder) -> None
     sides = [len(polygon.vertices) for polygon in thing.data.polygons]
     assert sum(side - 2 for side in sides) == TRIANGLES
     assert sides.count(4) > 0.5 * POLYGONS
+    colors = {tuple(c.color_srgb[:]) for c in thing.data.color_attributes["Painted"].data}
+    assert len(colors) == 1, "divided polygons keep their other attributes"
     assert psnr_of_textures(thing) > GOOD_DB
     assert (np.array(thing.matrix_world) == before[0]).all()
     assert len(bpy.data.objects) == before[1]
@@ -168,6 +172,7 @@ def test_detail_comes_from_another_mesh(job: JobFolder) -> None:
     dense = add_ball("Dense")
     thing = add_ball("Retopologised", uvs=True)
     bpy.context.scene.gwrap.bake.dense = dense
+    bpy.context.scene.gwrap.ambient_occlusion = True
     assert press(job).state == "DONE"
     request = read_job(job.job_path).bake
     assert request is not None
@@ -175,6 +180,8 @@ def test_detail_comes_from_another_mesh(job: JobFolder) -> None:
     material = thing.material_slots[0].material
     assert material.node_tree.nodes["Normal Texture"].image.colorspace_settings.name == "Non-Color"
     assert not dense.material_slots
+    assert material.node_tree.nodes["Occlusion Texture"].image.name == "occlusion.png"
+    assert material.node_tree.nodes.active.image.name.startswith("albedo")
 
 
 def test_a_mirrored_object_is_not_inside_out(job: JobFolder) -> None:

@@ -27,7 +27,9 @@ from gaussian_wrapping_addon.ops.results.scene_objects import ImportedResult, im
 from tests.blender.synthetic_result import (
     WORLD_FROM_SCENE,
     cube_mesh,
+    png_bytes,
     rotation_about,
+    write_region_result,
     write_result,
 )
 from tests.blender.test_detail import write_detail
@@ -358,3 +360,35 @@ def test_a_result_folder_is_exported_in_the_background(tmp_path: Path) -> None:
     assert path.name == "nose.obj"
     with pytest.raises(UsageError, match="no mesh mouth"):
         export_result(result, requests, regions=("mouth",))
+
+
+def glb_json(path: Path) -> dict:
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+
+
+def test_occlusion_is_in_lit_glb_files_alone(tmp_path: Path) -> None:
+    """Blender draws nothing of it; imported again without it, the material loses it."""
+    result = write_result(tmp_path / "job")
+    dark = result / "auto" / "occlusion.png"
+    dark.write_bytes(png_bytes(np.full((16, 16, 3), 90, np.uint8)))
+    found = import_result(result, bpy.context.scene)
+    (thing,) = found.meshes
+    material = thing.data.materials[0]
+    assert material.node_tree.nodes.active.image.name.startswith("albedo")
+    before = names_in_file()
+    (path,) = export_objects(found.frame, [thing], ObjectExport("glb", tmp_path / "lit"))
+    values = glb_json(path)
+    texture = values["materials"][0]["occlusionTexture"]["index"]
+    assert values["images"][values["textures"][texture]["source"]]["name"] == "auto-occlusion"
+    assert len(values["images"]) == 2
+    (path,) = export_objects(found.frame, [thing], ObjectExport("obj", tmp_path / "obj"))
+    assert sorted(p.name for p in path.parent.glob("*.png")) == ["auto-albedo.png"]
+    set_shading(material, "UNLIT")
+    (path,) = export_objects(found.frame, [thing], ObjectExport("glb", tmp_path / "unlit"))
+    assert "occlusionTexture" not in glb_json(path)["materials"][0]
+    assert names_in_file() == before
+    dark.unlink()
+    write_region_result(result / "auto", half=0.7)
+    import_result(result, bpy.context.scene)
+    assert [n.name for n in material.node_tree.nodes if "cclusion" in n.name] == []

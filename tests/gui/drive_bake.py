@@ -25,6 +25,7 @@ WAIT_S = 240.0
 def steps() -> Iterator[float]:
     """The visit; each value is the time to let Blender live."""
     os.environ["GAUSSIAN_WRAPPING_PYTHON"] = os.environ["GW_GUI_WORKER"]
+    open_only("GWRAP_PT_bake")
     yield from driving.open_tab()
     press(bpy.ops.gwrap.import_result, directory=str(FOLDER / "ball" / "result"))
     yield 0.5
@@ -33,8 +34,6 @@ def steps() -> Iterator[float]:
         thing.hide_set(True)
     add("Suzanne")
     bpy.context.object.location = (0.0, 0.0, 0.0)
-    yield 0.5
-    open_only("GWRAP_PT_bake")
     yield 0.8
     screenshot("1-bake")
     check(not bpy.data.objects["Suzanne"].data.uv_layers, "the foreign mesh has no UVs")
@@ -107,15 +106,13 @@ def uv_names(name: str) -> list[str]:
 
 
 def open_only(panel: str) -> None:
-    """Show one panel of the tab: open it for this session, close what takes its room."""
-    registered = driving.module("registration")
-    closed = [c for c in registered.CLASSES if issubclass(c, bpy.types.Panel)]
-    shown = [c for c in closed if c.__name__ == panel]
-    for cls in reversed(closed):
+    """Register the panels anew, one open and the others closed; before the tab is first shown."""
+    classes = driving.module("registration").CLASSES
+    panels = [cls for cls in classes if issubclass(cls, bpy.types.Panel)]
+    for cls in reversed(panels):
         bpy.utils.unregister_class(cls)
-    for cls in (*shown, *(c for c in closed if c not in shown)):
-        options = set(getattr(cls, "bl_options", set())) - {"DEFAULT_CLOSED"}
-        cls.bl_options = options if cls in shown else options | {"DEFAULT_CLOSED"}
+    for cls in panels:
+        cls.bl_options = set() if cls.__name__ == panel else {"DEFAULT_CLOSED"}
         bpy.utils.register_class(cls)
 
 

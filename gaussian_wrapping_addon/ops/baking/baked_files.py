@@ -33,6 +33,8 @@ class BakedFiles:
     albedo: tuple[Path, ...]
     normal_map: tuple[Path, ...]
     """The same, or empty."""
+    occlusion: tuple[Path, ...]
+    """The same, or empty."""
     has_own_uvs: bool
     """Whether the UVs are those of the mesh that was handed over."""
     has_own_faces: bool
@@ -70,12 +72,13 @@ def read_baked(folder: Path) -> BakedFiles:
             raise ValueError("there are fewer tiles than textures")
     except (KeyError, TypeError, ValueError) as error:
         raise ParseError(figures_path, "whole file", f"not of a bake ({error}).", _HINT) from None
-    albedo, normal_map = (
+    albedo, normal_map, occlusion = (
         tuple(folder / atlas_file(name, number, udims) for number in range(max(len(udims), 1)))
-        for name in ("albedo", "normal")
+        for name in ("albedo", "normal", "occlusion")
     )
     normal_map = normal_map if normal_map[0].is_file() else ()
-    for image in (*albedo, *normal_map):
+    occlusion = occlusion if occlusion[0].is_file() else ()
+    for image in (*albedo, *normal_map, *occlusion):
         if not image.is_file():
             raise DatasetError(f"{folder} holds no {image.name}.", _HINT)
     if udims:
@@ -84,6 +87,6 @@ def read_baked(folder: Path) -> BakedFiles:
         shift = np.stack([tile % 10, tile // 10], axis=1)[:, None].astype(np.float32)
         corner_uvs = corner_uvs + shift
     return BakedFiles(
-        folder.name, vertices, faces, corner_uvs, udims, albedo, normal_map, has_own_uvs,
+        folder.name, vertices, faces, corner_uvs, udims, albedo, normal_map, occlusion, has_own_uvs,
         has_own_faces, coverage, warnings,
     )  # fmt: skip

@@ -14,7 +14,13 @@ import numpy as np
 from ...core.errors import UsageError
 from ..common import tags
 from ..common.mesh_data import build_mesh, mesh_of
-from ..results.materials import create_material, load_texture, set_shading, shading_of
+from ..results.materials import (
+    create_material,
+    load_texture,
+    set_occlusion,
+    set_shading,
+    shading_of,
+)
 from .baked_files import BakedFiles
 from .triangulation import Triangulation, scene_points, triangulation_of
 
@@ -175,7 +181,7 @@ def _divide(
             except ValueError:
                 continue  # Blender has this triangle already: a face folded onto itself
             for loop, before, uv in zip(new.loops, loops, corner_uvs[row], strict=True):
-                loop.copy_from(before)
+                _copy_layers(work.loops.layers, before, loop)
                 loop[layer].uv = uv.tolist()
         bmesh.ops.delete(work, geom=list(old.values()), context="FACES_ONLY")
         work.to_mesh(mesh)
@@ -183,13 +189,24 @@ def _divide(
         work.free()
 
 
+def _copy_layers(layers: Any, source: Any, target: Any) -> None:
+    """Copy a corner's UVs, colours and attributes; ``BMLoop.copy_from`` breaks in Blender 4.3."""
+    for layer in layers.uv.values():
+        target[layer].uv = source[layer].uv
+    for kind in ("color", "float_color", "float", "float_vector", "int", "bool", "string"):
+        for layer in getattr(layers, kind).values() if hasattr(layers, kind) else ():
+            target[layer] = source[layer]
+
+
 def _set_material(thing: bpy.types.Object, frame: bpy.types.Object, baked: BakedFiles) -> None:
     image = _load(baked.albedo, baked.udims, "sRGB")
     normal = _load(baked.normal_map, baked.udims, "Non-Color") if baked.normal_map else None
+    dark = _load(baked.occlusion, baked.udims, "Non-Color") if baked.occlusion else None
     mesh = mesh_of(thing)
     if mesh.users > 1:
         thing.data = mesh = mesh.copy()
     material = create_material(f"{thing.name} photos", image, normal)
+    set_occlusion(material, dark)
     set_shading(material, _shading(frame))
     mesh.materials.clear()
     mesh.materials.append(material)

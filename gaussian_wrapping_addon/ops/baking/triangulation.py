@@ -45,6 +45,7 @@ def triangulation_of(thing: bpy.types.Object) -> Triangulation:
     """
     if thing.type != "MESH":
         raise UsageError(f"{thing.name} is no mesh.", "Select a mesh object.")
+    mesh_of(thing).update_tag()  # scripts may have changed its layers, which tags nothing
     evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
     if thing.modifiers and not evaluated.is_evaluated:
         raise UsageError(

@@ -12,7 +12,13 @@ import bpy
 import numpy as np
 
 from ...core.errors import ResourceError, UsageError
-from ..results.materials import fold_specular, set_shading, shading_of, show_as_emission
+from ..results.materials import (
+    fold_specular,
+    set_occlusion,
+    set_shading,
+    shading_of,
+    show_as_emission,
+)
 
 _UNSAFE = re.compile(r"[^\w.-]+")
 
@@ -65,6 +71,8 @@ class MaterialCopies:
             elif shading == "UNLIT" and self._unlit == "emission":
                 show_as_emission(copy)
                 self.shading = "emission"
+            if self._unlit != "keep" or self.shading == "unlit":
+                set_occlusion(copy, None)  # no other format, nor an unlit material, has it
             if self._fold_specular:
                 fold_specular(copy)
         tree: Any = copy.node_tree

@@ -53,7 +53,7 @@ def update_levels(
     for number, level in enumerate(region.levels, 1):
         name = f"{region.name} LOD{number}"
         data = build_mesh(name, level.vertices, level.faces, level.corner_uvs, level.face_atlas)
-        for material in create_materials(name, level.albedo, level.normal_map):
+        for material in create_materials(name, level.albedo, level.normal_map, level.occlusion):
             data.materials.append(material)
         thing = bpy.data.objects.new(name, data)
         thing.parent = mesh.parent

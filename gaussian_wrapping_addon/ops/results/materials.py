@@ -14,6 +14,9 @@ from ...core.texture.files.shading import ROUGHNESS, SPECULAR_LEVEL
 from ..common import tags
 
 _NORMAL_IMAGE, _NORMAL = "Normal Texture", "Normal Map"
+_OCCLUSION_IMAGE, _OCCLUSION_RED, _OCCLUSION = "Occlusion Texture", "Occlusion Red", "glTF Output"
+_GLTF_GROUP = "glTF Material Output"
+"""Node group with the input ``Occlusion`` that Blender's glTF exporter reads; renders nothing."""
 _IMAGE, _LIT, _UNLIT, _OUTPUT = "Photo Texture", "Lit", "Unlit", "Output"
 
 
@@ -76,24 +79,31 @@ def create_material(
 
 
 def create_materials(
-    name: str, albedo: Sequence[Path], normal_map: Sequence[Path]
+    name: str,
+    albedo: Sequence[Path],
+    normal_map: Sequence[Path],
+    occlusion: Sequence[Path] = (),
 ) -> list[bpy.types.Material]:
     """Create a material for each atlas: ``name``, then ``name 2`` and on.
 
     Parameters
     ----------
-    albedo, normal_map : sequence of Path
-        Images, one for each atlas; normal maps may be empty.
+    albedo, normal_map, occlusion : sequence of Path
+        Images, one for each atlas; the last two may be empty.
     """
-    normals = load_normal_maps(normal_map, len(albedo))
-    return [
-        create_material(f"{name} {number}" if number > 1 else name, load_texture(path), normal)
-        for number, (path, normal) in enumerate(zip(albedo, normals, strict=True), 1)
-    ]
+    normals = load_data_maps(normal_map, len(albedo))
+    dark = load_data_maps(occlusion, len(albedo))
+    materials = []
+    for number, (path, normal) in enumerate(zip(albedo, normals, strict=True), 1):
+        called = f"{name} {number}" if number > 1 else name
+        material = create_material(called, load_texture(path), normal)
+        set_occlusion(material, dark[number - 1])
+        materials.append(material)
+    return materials
 
 
-def load_normal_maps(paths: Sequence[Path], count: int) -> list[bpy.types.Image | None]:
-    """Load the normal maps of ``count`` atlases; each None if there are none."""
+def load_data_maps(paths: Sequence[Path], count: int) -> list[bpy.types.Image | None]:
+    """Load maps that are no colours, of ``count`` atlases; each None if there are none."""
     return [load_texture(path, "Non-Color") for path in paths] or [None] * count
 
 
@@ -124,6 +134,44 @@ def set_normal_map(material: bpy.types.Material, image: bpy.types.Image | None) 
         nodes.active = active  # Workbench draws the active image
     texture.image = image
     return True
+
+
+def set_occlusion(material: bpy.types.Material, image: bpy.types.Image | None) -> bool:
+    """Set or remove the occlusion map, for glTF; False if the material is not ours.
+
+    Blender does not render it: its own lights make their own shadows.
+    """
+    tree: Any = material.node_tree
+    if tree is None or _LIT not in tree.nodes:
+        return False
+    nodes, links = tree.nodes, tree.links
+    for name in (_OCCLUSION, _OCCLUSION_RED, _OCCLUSION_IMAGE):
+        if name in nodes:
+            nodes.remove(nodes[name])
+    if image is None:
+        return True
+    active = nodes.active
+    texture = nodes.new("ShaderNodeTexImage")
+    texture.name, texture.image, texture.location = _OCCLUSION_IMAGE, image, (-600, 700)
+    red = nodes.new("ShaderNodeSeparateColor")
+    red.name, red.location = _OCCLUSION_RED, (-250, 700)
+    group = nodes.new("ShaderNodeGroup")
+    group.name, group.node_tree, group.location = _OCCLUSION, _gltf_group(), (50, 700)
+    links.new(texture.outputs["Color"], red.inputs["Color"])
+    links.new(red.outputs["Red"], group.inputs["Occlusion"])
+    nodes.active = active  # Workbench draws the active image
+    return True
+
+
+def _gltf_group() -> bpy.types.NodeTree:
+    group: Any = bpy.data.node_groups.get(_GLTF_GROUP)
+    if group is None:
+        groups: Any = bpy.data.node_groups
+        group = groups.new(_GLTF_GROUP, "ShaderNodeTree")
+    if "Occlusion" not in group.interface.items_tree:
+        group.interface.new_socket("Occlusion", in_out="INPUT", socket_type="NodeSocketFloat")
+    found: bpy.types.NodeTree = group
+    return found
 
 
 def set_shading(material: bpy.types.Material, shading: str) -> bool:

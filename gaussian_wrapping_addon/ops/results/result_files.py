@@ -46,6 +46,8 @@ class LevelResult:
     """The same, or empty."""
     face_atlas: np.ndarray | None = None
     """(f,) uint8 atlas of each face; None if there is one."""
+    occlusion: tuple[Path, ...] = ()
+    """Ambient occlusion, one for each atlas, or empty."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class RegionResult:
     """(f,) uint8 atlas of each face; None if there is one."""
     levels: tuple[LevelResult, ...] = ()
     """Levels of detail 1, 2, ..."""
+    occlusion: tuple[Path, ...] = ()
+    """Ambient occlusion, one for each atlas, or empty."""
 
 
 @dataclass(frozen=True)
@@ -185,10 +189,11 @@ def _region(folder: Path) -> RegionResult:
             raise DatasetError(f"{folder} holds too many levels.", "Mesh the region again.")
         arrays = read_mesh_arrays(level)
         textures = _textures(level.parent, arrays[3])
-        levels.append(LevelResult(*arrays[:3], *textures, arrays[3]))
+        dark = _occlusion(level.parent, len(textures[0]))
+        levels.append(LevelResult(*arrays[:3], *textures, arrays[3], dark))
     return RegionResult(
         folder.name, vertices, faces, corner_uvs, albedo, box, stamp, normal_map, face_atlas,
-        tuple(levels),
+        tuple(levels), _occlusion(folder, len(albedo)),
     )  # fmt: skip
 
 
@@ -205,6 +210,12 @@ def _textures(
         if not path.is_file():
             raise DatasetError(f"{folder} holds no {path.name}.", "Mesh the region again.")
     return albedo, normal_map if normal_map[0].is_file() else ()
+
+
+def _occlusion(folder: Path, atlases: int) -> tuple[Path, ...]:
+    """Return the occlusion maps if there is one for each atlas; they are optional."""
+    paths = tuple(folder / atlas_file("occlusion", number) for number in range(atlases))
+    return paths if all(path.is_file() for path in paths) else ()
 
 
 def read_mesh_arrays(

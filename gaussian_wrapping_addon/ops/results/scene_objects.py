@@ -20,9 +20,10 @@ from .level_objects import update_levels
 from .materials import (
     create_material,
     create_materials,
-    load_normal_maps,
+    load_data_maps,
     load_texture,
     set_normal_map,
+    set_occlusion,
     set_shading,
     shading_of,
 )
@@ -175,7 +176,9 @@ def _update_mesh(
         region.name, region.vertices, region.faces, region.corner_uvs, region.face_atlas
     )
     if thing is None:
-        for material in create_materials(region.name, region.albedo, region.normal_map):
+        for material in create_materials(
+            region.name, region.albedo, region.normal_map, region.occlusion
+        ):
             mesh.materials.append(material)
         thing = bpy.data.objects.new(region.name, mesh)
         thing.parent = frame
@@ -202,16 +205,19 @@ def _keep_materials(
     Slots of atlases that no longer exist stay if they contain a material of the user.
     """
     images = [load_texture(path) for path in region.albedo]
-    normals = load_normal_maps(region.normal_map, len(images))
+    normals = load_data_maps(region.normal_map, len(images))
+    dark = load_data_maps(region.occlusion, len(images))
     for number, (image, normal_map) in enumerate(zip(images, normals, strict=True)):
         if number < len(old):
             kept = old[number]
             mesh.materials.append(kept)
             if kept is not None:
                 set_normal_map(kept, normal_map)
+                set_occlusion(kept, dark[number])
         else:
             name = f"{region.name} {number + 1}"
             material = create_material(name, image, normal_map)
+            set_occlusion(material, dark[number])
             set_shading(material, shading_of(old[0] if old else None) or "LIT")
             mesh.materials.append(material)
     for further in old[len(images) :]:

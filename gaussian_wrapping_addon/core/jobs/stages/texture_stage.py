@@ -16,6 +16,9 @@ from ..store.job_folder import JobFolder
 from ..store.stage_folder import STAGE_VERSIONS, Stage, run_stage, stage_key
 from .mesh_stage import DENSE_MESH
 
+OCCLUSION_VERSION = 2
+"""Raise it where ambient occlusion alone is computed otherwise: other textures stay valid."""
+
 
 def run_texture(
     folder: JobFolder,
@@ -36,7 +39,8 @@ def run_texture(
         Memory or disk space is not sufficient.
     """
     texture = job.settings.texture
-    key = stage_key(STAGE_VERSIONS["texture"], meshed.key, to_json(texture))
+    occlusion = [OCCLUSION_VERSION] if texture.ambient_occlusion == "on" else []
+    key = stage_key(STAGE_VERSIONS["texture"], meshed.key, to_json(texture), *occlusion)
 
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         from ...dataset.photo_source import PhotoSource
