@@ -17,11 +17,13 @@ from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
 from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.results.materials import shading_of
 from gaussian_wrapping_addon.ui.baking import bake_panel
 from tests.blender import job_play
 from tests.blender.baked_ball import add_ball, image_of, import_ball, psnr_of_textures
 from tests.blender.ball_job import write_ball_job
 from tests.blender.fake_layout import draw
+from tests.blender.synthetic_result import write_region_result
 
 pytestmark = [
     pytest.mark.usefixtures("ended_workers"),
@@ -158,6 +160,12 @@ def test_fewer_faces_become_a_lighter_object_with_a_normal_map(job: JobFolder) -
     assert psnr_of_textures(light) > GOOD_DB
     assert thing.hide_get()
     assert thing.data.materials.keys() == []
+    # It is shaded and exported with the result.
+    bpy.ops.gwrap.set_shading(shading="UNLIT")
+    assert shading_of(light.material_slots[0].material) == "UNLIT"
+    bpy.ops.gwrap.export_meshes(directory=str(job.root.parent / "files"), scope="ALL")
+    exported = sorted(p.name for p in (job.root.parent / "files").glob("*.glb"))
+    assert exported == ["Foreign_light.glb", "auto.glb"]
     # Once more: the same object, not another one.
     thing.hide_set(False)
     thing.select_set(True)
@@ -274,6 +282,21 @@ def test_a_mesh_edited_meanwhile_keeps_its_edits_and_says_so(job: JobFolder) -> 
     assert "Foreign has changed since" in status.error
     assert not thing.data.uv_layers
     assert not thing.data.materials
+
+
+def test_a_result_mesh_that_is_made_anew_loses_its_bake(job: JobFolder) -> None:
+    """The cube inside the ball, baked onto, then meshed again: the texture is the region's."""
+    frame = import_ball(job)
+    (thing,) = (child for child in frame.children if tags.kind_of(child) == "mesh")
+    bpy.ops.object.select_all(action="DESELECT")
+    bpy.context.view_layer.objects.active = thing
+    thing.select_set(True)
+    assert press(job).state == "DONE"
+    assert Path(image_of(thing).filepath).parent == job.baked / "auto"
+    write_region_result(job.result / "auto", half=0.7)
+    assert bpy.ops.gwrap.import_result(directory=str(job.result)) == {"FINISHED"}
+    assert Path(image_of(thing).filepath) == job.result / "auto" / "albedo.png"
+    assert tags.BAKE not in thing
 
 
 def test_a_cancelled_bake_is_resumed_onto_its_object(job: JobFolder) -> None:

@@ -15,6 +15,8 @@ from ...core.errors import UsageError
 KIND = "gwrap_kind"
 """``"frame"`` (the parent empty), ``"mesh"``, ``"lod"``, ``"camera"``, ``"region"``,
 ``"point"`` or ``"baked"``."""
+WITH_TEXTURE = ("mesh", "lod", "baked")
+"""Kinds of meshes with our material: of regions, coarser levels, lighter meshes of a bake."""
 RESULT = "gwrap_result"
 """On the frame: the result folder; ``//`` means beside the .blend file."""
 FINGERPRINT = "gwrap_fingerprint"

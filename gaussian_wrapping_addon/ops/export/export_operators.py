@@ -83,7 +83,7 @@ class GWRAP_OT_export_meshes(NeedsObjectMode, bpy.types.Operator):
             if not chosen:
                 raise UsageError("No mesh of a result is selected.", "Select some, or export all.")
         else:
-            kinds = ("mesh", "lod") if self.levels else ("mesh",)
+            kinds = tags.WITH_TEXTURE if self.levels else ("mesh", "baked")
             children = frame.children_recursive if frame is not None else ()
             chosen = [t for t in children if tags.kind_of(t) in kinds]
         request = ObjectExport(
@@ -129,11 +129,13 @@ class GWRAP_OT_pack_images(NeedsResult, ReportsErrors, bpy.types.Operator):
 
 
 def chosen_meshes(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the selected meshes and levels of results."""
+    """Return the selected meshes of results, with levels and lighter meshes."""
     return [
         t
         for t in context.selected_objects
-        if tags.kind_of(t) in ("mesh", "lod") and t.type == "MESH" and tags.frame_of(t) is not None
+        if tags.kind_of(t) in tags.WITH_TEXTURE
+        and t.type == "MESH"
+        and tags.frame_of(t) is not None
     ]
 
 

@@ -85,12 +85,12 @@ class GWRAP_OT_set_shading(NeedsResult, bpy.types.Operator):
 
 
 def materials_of(frame: bpy.types.Object | None) -> list[bpy.types.Material]:
-    """Return our materials on the meshes and levels of detail of a result."""
+    """Return our materials on the meshes of a result, coarser and lighter ones included."""
     children = frame.children if frame is not None else ()
     found = [
         material
         for child in children
-        if tags.kind_of(child) in ("mesh", "lod")
+        if tags.kind_of(child) in tags.WITH_TEXTURE
         for slot in child.material_slots
         if (material := slot.material) is not None and materials.shading_of(material) is not None
     ]

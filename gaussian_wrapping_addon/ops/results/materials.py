@@ -245,7 +245,7 @@ def images_of(frame: bpy.types.Object | None) -> list[bpy.types.Image]:
     found = [
         node.image
         for child in (frame.children_recursive if frame is not None else ())
-        if tags.kind_of(child) in ("mesh", "lod")
+        if tags.kind_of(child) in tags.WITH_TEXTURE
         for slot in child.material_slots
         if shading_of(slot.material) is not None
         for node in _nodes_of(slot.material)

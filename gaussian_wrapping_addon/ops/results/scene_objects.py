@@ -187,7 +187,15 @@ def _update_mesh(
         collection.objects.link(thing)
     else:
         old = mesh_of(thing)
-        _keep_materials(list(old.materials), mesh, region)
+        if thing.get(tags.BAKE):  # its material shows a bake onto the mesh that is replaced
+            for material in create_materials(
+                region.name, region.albedo, region.normal_map, region.occlusion
+            ):
+                mesh.materials.append(material)
+            for tag in (tags.BAKE, tags.BAKE_NOTE):
+                thing.pop(tag, None)
+        else:
+            _keep_materials(list(old.materials), mesh, region)
         thing.data = mesh
         if old.users == 0:
             name = old.name
