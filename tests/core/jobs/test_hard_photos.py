@@ -181,10 +181,10 @@ REFUSED = {
     "13 all transparent": (
         Case(ring(), save=save_transparent), "10 photos are masked altogether", "masks",
     ),
-    "14 nearly one place": (Case(NEARLY), "from nearly one place", "Walk around"),
 }  # fmt: skip
 
 REFUSED_AT_ONCE = {
+    "14 nearly one place": (Case(NEARLY), "from nearly one place", "Walk around"),
     "15 one camera": (Case(ring()[:1]), "Only 1 photo is usable", "Add photos"),
     "16 two cameras": (Case(ring()[:2]), "Only 2 photos are usable", "Add photos"),
     "17 identical poses": (Case([ring()[0]] * 6), "taken from one place", "Walk around"),

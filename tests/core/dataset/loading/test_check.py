@@ -52,7 +52,7 @@ def far_points(source: Path) -> None:
     [
         (turned_photo, "rotated by 90 degrees"),
         (cut_photo, "its camera 64 x 48"),
-        (icons, "5 of 5 photos cannot be read"),
+        (icons, "of 5 photos cannot be read"),
         (far_points, "from nearly one place"),
     ],
 )
