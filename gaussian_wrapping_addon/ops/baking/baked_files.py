@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.errors import DatasetError, ParseError
 from ...core.files import read_json
+from ...core.regular_files import reject_foreign_entries
 from ...core.texture.files.file_checks import atlas_file
 from ..results.result_files import read_mesh_arrays
 
@@ -50,8 +51,9 @@ def read_baked(folder: Path) -> BakedFiles:
     Raises
     ------
     DatasetError, ParseError
-        A file is missing or invalid.
+        A file is missing or invalid, or the folder holds links.
     """
+    reject_foreign_entries(folder)
     path = folder / "mesh.npz"
     if not path.is_file():
         raise DatasetError(f"{folder} holds no mesh.npz.", _HINT)

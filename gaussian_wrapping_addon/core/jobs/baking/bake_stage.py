@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ...array_file import is_whole
 from ...errors import UsageError
 from ...files import write_json
 from ...progress import Progress
@@ -69,7 +70,10 @@ def run_bake(
     def work(stage_folder: Path, progress: Progress) -> dict[str, Any]:
         return _bake(request, cameras, trained, stage_folder, progress, threads)
 
-    baked = run_stage(folder.stages, f"bake-{request.name}", key, progress.span(0.0, 0.98), work)
+    baked = run_stage(
+        folder.stages, f"bake-{request.name}", key, progress.span(0.0, 0.98), work,
+        whole=lambda stage_folder: is_whole(stage_folder / "files" / "mesh.npz"),
+    )  # fmt: skip
     with new_result(folder.baked) as new:
         shutil.copytree(baked.folder / "files", new / request.name)
     progress.update(1.0, "finished")

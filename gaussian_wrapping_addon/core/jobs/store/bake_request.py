@@ -6,8 +6,8 @@ Standard library only.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from ...errors import DatasetError, UsageError
@@ -53,7 +53,7 @@ class BakeRequest:
         """
         files = ((self.mesh, "mesh"), (self.sidecar, "sidecar"), (self.dense, "dense mesh"))
         for path, what in files:
-            if (path or what == "mesh") and not Path(path).is_file():
+            if (path or what == "mesh") and not os.path.isfile(path):
                 raise DatasetError(f"The {what} {path} does not exist.", "Check the path.")
         for value, known in ((self.uvs, UV_CHOICES), (self.up, UP_AXES)):
             if value not in known:

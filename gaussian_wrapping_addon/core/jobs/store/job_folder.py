@@ -18,6 +18,7 @@ from ...files import overwrite_json, read_json, write_json
 from ...processes.process_identity import owner_alive, process_start_ticks
 from ...regular_files import read_bounded, reject_foreign_entries, touch_regular
 
+FOREIGN_LOCK_HINT = "If it is no job of this add-on, delete lock.json there."
 STATES = ("NEW", "RUNNING", "CANCELLING", "CANCELLED", "FAILED", "DONE", "LOST")
 ACTIVE_STATES = ("NEW", "RUNNING", "CANCELLING")
 MARKER = ".gaussian-wrapping-job"
@@ -98,9 +99,6 @@ def _is_kind(name: str, value: Any) -> bool:
 
 def _read_small(path: Path) -> Any:
     return read_json(path, most_bytes=limits.MAX_STATUS_BYTES)
-
-
-FOREIGN_LOCK_HINT = "If it is no job of this add-on, delete lock.json there."
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ Needs numpy only.
 from __future__ import annotations
 
 import io
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from ...array_file import read_arrays
 from ...errors import ParseError
 from ...files import write_bytes
 from .mesh_reader import FileMesh
@@ -45,21 +45,19 @@ def read_handed_over(path: Path) -> FileMesh:
     """
     if not path.is_file():
         raise ParseError(path, "whole file", "the file does not exist.", _AGAIN)
+    names = ("frame", "vertices", "faces")
+    arrays = read_arrays(path, names, optional=("corner_uvs",), most_bytes=MAX_BYTES, hint=_AGAIN)
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(item.file_size for item in archive.infolist()) > MAX_BYTES:
-                raise ValueError("too large")
-        with np.load(path, allow_pickle=False) as arrays:
-            if str(arrays["frame"]) != "world":
-                raise ValueError("not in world coordinates")
-            vertices = np.asarray(arrays["vertices"], np.float64)
-            faces = np.asarray(arrays["faces"])
-            uvs = arrays["corner_uvs"].astype(np.float64) if "corner_uvs" in arrays.files else None
+        if str(arrays["frame"]) != "world":
+            raise ValueError("not in world coordinates")
+        vertices = np.asarray(arrays["vertices"], np.float64)
+        faces = arrays["faces"]
+        uvs = arrays["corner_uvs"].astype(np.float64) if "corner_uvs" in arrays else None
         if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
             raise ValueError("not lists of triples")
         if uvs is not None and uvs.shape != (len(faces), 3, 2):
             raise ValueError("UVs are not those of the faces")
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, TypeError) as error:
         raise ParseError(
             path, "whole file", f"not a mesh handed over by Blender ({error}).", _AGAIN
         ) from None

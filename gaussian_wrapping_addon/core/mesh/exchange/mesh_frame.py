@@ -66,7 +66,7 @@ def _turned(y_up: bool, offset: np.ndarray) -> Similarity:
 def _of_sidecar(path: Path) -> Similarity:
     if not path.is_file():
         raise ParseError(path, "whole file", "the sidecar does not exist.", "Check the path.")
-    values = read_json(path)
+    values = read_json(path, follow_links=True)
     try:
         found = Similarity.from_json(values["world_from_file"])
         if not (np.isfinite(found.matrix()).all() and found.scale > 0.0):
@@ -80,7 +80,7 @@ def _of_sidecar(path: Path) -> Similarity:
 
 def _of_result(path: Path, name: str) -> Similarity | None:
     """Return the transform of a file of a result folder; ``None`` if it is not described there."""
-    values = read_json(path)
+    values = read_json(path, follow_links=True)
     frames = values.get("frames") if isinstance(values, dict) else None
     if not isinstance(frames, dict) or name not in frames or name == "mesh.npz":
         return None

@@ -56,7 +56,8 @@ def read_mesh_file(path: Path) -> FileMesh:
             "pip install -r requirements-worker.txt there.",
         ) from None
     forbid_ghostscript()  # a GLB holds its textures, which trimesh opens in any format
-    options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+    named = path.suffix.lower() in (".obj", ".ply")  # textures of other files, which are not read
+    options: dict[str, Any] = {"skip_materials": True} if named else {}
     try:
         loaded: Any = trimesh.load(path, process=False, **options)
         # Joined here: trimesh would change the UVs of parts with different materials.
