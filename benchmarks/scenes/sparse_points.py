@@ -105,10 +105,7 @@ def _candidates(
     rows = []
     for index, (camera, photo) in enumerate(zip(cameras, photos, strict=True)):
         pixels = _keypoints(photo, each, random)
-        local = np.ones((len(pixels), 3))
-        local[:, 0] = (pixels[:, 0] + 0.5 - camera.cx) / camera.fx
-        local[:, 1] = (pixels[:, 1] + 0.5 - camera.cy) / camera.fy
-        directions = local @ camera.rotation
+        directions = camera.rays_at(pixels + 0.5) @ camera.rotation
         origins = np.broadcast_to(camera.center, directions.shape)
         distance, face = rays.first_hits(origins, directions)
         hit = np.isfinite(distance)

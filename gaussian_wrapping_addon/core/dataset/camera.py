@@ -77,6 +77,24 @@ class Camera:
         )
         return pixels, depth
 
+    def shown(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Look (n, 3) world points up in the image.
+
+        Returns
+        -------
+        indices : (m,) int64
+            Of the points that project into the image.
+        row, column : (m,) int64
+            Their pixels.
+        depth : (m,) float64
+            Their z-depths, > 0, world units.
+        """
+        pixels, depth = self.project(points)
+        size = (self.width, self.height)
+        indices = np.flatnonzero((depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1))
+        column, row = pixels[indices].astype(np.int64).T
+        return indices, row, column, depth[indices]
+
     def rays(self) -> np.ndarray:
         """Return (height, width, 3) float64 directions with z = 1, camera frame."""
         u = (np.arange(self.width) + 0.5 - self.cx) / self.fx
@@ -84,6 +102,13 @@ class Camera:
         out = np.ones((self.height, self.width, 3))
         out[..., 0] = u[None, :]
         out[..., 1] = v[:, None]
+        return out
+
+    def rays_at(self, pixels: np.ndarray) -> np.ndarray:
+        """Return (n, 3) float64 directions with z = 1, camera frame, of (n, 2) pixel positions."""
+        out = np.ones((len(pixels), 3))
+        out[:, 0] = (pixels[:, 0] - self.cx) / self.fx
+        out[:, 1] = (pixels[:, 1] - self.cy) / self.fy
         return out
 
     def resized(self, width: int, height: int) -> Camera:

@@ -211,10 +211,8 @@ def _points_along_rays(
         depth = _depth_near_points(points, camera, pixels, random)
         if depth is None:
             depth = _most_seen_depth(camera, pixels, cameras, random)
-        rays = np.ones((count, 3))
-        rays[:, 0] = (pixels[:, 0] - camera.cx) / camera.fx
-        rays[:, 1] = (pixels[:, 1] - camera.cy) / camera.fy
-        found_points.append((rays * depth[:, None]) @ camera.rotation + camera.center)
+        local = camera.rays_at(pixels) * depth[:, None]
+        found_points.append(local @ camera.rotation + camera.center)
         found_colors.append(photo[row, column] / 255.0)
     return np.concatenate(found_points), np.concatenate(found_colors)
 
@@ -245,14 +243,7 @@ def _most_seen_depth(
     near, far = 0.1 * tolerances.SCENE_RADIUS, 4.0 * tolerances.SCENE_RADIUS
     best = np.zeros(len(pixels))
     most = np.full(len(pixels), -1)
-    rays = np.stack(
-        [
-            (pixels[:, 0] - camera.cx) / camera.fx,
-            (pixels[:, 1] - camera.cy) / camera.fy,
-            np.ones(len(pixels)),
-        ],
-        axis=1,
-    )
+    rays = camera.rays_at(pixels)
     for _ in range(_DEPTH_TRIALS):
         # Uniform in inverse depth, which matches the depth resolution of the photos.
         depth = 1.0 / random.uniform(1.0 / far, 1.0 / near, len(pixels))

@@ -63,24 +63,10 @@ def count_seen_through(points: np.ndarray, depth_maps: Sequence[DepthMap]) -> np
     """
     count = np.zeros(len(points), np.int64)
     for depth_map in depth_maps:
-        seen, there = sampled(points, depth_map)
-        depth = depth_map.camera.to_camera(points[seen])[:, 2]
-        behind = depth_map.depth[there] > (1.0 + SEEN_THROUGH_SHARE) * depth
-        count[seen] += behind & (depth_map.confidence[there] > 0)
+        shown, row, column, depth = depth_map.camera.shown(points)
+        behind = depth_map.depth[row, column] > (1.0 + SEEN_THROUGH_SHARE) * depth
+        count[shown] += behind & (depth_map.confidence[row, column] > 0)
     return count
-
-
-def sampled(
-    points: np.ndarray, depth_map: DepthMap
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return which points lie in the image (m,), and rows and columns of their pixels."""
-    camera = depth_map.camera
-    pixels, depth = camera.project(points)
-    inside = (depth > 0) & (pixels >= 0).all(1)
-    inside &= (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
-    seen = np.flatnonzero(inside)
-    column, row = pixels[seen].astype(np.int64).T
-    return seen, (row, column)
 
 
 def _guessed(depth_map: DepthMap) -> np.ndarray:

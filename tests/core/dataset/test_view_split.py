@@ -7,7 +7,11 @@ import dataclasses
 
 import numpy as np
 
-from gaussian_wrapping_addon.core.dataset.view_split import held_out_views, training_views
+from gaussian_wrapping_addon.core.dataset.view_split import (
+    evenly_spaced,
+    held_out_views,
+    training_views,
+)
 from tests.core.training.small_scene import PhotosInMemory, sphere_scene
 
 
@@ -31,3 +35,11 @@ def test_photos_covered_by_their_mask_are_not_trained_on() -> None:
     masked = PhotosInMemory(scene, photos.photos, masks)
     assert training_views(scene, masked, 4) == [1, 3, 5, 6, 7]
     assert training_views(scene, masked, 0) == [0, 1, 3, 4, 5, 6, 7, 8]
+
+
+def test_a_few_of_many_are_spread_evenly_from_the_first_to_the_last() -> None:
+    assert evenly_spaced("abcdefghi", 3) == ["a", "e", "i"]
+    assert evenly_spaced(range(10), 4) == [0, 3, 6, 9]
+    assert evenly_spaced(range(40), 1) == [0]
+    for count in range(5):
+        assert evenly_spaced(range(count), 5) == list(range(count))

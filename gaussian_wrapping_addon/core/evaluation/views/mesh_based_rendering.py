@@ -261,11 +261,7 @@ def _distance(vertices: np.ndarray, faces: np.ndarray, training: Sequence[PhotoV
 def _rays(depth: np.ndarray, camera: Camera, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the points and unit directions of pixels (flat indices) with a finite depth."""
     rows, columns = np.divmod(chosen, camera.width)
-    local = np.empty((len(chosen), 3))
-    local[:, 0] = (columns + 0.5 - camera.cx) / camera.fx
-    local[:, 1] = (rows + 0.5 - camera.cy) / camera.fy
-    local[:, 2] = 1.0
-    rays = local @ camera.rotation
+    rays = camera.rays_at(np.stack([columns, rows], 1) + 0.5) @ camera.rotation
     points = camera.center + rays * depth.reshape(-1)[chosen, None].astype(np.float64)
     return points, (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
 

@@ -14,8 +14,8 @@ import numpy as np
 from scipy import ndimage
 
 from .evidence import PackedPhotos
-from .evidence_kernels import correlate
-from .planes import Plane, image_plane, lifted_pixels, rays_at, with_ones
+from .evidence_kernels import THROUGH_SHARE, correlate
+from .planes import LEAST_INVERSE_DEPTH, Plane, image_plane, lifted_pixels, with_ones
 
 SCALES_PX = ((1.5, 8.0), (0.7, 5.0))
 """Standard deviations of the two Gaussians whose difference is the texture, coarse and fine."""
@@ -113,7 +113,7 @@ class Aligner:
         pixels = part.pixels[self.random.choice(len(part.pixels), count, replace=False)]
         camera = self.photos.cameras[part.view]
         inverse = with_ones(pixels) @ image_plane(plane, camera)
-        if not (inverse > 1e-9).all():
+        if not (inverse > LEAST_INVERSE_DEPTH).all():
             return None
         points = lifted_pixels(camera, pixels, inverse)
         depth = float(np.median(np.linalg.norm(points - camera.center, axis=1)))
@@ -131,16 +131,14 @@ class Aligner:
             return None
         column, row = pixels.astype(np.int64).T
         others = np.array([other for _, other in sorted(found, reverse=True)[:MOST_SOURCES]])
-        rays = rays_at(camera, pixels) @ camera.rotation
+        rays = camera.rays_at(pixels + 0.5) @ camera.rotation
         return _Sampled(part.view, rays, row * self.plain.shape[2] + column, others)
 
     def _seen_plain(self, other: int, points: np.ndarray) -> float:
         """Return the share of points that land on plain pixels which nothing known hides."""
-        pixels, depth = self.photos.cameras[other].project(points)
-        inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < self.photos.sizes[other]).all(1)
-        column, row = pixels[inside].astype(np.int64).T
+        _, row, column, depth = self.photos.cameras[other].shown(points)
         known = self.photos.depths[other][row, column]
-        hidden = (known > 0) & (known < 0.97 * depth[inside])
+        hidden = (known > 0) & (known < (1.0 - THROUGH_SHARE) * depth)
         return float((self.plain[other][row, column] & ~hidden).sum() / len(points))
 
 

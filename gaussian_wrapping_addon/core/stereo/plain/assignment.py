@@ -37,6 +37,9 @@ MOST_RANKED, MOST_PAIRED, MOST_TRIED = 14, 6, 20
 """Planes of a segment that are looked at, of these put together in pairs, and choices whose votes
 are counted."""
 
+LEAST_RANKED = 0.05
+"""Share of a segment's known depths, weighed, that a plane explains which is looked at."""
+
 VOTING_PIXELS = 200
 
 GAP_PX, LIKE_LEVELS = 9, 8.0
@@ -135,7 +138,7 @@ class _Choices:
     def best(self) -> list[Assignment]:
         """Return the choices that explain enough, the best first."""
         rank = self.shares * np.minimum(self.spreads / FULL_SPREAD, 1.0)
-        order = [int(k) for k in np.argsort(-rank)[:MOST_RANKED] if self.shares[k] > 0.05]
+        order = [int(k) for k in np.argsort(-rank)[:MOST_RANKED] if self.shares[k] > LEAST_RANKED]
         found = [
             (self.shares[k], Assignment((k,)))
             for k in order

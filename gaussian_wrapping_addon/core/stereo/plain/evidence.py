@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...dataset.camera import Camera
+from ...dataset.view_split import evenly_spaced
 from ..depth_maps import DepthMap
 from .evidence_kernels import (
     AGREEING,
@@ -19,10 +20,13 @@ from .evidence_kernels import (
     UNLIKE,
     count_votes,
 )
-from .planes import lifted_pixels
+from .planes import LEAST_INVERSE_DEPTH, lifted_pixels
 
 MOST_ASKED = 40
 """Photos asked about the points of one; a regular choice of more."""
+
+LEAST_SHOWN = 0.9
+"""Share of the pixels that must show a plane; photos need not be asked about another."""
 
 GAIN_PIXELS, LEAST_PAIRS = 600, 30
 """Confirmed pixels of a photo that gains are measured on, and least number of a pair of photos."""
@@ -78,8 +82,8 @@ class PackedPhotos:
 
     def votes(self, view: int, pixels: np.ndarray, inverse_depths: np.ndarray) -> Votes:
         """Return what the other photos say about a plane's inverse depths at pixels."""
-        good = inverse_depths > 1e-9
-        if good.mean() < 0.9:
+        good = inverse_depths > LEAST_INVERSE_DEPTH
+        if good.mean() < LEAST_SHOWN:
             return Votes(0.0, 1.0)
         total = self.counts(view, pixels[good], inverse_depths[good]).sum(0)
         all_votes = total[[AGREEING, ALIKE, THROUGH, UNLIKE]].sum()
@@ -96,7 +100,7 @@ class PackedPhotos:
 
 def photos_asked(count: int) -> np.ndarray:
     """Return (m,) int64: which of so many photos are asked, a regular choice."""
-    return np.linspace(0, count - 1, min(MOST_ASKED, count)).round().astype(np.int64)
+    return np.array(evenly_spaced(range(count), MOST_ASKED), np.int64)
 
 
 def packed(depth_maps: Sequence[DepthMap], random: np.random.Generator) -> PackedPhotos:
@@ -158,14 +162,12 @@ def _ratio(
     photos: PackedPhotos, other: int, points: np.ndarray, color: np.ndarray
 ) -> np.ndarray | None:
     """Return (3,) median log ratio of colours where another photo's depth agrees, or ``None``."""
-    pixels, depth = photos.cameras[other].project(points)
-    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < photos.sizes[other]).all(1)
-    column, row = pixels[inside].astype(np.int64).T
-    agree = np.abs(photos.depths[other][row, column] / depth[inside] - 1.0) < AGREEING_SHARE / 2
+    shown, row, column, depth = photos.cameras[other].shown(points)
+    agree = np.abs(photos.depths[other][row, column] / depth - 1.0) < AGREEING_SHARE / 2
     if agree.sum() < LEAST_PAIRS:
         return None
     there = photos.images[other][row, column][agree] + _DARK
-    return np.median(np.log(there / color[inside][agree]), axis=0)
+    return np.median(np.log(there / color[shown][agree]), axis=0)
 
 
 __all__ = [

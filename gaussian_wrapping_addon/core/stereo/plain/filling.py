@@ -17,7 +17,15 @@ from .alignment import Aligner, Part
 from .assignment import FAR_DISTANCE, Assignment, assigned, continued, lies_far, on_planes
 from .candidates import SPEAKING_SHARE, proposed_planes
 from .evidence import AGREEING, NEARER, THROUGH, PackedPhotos, packed
-from .planes import Plane, image_plane, lifted_pixels, pooled, refined, with_ones
+from .planes import (
+    LEAST_INVERSE_DEPTH,
+    Plane,
+    image_plane,
+    lifted_pixels,
+    pooled,
+    refined,
+    with_ones,
+)
 from .segments import BORDER_PX, Segment, segments_of
 
 _logger = logging.getLogger(__name__)
@@ -288,13 +296,13 @@ class _Filled:
         """Empty the pixels that other photos do not agree with."""
         known = self.photos.depths.copy()
         for view, inverse in enumerate(self.inverse):
-            row, column = np.nonzero(inverse > 1e-9)
+            row, column = np.nonzero(inverse > LEAST_INVERSE_DEPTH)
             known[view][row, column] = 1.0 / inverse[row, column]
             known[view][self._padded(self.owner[view] == _FAR)] = FAR_DISTANCE
         photos = self.photos.with_depths(known)
         for view, inverse in enumerate(self.inverse):
             progress.check()
-            row, column = np.nonzero(inverse > 1e-9)
+            row, column = np.nonzero(inverse > LEAST_INVERSE_DEPTH)
             pixels = np.stack([column, row], 1).astype(np.float64)
             counts = photos.counts(view, pixels, inverse[row, column], CHECKED_SHARE)
             agree = counts[:, AGREEING]
@@ -320,8 +328,10 @@ class _Filled:
         known = np.zeros_like(self.photos.depths)
         for view, (inverse, owner) in enumerate(zip(self.inverse, self.owner, strict=True)):
             far = owner == _FAR
-            inner = ndimage.binary_erosion(far | (inverse > 1e-9), iterations=BEHIND_MARGIN_PX)
-            depth = np.where(far, FAR_DISTANCE, 1.0 / np.maximum(inverse, 1e-9))
+            inner = ndimage.binary_erosion(
+                far | (inverse > LEAST_INVERSE_DEPTH), iterations=BEHIND_MARGIN_PX
+            )
+            depth = np.where(far, FAR_DISTANCE, 1.0 / np.maximum(inverse, LEAST_INVERSE_DEPTH))
             known[view, : far.shape[0], : far.shape[1]] = np.where(inner, depth, 0.0)
         return self.photos.with_depths(known)
 
@@ -336,7 +346,7 @@ class _Filled:
         """Return a depth map with what is filled and without what is borrowed."""
         inverse, camera = self.inverse[view], depth_map.camera
         confirmed = depth_map.confidence > 0
-        filled = inverse > 1e-9
+        filled = inverse > LEAST_INVERSE_DEPTH
         filled &= ~(confirmed & (np.abs(depth_map.depth * inverse - 1.0) < KEPT_SHARE))
         if depth_map.mask is not None:
             filled &= depth_map.mask
@@ -346,7 +356,7 @@ class _Filled:
             plane = self.planes[number]
             away = np.sign(plane.offset - plane.normal @ camera.center)
             normal[filled & (self.owner[view] == number)] = -away * plane.normal
-        lost = borrowed[view, : camera.height, : camera.width] & (inverse <= 1e-9)
+        lost = borrowed[view, : camera.height, : camera.width] & (inverse <= LEAST_INVERSE_DEPTH)
         far = (self.owner[view] == _FAR) | self.seen_through(depth_map, view, behind)
         if depth_map.mask is not None:
             far &= depth_map.mask

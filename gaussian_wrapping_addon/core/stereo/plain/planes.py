@@ -14,6 +14,9 @@ LIKE_COSINE, LIKE_SHARE = 0.996, 0.012
 """Planes are one if their normals are so close and each passes the other's centre so closely,
 relative to the distance of the camera (three times that for the weaker one's plane)."""
 
+LEAST_INVERSE_DEPTH = 1e-9
+"""Pixels where that of a plane is smaller do not show it: it is too far away, or lies behind."""
+
 ANNEALING = (0.02, 0.014, 0.01, 0.007, 0.005, 0.0035, 0.0025, 0.0025)
 """Scales of the residuals, relative to the depth, of the steps of a robust fit."""
 
@@ -58,16 +61,8 @@ def with_ones(pixels: np.ndarray) -> np.ndarray:
 
 def lifted_pixels(camera: Camera, pixels: np.ndarray, inverse_depths: np.ndarray) -> np.ndarray:
     """Return the (n, 3) points, scene frame, of (n, 2) pixels with centres whole."""
-    local = rays_at(camera, pixels) / inverse_depths[:, None]
+    local = camera.rays_at(pixels + 0.5) / inverse_depths[:, None]
     return (local - camera.cam_from_world[:, 3]) @ camera.rotation
-
-
-def rays_at(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Return (n, 3) directions with z = 1, camera frame, of (n, 2) pixels with centres whole."""
-    rays = np.ones((len(pixels), 3))
-    rays[:, 0] = (pixels[:, 0] + 0.5 - camera.cx) / camera.fx
-    rays[:, 1] = (pixels[:, 1] + 0.5 - camera.cy) / camera.fy
-    return rays
 
 
 def fit_plane(

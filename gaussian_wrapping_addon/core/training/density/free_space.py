@@ -37,11 +37,7 @@ def contradicted(
     through, agreeing = (np.zeros(len(means), np.int32) for _ in range(2))
     views = sorted(priors)
     for prior in (priors[views[k]] for k in photos_asked(len(views))):
-        pixels, depth = prior.camera.project(means)
-        size = (prior.camera.width, prior.camera.height)
-        shown = np.flatnonzero((depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1))
-        column, row = pixels[shown].astype(np.int64).T
-        own = depth[shown]
+        shown, row, column, own = prior.camera.shown(means)
         through[shown] += prior.free[row, column] > (1.0 + THROUGH_SHARE) * own
         agreeing[shown] += np.abs(prior.known[row, column] - own) < AGREEING_SHARE * own
     near = np.linalg.norm(means, axis=1) < tolerances.FAR_RADIUS

@@ -58,10 +58,8 @@ def far_shell(
         row, column, color = _open_cells(depth_map, points)
         camera = depth_map.camera
         at = (np.stack([column, row], 1) + 0.5) * CELL_PX  # (m, 2) pixels
-        rays = np.ones((len(at), 3))
-        rays[:, 0] = (at[:, 0] - camera.cx) / camera.fx
-        rays[:, 1] = (at[:, 1] - camera.cy) / camera.fy
-        directions.append(onto_sphere(camera.center, rays @ camera.rotation, radius))
+        rays = camera.rays_at(at) @ camera.rotation
+        directions.append(onto_sphere(camera.center, rays, radius))
         colors.append(color)
         angles.append(np.full(len(at), CELL_PX / camera.fx))
     found, color = np.concatenate(directions), np.concatenate(colors)
