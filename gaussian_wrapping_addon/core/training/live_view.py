@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..dataset.photo_source import PhotoSource
+from ..dataset.view_split import evenly_spaced
 from ..files import write_bytes
 from ..gaussians.model import OrientedGaussians
 from ..imaging.lpips import lpips_if_ready
@@ -55,14 +56,6 @@ def divisor_for(photos: PhotoSource, index: int, longest_px: int) -> int:
     camera = photos.camera(index, 1)
     divisor = -(-max(camera.width, camera.height) // longest_px)
     return max(1, min(divisor, camera.width, camera.height))
-
-
-def evenly_spaced(views: Sequence[int], count: int) -> list[int]:
-    """Return at most ``count`` of the views, evenly spread."""
-    if not views:
-        return []
-    positions = np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)
-    return [views[position] for position in positions.tolist()]
 
 
 def measure_held_out(
@@ -261,18 +254,14 @@ def held_out_metrics(
     """
     figures = []
     lpips, reason = lpips_if_ready() if names else (None, "")
-    options = RenderOptions(depth=False, threads=threads)
     raw, renderer = RawArrays.from_gaussians(gaussians), ViewRenderer()
     for view, name in names.items():
         progress.update(1.0, f"measuring {name}")
         mask = photos.mask(view, 1)
         if mask is not None and not mask.any():
             continue
-        photo = photos.photo(view, 1)
-        image = renderer.render(raw, photos.camera(view, 1), options).color
-        if exposure_correction is not None:
-            image = exposure_correction(image, photo, mask)
-        scores = score_images(image, photo, mask, lpips=lpips, threads=threads)
+        image = _rendered(renderer, raw, photos, view, 1, threads, exposure_correction)
+        scores = score_images(image, photos.photo(view, 1), mask, lpips=lpips, threads=threads)
         figures.append(HeldOutMetrics(name, scores.psnr, scores.ssim, scores.lpips))
     if not figures or any(figure.lpips is not None for figure in figures):
         return figures, ""

@@ -14,7 +14,7 @@ import torch
 
 from ..dataset.photo_source import PhotoSource
 from ..dataset.scene import Scene
-from ..dataset.view_split import FEW_PHOTOS, held_out_views, training_views
+from ..dataset.view_split import FEW_PHOTOS, evenly_spaced, held_out_views, training_views
 from ..errors import Cancelled, DatasetError, WrapError
 from ..gaussians.initialisation import initial_gaussians
 from ..gaussians.model import OrientedGaussians
@@ -32,7 +32,7 @@ from .checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from .initialisation.dense_start import dense_start, matched_photos, on_planes
 from .initialisation.splat_start import start_from_splat, wrapping_settings
 from .iteration import NotFinite, Stepper, trimmed
-from .live_view import Correction, LiveView, evenly_spaced, held_out_metrics, measure_held_out
+from .live_view import Correction, LiveView, held_out_metrics, measure_held_out
 from .losses.neighbours import NeighbourLimits, find_neighbours
 from .poses.posed_photos import PosedPhotos
 from .result import TrainingResult

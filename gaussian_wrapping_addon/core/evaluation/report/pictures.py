@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ...dataset.photo_source import PhotoSource
+from ...dataset.view_split import evenly_spaced
 from ...files import write_bytes
 from ...gaussians.model import OrientedGaussians
 from ...render.projection.projection import RawArrays
@@ -99,8 +100,7 @@ def strip(images: Sequence[tuple[str, np.ndarray]], *, width_px: int = STRIP_PX)
 def worst_to_best(figures: Sequence[float], count: int = MAX_PICTURES) -> list[int]:
     """Return indices of figures to show: the lowest, the highest, evenly spaced ones between."""
     ranked = sorted(range(len(figures)), key=lambda i: (figures[i], i))
-    spread = np.linspace(0, len(ranked) - 1, min(count, len(ranked))).round().astype(int)
-    return [ranked[position] for position in spread.tolist()]
+    return evenly_spaced(ranked, count)
 
 
 def write_held_out(

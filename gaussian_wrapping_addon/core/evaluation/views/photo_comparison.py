@@ -13,6 +13,7 @@ import numpy as np
 
 from ...dataset.photo_source import PhotoSource
 from ...dataset.scene import Scene
+from ...dataset.view_split import evenly_spaced
 from ...imaging.lpips import lpips_if_ready
 from ...kernels.parallel import default_threads
 from ...mesh.textured_mesh import TexturedMesh
@@ -82,7 +83,7 @@ def compare_with_photos(
     """
     names = [view.camera.name for view in scene.views]
     wanted = [index for index, name in enumerate(names) if name in held_out]
-    chosen = _evenly_spaced(wanted or list(range(len(names))), MAX_PHOTOS)
+    chosen = evenly_spaced(wanted or range(len(names)), MAX_PHOTOS)
     cameras, images, counted = [], [], []
     reduction = 0
     for index in chosen:
@@ -118,15 +119,9 @@ def compare_with_photos(
     if reason:
         values["lpips_note"] = reason
     values["pictures"] = []
-    for number, index in enumerate(_evenly_spaced(list(range(len(shown))), MAX_PICTURES), start=1):
+    for number, index in enumerate(evenly_spaced(range(len(shown)), MAX_PICTURES), start=1):
         name = f"comparison-{number}.jpg"
         write_side_by_side(folder / name, *shown[index], max_width_px=PICTURE_WIDTH_PX)
         values["views"][index]["picture"] = name
         values["pictures"].append(name)
     return {**values, "held_out": bool(wanted), **description}
-
-
-def _evenly_spaced(items: list[int], count: int) -> list[int]:
-    """Return up to ``count`` evenly spaced items, including the first and the last."""
-    positions = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
-    return [items[position] for position in positions.tolist()]

@@ -44,7 +44,8 @@ took 335 s on two cores with a little other load (benchmarks/scenes wheel, prese
 
 WITHOUT_DEPTH = 0.45
 """Share of :data:`PIXEL_S` before depth is rendered (docs/benchmarks/kernels.md: depth adds 105 to
-141 % to rendering forward, and the normal losses come with it)."""
+141 % to rendering 50 000 Gaussians forward at up to 800 x 600 px, and the normal losses come with
+it)."""
 
 GAUSSIAN_S = 0.254e-6
 """Per Gaussian and iteration: projection, and the step of visible ones."""
@@ -56,7 +57,7 @@ thread, 40 000 Gaussians, 4000 pixels)."""
 MATCHING_PIXEL_S = 6e-6
 """Per pixel of all photos at the size at which they are matched for a dense start: 7.6 us of one
 thread (35 photos of 320 x 240 px, benchmarks/scenes wheel) on two threads, and 2 us for planes
-through plain parts (0.8 to 5.1 us on 15 scenes of benchmarks/zoo)."""
+through plain parts (0.8 to 5.1 us on the 15 scenes of docs/benchmarks/stereo-depths.md)."""
 
 MATCHING_PIXEL_BYTES = 200
 """Per such pixel: planes, costs, and the points that are fused."""

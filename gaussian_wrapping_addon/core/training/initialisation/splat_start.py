@@ -16,6 +16,7 @@ import torch
 from ...dataset.camera import Camera
 from ...dataset.photo_source import PhotoSource
 from ...dataset.scene import Scene
+from ...dataset.view_split import evenly_spaced
 from ...errors import DatasetError
 from ...gaussians.foreign_splat import read_foreign_splat
 from ...gaussians.mip_filter import mip_filter
@@ -215,12 +216,6 @@ def _logit(opacity: torch.Tensor) -> torch.Tensor:
     return torch.log(clamped) - torch.log1p(-clamped)
 
 
-def _evenly_spaced(indices: Sequence[int], count: int) -> list[int]:
-    """Return at most ``count`` of the indices, evenly spread."""
-    positions = np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int)
-    return [indices[i] for i in positions.tolist()]
-
-
 def _divisor(photos: PhotoSource, index: int) -> int:
     """Return the divisor of a small image that still has a few tiles."""
     camera = photos.camera(index, 1)
@@ -267,7 +262,7 @@ def _compare_with_photos(
     """
     options = RenderOptions(depth=False, threads=threads)
     errors, spreads = [], []
-    for index in _evenly_spaced(view_indices, MATCH_VIEWS):
+    for index in evenly_spaced(view_indices, MATCH_VIEWS):
         progress.check()
         divisor = _divisor(photos, index)
         with torch.no_grad():
