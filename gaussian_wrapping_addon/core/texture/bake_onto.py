@@ -19,12 +19,13 @@ from ..mesh.simplification.decimation import decimate
 from ..mesh.surface_mesh import SurfaceMesh
 from ..mesh.textured_mesh import TexturedMesh
 from ..mesh.topology import half_edges
+from ..mesh.udims import FIRST_UDIM
 from ..progress import Progress
 from ..report_warning import ReportWarning
 from ..settings import TextureSettings
 from .cost.texture_size import side_in_photos
 from .texture_mesh import texture_mesh, validate_for_texturing
-from .unwrap.own_uvs import FIRST_UDIM, OwnUvs, overlap_warning, own_uvs
+from .unwrap.own_uvs import OwnUvs, overlap_warning, own_uvs
 
 HARDLY_SEEN_SHARE = 0.05
 """A mesh of which photos see less probably lies elsewhere, or its faces point inwards."""

@@ -10,11 +10,11 @@ import numpy as np
 
 from ...core.errors import DatasetError, ParseError
 from ...core.files import read_json
+from ...core.mesh.udims import FIRST_UDIM, LAST_UDIM, udim_uvs
 from ...core.regular_files import reject_foreign_entries
 from ...core.texture.files.file_checks import atlas_file
 from ..results.result_files import read_mesh_arrays
 
-FIRST_UDIM, LAST_UDIM = 1001, 2000
 _HINT = "Bake the photos again."
 
 
@@ -84,10 +84,7 @@ def read_baked(folder: Path) -> BakedFiles:
         if not image.is_file():
             raise DatasetError(f"{folder} holds no {image.name}.", _HINT)
     if udims:
-        number = np.asarray(udims)[np.zeros(len(faces), int) if face_atlas is None else face_atlas]
-        tile = number - FIRST_UDIM
-        shift = np.stack([tile % 10, tile // 10], axis=1)[:, None].astype(np.float32)
-        corner_uvs = corner_uvs + shift
+        corner_uvs = udim_uvs(corner_uvs, face_atlas, udims)
     return BakedFiles(
         folder.name, vertices, faces, corner_uvs, udims, albedo, normal_map, occlusion, has_own_uvs,
         has_own_faces, coverage, warnings,

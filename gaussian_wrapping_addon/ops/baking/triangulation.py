@@ -12,7 +12,7 @@ import numpy as np
 from ...core.errors import UsageError
 from ...core.mesh.exchange.mesh_reader import FileMesh
 from ..common import tags
-from ..common.mesh_data import mesh_of, values_of
+from ..common.mesh_data import evaluated, mesh_of, values_of
 from ..placement.placement import placement_of
 from ..regions.region_objects import matrix_of, transformed
 
@@ -46,14 +46,8 @@ def triangulation_of(thing: bpy.types.Object) -> Triangulation:
     if thing.type != "MESH":
         raise UsageError(f"{thing.name} is no mesh.", "Select a mesh object.")
     mesh_of(thing).update_tag()  # scripts may have changed its layers, which tags nothing
-    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    if thing.modifiers and not evaluated.is_evaluated:
-        raise UsageError(
-            f"The modifiers of {thing.name} are not evaluated: it is disabled in viewports, or in "
-            "another scene.",
-            "Enable it, or apply its modifiers.",
-        )
-    mesh = evaluated.to_mesh()
+    shown = evaluated(thing)
+    mesh = shown.to_mesh()
     try:
         mesh.calc_loop_triangles()
         local = values_of(mesh.vertices, "co", 3, np.float32).reshape(-1, 3)
@@ -65,7 +59,7 @@ def triangulation_of(thing: bpy.types.Object) -> Triangulation:
         uvs = None if layer is None else values_of(layer.uv, "vector", 2, np.float32).reshape(-1, 2)
         is_own = _same_faces(mesh, mesh_of(thing))
     finally:
-        evaluated.to_mesh_clear()
+        shown.to_mesh_clear()
     if len(faces) == 0:
         raise UsageError(f"{thing.name} has no faces.", "Select a mesh with faces.")
     matrix = matrix_of(thing)

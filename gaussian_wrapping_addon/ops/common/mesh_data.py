@@ -8,10 +8,30 @@ from typing import Any, cast
 import bpy
 import numpy as np
 
+from ...core.errors import UsageError
+
 
 def mesh_of(thing: bpy.types.Object) -> bpy.types.Mesh:
     """Return the data of a mesh object."""
     return cast(bpy.types.Mesh, thing.data)
+
+
+def evaluated(thing: bpy.types.Object) -> bpy.types.Object:
+    """Return an object with its modifiers applied.
+
+    Raises
+    ------
+    UsageError
+        It has modifiers, and Blender does not evaluate them.
+    """
+    found = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    if thing.modifiers and not found.is_evaluated:
+        raise UsageError(
+            f"The modifiers of {thing.name} are not evaluated: it is disabled in viewports, or in "
+            "another scene.",
+            "Enable it, or apply its modifiers.",
+        )
+    return found
 
 
 def values_of(elements: Any, name: str, width: int, dtype: type) -> np.ndarray:

@@ -17,7 +17,7 @@ from ...core.regions.box import CUBE_CORNERS, CUBE_TRIANGLES, box_matrix
 from ...core.regions.region_file import region_to_json
 from ...core.regions.volume import check_volume
 from ..common import tags
-from ..common.mesh_data import values_of
+from ..common.mesh_data import evaluated, values_of
 from .region_hull import convex_hull
 
 # Share of the hull's volume by which that of a convex mesh may be off (float32 coordinates).
@@ -103,16 +103,10 @@ def local_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int
 
 
 def _mesh_hull(thing: bpy.types.Object) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
-    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    if thing.modifiers and not evaluated.is_evaluated:
-        raise UsageError(
-            f"The modifiers of {thing.name} are not evaluated: it is disabled in viewports, or in "
-            "another scene.",
-            "Enable it, or apply its modifiers.",
-        )
-    mesh = evaluated.to_mesh()
+    shown = evaluated(thing)
+    mesh = shown.to_mesh()
     points = values_of(mesh.vertices, "co", 3, np.float32)
-    evaluated.to_mesh_clear()
+    shown.to_mesh_clear()
     return convex_hull(points.reshape(-1, 3).astype(np.float64), thing.name)
 
 
@@ -120,12 +114,12 @@ def is_convex(thing: bpy.types.Object) -> bool:
     """Return whether a mesh, with its modifiers, is closed and convex."""
     hull, triangles = _mesh_hull(thing)
     center = hull.mean(0)
-    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    mesh = evaluated.to_mesh()
+    shown = evaluated(thing)
+    mesh = shown.to_mesh()
     mesh.calc_loop_triangles()
     vertices = values_of(mesh.vertices, "co", 3, np.float32)
     corners = values_of(mesh.loop_triangles, "vertices", 3, np.int32)
-    evaluated.to_mesh_clear()
+    shown.to_mesh_clear()
     own = vertices.reshape(-1, 3).astype(np.float64)[corners.reshape(-1, 3)] - center  # (m, 3, 3)
     volume = abs(float(np.linalg.det(own).sum()))
     # The hull's triangles may wind either way; seen from inside, all of them count.

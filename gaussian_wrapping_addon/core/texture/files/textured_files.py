@@ -27,7 +27,7 @@ from ...export_formats import RESULT_FORMATS
 from ...files import write_bytes, write_json
 from ...mesh.tangent_frame import shading_normals
 from ...mesh.textured_mesh import TexturedMesh
-from ..unwrap.own_uvs import udim_uvs
+from ...mesh.udims import udim_uvs
 from .file_checks import atlas_file, validate_for_export, write_errors
 from .glb import glb_bytes
 from .mesh_ply import vertex_colors, write_mesh_ply

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,12 +11,10 @@ from ... import limits
 from ...errors import MeshingError
 from ...mesh.face_graph import face_graph, uv_charts
 from ...mesh.surface_mesh import SurfaceMesh
+from ...mesh.udims import FIRST_UDIM, TILE_COLUMNS, TILE_ROWS
 from ...report_warning import ReportWarning
 from .unwrap import Unwrap
 
-TILE_COLUMNS, TILE_ROWS = 10, 100
-"""UDIM tiles are 1001 + column + 10 row; the last is 2000."""
-FIRST_UDIM = 1001
 EDGE_TOLERANCE = 1e-4
 """UVs that leave their tile by less are moved onto its edge: rounding of the program before."""
 MAX_FLAT_SHARE = 0.5
@@ -106,18 +103,6 @@ def overlap_warning(overlapping: int, used: int) -> ReportWarning | None:
         "sees."
     )
     return ReportWarning("uv-overlap", text, _NEW_UVS)
-
-
-def udim_uvs(
-    corner_uvs: np.ndarray, face_atlas: np.ndarray | None, udims: Sequence[int]
-) -> np.ndarray:
-    """Return (f, 3, 2) float32 UVs in the UDIM tiles of their atlases, from UVs in [0, 1]."""
-    number = np.asarray(udims, np.int64) - FIRST_UDIM
-    of_faces = np.zeros(len(corner_uvs), np.int64) if face_atlas is None else face_atlas
-    number = number[of_faces]
-    shift = np.stack([number % TILE_COLUMNS, number // TILE_COLUMNS], axis=1)
-    moved: np.ndarray = (corner_uvs + shift[:, None]).astype(np.float32)
-    return moved
 
 
 def uv_area(corner_uvs: np.ndarray) -> float:

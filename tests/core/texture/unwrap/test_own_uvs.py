@@ -9,10 +9,10 @@ import pytest
 from gaussian_wrapping_addon.core.errors import MeshingError
 from gaussian_wrapping_addon.core.limits import MAX_ATLASES
 from gaussian_wrapping_addon.core.mesh.surface_mesh import SurfaceMesh
+from gaussian_wrapping_addon.core.mesh.udims import udim_uvs
 from gaussian_wrapping_addon.core.texture.unwrap.own_uvs import (
     overlap_warning,
     own_uvs,
-    udim_uvs,
     uv_area,
 )
 
