@@ -50,6 +50,7 @@ SURROUNDINGS_REACH = 3.0
 """Reach of what such photos show, in median distances of points from the nearest camera."""
 
 SURROUNDINGS_MIN_VIEWS = 3
+"""Photos that must show a point of theirs; all, where there are fewer."""
 
 WHOLE_TAIL_SHARE = 0.005
 WHOLE_MIN_ALPHA = 0.1

@@ -108,6 +108,8 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
     ParseError
         A file is not in the format that jobs write.
     """
+    import numpy as np
+
     from ...dataset.refined_scene import with_poses
     from ...dataset.scene_file import SCENE_NAME, load_saved_scene
 
@@ -122,8 +124,10 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
         summary = read_json(paths[0])
         shown, frame = list(summary["cameras"]), summary["world_from_scene"]
         lenses = [_lens(entry) for entry in shown]
+        poses = np.array([entry["cam_from_world"] for entry in shown], np.float64)
+        poses = poses.reshape(len(shown), 3, 4)
         held_out = [str(entry["name"]) for entry in read_json(paths[1])["training"]["held_out"]]
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ParseError(paths[0], "cameras", f"not as expected ({error}).", again) from None
     for stage in sorted(job.stages.glob("cameras-*")):
         if not (stage / SCENE_NAME).is_file():
@@ -138,7 +142,6 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
         except (KeyError, TypeError, AttributeError):
             same = False
         if same:
-            poses = _poses(shown, paths[0], again)
             return with_poses(load_saved_scene(stage), poses), held_out
     raise DatasetError(
         f"The photos that the result of {folder.name} was made from are no longer in its stages.",
@@ -149,17 +152,6 @@ def job_scene(folder: Path) -> tuple[Scene, list[str]]:
 def _lens(entry: Any) -> dict[str, Any]:
     """Return a camera's entry without its pose and photo."""
     return {k: v for k, v in dict(entry).items() if k not in ("photo", "cam_from_world")}
-
-
-def _poses(shown: list[dict[str, Any]], path: Path, hint: str) -> np.ndarray:
-    """Return (n, 3, 4) float64."""
-    import numpy as np
-
-    try:
-        poses = [entry["cam_from_world"] for entry in shown]
-        return np.array(poses, np.float64).reshape(len(shown), 3, 4)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ParseError(path, "cameras", f"not as expected ({error}).", hint) from None
 
 
 def table(values: dict[str, Any]) -> list[str]:
