@@ -105,7 +105,7 @@ def test_depth_outside_of_the_region_is_left_out(monkeypatch: pytest.MonkeyPatch
 
 def test_fused_exact_depth_is_the_ball(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half a pixel of difference between the conventions would move it by a fifth of a voxel."""
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", reason="needs Open3D (requirements-benchmarks.txt)")
     cameras = eyes(30)
     monkeypatch.setattr(
         fusion, "render",

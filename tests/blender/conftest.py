@@ -94,15 +94,16 @@ def photos(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Put the fake in the place of the worker's Python; the value says how it behaves."""
+def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Put the fake in the place of the worker's Python; the value says what it does, and where."""
     from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
     from tests.blender.job_play import write_fake_python
 
     monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
 
-    def behave(mode: str) -> None:
+    def behave(mode: str, stage: str = "train") -> None:
         monkeypatch.setenv("GW_FAKE", mode)
+        monkeypatch.setenv("GW_FAKE_STAGE", stage)
 
     behave("quick")
     return behave

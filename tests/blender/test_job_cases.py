@@ -8,9 +8,10 @@
 | 39 | two jobs; two Blenders; stale lock, re-used pid, clock moved back | test_39 |
 | 40 | worker crashed, killed | test_jobs.py; out of memory: core/jobs/test_worker.py |
 | 41 | cancel in each stage, twice, in the import, not listened to | test_41, test_jobs.py |
-| 43 | folder long, not to be written, deleted while running, moved | test_43, test_jobs.py |
+| 43 | folder long, not to be written, deleted while running | test_43, test_jobs.py |
+| 43 | folder moved | test_found_jobs.py |
 | 44 | worker's Python missing | test_jobs.py |
-| 45 | .blend or job folder from elsewhere | test_45, test_jobs.py |
+| 45 | .blend or job folder from elsewhere | test_45, test_found_jobs.py |
 | - | Blender is never blocked | test_no_tick, test_bringing_in |
 """
 
@@ -36,7 +37,7 @@ import gaussian_wrapping_addon
 from gaussian_wrapping_addon import registration
 from gaussian_wrapping_addon.core.errors import UsageError
 from gaussian_wrapping_addon.core.jobs import client as client_module
-from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE, JobClient
+from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import (
     JobFolder,
@@ -55,7 +56,6 @@ from tests.blender.job_play import (
     play_until,
     start_wrap,
     status_of,
-    write_fake_python,
 )
 from tests.blender.synthetic_result import npy_bytes, png_bytes
 
@@ -84,26 +84,6 @@ class _HeldReading(background.Task):
 
     def finished(self, wait_s: float = 0.0) -> bool:
         return self.hold.is_set() and super().finished(wait_s)
-
-
-@pytest.fixture
-def photos(tmp_path: Path) -> Path:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    return folder
-
-
-@pytest.fixture
-def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
-    """Put the fake in the place of the worker's Python."""
-    monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
-
-    def behave(mode: str, stage: str = "train") -> None:
-        monkeypatch.setenv("GW_FAKE", mode)
-        monkeypatch.setenv("GW_FAKE_STAGE", stage)
-
-    behave("quick")
-    return behave
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.ops.common import tags
 from gaussian_wrapping_addon.ops.regions.region_hull import MOST_CANDIDATES, convex_hull
@@ -25,7 +24,6 @@ from tests.blender.job_play import (
     play_until,
     start_wrap,
     status_of,
-    write_fake_python,
 )
 from tests.blender.region_shapes import region_from_object
 from tests.blender.synthetic_result import WORLD_FROM_SCENE
@@ -34,24 +32,6 @@ pytestmark = pytest.mark.usefixtures("ended_workers")
 
 LIMIT_S = 60.0
 """Of processor time, for a mesh of a million faces; it took 4."""
-
-
-@pytest.fixture
-def photos(tmp_path: Path) -> Path:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    return folder
-
-
-@pytest.fixture
-def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
-
-    def behave(mode: str) -> None:
-        monkeypatch.setenv("GW_FAKE", mode)
-
-    behave("quick")
-    return behave
 
 
 def volume(points: np.ndarray) -> float:

@@ -35,6 +35,7 @@ from gaussian_wrapping_addon.ops.training import training_estimate
 from gaussian_wrapping_addon.ui.training import train_advanced_panel, train_panel
 from tests.blender.fake_layout import draw
 from tests.blender.fake_worker import LIVE, picture
+from tests.blender.job_play import write_fake_python
 from tests.blender.synthetic_result import npy_bytes, write_result
 
 pytestmark = pytest.mark.usefixtures("addon")
@@ -296,11 +297,7 @@ def test_train_more_adds_iterations_and_changes_nothing_else(
 @pytest.fixture
 def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Put the fake in the place of the worker's Python; return what it was asked."""
-    script = tmp_path / "fake-python"
-    fake = Path(__file__).with_name("fake_worker.py")
-    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{fake}" "$@"\n')
-    script.chmod(0o755)
-    monkeypatch.setenv(PYTHON_VARIABLE, str(script))
+    monkeypatch.setenv(PYTHON_VARIABLE, str(write_fake_python(tmp_path)))
     monkeypatch.setenv("GW_ASKED", str(tmp_path / "asked.json"))
     bpy.context.scene.gwrap.source = str(tmp_path)
     return tmp_path / "asked.json"

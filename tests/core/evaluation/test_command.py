@@ -199,7 +199,7 @@ def test_thin_parts_are_told_where_there_are_such(tmp_path: Path) -> None:
         assert any("0.1000 0.2000 0.3000" in line for line in table(result)) == told
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs a shell script")
+@pytest.mark.skipif(sys.platform == "win32", reason="the launcher is a shell script")
 def test_a_launcher_between_caller_and_child_does_not_end_it(tmp_path: Path) -> None:
     """In a virtual environment on Windows, the child's parent is not its caller."""
     mesh = write_ply(tmp_path / "mesh.ply", MESH)
@@ -308,7 +308,7 @@ def test_the_exit_code_tells_bad_data(tmp_path: Path) -> None:
     assert batch.main(["evaluate", str(mesh), "--truth", str(mesh)]) == 3
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="interrupts are sent otherwise there")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
 def test_an_interrupt_ends_it_and_its_child(tmp_path: Path) -> None:
     mesh = write_ply(tmp_path / "mesh.ply", MESH)
     out = tmp_path / "scores.json"

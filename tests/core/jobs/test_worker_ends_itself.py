@@ -55,7 +55,7 @@ Progress("train", reporter.event).enter(COMPILING, "any words")
 )
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks at processes of Linux")
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc, which Linux has")
 @pytest.mark.parametrize("code", [DEAF, COMPILES], ids=["deaf", "compiling"])
 def test_a_worker_that_does_not_listen_ends_itself(code: str, tmp_path: Path) -> None:
     folder = JobFolder(tmp_path)

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.kernels import kernel_cache
+from tests.read_only import read_only
 
 ROOT = Path(__file__).resolve().parents[3]
 PACKAGE = ROOT / "gaussian_wrapping_addon"
@@ -162,19 +163,10 @@ def test_without_any_place_kernels_work_and_one_line_says_so(installed: Path) ->
 
 
 def test_a_read_only_package_without_a_home(installed: Path) -> None:
-    folders = [installed / PACKAGE.name]
-    folders += [p for p in folders[0].rglob("*") if p.is_dir()]
-    for folder in folders:
-        folder.chmod(0o555)
     script = "import os; os.environ.pop('HOME', None)\n" + RUN
     environment = {"XDG_CACHE_HOME": NOWHERE, "LOCALAPPDATA": NOWHERE}
-    try:
-        if os.access(folders[0], os.W_OK):
-            pytest.skip("to this user nothing is read-only")
+    with read_only(installed / PACKAGE.name):
         output, errors = finish(start(["-c", script], installed, **environment))
-    finally:
-        for folder in folders:
-            folder.chmod(0o755)
     assert output == "2.0 0\n"
     assert errors.count("\n") == 1
     assert "NUMBA_CACHE_DIR" in errors

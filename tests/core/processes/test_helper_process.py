@@ -108,7 +108,9 @@ def test_the_memory_limit_holds(run) -> None:
         run("greedy", memory_bytes=2 * 2**30)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="others report the parent's too")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="elsewhere it includes the parent's"
+)
 def test_the_peak_is_the_helpers_own_and_the_largest_is_kept(
     run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,7 +20,9 @@ PRINT_PEAKS = (
 )
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="others report the parent's too")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="elsewhere it includes the parent's"
+)
 def test_a_small_child_of_a_large_parent_is_small() -> None:
     held = b"x" * (300 * 2**20)
     done = subprocess.run(

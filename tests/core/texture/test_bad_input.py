@@ -21,7 +21,7 @@ with a next step and nothing left behind.
 
 from __future__ import annotations
 
-import os
+import contextlib
 import subprocess
 import sys
 from dataclasses import replace
@@ -42,6 +42,7 @@ from tests.core.jobs.commands.test_export_files import write_result
 from tests.core.texture.test_texture_mesh import run
 from tests.core.texture.texture_scenes import look_at, photograph, ring, sphere, sphere_hit, waves
 from tests.core.texture.unwrap.test_unwrap import MESHES, noisy
+from tests.read_only import read_only
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -245,11 +246,11 @@ def test_49_places(case: str, tmp_path: Path) -> None:
         return
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "out"
+    closed: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
     if case == "read-only":
         out = tmp_path / "closed"
-        out.mkdir(mode=0o500)
-        if os.access(out, os.W_OK):
-            pytest.skip("root may write anywhere")
-    with pytest.raises(ResourceError, match="cannot be written") as caught:
+        out.mkdir()
+        closed = read_only(out)
+    with closed, pytest.raises(ResourceError, match="cannot be written") as caught:
         list(export_files(replace(request, out=out)))
     assert caught.value.hint

@@ -35,9 +35,8 @@ from tests.core.dataset.model_writers import (
     write_photos,
     write_project,
 )
+from tests.core.dataset.real_sets import real_set
 from tests.poses import look_at_pose
-
-DATA = Path(__file__).parents[5] / "shared" / "data"
 
 
 def load(source: Path, work: Path | None = None) -> Scene:
@@ -454,14 +453,12 @@ def test_angle_only_frames_take_the_size_of_the_photo(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["banana", "flowerpot", "fox"])
 def test_real_sets_keep_their_reprojection_error(tmp_path: Path, name: str) -> None:
     """Points of the model, projected by the scene's cameras, fall where the model saw them."""
-    if not (DATA / name).is_dir():
-        pytest.skip(f"the {name} data set is not at {DATA / name}")
-    pycolmap = pytest.importorskip("pycolmap")
-    scene = load(DATA / name, tmp_path / "work")
+    folder, pycolmap = real_set(name), pytest.importorskip("pycolmap")
+    scene = load(folder, tmp_path / "work")
     expected = {"banana": (14, 5486), "flowerpot": (80, 18090), "fox": (50, 12068)}[name]
     assert (len(scene.views), len(scene.points)) == expected
     assert scene.warnings == ()
-    native = pycolmap.Reconstruction(str(DATA / name / "sparse" / "0"))
+    native = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
     image = next(i for i in native.images.values() if i.name == scene.views[3].camera.name)
     seen = [p for p in image.points2D if p.has_point3D()]
     world = np.array([native.points3D[p.point3D_id].xyz for p in seen])

@@ -16,8 +16,7 @@ import pytest
 from gaussian_wrapping_addon.core.dataset.readers.colmap_reader import read_colmap
 from gaussian_wrapping_addon.core.dataset.readers.transforms_reader import read_transforms
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError
-
-FOX = Path(__file__).parents[5] / "shared" / "data" / "fox"
+from tests.core.dataset.real_sets import real_set
 
 
 def valid() -> dict[str, Any]:
@@ -47,10 +46,9 @@ def test_known_point_projects_to_the_known_pixel(tmp_path: Path) -> None:
 
 
 def test_agrees_with_the_colmap_model_of_the_same_photos() -> None:
-    if not FOX.is_dir():
-        pytest.skip(f"the fox data set is not at {FOX}")
-    colmap = {Path(p.name).name: p for p in read_colmap(FOX).photos}
-    frames = read_transforms(FOX / "transforms.json").photos
+    fox = real_set("fox")
+    colmap = {Path(p.name).name: p for p in read_colmap(fox).photos}
+    frames = read_transforms(fox / "transforms.json").photos
     assert len(frames) == len(colmap) == 50
     distances, angles = [], []
     for frame in frames:
