@@ -38,6 +38,8 @@ CHOOSING_SAMPLES = 20_000
 """Of the mesh, to choose alpha by; the chosen one is judged like every other mesh."""
 FLAT = 1e-12
 """Tetrahedra of less volume, as a share of the cubed diagonal, have no sphere."""
+LEAST_POINTS = 5
+"""Fewer make no tetrahedra (with the point that Qhull adds)."""
 
 
 def alpha_shape(points: np.ndarray, alpha: float) -> tuple[np.ndarray, np.ndarray]:
@@ -46,7 +48,6 @@ def alpha_shape(points: np.ndarray, alpha: float) -> tuple[np.ndarray, np.ndarra
     Parameters
     ----------
     points : (n, 3) float64
-        At least four, not in a plane.
     alpha : float
         Largest radius of a solid tetrahedron's circumscribed sphere, in units of the points.
 
@@ -54,8 +55,10 @@ def alpha_shape(points: np.ndarray, alpha: float) -> tuple[np.ndarray, np.ndarra
     -------
     vertices : (v, 3) float64
     faces : (f, 3) int64
-        None where no tetrahedron is small enough.
+        None where no tetrahedron is small enough, or too few points make one.
     """
+    if len(points) < LEAST_POINTS:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     tetrahedra = Delaunay(points).simplices  # (t, 4)
     edges = points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]  # (t, 3, 3)
     volume = np.linalg.det(edges)
@@ -78,7 +81,7 @@ def alpha_shape(points: np.ndarray, alpha: float) -> tuple[np.ndarray, np.ndarra
 def make_alpha(
     case: Case, *, threads: int, kept: Path, find_scene: SceneFinder = rendered_scene
 ) -> Record:
-    """Score the best alpha shape of a scene's sparse points, and write its record."""
+    """Score the best alpha shape of a scene's sparse points, or none, and write its record."""
     scene_folder = find_scene(case)
     folder = kept / case.study / case.identity
     folder.mkdir(parents=True, exist_ok=True)
@@ -90,7 +93,9 @@ def make_alpha(
     thresholds = [share * diagonal for share in THRESHOLD_SHARES]
     cameras = read_cameras(scene_folder)
     code = code_of_tree()
-    best = None
+    none = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    best: tuple[float, float | None, tuple[np.ndarray, np.ndarray], float, float]
+    best = 0.0, None, none, 0.0, 0.0
     for share in ALPHA_SHARES:
         wall_s, used_s = time.monotonic(), time.process_time()
         mesh = alpha_shape(points, share * diagonal)
@@ -101,10 +106,8 @@ def make_alpha(
             *mesh, truth, cameras, thresholds[MIDDLE : MIDDLE + 1], count=CHOOSING_SAMPLES,
             seed=0, threads=threads, protocols=("uniform",),
         )["uniform"].f1[0]  # fmt: skip
-        if best is None or found > best[0]:
+        if found > best[0]:
             best = found, share, mesh, wall_s, used_s
-    if best is None:
-        raise ValueError(f"no alpha of {ALPHA_SHARES} gives a surface")
     _, share, mesh, wall_s, used_s = best
     scores = score_protocols(
         *mesh, truth, cameras, thresholds, count=SURFACE_SAMPLES, seed=0, threads=threads,

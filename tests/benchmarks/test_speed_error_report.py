@@ -211,3 +211,4 @@ def test_an_alpha_shape_bounds_what_it_fills() -> None:
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()
     assert len(alpha_shape(grid, 0.05)[1]) == 0
+    assert len(alpha_shape(grid[:2], 10.0)[1]) == 0
