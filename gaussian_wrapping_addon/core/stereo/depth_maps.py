@@ -51,6 +51,13 @@ LEAST_CORRELATION = 0.5
 CERTAIN_SOURCES = 4
 """Sources and correlation that confidence needs, and sources from which it no longer rises."""
 
+SINGLE_COST = 0.7
+"""A lower mean cost confirms a depth with one source: in a second one, nothing need match."""
+
+SINGLE_PARALLAX_PX = 100.0
+"""Focal length times the sine of the angle between the rays of a depth with one source: a pixel,
+which is what the two may be apart, is then one per cent of the depth."""
+
 TEXTURE_VARIANCE = 20.0
 """Noise in the variance of a window that correlation is corrected for, squared grey levels."""
 
@@ -263,7 +270,9 @@ def _depth_map(
     count = _count(level.confirmed[view])
     floor = 1.0 + TEXTURE_VARIANCE / np.maximum(level.variances[view], 1e-3)
     correlation = np.clip((1.0 - level.costs[view]) * floor, 0.0, 1.0)
-    good = (count >= LEAST_SOURCES) & (correlation > LEAST_CORRELATION) & (means > 0)
+    good = (count >= LEAST_SOURCES) & (correlation > LEAST_CORRELATION)
+    good |= _from_aside(level, view, means) & (level.costs[view] < SINGLE_COST)
+    good &= means > 0
     if mask is not None:
         good &= mask
     confidence = np.minimum(count / CERTAIN_SOURCES, 1.0) * np.sqrt(correlation)
@@ -279,6 +288,20 @@ def _depth_map(
         color,
         mask,
     )
+
+
+def _from_aside(level: MatchingLevel, view: int, means: np.ndarray) -> np.ndarray:
+    """Return (h, w) bool: one source alone confirms the depth, and sees it from aside."""
+    camera, found = level.cameras[view], np.zeros(means.shape, bool)
+    rays = camera.rays()
+    for number, source in enumerate(level.sources[view]):
+        row, column = np.nonzero((level.confirmed[view] == 1 << number) & (means > 0))
+        away = (rays[row, column] / means[row, column, None]) @ camera.rotation  # (m, 3)
+        across = away + camera.center - level.cameras[source].center
+        sine = np.linalg.norm(np.cross(away, across), axis=1)
+        sine /= np.maximum(np.linalg.norm(away, axis=1) * np.linalg.norm(across, axis=1), 1e-30)
+        found[row, column] = camera.fx * sine > SINGLE_PARALLAX_PX
+    return found
 
 
 def _count(bits: np.ndarray) -> np.ndarray:

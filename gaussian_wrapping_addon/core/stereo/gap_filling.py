@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from .depth_maps import DepthMap
 from .fusion import DensePoints, lifted, merged
+from .open_cells import count_open
 
 MOST_COST = 0.7
 """A depth that no source confirms is a guess if it costs less; else nothing is known."""
@@ -28,6 +29,9 @@ SEEN_THROUGH_SHARE = 0.03
 
 SEEN_THROUGH_VIEWS = 2
 """Views that must see through a point for it to be left out."""
+
+OPEN_VIEWS = 2
+"""Views that must show a point where nothing matches for it to be left out."""
 
 
 def fill_gaps(depth_maps: Sequence[DepthMap], confirmed: DensePoints, wanted: int) -> DensePoints:
@@ -46,7 +50,8 @@ def fill_gaps(depth_maps: Sequence[DepthMap], confirmed: DensePoints, wanted: in
     distance, nearest = cKDTree(confirmed.positions).query(guesses.positions)
     reach = CLEARANCE * np.maximum(guesses.sizes, confirmed.sizes[nearest])
     guesses = guesses.select(distance > reach)
-    return guesses.select(count_seen_through(guesses.positions, depth_maps) < SEEN_THROUGH_VIEWS)
+    guesses = guesses.select(count_seen_through(guesses.positions, depth_maps) < SEEN_THROUGH_VIEWS)
+    return guesses.select(count_open(guesses.positions, depth_maps) < OPEN_VIEWS)
 
 
 def count_seen_through(points: np.ndarray, depth_maps: Sequence[DepthMap]) -> np.ndarray:

@@ -12,8 +12,10 @@ import pytest
 from gaussian_wrapping_addon.core.dataset.camera import Camera
 from gaussian_wrapping_addon.core.errors import Cancelled
 from gaussian_wrapping_addon.core.progress import Progress, ProgressEvent
+from gaussian_wrapping_addon.core.stereo import depth_maps as depth_maps_module
 from gaussian_wrapping_addon.core.stereo.depth_maps import (
     MOST_PIXELS,
+    SINGLE_COST,
     DepthMap,
     _depth_range,
     estimate_depth_maps,
@@ -75,6 +77,20 @@ def test_more_certain_depths_are_more_accurate() -> None:
     found, third = errors(depth_maps)[order], len(order) // 3
     assert certain.max() <= 1.0
     assert (found[-third:] < 0.01).mean() > (found[:third] < 0.01).mean() + 0.05
+
+
+@pytest.mark.parametrize(("least_px", "least"), [(10.0, 0.02), (1e9, 0.0)])
+def test_one_source_confirms_from_aside_alone(
+    least_px: float, least: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(depth_maps_module, "SINGLE_PARALLAX_PX", least_px)
+    found = few_maps(ball_scene()[1])
+    single = [(m.confidence > 0) & (m.agreeing == 1) for m in found]
+    share = np.mean([part.mean() for part in single])
+    assert share > least if least else share == 0.0
+    for m, part in zip(found, single, strict=True):
+        assert (m.cost[part] < SINGLE_COST).all()
+        assert (m.confidence[part] <= 0.25).all()
 
 
 def test_the_number_of_threads_does_not_matter_and_the_seed_does() -> None:

@@ -11,6 +11,7 @@ import pytest
 from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap
 from gaussian_wrapping_addon.core.stereo.fusion import fuse
 from gaussian_wrapping_addon.core.stereo.gap_filling import count_seen_through, fill_gaps
+from gaussian_wrapping_addon.core.stereo.open_cells import count_open
 from tests.core.stereo.ball_scene import arc_cameras, exact_map, surface_distance
 
 EXACT = [exact_map(camera) for camera in arc_cameras()[4:8]]
@@ -55,6 +56,21 @@ def test_guesses_near_confirmed_points_are_dropped() -> None:
     alone = fill_gaps(gaps, fuse(gaps, 10).select(np.arange(1)), 1000)
     beside = fill_gaps(gaps, fuse(EXACT, 8000), 1000)
     assert len(beside) < 0.5 * len(alone)
+
+
+def test_guesses_where_nothing_matches_in_two_other_photos_are_dropped() -> None:
+    """Where one photo shows them among what nothing explains, they stay."""
+    some = fuse([EXACT[0]], 10).select(np.arange(1))
+    kept, in_open = [], []
+    for opened in range(4):
+        costs = [0.5] + [0.9] * opened + [0.0] * (3 - opened)
+        maps = [with_gap(m, 1.0, cost=c) for m, c in zip(EXACT, costs, strict=True)]
+        found = fill_gaps(maps, some, 500)
+        kept.append(len(found))
+        in_open.append(count_open(found.positions, maps).max())
+    assert kept[1] > 50
+    assert in_open == [0, 1, 1, 1]
+    assert kept[3] < kept[2] < 0.8 * kept[1]
 
 
 def test_where_nothing_matches_and_where_masks_exclude_nothing_is_guessed() -> None:

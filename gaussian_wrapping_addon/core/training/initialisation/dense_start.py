@@ -110,7 +110,7 @@ def dense_start(
     wanted = start_budget(max_gaussians)
     found = fuse(maps, wanted)
     guesses = fill_gaps(maps, found, round(GUESS_SHARE * wanted))
-    known = np.concatenate([found.positions, guesses.positions, points])
+    known = np.concatenate([found.positions, points])
     shell, _ = far_shell(maps, known, round(SHELL_SHARE * wanted))
     gaussians = _gaussians(
         found, guesses, points, colors, [photos.camera(view, 1) for view in views], sh_degree

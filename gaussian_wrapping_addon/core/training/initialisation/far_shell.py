@@ -14,21 +14,13 @@ import numpy as np
 from ... import tolerances
 from ...stereo.depth_maps import DepthMap
 from ...stereo.fusion import DensePoints
-
-CELL_PX = 8
-"""Side of the cells of a photo, at the size it was matched at, that are covered or open."""
-
-OPEN_SHARE = 0.75
-"""Share of a cell's pixels that must be unexplained for the cell to be open."""
+from ...stereo.open_cells import CELL_PX, by_cell, cells_of, open_cells
 
 REACH_FACTOR = 4.0
 """Radius of the shell over the distance of the farthest points but one in a hundred."""
 
 LEAST_REACH = tolerances.FAR_RADIUS
 """Smallest radius: the cameras lie within a tenth of it."""
-
-BEHIND_COST = 0.7
-"""Matching cost from which a pixel is unexplained: nothing matches."""
 
 
 def far_shell(
@@ -94,27 +86,11 @@ def _open_cells(
     depth_map: DepthMap, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rows, columns and mean colours (m, 3) of the cells that nothing explains."""
-    camera = depth_map.camera
-    rows, columns = camera.height // CELL_PX, camera.width // CELL_PX
-    unknown = (depth_map.agreeing == 0) & (depth_map.cost >= BEHIND_COST)
-    if depth_map.mask is not None:
-        unknown &= depth_map.mask
-    share = _by_cell(unknown.astype(np.float64), rows, columns)
-    covered = np.zeros((rows, columns), bool)
-    pixels, depth = camera.project(points)
-    at = np.floor(pixels / CELL_PX)
-    inside = (depth > 0) & (at >= 0).all(1) & (at[:, 1] < rows) & (at[:, 0] < columns)
-    column, row = at[inside].astype(np.int64).T
-    covered[row, column] = True
-    row, column = np.nonzero((share >= OPEN_SHARE) & ~covered)
-    color = _by_cell(depth_map.color.astype(np.float64), rows, columns)[row, column]
-    return row, column, color
-
-
-def _by_cell(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Return the means of an image over its cells, (rows, columns) or (rows, columns, 3)."""
-    whole = image[: rows * CELL_PX, : columns * CELL_PX]
-    return whole.reshape(rows, CELL_PX, columns, CELL_PX, *image.shape[2:]).mean((1, 3))
+    found = open_cells(depth_map)
+    _, row, column = cells_of(points, depth_map)
+    found[row, column] = False
+    row, column = np.nonzero(found)
+    return row, column, by_cell(depth_map.color.astype(np.float64))[row, column]
 
 
 def onto_sphere(center: np.ndarray, rays: np.ndarray, radius: float) -> np.ndarray:
