@@ -76,3 +76,12 @@ def test_the_check_warns_of_points_that_loading_leaves_out(tmp_path: Path) -> No
     scene = load_scene(tmp_path / "set", tmp_path / "work", Progress(), threads=1)
     (warned,) = [warning.text for warning in scene.warnings if "sparse points" in warning.text]
     assert warned in [found.message for found in check_input(tmp_path / "set")]
+
+
+@pytest.mark.parametrize("path", ["a" * 300, "/".join(["b" * 200] * 30)], ids=["name", "path"])
+def test_paths_that_are_too_long_are_told_shortly_and_with_a_next_step(path: str) -> None:
+    (finding,) = check_input(Path(path))
+    assert finding.severity == "error"
+    assert "longer than this system stores" in finding.message
+    assert len(finding.message) < 250
+    assert finding.hint == "Use shorter names."
