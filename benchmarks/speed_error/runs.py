@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -60,14 +61,13 @@ def run_wrap(run: Run, scene: Path, settings: Settings) -> Path:
 def warm_up(scene: Path, settings: Settings, more: tuple[str, ...] = ()) -> None:
     """Wrap a scene in a minute and forget it, so that no measured run compiles kernels.
 
-    ``more`` arguments switch on what the measured runs use.
+    ``more`` arguments switch on what the measured runs use. Several may warm up at a time.
     """
-    folder = settings.folder / "warm-up"
-    shutil.rmtree(folder, ignore_errors=True)
     arguments = ("--iterations", "400", "--max-gaussians", "8000", *more)
     run = Run(scene.name, "draft", 0, "warm-up", arguments)
-    run_wrap(run, scene, dataclasses.replace(settings, folder=folder))
-    shutil.rmtree(folder)
+    settings.folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="warm-up-", dir=settings.folder) as folder:
+        run_wrap(run, scene, dataclasses.replace(settings, folder=Path(folder)))
 
 
 def run_variant(variant: Variant, base: Path, scene: Path, settings: Settings) -> Path:

@@ -12,7 +12,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks.speed_error.plan import Photos
+from benchmarks.speed_error import runs as speed_error_runs
+from benchmarks.speed_error.plan import Photos, Run
+from benchmarks.speed_error.runs import Settings, warm_up
 from benchmarks.study import command, making, mesh_based, record
 from benchmarks.study.case import Case, named, options
 from benchmarks.study.making import carry_out, kept_scores
@@ -280,3 +282,21 @@ def test_mesh_based_rendering_is_filled_into_records_of_kept_meshes(
     assert len(asked) == 1
     mesh_based.fill_in(PLAN, threads=1, again=True, runs=1, kept=kept, root=root)
     assert len(asked) == 2
+
+
+def test_runs_that_warm_up_at_once_do_not_share_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders: list[Path] = []
+
+    def wrap(run: Run, scene: Path, settings: Settings) -> Path:
+        folders.append(settings.folder)
+        if len(folders) == 1:
+            warm_up(scene, Settings(tmp_path / "kept", 1, False))
+        assert settings.folder.is_dir()
+        return scene
+
+    monkeypatch.setattr(speed_error_runs, "run_wrap", wrap)
+    warm_up(tmp_path, Settings(tmp_path / "kept", 1, False))
+    assert len(set(folders)) == 2
+    assert list((tmp_path / "kept").iterdir()) == []
