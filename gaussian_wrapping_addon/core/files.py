@@ -104,9 +104,7 @@ def read_json(path: Path, *, most_bytes: int | None = None, follow_links: bool =
     data = read_bounded(path, most_bytes or limits.MAX_JSON_BYTES, follow_links=follow_links)
 
     def refuse(name: str) -> Any:
-        raise ParseError(
-            path, "whole file", f"{name} is not a number.", "Export the file again."
-        )
+        raise ParseError(path, "whole file", f"{name} is not a number.", "Export the file again.")
 
     try:
         values = json.loads(data.decode("utf-8-sig"), parse_constant=refuse)

@@ -8,7 +8,14 @@ from tests.hostile.cases import (
     colmap_binary,
     colmap_sets,
     colmap_values,
+    commands,
+    findings,
+    job_folders,
+    job_places,
+    meshes,
     photos,
+    regions,
+    splats,
     transforms,
 )
 
@@ -18,6 +25,13 @@ GROUPS: tuple[Group, ...] = (
     colmap_sets.GROUP,
     transforms.GROUP,
     photos.GROUP,
+    splats.GROUP,
+    regions.GROUP,
+    job_folders.GROUP,
+    job_places.GROUP,
+    meshes.GROUP,
+    commands.GROUP,
+    findings.GROUP,
 )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import os
 import pty
 import re
@@ -21,8 +22,15 @@ from pathlib import Path
 from typing import Any
 
 from gaussian_wrapping_addon import batch
+from gaussian_wrapping_addon.core.dataset.loading.splat_cameras import splat_extent
 from gaussian_wrapping_addon.core.errors import EXIT_DONE, WrapError
+from gaussian_wrapping_addon.core.gaussians.foreign_splat import read_foreign_splat
+from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
+from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from gaussian_wrapping_addon.core.processes.peak_memory import own_peak_bytes
+from gaussian_wrapping_addon.core.progress import Progress
+from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.hostile.case import Variant, Way
 from tests.hostile.same_process import workers_in_this_process
 from tests.hostile.surroundings import CASE, HOME, TEMPORARY, changes, content, make_place, watched
@@ -136,6 +144,7 @@ def _here(variant: Variant, place: Path) -> Outcome:
         warnings.catch_warnings(record=True) as warned,
         contextlib.redirect_stdout(output),
         contextlib.redirect_stderr(errors),
+        _silent_log(),
         workers_in_this_process(),
     ):
         warnings.simplefilter("always")
@@ -161,6 +170,17 @@ def _here(variant: Variant, place: Path) -> Outcome:
     )  # fmt: skip
 
 
+@contextlib.contextmanager
+def _silent_log() -> Iterator[None]:
+    """Stand for the log file of a worker: what its modules log is no output of the command."""
+    nowhere = logging.NullHandler()
+    logging.getLogger().addHandler(nowhere)
+    try:
+        yield
+    finally:
+        logging.getLogger().removeHandler(nowhere)
+
+
 def _held_bytes() -> int:
     """Let the peak of this process begin anew; return what it holds, 0 where that is unknown."""
     try:
@@ -171,26 +191,38 @@ def _held_bytes() -> int:
 
 
 def _load() -> int:
-    """Run the first stage of ``wrap set --out out``, with the words of the command line."""
-    from gaussian_wrapping_addon.core.jobs.stages.cameras_stage import run_cameras
-    from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
-    from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
-    from gaussian_wrapping_addon.core.progress import Progress
-    from gaussian_wrapping_addon.core.settings import JobSettings
+    """Run the first stage of ``wrap set --out out``, with the words of the command line.
 
-    source = next(Path.cwd().glob("set*"))
+    A splat is read and measured, but not rendered.
+    """
+    source = next(path for path in Path.cwd().iterdir() if path.stem == "set")
     try:
-        job = make_job("wrap", source, JobSettings(threads=1))
-        folder = JobFolder(Path.cwd() / "out")
-        folder.create()
-        stage = run_cameras(folder, job, Progress(), threads=1)
+        warned, ready = (_read_splat if source.suffix == ".ply" else _load_set)(source)
     except WrapError as error:
         print(f"error: {error}")
         return error.exit_code
-    for warning in stage.done["warnings"]:
-        print(f"warning: {warning['text']} {warning.get('hint', '')}")
-    print(f"{stage.done['views']} photos and {stage.done['points']} points are ready")
+    for text, hint in warned:
+        print(f"warning: {text} {hint}")
+    print(ready)
     return EXIT_DONE
+
+
+def _load_set(source: Path) -> tuple[list[tuple[str, str]], str]:
+    job = make_job("wrap", source, JobSettings(threads=1))
+    folder = JobFolder(Path.cwd() / "out")
+    folder.create()
+    done = run_cameras(folder, job, Progress(), threads=1).done
+    warned = [(warning["text"], warning.get("hint", "")) for warning in done["warnings"]]
+    return warned, f"{done['views']} photos and {done['points']} points are ready"
+
+
+def _read_splat(source: Path) -> tuple[list[tuple[str, str]], str]:
+    splat = read_foreign_splat(source)
+    gaussians = splat.gaussians
+    opacities = gaussians.opacity_logits.sigmoid().numpy()
+    extent = splat_extent(gaussians.means.numpy(), opacities)
+    warned = [(warning.text, warning.hint) for warning in splat.warnings]
+    return warned, f"{len(gaussians.means)} Gaussians reach {extent.radius:.2f} from their middle"
 
 
 def _in_process(variant: Variant, place: Path) -> Outcome:

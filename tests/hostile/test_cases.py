@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,7 @@ def test_it_ends_as_the_table_says(row: str, tmp_path: Path) -> None:
     assert ended.code == variant.code, ended.output
     assert ended.line(variant.says), ended.output
     assert ended.errors == ""
+    assert not re.search(r"[^\n\t -~\u00a0-\U0010ffff]", ended.output), "control characters"
     assert ended.left == []
     assert ended.outside == []
     assert variant.starts or ended.started == []

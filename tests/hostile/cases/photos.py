@@ -122,9 +122,11 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
 def _png(width: int, height: int, body: bytes = b"") -> bytes:
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     return (
-        b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", head) + _chunk(b"IDAT", zlib.compress(body, 9))
+        b"\x89PNG\r\n\x1a\n"
+        + _chunk(b"IHDR", head)
+        + _chunk(b"IDAT", zlib.compress(body, 9))
         + _chunk(b"IEND", b"")
-    )  # fmt: skip
+    )
 
 
 _HUGE = _png(50_000, 50_000, bytes(4_000_000))

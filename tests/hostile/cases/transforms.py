@@ -318,6 +318,14 @@ _TABLES = Case(
     ),
 )
 
-GROUP = Group("transforms.json and other poses", (
-    _JSON, _MATRICES, _PATHS, _INTRINSICS, _FRAMES, _TABLES,
-))  # fmt: skip
+GROUP = Group(
+    "transforms.json and other poses",
+    (
+        _JSON,
+        _MATRICES,
+        _PATHS,
+        _INTRINSICS,
+        _FRAMES,
+        _TABLES,
+    ),
+)

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from ...errors import DatasetError, WrapError
+from ...errors import DatasetError, WrapError, known_error
 from ...files import real_path
 from ...limits import MIN_IMAGES
 from ...ply.table import vertex_layout
@@ -73,7 +73,10 @@ def check_input(source: Path) -> list[Finding]:
     except WrapError as error:
         findings.append(Finding("error", error.message, error.hint))
     except OSError as error:
-        findings.append(Finding("error", f"{source} cannot be read: {error.strerror}."))
+        known = known_error(error, source) or DatasetError(
+            f"{source} cannot be read: {error.strerror}.", "Check the path and its permissions."
+        )
+        findings.append(Finding("error", known.message, known.hint))
     return findings
 
 
