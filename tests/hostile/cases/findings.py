@@ -176,7 +176,7 @@ def _elsewhere(build: Build) -> Build:
 
 
 _LINKED_FOLDERS = Case(
-    70,
+    69,
     "Folders of photos that are links",
     (
         Variant("COLMAP", _elsewhere(colmap()), 0, "6 photos: 6 of", needs=Needs.POSIX),
@@ -209,7 +209,7 @@ def _evil(
 
 
 _CONTROL = Case(
-    71,
+    70,
     "Escape sequences and newlines in names, in a terminal",
     (
         _evil("of a photo in a model", _named_evil, 0, ("check", "set")),

@@ -316,7 +316,7 @@ _STATES = Case(
             "a result that leads elsewhere",
             steps(begun, status(state="DONE", result="/etc")),
             0,
-            "^results: .*case/out/result$",
+            "^results: .*/out/result$",
             _STATUS,
         ),
         Variant(
