@@ -104,7 +104,7 @@ def read_json(path: Path, *, most_bytes: int | None = None, follow_links: bool =
     data = read_bounded(path, most_bytes or limits.MAX_JSON_BYTES, follow_links=follow_links)
 
     def refuse(name: str) -> Any:
-        raise ValueError(f"{name} is not a number")
+        raise ParseError(path, "whole file", f"{name} is not a number.", "Export the file again.")
 
     try:
         values = json.loads(data.decode("utf-8-sig"), parse_constant=refuse)
@@ -116,19 +116,27 @@ def read_json(path: Path, *, most_bytes: int | None = None, follow_links: bool =
         raise ParseError(
             path, f"byte {error.start}", "not UTF-8 text.", "Save it as UTF-8."
         ) from None
-    except (ValueError, RecursionError) as error:
-        raise ParseError(path, "whole file", f"{error}.", "Export the file again.") from None
+    except RecursionError:
+        raise _too_deep(path) from None
+    except ValueError:  # of Python's limit on digits
+        raise ParseError(
+            path, "whole file", "a number has thousands of digits.", "Export the file again."
+        ) from None
     _check_depth(path, values, 0)
     return values
 
 
 def _check_depth(path: Path, values: Any, depth: int) -> None:
     if depth > limits.MAX_JSON_DEPTH:
-        raise ParseError(path, "whole file", "nested too deeply.", "Export the file again.")
+        raise _too_deep(path)
     children = values.values() if isinstance(values, dict) else values
     if isinstance(values, (dict, list)):
         for child in children:
             _check_depth(path, child, depth + 1)
+
+
+def _too_deep(path: Path) -> ParseError:
+    return ParseError(path, "whole file", "nested too deeply.", "Export the file again.")
 
 
 def real_path(path: str | Path) -> Path:

@@ -89,7 +89,10 @@ def read_bounded(path: Path, most_bytes: int, *, follow_links: bool = False) -> 
     with open_regular(path, follow_links=follow_links) as stream:
         data = stream.read(most_bytes + 1)
     if len(data) > most_bytes:
-        raise ParseError(path, "whole file", f"more than {most_bytes} bytes are too many.")
+        raise ParseError(
+            path, "whole file", f"more than {most_bytes} bytes are too many.",
+            "Check that it is the right file.",
+        )  # fmt: skip
     return data
 
 

@@ -15,6 +15,8 @@ _importing = threading.Lock()
 def import_pycolmap() -> Any:
     """Return the module pycolmap; the worker's handling of SIGTERM stays as it is.
 
+    Its own log goes to stderr, not to files.
+
     Raises
     ------
     ImportError
@@ -28,4 +30,6 @@ def import_pycolmap() -> Any:
         with kept_signal_handlers():
             import pycolmap
 
+        # Its warnings would otherwise fill the folder for temporary files, one file a process.
+        pycolmap.logging.logtostderr = True
         return pycolmap

@@ -10,6 +10,10 @@ from typing import Any, cast
 from ..errors import UsageError
 from .declaration import declarations, value_at
 
+_KINDS: dict[Any, str] = {int: "a whole number", float: "a number", str: "text"}
+_SHOWN_NAME = 40
+"""Characters of an unknown entry that a message shows."""
+
 
 def to_json(settings: Any) -> dict[str, Any]:
     """Convert a settings dataclass to plain JSON values."""
@@ -45,7 +49,8 @@ def from_json(kind: type, values: Any, location: str = "settings") -> Any:
     fields = {f.name for f in dataclasses.fields(kind)}
     unknown = sorted(set(values) - fields)
     if unknown:
-        raise UsageError(f"{location} has an unknown entry {unknown[0]!r}.", "Remove it.")
+        name = unknown[0][:_SHOWN_NAME]
+        raise UsageError(f"{location} has an unknown entry {name!r}.", "Remove it.")
     arguments = {}
     for name, value in values.items():
         wanted = hints[name]
@@ -64,5 +69,6 @@ def from_json(kind: type, values: Any, location: str = "settings") -> Any:
                 raise UsageError(f"{where} must hold only text.", "Use strings.")
             arguments[name] = tuple(value)
         else:
-            raise UsageError(f"{where} has the wrong type.", f"Expected {wanted}.")
+            kind_wanted = _KINDS.get(wanted, "a list of text")
+            raise UsageError(f"{where} has the wrong type.", f"Give {kind_wanted}.")
     return kind(**arguments)

@@ -244,7 +244,7 @@ def _find_mask(
             stored = _resized_mask(stored, shape, mask_path)
     except DatasetError as error:
         with notes.lock:
-            notes.wrong_masks.append(error.message)
+            notes.wrong_masks.append(f"Mask {error.message}")
         return mask
     from_file = stored >= MASK_THRESHOLD
     combined = from_file if mask is None else from_file & mask
@@ -257,7 +257,7 @@ def _resized_mask(mask: np.ndarray, shape: tuple[int, ...], path: Path) -> np.nd
     same = LensCamera("SIMPLE_PINHOLE", mask.shape[1], mask.shape[0], (1.0, 0.0, 0.0))
     if not same_proportions((shape[1], shape[0]), same):
         raise DatasetError(
-            f"Mask {path.name} is {mask.shape[1]} x {mask.shape[0]} pixels, its photo "
+            f"{path.name} is {mask.shape[1]} x {mask.shape[0]} pixels, its photo "
             f"{shape[1]} x {shape[0]}."
         )
     resized = Image.fromarray(mask).resize((shape[1], shape[0]), Image.Resampling.NEAREST)

@@ -149,7 +149,7 @@ def read_model(model: ModelFiles) -> SourceModel:
     if not photos:
         raise DatasetError(
             f"None of the {len(images)} images of {model.path('images').name} is usable.",
-            warnings[-1].text if warnings else "Solve the cameras again.",
+            " ".join([*(warning.text for warning in warnings[-1:]), "Solve the cameras again."]),
         )
     points_path = model.path("points3D")
     if points_path.is_file():

@@ -107,7 +107,7 @@ def read_transforms(path: Path) -> SourceModel:
     if not photos:
         raise DatasetError(
             f"None of the {len(frames)} frames of {path.name} is usable.",
-            " ".join(warning.text for warning in warnings),
+            " ".join([*(warning.text for warning in warnings), _AGAIN]),
         )
     points, colors = _start_points(path, values.get("ply_file_path"), warnings)
     facts: dict[str, Any] = {

@@ -7,6 +7,7 @@ line to stdout, in the protocol of :mod:`~.run_in_worker`.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from ...dataset.frames.file_frame import FileFrame, file_offset
 from ...dataset.frames.placement_file import FILE_NAME, read_placement
 from ...dataset.photos.image_formats import open_image
 from ...dataset.similarity import Similarity
-from ...errors import DatasetError, ParseError, UsageError
+from ...errors import DatasetError, ParseError, UsageError, WrapError
 from ...export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
 from ...files import read_json, real_path, write_bytes
 from ...names import SPLAT_STEM, file_stems
@@ -109,9 +110,9 @@ def frames_of(result: Path) -> tuple[Similarity, Similarity]:
         world_from_scene = Similarity.from_json(read_json(path)["world_from_scene"])
         if not (np.isfinite(world_from_scene.matrix()).all() and world_from_scene.scale > 0.0):
             raise ValueError("a number is not finite")
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError):
         raise ParseError(
-            path, "world_from_scene", f"not a transform ({error}).", "Run the job again."
+            path, "world_from_scene", "not a transform.", "Run the job again."
         ) from None
     placement = result / FILE_NAME
     found = read_placement(placement, world_from_scene) if placement.is_file() else None
@@ -144,15 +145,27 @@ def export_files(request: ExportRequest) -> Iterator[Path]:
         _splat_of(request.result)  # before anything is written
     if request.out.exists() and not request.out.is_dir():
         raise UsageError(f"{request.out} is a file.", "Give a folder for the exports.")
-    with write_errors(request.out):
-        request.out.mkdir(parents=True, exist_ok=True)
-    wanted = [f for f in request.formats if f != "splat"]
-    if wanted:
-        for mesh in _meshes(request):
-            for name in wanted:
-                yield _write_mesh(request, mesh, name, *frames)
-    if "splat" in request.formats:
-        yield _write_splat(request, *frames)
+    made = [path for path in (request.out, *request.out.parents) if not path.exists()]
+    try:
+        with write_errors(request.out):
+            request.out.mkdir(parents=True, exist_ok=True)
+        wanted = [f for f in request.formats if f != "splat"]
+        if wanted:
+            for mesh in _meshes(request):
+                for name in wanted:
+                    yield _write_mesh(request, mesh, name, *frames)
+        if "splat" in request.formats:
+            yield _write_splat(request, *frames)
+    except WrapError:
+        _remove_empty(made)
+        raise
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders, the innermost first, until one holds something."""
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def _meshes(request: ExportRequest) -> Iterator[StoredMesh]:

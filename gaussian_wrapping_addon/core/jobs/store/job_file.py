@@ -82,7 +82,7 @@ class JobFile:
             raise UsageError("job.json names no command or source.", "Start the job again.")
         if not isinstance(values["region_bodies"], dict):
             raise UsageError("job.json: region_bodies must be an object.", "Start the job again.")
-        settings = from_json(JobSettings, values["settings"]).validated()
+        settings = _settings_of(values["settings"])
         _check_source(values["source"])
         _check_bodies(settings, values["region_bodies"])
         lengths = _checked_lengths(values.get("edge_lengths", {}), settings.regions)
@@ -149,6 +149,19 @@ def make_job(
         start_splat=str(real_path(start)) if start else "",
     )
     return JobFile(command, str(real_path(source)), settings, bodies, lengths)
+
+
+def _settings_of(values: Any) -> JobSettings:
+    """Return the settings of a job file; errors name the file, not options."""
+    try:
+        settings: JobSettings = from_json(JobSettings, values).validated()
+    except SettingError as error:
+        raise UsageError(
+            f"job.json: settings.{error.setting} is out of range.", f"Give {error.wanted}."
+        ) from None
+    except UsageError as error:
+        raise UsageError(f"job.json: {error.message}", error.hint) from None
+    return settings
 
 
 def _check_source(source: str) -> None:
