@@ -15,7 +15,7 @@ from typing import IO
 
 from ... import limits
 from ...errors import DatasetError
-from .image_formats import open_image
+from .image_formats import open_image, without_warnings
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 
@@ -164,7 +164,7 @@ def _read_other(path: Path) -> PhotoHeader | None:
     except ImportError:
         return None
     try:
-        with open_image(path) as image:
+        with without_warnings(), open_image(path) as image:
             width, height = image.size
             if image.format == "TIFF":  # Pillow turns these upright itself, size included
                 return PhotoHeader(width, height)
