@@ -170,6 +170,14 @@ def _zero_quaternion(columns: Columns) -> None:
         columns[f"rot_{number}"][0] = 0.0
 
 
+def _vast_text(data: bytes) -> bytes:
+    """Write 1e300 as the first number, and an empty line behind the first Gaussian."""
+    head, body = data.split(b"end_header\n")
+    lines = body.split(b"\n")
+    lines[0] = b"1e300 " + lines[0].split(b" ", 1)[1]
+    return head + b"end_header\n" + b"\n".join([lines[0], b"", *lines[1:]])
+
+
 def _start(name: str, build: Build, says: str, code: int = 0) -> Variant:
     return Variant(name, build, code, says, ("wrap", "set.ply"), way=Way.LOADING, writes=("out",))
 
@@ -181,6 +189,7 @@ _VALUES = Case(
     (
         _start("position NaN", _rows(x=np.nan), f"1 {_DROPPED}"),
         _start("position Inf", _rows(x=np.inf), f"1 {_DROPPED}"),
+        _start("1e300 in text", splat(format="ascii", edit=_vast_text), f"1 {_DROPPED}"),
         _start("quaternion 0", splat(_zero_quaternion), f"1 {_DROPPED}"),
         _start("log-scale 80", _rows(scale_1=80.0), f"1 {_DROPPED}"),
         _start("opacity ±Inf", _rows(opacity=np.inf, f_dc_0=-np.inf), f"2 {_DROPPED}"),
