@@ -22,6 +22,7 @@ from tests.hostile.inputs import (
     pipe,
     plain,
     steps,
+    unreadable,
 )
 
 _IMAGE = "set/images/p00.png"
@@ -104,6 +105,13 @@ _FILES = Case(
             0,
             _NO_FILE,
             needs=Needs.POSIX,
+        ),
+        Variant(
+            "that may not be read",
+            steps(colmap(), unreadable(_IMAGE)),
+            0,
+            r"1 photos cannot be read .*p00\.png cannot be read: Permission denied.*Check its perm",
+            needs=Needs.USER,
         ),
         _bad("cut JPEG, header whole", _cut_jpeg, "6 photos: 6 of 64 x 48"),
         _loaded(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 import struct
@@ -36,6 +37,8 @@ _VALUES: tuple[Any, ...] = (
     [], {}, [[]], [1, 2, 3], {"a": 1}, [[0.0] * 4] * 4, [None] * 3,
 )  # fmt: skip
 """JSON values in place of others."""
+_NAMES = ("", "a", "x" * 5000, "\x1b[2J\n", "\ud800", "scale", "version", "0")
+"""Keys in place of others."""
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?", re.IGNORECASE)
 _DEEP = 5000
 
@@ -129,11 +132,11 @@ def revalued(data: bytes, random: Random) -> bytes:
         if kind == 0:
             del holder[key]
         elif kind == 1 and isinstance(holder, dict):
-            holder[_VALUES[int(random.integers(16, 24))]] = holder.pop(key)
+            holder[_NAMES[int(random.integers(len(_NAMES)))]] = holder.pop(key)
         elif kind == 2 and isinstance(holder, list):
-            holder.append(holder[key])
+            holder.append(copy.deepcopy(holder[key]))
         else:
-            holder[key] = _VALUES[int(random.integers(len(_VALUES)))]
+            holder[key] = copy.deepcopy(_VALUES[int(random.integers(len(_VALUES)))])
     text = json.dumps(values)
     if random.random() < 0.02:
         text = text.replace(":", ":" + "[" * _DEEP, 1)

@@ -74,7 +74,8 @@ def check_input(source: Path) -> list[Finding]:
         findings.append(Finding("error", error.message, error.hint))
     except OSError as error:
         known = known_error(error, source) or DatasetError(
-            f"{source} cannot be read: {error.strerror}.", "Check the path and its permissions."
+            f"{source} cannot be read: {error.strerror}.",
+            "Check the path and its permissions.",
         )
         findings.append(Finding("error", known.message, known.hint))
     return findings

@@ -69,6 +69,10 @@ def read_photo_header(path: Path) -> PhotoHeader | None:
                 if other is None:
                     return None
                 header = other
+    except PermissionError as error:
+        raise DatasetError(
+            f"{path.name} cannot be read: {error.strerror}.", "Check its permissions."
+        ) from None
     except (OSError, ValueError, struct.error, SyntaxError, OverflowError) as error:
         reason = str(error) or type(error).__name__
         raise DatasetError(f"{path.name} is not a readable photo ({reason}).", _ANOTHER) from None
