@@ -99,9 +99,15 @@ def read_json(path: Path, *, most_bytes: int | None = None, follow_links: bool =
     Raises
     ------
     ParseError
-        Names the line, or the limit that was exceeded; or it is not a regular file.
+        Names the line, or the limit that was exceeded; or it is not a regular file, or the user
+        may not read it.
     """
-    data = read_bounded(path, most_bytes or limits.MAX_JSON_BYTES, follow_links=follow_links)
+    try:
+        data = read_bounded(path, most_bytes or limits.MAX_JSON_BYTES, follow_links=follow_links)
+    except PermissionError as error:
+        raise ParseError(
+            path, "whole file", f"cannot be read: {error.strerror}.", "Check its permissions."
+        ) from error
 
     def refuse(name: str) -> Any:
         raise ParseError(path, "whole file", f"{name} is not a number.", "Export the file again.")

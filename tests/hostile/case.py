@@ -32,12 +32,15 @@ class Needs(enum.Enum):
 
     POSIX = "links, pipes and devices are those of POSIX"
     LINUX = "/proc and /dev/full are those of Linux"
+    USER = "root may read everything"
     CLOSED_FOLDER = "this user may write into read-only folders, and cannot mount any"
 
     def met(self) -> bool:
         """Tell whether this machine and user have it; closed folders are seen when tried."""
         if self is Needs.LINUX:
             return sys.platform.startswith("linux")
+        if self is Needs.USER:
+            return os.name != "nt" and os.geteuid() != 0
         return os.name != "nt"
 
 

@@ -95,6 +95,11 @@ def remove(name: str) -> Build:
     return lambda folder: (folder / name).unlink(missing_ok=True)
 
 
+def unreadable(name: str) -> Build:
+    """Return what takes all rights on an entry away."""
+    return lambda folder: (folder / name).chmod(0)
+
+
 def renamed(name: str, new: str) -> Build:
     """Return what moves an entry."""
 

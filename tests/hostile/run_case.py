@@ -84,6 +84,9 @@ def run_variant(variant: Variant, place: Path) -> Outcome:
         else:
             outcome = _here(variant, place)
     outcome.left = changes(before, content(place), variant.writes)
+    for name in before:
+        if "may not be read" in before[name]:
+            (place / name).chmod(0o700)  # so that the place can be removed
     return outcome
 
 
@@ -113,7 +116,7 @@ def _surroundings(variant: Variant, place: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _within(seconds: float) -> Iterator[None]:
+def within(seconds: float) -> Iterator[None]:
     """Raise where the block takes longer, such as one that waits for a pipe."""
     if (
         not hasattr(signal, "setitimer")
@@ -137,7 +140,7 @@ def _within(seconds: float) -> Iterator[None]:
 def _here(variant: Variant, place: Path) -> Outcome:
     output, errors = io.StringIO(), io.StringIO()
     code: int | None = None
-    held_bytes = _held_bytes()
+    held_bytes = reset_peak_memory()
     with (
         _surroundings(variant, place),
         watched(place) as seen,
@@ -150,7 +153,7 @@ def _here(variant: Variant, place: Path) -> Outcome:
         warnings.simplefilter("always")
         begun_s = time.monotonic()
         try:
-            with _within(HERE_LIMIT_S):
+            with within(HERE_LIMIT_S):
                 code = _load() if variant.way is Way.LOADING else batch.main(list(variant.words))
         except (Exception, TimeLimitError) as error:
             errors.write(f"Traceback: {type(error).__name__}: {error}")
@@ -181,7 +184,7 @@ def _silent_log() -> Iterator[None]:
         logging.getLogger().removeHandler(nowhere)
 
 
-def _held_bytes() -> int:
+def reset_peak_memory() -> int:
     """Let the peak of this process begin anew; return what it holds, 0 where that is unknown."""
     try:
         _RESET_PEAK.write_text("5")

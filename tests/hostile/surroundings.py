@@ -129,6 +129,9 @@ def content(place: Path) -> dict[str, str]:
     waiting = [place]
     while waiting:
         folder = waiting.pop()
+        if not os.access(folder, os.R_OK | os.X_OK):
+            found[os.path.relpath(folder, place)] = "folder that may not be read"
+            continue
         for entry in os.scandir(folder):
             name = os.path.relpath(entry.path, place)
             state = entry.stat(follow_symlinks=False)
@@ -149,6 +152,8 @@ _HASHED_BYTES = 4 * 1024 * 1024
 
 
 def _hash(path: Path, size: int) -> str:
+    if not os.access(path, os.R_OK):
+        return f"file of {size} bytes that may not be read"
     with path.open("rb") as stream:
         digest = hashlib.sha256(stream.read(_HASHED_BYTES)).hexdigest()
     return f"file of {size} bytes, {digest}"

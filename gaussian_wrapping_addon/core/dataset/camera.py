@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import limits
 from .similarity import Similarity
 
 
@@ -139,7 +140,24 @@ class Camera:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Camera:
-        """Build from :meth:`to_json`'s values."""
+        """Build from :meth:`to_json`'s values.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            An entry is missing, of another kind, or such as no camera has.
+        """
         values = dict(values)
-        values["cam_from_world"] = np.asarray(values["cam_from_world"], np.float64).reshape(3, 4)
-        return cls(**values)
+        try:
+            pose = np.asarray(values.pop("cam_from_world"), np.float64).reshape(3, 4)
+            lens = [float(values[name]) for name in ("fx", "fy", "cx", "cy")]
+        except OverflowError:
+            raise ValueError("a number is too large") from None
+        sides = (values["width"], values["height"])
+        if not isinstance(values["name"], str) or any(type(side) is not int for side in sides):
+            raise TypeError("a camera needs a name and whole numbers as its size")
+        if not (np.isfinite(pose).all() and np.isfinite(lens).all()):
+            raise ValueError("a number is not finite")
+        if min(*sides, *lens[:2]) <= 0 or max(sides) > limits.MAX_IMAGE_SIDE_PX:
+            raise ValueError("the size or the focal length is out of range")
+        return cls(**values, cam_from_world=pose)

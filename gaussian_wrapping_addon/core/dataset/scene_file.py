@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import os
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,7 @@ def scene_from_json(values: Any, folder: Path) -> Scene:
         raise ParseError(path, "views", f"not as expected ({error}).", _AGAIN) from None
     for view in views:
         for file in (view.photo_path, view.mask_path):
-            if file is not None and not file.is_file():
+            if file is not None and not os.path.isfile(file):  # false for over-long names as well
                 raise DatasetError(
                     f"Photo {file} no longer exists.", "Put it back, or start the job anew."
                 )

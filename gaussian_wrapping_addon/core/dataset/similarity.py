@@ -53,9 +53,10 @@ class Similarity:
         )
 
     def matrix(self) -> np.ndarray:
-        """Return the (4, 4) float64 matrix."""
+        """Return the (4, 4) float64 matrix; not finite where numbers are too large."""
         matrix = np.eye(4)
-        matrix[:3, :3] = self.scale * self.rotation
+        with np.errstate(over="ignore", invalid="ignore"):
+            matrix[:3, :3] = self.scale * self.rotation
         matrix[:3, 3] = self.translation
         return matrix
 
@@ -69,9 +70,18 @@ class Similarity:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Similarity:
-        """Build from :meth:`to_json`'s values."""
-        return cls(
-            float(values["scale"]),
-            np.asarray(values["rotation"], np.float64).reshape(3, 3),
-            np.asarray(values["translation"], np.float64).reshape(3),
-        )
+        """Build from :meth:`to_json`'s values.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            An entry is missing, of another kind, or beyond float64.
+        """
+        try:
+            return cls(
+                float(values["scale"]),
+                np.asarray(values["rotation"], np.float64).reshape(3, 3),
+                np.asarray(values["translation"], np.float64).reshape(3),
+            )
+        except OverflowError:
+            raise ValueError("a number is too large") from None

@@ -73,7 +73,8 @@ def read_foreign_splat(path: Path) -> ForeignSplat:
     dtype = np.float64 if wide else np.float32
 
     def columns(*names: str) -> np.ndarray:
-        stacked = [rows[name].astype(dtype) for name in names]  # (n,) each
+        with np.errstate(over="ignore"):  # becomes infinite: such Gaussians are left out
+            stacked = [rows[name].astype(dtype) for name in names]  # (n,) each
         return np.stack(stacked, axis=1) if stacked else np.zeros((len(rows), 0), dtype)
 
     names = header.names

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +80,9 @@ def read_vertices(
         if vertex.count == 0:
             return np.zeros(0, layout)
         try:
-            table = np.loadtxt(stream, ndmin=2, comments=None, max_rows=vertex.count)  # (n, p)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of empty lines, which do not count
+                table = np.loadtxt(stream, ndmin=2, comments=None, max_rows=vertex.count)  # (n, p)
         except ValueError as error:
             raise ParseError(path, "body", f"{error}.", hint) from None
     if table.shape != (vertex.count, len(vertex.properties)):

@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
+import numpy as np
+import pytest
+
+from gaussian_wrapping_addon.core.dataset.camera import Camera
 from tests.core.render.scenes import look_at
 
 CAMERA = look_at((2.2, 1.0, 0.8), width=33, height=17)
@@ -33,3 +37,20 @@ def test_points_outside_the_image_and_behind_the_camera_are_not_shown() -> None:
     indices, row, column, _ = CAMERA.shown(points)
     assert (indices.tolist(), row.tolist(), column.tolist()) == ([5], [2], [6])
     assert all(len(part) == 0 for part in CAMERA.shown(np.zeros((0, 3))))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"width": 0}, {"width": 64.0}, {"height": True}, {"height": 10**9}, {"fx": 0.0},
+        {"fy": float("nan")}, {"cx": 10**400}, {"cy": "left"}, {"name": 5}, {"lens": "wide"},
+        {"cam_from_world": [1.0, 2.0]}, {"cam_from_world": [[10**400] * 4] * 3},
+        {"cam_from_world": [[float("inf")] * 4] * 3},
+    ],
+)  # fmt: skip
+def test_values_that_no_camera_has_are_refused(change: dict[str, Any]) -> None:
+    camera = Camera("a.png", 64, 48, 60.0, 61.0, 32.0, 24.0, np.eye(3, 4))
+    values = camera.to_json()
+    assert np.array_equal(Camera.from_json(values).cam_from_world, camera.cam_from_world)
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        Camera.from_json({**values, **change})

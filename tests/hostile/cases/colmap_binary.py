@@ -8,7 +8,18 @@ from collections.abc import Callable
 
 from tests.core.dataset.model_writers import Model
 from tests.hostile.case import Case, Group, Needs, Variant, Way
-from tests.hostile.inputs import changed, colmap, file, folder_of, link, nothing, pipe, steps
+from tests.hostile.inputs import (
+    changed,
+    colmap,
+    file,
+    folder_of,
+    link,
+    nothing,
+    pipe,
+    steps,
+    transforms,
+    unreadable,
+)
 
 _WANTED = "Give a folder of photos"
 _READER = "tests/core/dataset/readers/test_colmap_reader.py"
@@ -46,6 +57,27 @@ _NO_SET = Case(
             3,
             rf"set is neither a file nor a folder\. {_WANTED}",
             needs=Needs.POSIX,
+        ),
+        Variant(
+            "a folder that may not be read",
+            steps(colmap(), unreadable("set")),
+            3,
+            r"set cannot be read: Permission denied\. Check the path and its permissions",
+            needs=Needs.USER,
+        ),
+        Variant(
+            "a model that may not be read",
+            steps(colmap(), unreadable("set/sparse/0/images.bin")),
+            3,
+            r"images\.bin, whole file: cannot be read: Permission denied.*Export the model",
+            needs=Needs.USER,
+        ),
+        Variant(
+            "a transforms.json that may not be read",
+            steps(transforms(), unreadable("set/transforms.json")),
+            3,
+            r"transforms\.json, whole file: cannot be read: Permission denied\. Check its perm",
+            needs=Needs.USER,
         ),
         Variant(
             "a link that leads nowhere",

@@ -145,6 +145,15 @@ _QUATERNIONS = Case(
 )
 
 
+def _vast(model: Model) -> None:
+    model.images[0].translation = np.full(3, 1e308)
+
+
+def _all_vast(model: Model) -> None:
+    for image in model.images:
+        image.translation = image.translation * 1e200
+
+
 def _far(model: Model) -> None:
     model.images[0].translation = np.array([1e6, 0.0, 0.0])
 
@@ -154,6 +163,13 @@ _PLACES = Case(
     "Cameras that are nowhere or far away",
     (
         Variant("translation Inf", colmap(_first(translation=np.full(3, np.inf))), 0, _DROPPED),
+        Variant("one 1e308 away", colmap(_vast, count=8), 0, "1 cameras are far away from all"),
+        Variant(
+            "all 1e200 away",
+            colmap(_all_vast),
+            3,
+            r"The cameras lie farther than 1e\+100 units from the origin.*Solve the cameras again",
+        ),
         Variant("one 10⁶ units away", colmap(_far, count=8), 0, "1 cameras are far away from all"),
         Variant(
             "one 10⁶ units away, loaded",

@@ -93,10 +93,27 @@ _CIRCLES = Case(
         _circle("status", ("status", "set"), 2, "set holds no job.*Choose a job folder"),
         _circle("resume", ("resume", "set", "--no-blend"), 2, "does not exist.*Choose a folder"),
         _circle("mesh", ("mesh", "--out", "set", "--no-blend"), 2, "does not exist.*Choose"),
+        _circle("work-tiles", ("work-tiles", "set"), 2, "set is not a job folder.*Give the --out"),
+        Variant(
+            "as a region",
+            steps(colmap(), link("a.json", "b.json"), link("b.json", "a.json")),
+            3,
+            r"Region file a\.json does not exist.*Check the path",
+            ("wrap", "set", "--region", "a.json", *_OUT),
+            needs=Needs.POSIX,
+        ),
+        Variant(
+            "as --out",
+            steps(colmap(), link("a", "b"), link("b", "a")),
+            4,
+            "(a|b) cannot be written: .*Check that the folder exists",
+            ("wrap", "set", "--out", "a", "--no-blend"),
+            needs=Needs.POSIX,
+        ),
     ),
     (
         f"{_HOSTILE_PHOTOS}::test_links_in_a_circle_among_photos_are_left_out",
-        ("tests/blender/test_found_jobs.py::test_a_file_whose_folders_are_links_in_a_circle_opens"),
+        "tests/blender/test_found_jobs.py::test_a_file_whose_folders_are_links_in_a_circle_opens",
     ),
 )
 

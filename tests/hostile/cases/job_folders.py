@@ -8,7 +8,7 @@ from typing import Any
 
 from gaussian_wrapping_addon.core import limits
 from tests.hostile.case import Build, Case, Group, Needs, Variant
-from tests.hostile.inputs import file, link, pipe, remove, steps
+from tests.hostile.inputs import file, link, pipe, region, remove, steps, unreadable
 from tests.hostile.jobs import begun, job_entry, locked_by, status, this_process, trained
 
 _FOLDERS = "tests/core/jobs/store/test_hostile_folders.py"
@@ -202,6 +202,7 @@ def _entry(place: str, value: Any, says: str, name: str = "") -> Variant:
 
 
 _AGAIN = "Start the job again"
+_FLAT = region(vertices=[[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
 _ENTRIES = Case(
     64,
     "Entries of job.json that no job holds",
@@ -211,6 +212,13 @@ _ENTRIES = Case(
             0,
             r"job\.json: settings\.training\.densify_every is out of range\. Give from 1",
         ),
+        _entry(
+            "settings.training.focus",
+            "[" * 5000,
+            f"focus is no list of regions.*{_AGAIN}",
+            "a focus nested deeply",
+        ),
+        _entry("settings.training.focus", "[]", f"focus is no list of regions.*{_AGAIN}"),
         _entry("settings.training.focus", "{", f"focus is no list of regions.*{_AGAIN}"),
         _entry(
             "settings.training.focus", "[1]", f"focus.0., top level: is not an object.*{_AGAIN}"
@@ -237,9 +245,11 @@ _ENTRIES = Case(
         ),
         _entry("settings.regions", ["/nowhere/x.json"], f"holds no region '/nowhere.*{_AGAIN}"),
         _entry("region_bodies", {"/x.json": {"a": 1}}, rf"x\.json, class_name: .*{_AGAIN}"),
+        _entry("region_bodies", {"/x.json": _FLAT}, f"is flat.*{_AGAIN}", "a flat region"),
         _entry("region_bodies", [], f"region_bodies must be an object.*{_AGAIN}"),
         _entry("source", "/", "'/' cannot be the source of a job.*Give the folder of the photos"),
         _entry("source", "", "'' cannot be the source of a job.*Give the folder of the photos"),
+        _entry("source", "a\0b", "cannot be the source of a job.*Give the folder of the photos"),
         _entry("source", 5, f"names no command or source.*{_AGAIN}"),
         _entry("command", "rm", f"names no command or source.*{_AGAIN}"),
         _entry("command", ["wrap"], f"names no command or source.*{_AGAIN}"),
@@ -275,12 +285,7 @@ _ENTRIES = Case(
             _RESUME,
         ),
     ),
-    (
-        (
-            "tests/core/jobs/store/test_hostile_job_files.py::"
-            "test_a_bad_job_file_is_refused_before_a_worker_starts"
-        ),
-    ),
+    ("tests/core/jobs/store/test_job_file.py::test_what_is_not_a_job_is_refused_by_name",),
 )
 
 _STATES = Case(
@@ -290,6 +295,30 @@ _STATES = Case(
         Variant("a list", steps(begun, file("out/status.json", "[]")), 0, _UNREADABLE, _STATUS),
         Variant(
             "half a file", steps(begun, file("out/status.json", '{"sta')), 0, _UNREADABLE, _STATUS
+        ),
+        Variant(
+            "a status that may not be read",
+            steps(begun, unreadable("out/status.json")),
+            0,
+            _UNREADABLE,
+            _STATUS,
+            needs=Needs.USER,
+        ),
+        Variant(
+            "a job file that may not be read",
+            steps(begun, unreadable("out/job.json")),
+            3,
+            r"job\.json, whole file: cannot be read: Permission denied\. Check its permissions",
+            _RESUME,
+            needs=Needs.USER,
+        ),
+        Variant(
+            "a folder that may not be read",
+            steps(begun, unreadable("out/stages")),
+            3,
+            r"stages cannot be read: Permission denied.*Check its permissions",
+            _RESUME,
+            needs=Needs.USER,
         ),
         Variant(
             "an unknown state",

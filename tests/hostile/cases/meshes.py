@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import struct
 import zipfile
@@ -253,6 +254,19 @@ def _disagreeing(path: Path) -> None:
     np.savez(path, **{**arrays, "means": arrays["means"][:7]})
 
 
+def _scene_entry(change: Callable[[dict[str, Any]], object]) -> Build:
+    """Return the build of a finished training whose cameras are changed."""
+
+    def build(folder: Path) -> None:
+        sphere(folder)
+        (path,) = folder.glob("out/stages/cameras-*/scene.json")
+        values = json.loads(path.read_text())
+        change(values)
+        path.write_text(json.dumps(values))
+
+    return build
+
+
 _ESTIMATE = ("estimate-mesh", "--out", "out")
 _RESUME = r"gaussians\.npz, whole file: .*Delete the folder and run the job again"
 
@@ -271,6 +285,27 @@ _CHECKPOINTS = Case(
         _estimated("compressed 100 MB of zeros", _compressed),
         _estimated("Python objects", _pickled),
         _estimated("without positions", _without),
+        Variant(
+            "a photo of 5000 characters",
+            _scene_entry(lambda scene: scene["views"][0].update(photo="x" * 5000)),
+            3,
+            r"Photo .*xxx.* no longer exists.*Put it back, or start the job anew",
+            _ESTIMATE,
+        ),
+        Variant(
+            "a camera without size",
+            _scene_entry(lambda scene: scene["views"][0]["camera"].update(width=-1)),
+            3,
+            r"scene\.json, views: not as expected \(the size or the focal length is out of range",
+            _ESTIMATE,
+        ),
+        Variant(
+            "a camera of words",
+            _scene_entry(lambda scene: scene["views"][0]["camera"].update(fx="wide")),
+            3,
+            r"scene\.json, views: not as expected \(could not convert string to float",
+            _ESTIMATE,
+        ),
         _estimated(
             "of other lengths",
             _disagreeing,

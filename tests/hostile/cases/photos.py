@@ -22,6 +22,7 @@ from tests.hostile.inputs import (
     pipe,
     plain,
     steps,
+    unreadable,
 )
 
 _IMAGE = "set/images/p00.png"
@@ -62,6 +63,19 @@ def _loaded(name: str, build: Build, says: str, code: int = 0, **more: object) -
     return Variant(f"{name}, loaded", build, code, says, way=Way.LOADING, writes=("out",), **more)  # type: ignore[arg-type]
 
 
+def _exif_cut(path: Path) -> None:
+    """Save a photo whose EXIF entries are cut, of which Pillow would warn."""
+    exif = Image.Exif()
+    exif[0x010F], exif[0x920A], exif[0xA405] = "Maker", 35.0, 50
+    plain(64, 48, format="JPEG", exif=exif.tobytes()[:40])(path)
+
+
+def _tiff_cut(path: Path) -> None:
+    plain(64, 48, format="TIFF")(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) - 30])
+
+
 _HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(200)
 _FILES = Case(
     25,
@@ -92,12 +106,22 @@ _FILES = Case(
             _NO_FILE,
             needs=Needs.POSIX,
         ),
+        Variant(
+            "that may not be read",
+            steps(colmap(), unreadable(_IMAGE)),
+            0,
+            r"1 photos cannot be read .*p00\.png cannot be read: Permission denied.*Check its perm",
+            needs=Needs.USER,
+        ),
         _bad("cut JPEG, header whole", _cut_jpeg, "6 photos: 6 of 64 x 48"),
         _loaded(
             "cut JPEG",
             photo("p00.png", _cut_jpeg),
             r"1 photos cannot be read and are not used: p00\.png cannot be decoded",
         ),
+        _bad("cut EXIF entries", _exif_cut, "6 photos: 6 of 64 x 48"),
+        _bad("cut TIFF", _tiff_cut, "6 photos: |1 photos cannot be read .*Export it again as JPEG"),
+        _loaded("cut EXIF entries", photo("p00.png", _exif_cut), "6 photos and"),
         _loaded("moving WebP", photo("p00.png", _moving_webp), "6 photos and"),
         Variant(
             "more than a fifth",

@@ -19,6 +19,7 @@ from tests.hostile.inputs import (
     pipe,
     region,
     steps,
+    unreadable,
 )
 
 _REGION = "tests/core/regions/test_region.py"
@@ -97,6 +98,12 @@ _FILES = Case(
             link("box.json", "/dev/zero"),
             r"Region file box\.json does not exist.*Check the path",
             needs=Needs.POSIX,
+        ),
+        _given(
+            "that may not be read",
+            steps(json_file("box.json", region()), unreadable("box.json")),
+            r"box\.json, whole file: cannot be read: Permission denied\. Check its permissions",
+            needs=Needs.USER,
         ),
         _given("no simplices", json_file("box.json", region()), _READ),
         _given(

@@ -32,7 +32,7 @@ def _columns() -> Columns:
     return columns
 
 
-def _splat(
+def splat(
     change: Callable[[Columns], None] = lambda columns: None,
     *,
     format: str = "binary_little_endian",
@@ -56,7 +56,7 @@ def _splat(
 
 
 def _replaced(old: str, new: str) -> Build:
-    return _splat(edit=lambda data: data.replace(old.encode(), new.encode(), 1))
+    return splat(edit=lambda data: data.replace(old.encode(), new.encode(), 1))
 
 
 def _bad(name: str, build: Build, says: str, code: int = 3) -> Variant:
@@ -67,24 +67,22 @@ _FACT = "200 Gaussians with harmonics of degree 0"
 
 
 def _without(*names: str) -> Build:
-    return _splat(lambda columns: [columns.pop(name) for name in names] and None)
+    return splat(lambda columns: [columns.pop(name) for name in names] and None)
 
 
 def _with(**more: float) -> Build:
-    return _splat(lambda columns: columns.update({n: np.full(200, v) for n, v in more.items()}))
+    return splat(lambda columns: columns.update({n: np.full(200, v) for n, v in more.items()}))
 
 
 _HEADERS = Case(
     31,
     "Splat PLY: encodings, headers, counts",
     (
-        _bad("ASCII", _splat(format="ascii"), _FACT, 0),
-        _bad("big endian", _splat(format="binary_big_endian"), _FACT, 0),
+        _bad("ASCII", splat(format="ascii"), _FACT, 0),
+        _bad("big endian", splat(format="binary_big_endian"), _FACT, 0),
         _bad(
             "CR and LF in the header",
-            _splat(
-                edit=lambda data: data.replace(b"\n", b"\r\n", data.index(b"end_header") and 17)
-            ),
+            splat(edit=lambda data: data.replace(b"\n", b"\r\n", data.index(b"end_header") and 17)),
             _FACT,
             0,
         ),
@@ -115,7 +113,7 @@ _HEADERS = Case(
         ),
         _bad(
             "count 0",
-            _splat(
+            splat(
                 lambda columns: [columns.update({n: c[:0]}) for n, c in columns.items()] and None
             ),
             r"set\.ply holds no Gaussians.*Export the splat again",
@@ -143,7 +141,7 @@ _HEADERS = Case(
         _bad("more properties", _with(segment=1.0, confidence=0.5), _FACT, 0),
         _bad(
             "body cut",
-            _splat(edit=lambda data: data[:-40]),
+            splat(edit=lambda data: data[:-40]),
             r"set\.ply, byte \d+: cut off: the header declares \d+ bytes.*Export or download",
         ),
         _bad("an unknown line", _replaced("comment a", "remark a"), rf"line 3: .*{_EXPECTED}"),
@@ -164,12 +162,20 @@ def _rows(**values: float) -> Build:
         for row, (name, value) in enumerate(values.items()):
             columns[name][row] = value
 
-    return _splat(change)
+    return splat(change)
 
 
 def _zero_quaternion(columns: Columns) -> None:
     for number in range(4):
         columns[f"rot_{number}"][0] = 0.0
+
+
+def _vast_text(data: bytes) -> bytes:
+    """Write 1e300 as the first number, and an empty line behind the first Gaussian."""
+    head, body = data.split(b"end_header\n")
+    lines = body.split(b"\n")
+    lines[0] = b"1e300 " + lines[0].split(b" ", 1)[1]
+    return head + b"end_header\n" + b"\n".join([lines[0], b"", *lines[1:]])
 
 
 def _start(name: str, build: Build, says: str, code: int = 0) -> Variant:
@@ -183,18 +189,19 @@ _VALUES = Case(
     (
         _start("position NaN", _rows(x=np.nan), f"1 {_DROPPED}"),
         _start("position Inf", _rows(x=np.inf), f"1 {_DROPPED}"),
-        _start("quaternion 0", _splat(_zero_quaternion), f"1 {_DROPPED}"),
+        _start("1e300 in text", splat(format="ascii", edit=_vast_text), f"1 {_DROPPED}"),
+        _start("quaternion 0", splat(_zero_quaternion), f"1 {_DROPPED}"),
         _start("log-scale 80", _rows(scale_1=80.0), f"1 {_DROPPED}"),
         _start("opacity ±Inf", _rows(opacity=np.inf, f_dc_0=-np.inf), f"2 {_DROPPED}"),
         _start(
             "all of them NaN",
-            _splat(lambda columns: columns.update(x=np.full(200, np.nan))),
+            splat(lambda columns: columns.update(x=np.full(200, np.nan))),
             r"set\.ply, body: none of the 200 Gaussians has valid values.*Export the splat again",
             3,
         ),
         _start(
             "all of them transparent",
-            _splat(lambda columns: columns.update(opacity=np.full(200, -50.0))),
+            splat(lambda columns: columns.update(opacity=np.full(200, -50.0))),
             "All Gaussians of the splat are transparent.*Check that opacities are stored as logits",
             3,
         ),
@@ -247,7 +254,7 @@ _OTHER = Case(
         _other("splat", r"antimatter15 \.splat"),
         Variant(
             "a splat given as a true surface",
-            _splat(),
+            splat(),
             3,
             r"set\.ply, .*(face|cloud|none).*Export",
             ("evaluate", "set.ply", "--truth", "set.ply"),

@@ -149,6 +149,16 @@ _MATRICES = Case(
             "a shear", lambda m: m + 0.5 * np.eye(4, k=1), f"the matrix is not a rotation.*{_AGAIN}"
         ),
         _bad_matrix(
+            "1e200",
+            lambda m: m * [[1e200], [1e200], [1e200], [1]],
+            f"the matrix is not a rotation.*{_AGAIN}",
+        ),
+        _bad_matrix(
+            "1e-320",
+            lambda m: m * [[1e-320], [1e-320], [1e-320], [1]],
+            f"the matrix has no rotation.*{_AGAIN}",
+        ),
+        _bad_matrix(
             "zeros",
             lambda m: 0 * m + np.diag([0, 0, 0, 1.0]),
             f"the matrix has no rotation.*{_AGAIN}",

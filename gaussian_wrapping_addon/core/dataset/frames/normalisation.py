@@ -33,6 +33,10 @@ _MIN_AGREEMENT_COS = np.cos(np.radians(50.0))
 """Largest angle between the up direction and the cameras' mean up, as a cosine."""
 
 
+MAX_COORDINATE = 1e100
+"""Of a camera, in world units: squares of larger ones come near the end of float64."""
+
+
 @dataclass(frozen=True)
 class SceneFrame:
     """The similarity to the scene frame, the cameras to keep, and the rule for up."""
@@ -64,7 +68,14 @@ def find_scene_frame(rotations: np.ndarray, centers: np.ndarray) -> SceneFrame:
     DatasetError
         All cameras coincide, or too few remain.
     """
-    keep = near_cameras(centers)
+    with np.errstate(over="ignore", invalid="ignore"):
+        keep = near_cameras(centers)
+        vast = bool(keep.any()) and np.abs(centers[keep]).max() > MAX_COORDINATE
+    if vast:
+        raise DatasetError(
+            f"The cameras lie farther than {MAX_COORDINATE:g} units from the origin.",
+            "Solve the cameras again.",
+        )
     if int(keep.sum()) < MIN_IMAGES:
         raise DatasetError(
             f"Only {int(keep.sum())} cameras are near each other; {MIN_IMAGES} are needed.",

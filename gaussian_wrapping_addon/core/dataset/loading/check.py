@@ -23,7 +23,7 @@ from ..readers.source_kind import SPLAT, SourceKind, read_poses, source_kind
 from ..readers.source_model import PosedPhoto
 from ..readers.splat_header import read_splat_header
 from .lens_fit import MIN_PHOTO_SIDE_PX, fit_lens
-from .sparse_points import points_in_scene
+from .sparse_points import nothing_in_common, points_in_scene
 from .splat_cameras import NO_PHOTOS_HINT, NO_PHOTOS_WARNING
 
 Severity = Literal["error", "warning", "fact"]
@@ -74,7 +74,8 @@ def check_input(source: Path) -> list[Finding]:
         findings.append(Finding("error", error.message, error.hint))
     except OSError as error:
         told = known_error(error, source) or DatasetError(
-            f"{source} cannot be read: {error.strerror}.", "Check its permissions."
+            f"{source} cannot be read: {error.strerror}.",
+            "Check the path and its permissions.",
         )
         findings.append(Finding("error", told.message, told.hint))
     return findings
@@ -146,9 +147,11 @@ def _check_poses(kind: SourceKind, findings: list[Finding]) -> None:
         findings.append(
             Finding("warning", "All cameras lie on one line; depth will be inaccurate.")
         )
-    left_out: list[ReportWarning] = []
-    points_in_scene(model.points, model.point_colors, frame.scene_from_world, left_out)
-    findings += [Finding("warning", warning.text, warning.hint) for warning in left_out]
+    more: list[ReportWarning] = []
+    if (apart := nothing_in_common(model)) is not None:
+        more.append(apart)
+    points_in_scene(model.points, model.point_colors, frame.scene_from_world, more)
+    findings += [Finding("warning", warning.text, warning.hint) for warning in more]
 
 
 def _check_files(

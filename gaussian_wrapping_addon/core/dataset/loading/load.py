@@ -23,7 +23,7 @@ from ..readers.source_kind import SourceKind, read_poses, source_kind
 from ..readers.source_model import SourceModel
 from ..scene import Scene, View
 from ..similarity import Similarity
-from .sparse_points import MIN_POINTS, points_in_scene
+from .sparse_points import MIN_POINTS, nothing_in_common, points_in_scene
 from .start_points import make_start_points
 from .views import PreparedView, prepare_views
 
@@ -85,6 +85,8 @@ def load_scene(
     views, scene_from_world, frame_facts = _frame(views, warnings)
     facts.update(frame_facts)
     cameras = [snapped_camera(_camera(view).moved(scene_from_world)) for view in views]
+    if (apart := nothing_in_common(model)) is not None:
+        warnings.append(apart)
     points, colors = points_in_scene(model.points, model.point_colors, scene_from_world, warnings)
     if len(points) < MIN_POINTS:
         points, colors, facts["start_points"] = make_start_points(

@@ -7,7 +7,10 @@ file named ``.jpg`` would start Ghostscript.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +34,17 @@ def open_image(path: Path) -> Image.Image:
     from PIL import Image
 
     return Image.open(path, formats=_formats())
+
+
+@contextlib.contextmanager
+def without_warnings() -> Iterator[None]:
+    """Let Pillow warn of nothing on the terminal while the block opens and decodes.
+
+    It warns of EXIF entries that are cut, and of sizes that our own check of the header allows.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def forbid_ghostscript() -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .image_formats import open_image
+from .image_formats import open_image, without_warnings
 
 _EXIF_FOLDER = 0x8769
 _MAKE, _MODEL, _LENS = 0x010F, 0x0110, 0xA434
@@ -33,7 +33,7 @@ def read_lens_exif(path: Path, width: int, height: int) -> LensExif:
     from PIL import Image
 
     try:
-        with open_image(path) as image:
+        with without_warnings(), open_image(path) as image:
             exif = image.getexif()
             tags: dict[int, Any] = {**exif, **exif.get_ifd(_EXIF_FOLDER)}
     except (OSError, ValueError, SyntaxError, TypeError, KeyError, Image.DecompressionBombError):

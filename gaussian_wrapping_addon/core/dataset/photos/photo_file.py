@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...errors import DatasetError
-from .image_formats import open_image
+from .image_formats import open_image, without_warnings
 from .photo_header import PhotoHeader, read_photo_header
 
 if TYPE_CHECKING:
@@ -115,9 +114,7 @@ def _open(path: Path) -> Image.Image:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with warnings.catch_warnings():
-            # Pillow warns at its own, smaller size; ours was checked on the header.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        with without_warnings():
             image = open_image(path)
             image.load()
     except UnidentifiedImageError:

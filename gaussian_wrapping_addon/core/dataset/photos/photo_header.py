@@ -15,7 +15,7 @@ from typing import IO
 
 from ... import limits
 from ...errors import DatasetError
-from .image_formats import open_image
+from .image_formats import open_image, without_warnings
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 
@@ -69,6 +69,10 @@ def read_photo_header(path: Path) -> PhotoHeader | None:
                 if other is None:
                     return None
                 header = other
+    except PermissionError as error:
+        raise DatasetError(
+            f"{path.name} cannot be read: {error.strerror}.", "Check its permissions."
+        ) from None
     except (OSError, ValueError, struct.error, SyntaxError, OverflowError) as error:
         reason = str(error) or type(error).__name__
         raise DatasetError(f"{path.name} is not a readable photo ({reason}).", _ANOTHER) from None
@@ -164,7 +168,7 @@ def _read_other(path: Path) -> PhotoHeader | None:
     except ImportError:
         return None
     try:
-        with open_image(path) as image:
+        with without_warnings(), open_image(path) as image:
             width, height = image.size
             if image.format == "TIFF":  # Pillow turns these upright itself, size included
                 return PhotoHeader(width, height)

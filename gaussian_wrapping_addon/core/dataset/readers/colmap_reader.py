@@ -173,7 +173,7 @@ def read_model(model: ModelFiles) -> SourceModel:
         "images_in_model": len(images),
         "points_in_model": len(raw.positions),
     }
-    measured = finite & np.isfinite(raw.errors) & (raw.errors >= 0)
+    measured = finite & (raw.errors >= 0) & (raw.errors <= limits.MAX_IMAGE_SIDE_PX)
     weights = raw.track_lengths * measured
     if weights.sum() > 0:
         error_px = float((np.where(measured, raw.errors, 0.0) * weights).sum() / weights.sum())

@@ -156,7 +156,10 @@ def _pose(path: Path, place: str, value: Any) -> tuple[np.ndarray, bool]:
     if matrix.shape == (4, 4) and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise ParseError(path, place, "the last row must be 0 0 0 1.", _AGAIN)
     linear = matrix[:3, :3]
-    determinant = float(np.linalg.det(linear))
+    with np.errstate(all="ignore"):  # of numbers near the ends of float64
+        determinant = float(np.linalg.det(linear))
+    if not math.isfinite(determinant):
+        raise ParseError(path, place, "the matrix is not a rotation.", _AGAIN)
     if determinant < 0:
         raise ParseError(path, place, "the matrix mirrors.", "Export with right-handed axes.")
     scale = determinant ** (1.0 / 3.0)

@@ -19,7 +19,7 @@ import numpy as np
 from ...array_file import read_arrays
 from ...dataset.frames.file_frame import FileFrame, file_offset
 from ...dataset.frames.placement_file import FILE_NAME, read_placement
-from ...dataset.photos.image_formats import open_image
+from ...dataset.photos.image_formats import open_image, without_warnings
 from ...dataset.similarity import Similarity
 from ...errors import DatasetError, ParseError, UsageError, WrapError
 from ...export_formats import EXPORT_FORMATS, SHADINGS, WORKER_FORMATS
@@ -290,7 +290,8 @@ def _image(path: Path) -> Image:
     from PIL import Image
 
     try:
-        return open_image(path).convert("RGB")
+        with without_warnings():
+            return open_image(path).convert("RGB")
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise ParseError(
             path, "whole file", f"not an image ({error}).", "Mesh the region again."

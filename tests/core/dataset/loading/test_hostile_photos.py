@@ -11,17 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gaussian_wrapping_addon import batch
 from gaussian_wrapping_addon.core.dataset.loading.check import Finding, check_input
 from gaussian_wrapping_addon.core.dataset.loading.load import load_scene
 from gaussian_wrapping_addon.core.dataset.photos.photo_finder import find_mask
-from gaussian_wrapping_addon.core.errors import ResourceError
 from gaussian_wrapping_addon.core.files import resolve_inside
-from gaussian_wrapping_addon.core.jobs.client import JobClient
-from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
 from gaussian_wrapping_addon.core.progress import Progress
-from gaussian_wrapping_addon.core.settings import JobSettings
 from tests.core.dataset.model_writers import (
     ring_model,
     ring_poses,
@@ -81,30 +76,6 @@ def test_links_in_a_circle_among_photos_are_left_out(tmp_path: Path, kind: str) 
     assert any("p05.png" in finding.message for finding in findings)
     assert not any("p05" in name for name, _, _ in source_fingerprint(tmp_path))
     assert resolve_inside(tmp_path, "images/p05.png") in (None, tmp_path / "images" / "p05.png")
-
-
-@needs_links
-def test_an_input_or_output_that_is_a_circle_is_refused_with_words(
-    tmp_path: Path,
-) -> None:
-    make_circle(tmp_path / "photos")
-    circle = str(tmp_path / "photos")
-    assert "does not exist" in errors(check_input(tmp_path / "photos"))[0]
-    (tmp_path / "good").mkdir()
-    for words, code in (
-        (["check", circle], 3),
-        (["wrap", circle, "--out", str(tmp_path / "out"), "--no-blend"], 3),
-        (["resume", circle, "--no-blend"], 2),
-        (["mesh", "--out", circle, "--no-blend"], 2),
-        (["status", circle], 2),
-        (["work-tiles", circle], 2),
-        (["estimate", circle], 3),
-        (["wrap", str(tmp_path / "good"), "--region", circle, "--out", "out", "--no-blend"], 3),
-    ):
-        assert batch.main(words) == code, words
-    job = make_job("wrap", tmp_path / "good", JobSettings())
-    with pytest.raises(ResourceError, match="cannot be written"):
-        JobClient.start(tmp_path / "photos", job)
 
 
 @pytest.mark.parametrize("kind", ["transforms", "binary", "text"])

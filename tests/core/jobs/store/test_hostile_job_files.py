@@ -1,81 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Entries of job.json that no job of ours holds are refused before a worker starts."""
+"""Sources, start splats and regions that no job can use; tests/hostile has those of job.json."""
 
 from __future__ import annotations
 
-import copy
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from gaussian_wrapping_addon.core import limits
 from gaussian_wrapping_addon.core.errors import DatasetError, ParseError, UsageError
-from gaussian_wrapping_addon.core.files import write_json
-from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.stages.training_stage import start_fingerprint
-from gaussian_wrapping_addon.core.jobs.store.job_file import JobFile, make_job, read_job
-from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
+from gaussian_wrapping_addon.core.jobs.store.job_file import make_job
 from gaussian_wrapping_addon.core.jobs.store.stage_folder import source_fingerprint
 from gaussian_wrapping_addon.core.ply.header import read_ply_header
 from gaussian_wrapping_addon.core.regions.region import parse_region
 from gaussian_wrapping_addon.core.regions.region_file import parse_region_file, region_to_json
 from gaussian_wrapping_addon.core.settings import JobSettings
-
-FLAT = {
-    "class_name": "GaussianWrappingBoundingVolume", "version": 1,
-    "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "said"),
-    [
-        ("settings.training.densify_every", 0, "from 1 to 1000000"),
-        ("settings.training.focus", "{", "no list of regions"),
-        ("settings.training.focus", "[" * 5000, "no list of regions"),
-        ("settings.training.focus", "[]", "no list of regions"),
-        ("settings.training.focus", "[1]", "focus.0., top level: is not an object"),
-        pytest.param("settings.meshing.edge_length", 10**400, "too large", id="edge_length"),
-        ("settings.regions", ["/nowhere/x.json"], "holds no region"),
-        ("region_bodies", {"/tmp/x.json": {"a": 1}}, "x.json, class_name"),
-        ("region_bodies", {"/tmp/x.json": FLAT}, "is flat"),
-        ("source", "/", "cannot be the source"),
-        ("source", "", "cannot be the source"),
-        ("source", "a\0b", "cannot be the source"),
-    ],
-)
-def test_a_job_file_from_elsewhere_is_refused(
-    tmp_path: Path, place: str, value: Any, said: str
-) -> None:
-    (tmp_path / "photos").mkdir()
-    folder = JobFolder(tmp_path / "out")
-    folder.create()
-    values = copy.deepcopy(make_job("wrap", tmp_path / "photos", JobSettings()).to_json())
-    *parents, last = place.split(".")
-    entry = values
-    for name in parents:
-        entry = entry[name]
-    entry[last] = value
-    with pytest.raises(UsageError, match=said):
-        JobFile.from_json(values)
-    if value != 10**400:
-        write_json(folder.job_path, values)
-        with pytest.raises(UsageError, match=said):
-            read_job(folder.job_path)
-
-
-def test_a_bad_job_file_is_refused_before_a_worker_starts(tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
-    folder = JobFolder(tmp_path / "out")
-    folder.create()
-    values = make_job("wrap", tmp_path / "photos", JobSettings()).to_json()
-    write_json(folder.job_path, {**values, "source": "/"})
-    with pytest.raises(UsageError, match="cannot be the source"):
-        JobClient.resume(folder.root, python="no Python is started")
-    assert not folder.status_path.exists()
 
 
 def test_a_whole_disk_is_no_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
