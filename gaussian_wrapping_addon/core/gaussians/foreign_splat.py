@@ -68,6 +68,8 @@ def read_foreign_splat(path: Path) -> ForeignSplat:
         If the splat format is not supported.
     """
     header = read_splat_header(path)
+    if header.count == 0:
+        raise ParseError(path, "header", "there are no Gaussians.", "Export the splat again.")
     rows = read_vertices(path, header.ply, EXPECTED)
     wide = any(kind == "f8" for _, kind in header.ply.elements[0].properties)
     dtype = np.float64 if wide else np.float32

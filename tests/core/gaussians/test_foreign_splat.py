@@ -228,6 +228,17 @@ def test_a_count_beyond_the_file_allocates_nothing(tmp_path: Path) -> None:
             read_foreign_splat(path)
 
 
+@pytest.mark.parametrize("degree", [0, 3])
+def test_an_empty_splat_is_refused(tmp_path: Path, degree: int) -> None:
+    path = write_ply(tmp_path / "a.ply", splat_columns(example(degree)))
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    assert body
+    path.write_bytes(header.replace(b"vertex 30", b"vertex 0") + b"end_header\n")
+    with pytest.raises(ParseError, match="no Gaussians") as raised:
+        read_foreign_splat(path)
+    assert raised.value.hint
+
+
 def test_flat_needles_stay_renderable(tmp_path: Path) -> None:
     columns = splat_columns(example(0))
     columns["scale_1"] = np.full(COUNT, -39.0)

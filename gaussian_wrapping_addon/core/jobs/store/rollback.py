@@ -111,4 +111,6 @@ def _read(path: Path) -> dict[str, Any] | None:
     wanted = {"job": dict, "status": dict, "stages": list}
     if not isinstance(values, dict) or set(values) != set(wanted):
         return None
-    return values if all(isinstance(values[k], kind) for k, kind in wanted.items()) else None
+    if not all(isinstance(values[name], kind) for name, kind in wanted.items()):
+        return None
+    return values if all(isinstance(stage, str) for stage in values["stages"]) else None

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_wrapping_addon.core.errors import UsageError
-from gaussian_wrapping_addon.core.files import write_json
+from gaussian_wrapping_addon.core.files import read_json, write_json
 from gaussian_wrapping_addon.core.jobs.client import JobClient
 from gaussian_wrapping_addon.core.jobs.commands.tile_worker import work_on_tiles
 from gaussian_wrapping_addon.core.jobs.stages.mesh_keys import mesh_stages
@@ -201,5 +201,16 @@ def test_without_a_finished_job_nothing_is_put_back(folder: JobFolder) -> None:
 def test_a_broken_file_puts_nothing_back(folder: JobFolder, content: object) -> None:
     job = begin(folder, regions=("all",))
     write_json(folder.root / NAME, content)
+    assert work(folder) == 3
+    assert (folder.read_status().state, read_job(folder.job_path)) == ("FAILED", job)
+
+
+@pytest.mark.parametrize("stage", [{}, [], 1, None])
+def test_a_list_with_other_things_than_names_puts_nothing_back(
+    folder: JobFolder, stage: object
+) -> None:
+    job = begin(folder, regions=("all",))
+    saved = read_json(folder.root / NAME)
+    write_json(folder.root / NAME, {**saved, "stages": [*saved["stages"], stage]})
     assert work(folder) == 3
     assert (folder.read_status().state, read_job(folder.job_path)) == ("FAILED", job)
