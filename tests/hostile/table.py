@@ -55,6 +55,8 @@ command's own, no file of somebody else read, no program started that the comman
 {user}. Rows marked with ▸ ran in a process of their own, the others in one that has its modules
 loaded. `…` stands for the folder of the row. *Loading* is the first stage of `wrap`. Under the
 tables: tests of what no single command line shows.
+
+Fuzzers change good files by chance as well, for as long as one likes (`CONTRIBUTING.md`).
 """
 
 

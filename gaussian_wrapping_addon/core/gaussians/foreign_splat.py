@@ -65,11 +65,9 @@ def read_foreign_splat(path: Path) -> ForeignSplat:
     ParseError
         If the file is no splat, truncated, or has no valid Gaussian; names location and next step.
     DatasetError
-        If the splat format is not supported.
+        If the splat format is not supported, or the file holds no Gaussians.
     """
     header = read_splat_header(path)
-    if header.count == 0:
-        raise ParseError(path, "header", "there are no Gaussians.", "Export the splat again.")
     rows = read_vertices(path, header.ply, EXPECTED)
     wide = any(kind == "f8" for _, kind in header.ply.elements[0].properties)
     dtype = np.float64 if wide else np.float32

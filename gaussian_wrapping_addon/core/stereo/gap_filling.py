@@ -6,14 +6,14 @@ See docs/method.md, section 11.8.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from .depth_maps import DepthMap
 from .fusion import DensePoints, lifted, merged
-from .open_cells import count_open
+from .open_cells import shown_open
 
 MOST_COST = 0.7
 """A depth that no source confirms is a guess if it costs less; else nothing is known."""
@@ -50,17 +50,24 @@ def fill_gaps(depth_maps: Sequence[DepthMap], confirmed: DensePoints, wanted: in
     distance, nearest = cKDTree(confirmed.positions).query(guesses.positions)
     reach = CLEARANCE * np.maximum(guesses.sizes, confirmed.sizes[nearest])
     guesses = guesses.select(distance > reach)
-    guesses = guesses.select(count_seen_through(guesses.positions, depth_maps) < SEEN_THROUGH_VIEWS)
-    return guesses.select(count_open(guesses.positions, depth_maps) < OPEN_VIEWS)
+    for against, views in ((seen_through, SEEN_THROUGH_VIEWS), (shown_open, OPEN_VIEWS)):
+        guesses = guesses.select(count_views(guesses.positions, depth_maps, against) < views)
+    return guesses
 
 
-def count_seen_through(points: np.ndarray, depth_maps: Sequence[DepthMap]) -> np.ndarray:
-    """Count the views whose confirmed depth lies clearly behind each point.
+def count_views(
+    points: np.ndarray,
+    depth_maps: Sequence[DepthMap],
+    against: Callable[[np.ndarray, DepthMap], np.ndarray],
+) -> np.ndarray:
+    """Count the views that speak against each point.
 
     Parameters
     ----------
     points : (n, 3) float64
         Scene frame.
+    against : callable
+        Returns the indices of the points that a view speaks against, each once.
 
     Returns
     -------
@@ -68,10 +75,16 @@ def count_seen_through(points: np.ndarray, depth_maps: Sequence[DepthMap]) -> np
     """
     count = np.zeros(len(points), np.int64)
     for depth_map in depth_maps:
-        shown, row, column, depth = depth_map.camera.shown(points)
-        behind = depth_map.depth[row, column] > (1.0 + SEEN_THROUGH_SHARE) * depth
-        count[shown] += behind & (depth_map.confidence[row, column] > 0)
+        count[against(points, depth_map)] += 1
     return count
+
+
+def seen_through(points: np.ndarray, depth_map: DepthMap) -> np.ndarray:
+    """Return the indices of the points (n, 3) with a view's confirmed depth clearly behind them."""
+    shown, row, column, depth = depth_map.camera.shown(points)
+    behind = depth_map.depth[row, column] > (1.0 + SEEN_THROUGH_SHARE) * depth
+    found: np.ndarray = shown[behind & (depth_map.confidence[row, column] > 0)]
+    return found
 
 
 def _guessed(depth_map: DepthMap) -> np.ndarray:

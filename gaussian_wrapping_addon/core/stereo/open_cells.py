@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from .depth_maps import DepthMap
@@ -54,23 +52,11 @@ def cells_of(points: np.ndarray, depth_map: DepthMap) -> tuple[np.ndarray, np.nd
     return indices[whole], row[whole], column[whole]
 
 
-def count_open(points: np.ndarray, depth_maps: Sequence[DepthMap]) -> np.ndarray:
-    """Count the views that show each point in an open cell.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Scene frame.
-
-    Returns
-    -------
-    (n,) int64
-    """
-    count = np.zeros(len(points), np.int64)
-    for depth_map in depth_maps:
-        indices, row, column = cells_of(points, depth_map)
-        count[indices] += open_cells(depth_map)[row, column]
-    return count
+def shown_open(points: np.ndarray, depth_map: DepthMap) -> np.ndarray:
+    """Return the indices of the points (n, 3) that a photo shows in open cells."""
+    indices, row, column = cells_of(points, depth_map)
+    found: np.ndarray = indices[open_cells(depth_map)[row, column]]
+    return found
 
 
 def by_cell(image: np.ndarray) -> np.ndarray:

@@ -234,9 +234,9 @@ def test_an_empty_splat_is_refused(tmp_path: Path, degree: int) -> None:
     header, body = path.read_bytes().split(b"end_header\n", 1)
     assert body
     path.write_bytes(header.replace(b"vertex 30", b"vertex 0") + b"end_header\n")
-    with pytest.raises(ParseError, match="no Gaussians") as raised:
+    with pytest.raises(DatasetError, match=r"^a\.ply holds no Gaussians\.") as raised:
         read_foreign_splat(path)
-    assert raised.value.hint
+    assert raised.value.hint == "Export the splat again."
 
 
 def test_flat_needles_stay_renderable(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ import pytest
 
 from gaussian_wrapping_addon.core.stereo.depth_maps import DepthMap
 from gaussian_wrapping_addon.core.stereo.fusion import fuse
-from gaussian_wrapping_addon.core.stereo.gap_filling import count_seen_through, fill_gaps
-from gaussian_wrapping_addon.core.stereo.open_cells import count_open
+from gaussian_wrapping_addon.core.stereo.gap_filling import count_views, fill_gaps, seen_through
+from gaussian_wrapping_addon.core.stereo.open_cells import shown_open
 from tests.core.stereo.ball_scene import arc_cameras, exact_map, surface_distance
 
 EXACT = [exact_map(camera) for camera in arc_cameras()[4:8]]
@@ -67,7 +67,7 @@ def test_guesses_where_nothing_matches_in_two_other_photos_are_dropped() -> None
         maps = [with_gap(m, 1.0, cost=c) for m, c in zip(EXACT, costs, strict=True)]
         found = fill_gaps(maps, some, 500)
         kept.append(len(found))
-        in_open.append(count_open(found.positions, maps).max())
+        in_open.append(count_views(found.positions, maps, shown_open).max())
     assert kept[1] > 50
     assert in_open == [0, 1, 1, 1]
     assert kept[3] < kept[2] < 0.8 * kept[1]
@@ -88,13 +88,13 @@ def test_views_that_see_through_points_are_counted(share: float, count: int) -> 
     points = np.concatenate(
         [m.camera.center + share * (top - m.camera.center) for m in EXACT]
     )  # (4, 3), each on its own camera's ray
-    own = [count_seen_through(p[None], [m])[0] for p, m in zip(points, EXACT, strict=True)]
+    own = [count_views(p[None], [m], seen_through)[0] for p, m in zip(points, EXACT, strict=True)]
     assert sum(own) == count
 
 
 def test_points_outside_the_photos_are_not_seen_through() -> None:
     away = EXACT[0].camera.center - EXACT[0].camera.forward
-    assert count_seen_through(away[None], [EXACT[0]]).tolist() == [0]
+    assert count_views(away[None], [EXACT[0]], seen_through).tolist() == [0]
     blind = dataclasses.replace(EXACT[0], confidence=np.zeros_like(EXACT[0].confidence))
     before = EXACT[0].camera.center + EXACT[0].camera.forward
-    assert count_seen_through(before[None], [EXACT[0], blind]).tolist() == [1]
+    assert count_views(before[None], [EXACT[0], blind], seen_through).tolist() == [1]

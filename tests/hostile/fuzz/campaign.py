@@ -7,7 +7,6 @@ import contextlib
 import io
 import json
 import logging
-import shutil
 import tempfile
 import time
 import traceback
@@ -46,12 +45,10 @@ class Report:
 
 @contextlib.contextmanager
 def _good_input(target: Target) -> Iterator[tuple[Path, list[Path]]]:
-    folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
-    try:
+    with tempfile.TemporaryDirectory(prefix="fuzz-", ignore_cleanup_errors=True) as place:
+        folder = Path(place)
         target.build(folder)
         yield folder, [path for name in target.files for path in sorted(folder.glob(name))]
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def fuzz(

@@ -84,8 +84,6 @@ def check_input(source: Path) -> list[Finding]:
 def _check_splat(path: Path, findings: list[Finding]) -> None:
     header = read_splat_header(path)
     vertex_layout(path, header.ply, "Export or download the splat again.")
-    if header.count == 0:
-        raise DatasetError(f"{path.name} holds no Gaussians.", "Export the splat again.")
     kind = "surfels" if header.axes == 2 else "Gaussians"
     findings.append(
         Finding(

@@ -78,7 +78,7 @@ def read_splat_header(path: Path) -> SplatHeader:
     ParseError
         The file is not a splat (names the missing property), or a compressed variant.
     DatasetError
-        The suffix is that of another splat format.
+        The suffix is that of another splat format, or there are no Gaussians.
     """
     is_splat_path(path)
     ply = read_ply_header(path, EXPECTED)
@@ -105,7 +105,10 @@ def read_splat_header(path: Path) -> SplatHeader:
             f"{', '.join(missing[:3])} is missing.", EXPECTED,
         )  # fmt: skip
     axes = 3 if "scale_2" in names else 2
-    return SplatHeader(ply, _degree(path, names), axes, colors)
+    header = SplatHeader(ply, _degree(path, names), axes, colors)
+    if header.count == 0:
+        raise DatasetError(f"{path.name} holds no Gaussians.", "Export the splat again.")
+    return header
 
 
 def _degree(path: Path, names: set[str]) -> int:
