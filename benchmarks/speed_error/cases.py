@@ -8,8 +8,9 @@ from .plan import PRESETS
 
 STUDY = "speed"
 SCENES = ("wheel", "spot", "fence", "room")
-MESHED_PRESETS = PRESETS[:2]
-"""Whose trainings every mesher gets."""
+MESHED_PRESETS = ("standard",)
+"""Whose trainings every mesher gets: differences between meshers hardly depend on the training
+(docs/benchmarks/meshing.md)."""
 ALPHA = "alpha"
 """The alpha shape of the sparse points: what is there before anything is trained."""
 
