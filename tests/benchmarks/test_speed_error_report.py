@@ -124,7 +124,7 @@ def test_headings_stand_over_their_figures() -> None:
 
 def test_mesh_based_rendering_has_a_column_where_it_was_measured() -> None:
     records = all_records()
-    name = preset_case("spot", "draft").identity
+    name = preset_case("spot", MESHED_PRESETS[0]).identity
     records[name] = invented(records[name].case, mbr={"psnr": 22.25})
     for table in (preset_table(records), mesher_table(records)):
         check(table)
@@ -153,11 +153,11 @@ def test_thin_parts_and_open_meshes_are_shown_as_they_are() -> None:
 
 def test_a_further_mesh_costs_its_training_too() -> None:
     records = all_records()
-    further = records[mesher_case("spot", "draft", NINE).identity]
+    further = records[mesher_case("spot", "standard", NINE).identity]
     further.processor_s.clear()
     further.processor_s.update(mesh=7.0, texture=2.0)  # its own job trained nothing
     assert spent_s(further, records) == 1.0 + 60.0 + 7.0
-    assert spent_s(records[preset_case("spot", "draft").identity], records) == 81.0
+    assert spent_s(records[preset_case("spot", "standard").identity], records) == 81.0
     assert spent_s(records[alpha_case("spot").identity], records) == 0.25
 
 
