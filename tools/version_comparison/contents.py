@@ -108,8 +108,15 @@ class Contents:
     left_out: int
 
 
-def read_contents(root: Path) -> Contents:
-    """Read everything below a folder."""
+def read_contents(root: Path, also_left_out: tuple[LeftOut, ...] = ()) -> Contents:
+    """Read everything below a folder.
+
+    Parameters
+    ----------
+    also_left_out : tuple of LeftOut
+        Entries of JSON files, besides :data:`LEFT_OUT_ENTRIES`.
+    """
+    rules = (*LEFT_OUT_ENTRIES, *also_left_out)
     items: dict[str, Item] = {}
     left_out = 0
     older = {
@@ -129,7 +136,7 @@ def read_contents(root: Path) -> Contents:
             left_out += 1
             continue
         for entry, item in usd.get(path) or _items_of(path):
-            if item.kind in ("json", "usd") and _is_left_out(path.name, entry):
+            if item.kind in ("json", "usd") and _is_left_out(path.name, entry, rules):
                 left_out += 1
             else:
                 items[f"{name} : {entry}" if entry else f"{name} : content"] = item
@@ -152,10 +159,9 @@ def _matches(name: str, rules: tuple[LeftOut, ...]) -> bool:
     return any(fnmatch.fnmatch(name, rule.pattern) for rule in rules)
 
 
-def _is_left_out(file: str, entry: str) -> bool:
+def _is_left_out(file: str, entry: str, rules: tuple[LeftOut, ...]) -> bool:
     return any(
-        fnmatch.fnmatch(file, rule.file) and re.search(rule.pattern, entry)
-        for rule in LEFT_OUT_ENTRIES
+        fnmatch.fnmatch(file, rule.file) and re.search(rule.pattern, entry) for rule in rules
     )
 
 

@@ -16,22 +16,14 @@ from pathlib import Path
 from types import FrameType
 
 from .. import limits
-from ..errors import (
-    DISK_FULL_ERRNOS,
-    EXIT_DONE,
-    EXIT_OTHER,
-    EXIT_RESOURCES,
-    Cancelled,
-    WrapError,
-    unwritable_error,
-)
+from ..errors import EXIT_DONE, Cancelled, WrapError
 from ..files import remove_partial_files
 from ..log_lines import LineFormatter
 from ..processes.helper_process import emit, kill_helpers
 from ..processes.process_identity import Caller, process_start_ticks
-from ..processes.worker_requirements import missing_package
 from ..progress import COMPILING, ProgressEvent
 from ..regular_files import open_regular
+from .failure import failure_of
 from .store.job_file import read_job
 from .store.job_folder import JobFolder, JobStatus
 from .store.rollback import discard_rollback, roll_back
@@ -42,8 +34,6 @@ HEARTBEAT_S = 5.0
 STATUS_EVERY_S = 0.25
 PARENT_POLL_S = 1.0
 RESUME_HINT = "Resume continues from the last checkpoint."
-FULL_DISK_HINT = "Make room on that disk, then resume: the last checkpoint is intact."
-BUG_HINT = "Send the job folder's log.txt with a bug report."
 
 
 class _Reporter:
@@ -211,37 +201,13 @@ def main(arguments: list[str]) -> int:
         _logger.info("cancelled")
         code = Cancelled.exit_code
         state, error, hint = "CANCELLED", "", RESUME_HINT
-    except WrapError as failure:
-        _logger.error("%s", failure)
-        code, state, error, hint = failure.exit_code, "FAILED", failure.message, failure.hint
-        if isinstance(failure.__cause__, OSError) and failure.__cause__.errno in DISK_FULL_ERRNOS:
-            hint = FULL_DISK_HINT
-    except OSError as failure:
-        _logger.exception("a file could not be read or written")
-        if failure.errno in DISK_FULL_ERRNOS:
-            full = unwritable_error(failure.filename or folder.root, failure)
-            code, state, error = full.exit_code, "FAILED", full.message
-            hint = FULL_DISK_HINT
+    except Exception as error_of_job:
+        failure = failure_of(error_of_job, folder.root)
+        if isinstance(error_of_job, WrapError):
+            _logger.error("%s", error_of_job)
         else:
-            code, state = EXIT_OTHER, "FAILED"
-            error, hint = f"Unexpected {type(failure).__name__}: {failure}", BUG_HINT
-    except ImportError as failure:
-        _logger.exception("a package is missing")
-        missing = missing_package(failure)
-        code, state = EXIT_OTHER, "FAILED"
-        error = f"Unexpected {type(failure).__name__}: {failure}"
-        hint = BUG_HINT
-        if missing is not None:
-            error, hint = missing.message, missing.hint
-    except MemoryError:
-        _logger.exception("out of memory")
-        code, state = EXIT_RESOURCES, "FAILED"
-        error, hint = "Not enough memory.", "Close other programs, or choose a smaller preset."
-    except Exception as failure:
-        _logger.exception("unexpected failure")
-        code, state = EXIT_OTHER, "FAILED"
-        error = f"Unexpected {type(failure).__name__}: {failure}"
-        hint = BUG_HINT
+            _logger.exception("the job failed" if failure.is_known else "unexpected failure")
+        code, state, error, hint = failure.code, "FAILED", failure.error, failure.hint
     else:
         code, state, error, hint = EXIT_DONE, "DONE", "", ""
     reporter.end()

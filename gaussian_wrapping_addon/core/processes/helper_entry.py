@@ -15,7 +15,7 @@ from ..errors import WrapError
 from .helper_process import emit
 from .peak_memory import own_peak_bytes
 from .process_identity import Caller
-from .worker_requirements import missing_package
+from .worker_requirements import package_error
 
 _PARENT_POLL_S = 1.0
 
@@ -37,7 +37,7 @@ def main(arguments: list[str]) -> int:
         emit(error=error.message, hint=error.hint)
         return error.exit_code
     except ImportError as error:
-        missing = missing_package(error)
+        missing = package_error(error)
         if missing is None:
             raise
         emit(error=missing.message, hint=missing.hint)

@@ -53,17 +53,17 @@ def _main(module: str, arguments: list[str]) -> int:
         called = importlib.import_module(f"{_PACKAGE}.core.{module}").main
     except ImportError as error:
         named = importlib.import_module(f"{_PACKAGE}.core.processes.worker_requirements")
-        missing = named.missing_package(error)
+        missing = named.package_error(error)
         if missing is None:
             raise
-        return _refuse(missing.message, missing.hint)
+        return _refuse(missing.message, missing.hint, missing.exit_code)
     return int(called(arguments))
 
 
-def _refuse(error: str, hint: str) -> int:
+def _refuse(error: str, hint: str, code: int = 1) -> int:
     """Report an error as commands, helpers and workers do: one JSON line on stdout."""
     sys.stdout.write(json.dumps({"error": error, "hint": hint}) + "\n")
-    return 1
+    return code
 
 
 if __name__ == "__main__":

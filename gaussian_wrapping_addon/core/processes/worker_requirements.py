@@ -9,7 +9,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import UsageError, WorkerError
+from ..errors import ResourceError, UsageError, WorkerError, WrapError
 
 FILE_NAME = "requirements-worker.txt"
 _LINE = re.compile(r"^([A-Za-z0-9][\w.-]*)[^\S\n]*([^#;\n]*)", re.MULTILINE)
@@ -17,6 +17,15 @@ _COMPARE = {
     "==": operator.eq, "!=": operator.ne, ">=": operator.ge, "<=": operator.le,
     ">": operator.gt, "<": operator.lt,
 }  # fmt: skip
+_NO_ROOM = (
+    "failed to map segment",
+    "annot allocate memory",
+    "cannot apply additional memory protection",
+    "cannot enable executable stack",
+    "paging file is too small",
+)
+"""What the loaders of Linux, macOS and Windows say where a library finds no room in memory."""
+_LLVM = "llvmlite.binding"
 _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -74,8 +83,22 @@ def read_requirements(path: Path) -> list[Requirement]:
     return found
 
 
-def missing_package(error: ImportError) -> WorkerError | None:
-    """Return the error of a Python that lacks a package, or ``None`` for a fault of our own."""
+def package_error(error: ImportError | OSError) -> WrapError | None:
+    """Return the error of a package that does not load, or ``None`` for anything else.
+
+    A library that finds no room in memory is an error of the import system, too; llvmlite reports
+    every reason as a file that is not there.
+    """
+    text = str(error)
+    if any(words in text for words in _NO_ROOM) or _LLVM in text:
+        return ResourceError(
+            f"A package of the worker's Python, {sys.executable}, could not be loaded, probably "
+            f"for want of memory: {text.strip().splitlines()[-1]}",
+            "Close other programs, or allow more memory (ulimit -v, a container's limit), then "
+            "resume. If there is enough, batch.py doctor checks the packages.",
+        )
+    if not isinstance(error, ImportError):
+        return None
     if (error.name or "").partition(".")[0] in ("", __name__.partition(".")[0]):
         return None
     return WorkerError(

@@ -21,7 +21,7 @@ from ...errors import (
 )
 from ...processes.helper_process import emit
 from ...processes.process_identity import Caller
-from ...processes.worker_requirements import missing_package
+from ...processes.worker_requirements import package_error
 from ...report_warning import ReportWarning
 
 PARENT_POLL_S = 1.0
@@ -48,13 +48,13 @@ def run_command(
         emit(error="Not enough memory.", hint=memory_hint)
         return EXIT_RESOURCES
     except ImportError as error:
-        missing = missing_package(error)
+        missing = package_error(error)
         if missing is None:
             raise
         emit(error=missing.message, hint=missing.hint)
         return missing.exit_code
     except OSError as error:
-        known = known_error(error)
+        known = known_error(error) or package_error(error)
         if known is not None:
             emit(error=known.message, hint=known.hint)
             return known.exit_code
