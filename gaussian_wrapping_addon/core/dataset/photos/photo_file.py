@@ -114,8 +114,9 @@ def _open(path: Path) -> Image.Image:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with without_warnings():
-            image = open_image(path)
+        # The pixels outlive the file, which is closed even where they cannot be decoded: Windows
+        # lets nobody remove an open file.
+        with without_warnings(), open_image(path) as image:
             image.load()
     except UnidentifiedImageError:
         raise DatasetError(f"{path.name} is not a photo that can be read.", _ANOTHER) from None
