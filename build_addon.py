@@ -26,7 +26,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent
 PACKAGE = ROOT / "gaussian_wrapping_addon"
 MANIFEST = "blender_manifest.toml"
-BESIDE_THE_PACKAGE = (MANIFEST, "LICENSE", "requirements-worker.txt")
+BESIDE_THE_PACKAGE = (
+    MANIFEST, "LICENSE", "requirements-worker.txt", "requirements-worker-hashes.txt",
+)  # fmt: skip
 
 # The earliest date that a zip can hold; every file gets it, so that the bytes do not depend on it.
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Put the list of the worker's packages into the wheel; everything else is in pyproject.toml."""
+"""Put the lists of the worker's packages into the wheel; everything else is in pyproject.toml."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from setuptools.command.build_py import build_py
 
 
 class BuildWithRequirements(build_py):
-    """Copy ``requirements-worker.txt`` beside the package's modules, as the extension zip does."""
+    """Copy the lists beside the package's modules, as the extension zip does."""
 
     def run(self) -> None:
         super().run()
         if not self.editable_mode:
-            name = "requirements-worker.txt"
-            self.copy_file(name, str(Path(self.build_lib) / "gaussian_wrapping_addon" / name))
+            for name in ("requirements-worker.txt", "requirements-worker-hashes.txt"):
+                self.copy_file(name, str(Path(self.build_lib) / "gaussian_wrapping_addon" / name))
 
 
 setup(cmdclass={"build_py": BuildWithRequirements})

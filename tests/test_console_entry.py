@@ -16,7 +16,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = "gaussian-wrapping"
-REQUIREMENTS = "gaussian_wrapping_addon/requirements-worker.txt"
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +73,8 @@ def test_the_wheel_is_complete(entry: tuple[str, str], tmp_path: Path) -> None:
     package = "gaussian_wrapping_addon"
     unneeded = shutil.ignore_patterns("__pycache__")
     shutil.copytree(ROOT / package, source / package, ignore=unneeded)
-    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", "requirements-worker.txt"):
+    lists = ("requirements-worker.txt", "requirements-worker-hashes.txt")
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", *lists):
         shutil.copy(ROOT / name, source)
     built = subprocess.run(
         [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet",
@@ -84,7 +84,8 @@ def test_the_wheel_is_complete(entry: tuple[str, str], tmp_path: Path) -> None:
     assert built.returncode == 0, built.stdout + built.stderr
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
-        assert archive.read(REQUIREMENTS) == (ROOT / "requirements-worker.txt").read_bytes()
+        for name in lists:
+            assert archive.read(f"{package}/{name}") == (ROOT / name).read_bytes()
         scripts = next(n for n in archive.namelist() if n.endswith("entry_points.txt"))
         assert f"{NAME} = {':'.join(entry)}" in archive.read(scripts).decode()
         archive.extractall(tmp_path / "site")
@@ -93,4 +94,4 @@ def test_the_wheel_is_complete(entry: tuple[str, str], tmp_path: Path) -> None:
         "--to", str(tmp_path / "worker"), place=tmp_path / "site",
     )  # fmt: skip
     assert checked.returncode == 0, checked.stdout + checked.stderr
-    assert REQUIREMENTS.rsplit("/", 1)[-1] in checked.stdout
+    assert f"--require-hashes -r {tmp_path / 'site' / package / lists[1]}" in checked.stdout

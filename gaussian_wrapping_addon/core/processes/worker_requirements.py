@@ -12,6 +12,8 @@ from pathlib import Path
 from ..errors import ResourceError, UsageError, WorkerError, WrapError
 
 FILE_NAME = "requirements-worker.txt"
+HASHES_NAME = "requirements-worker-hashes.txt"
+"""The same packages and what they need, by the hashes of their files; without torch."""
 _LINE = re.compile(r"^([A-Za-z0-9][\w.-]*)[^\S\n]*([^#;\n]*)", re.MULTILINE)
 _COMPARE = {
     "==": operator.eq, "!=": operator.ne, ">=": operator.ge, "<=": operator.le,
@@ -61,6 +63,12 @@ def requirements_file() -> Path:
         if (folder / FILE_NAME).is_file():
             return folder / FILE_NAME
     raise UsageError(f"{FILE_NAME} is missing.", "Install the add-on's zip again.")
+
+
+def hashes_file(requirements: Path) -> Path | None:
+    """Return the list with hashes that belongs to a list of packages; ``None`` for other lists."""
+    beside = requirements.with_name(HASHES_NAME)
+    return beside if requirements.name == FILE_NAME and beside.is_file() else None
 
 
 def read_requirements(path: Path) -> list[Requirement]:

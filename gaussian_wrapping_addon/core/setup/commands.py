@@ -3,6 +3,8 @@
 
 The torch that a plain ``pip install torch`` installs depends on the system: on Linux the build for
 CUDA, on Windows and macOS the one for the CPU. The other build comes from PyTorch's own index.
+From an index, all other packages are installed by the hashes of their files, before torch: its
+builds have other hashes on each index. A folder of wheels is taken as it is.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from pathlib import Path
 
 from ..errors import UsageError
 from ..processes.worker_environment import MARKER, WorkerEnvironment, venv_python
+from ..processes.worker_requirements import hashes_file, read_requirements
 from .pythons import FoundPython
 
 CPU = "cpu"
@@ -80,14 +83,6 @@ def all_commands(request: SetupRequest, python: FoundPython) -> list[Command]:
     UsageError
         The Python or the build of torch cannot be used.
     """
-    options = ["install", "--disable-pip-version-check", "--no-input", "--only-binary", ":all:"]
-    index = torch_index(request.torch)
-    if request.find_links:
-        # Isolated: pip's configured indexes and folders are ignored.
-        options = ["--isolated", *options, "--no-index", "--find-links", request.find_links]
-    elif index:
-        options += ["--extra-index-url", index]
-    options += ["-r", request.requirements]
     folder = request.environment.next_folder()
     if not python.can_install:
         version = f"{python.version[0]}.{python.version[1]}"
@@ -96,11 +91,35 @@ def all_commands(request: SetupRequest, python: FoundPython) -> list[Command]:
             f"Install them (Debian and Ubuntu: apt install python{version}-venv) or choose another"
             " Python.",
         )
+    installs = _installs(request)
     if not python.has_venv:
-        return [(python.path, "-I", *python.pip, *options, "--target", str(folder))]
+        target = ("--target", str(folder))
+        return [(python.path, "-I", *python.pip, *words, *target) for words in installs]
     pip = (str(venv_python(folder)), "-I", "-m", "pip")
     venv = (python.path, "-I", "-m", "venv", "--clear", str(folder))
-    return [venv, (*pip, *options), (*pip, "check")]
+    return [venv, *((*pip, *words) for words in installs), (*pip, "check")]
+
+
+def _installs(request: SetupRequest) -> list[Command]:
+    """Return the arguments of pip, one call after the other."""
+    options = ("install", "--disable-pip-version-check", "--no-input", "--only-binary", ":all:")
+    index = torch_index(request.torch)
+    if request.find_links:
+        # Isolated: pip's configured indexes and folders are ignored.
+        only_there = ("--no-index", "--find-links", request.find_links)
+        return [("--isolated", *options, *only_there, "-r", request.requirements)]
+    also = ("--extra-index-url", index) if index else ()
+    requirements = Path(request.requirements)
+    hashes = hashes_file(requirements)
+    if hashes is None:
+        return [(*options, *also, "-r", request.requirements)]
+    (torch,) = (r for r in read_requirements(requirements) if r.name == "torch")
+    # What the build for the processor needs is in the list with hashes.
+    alone = ("--no-deps",) if request.torch == CPU else ()
+    return [
+        (*options, "--require-hashes", "-r", str(hashes)),
+        (*options, *also, *alone, f"{torch.name}{torch.versions}"),
+    ]
 
 
 def check_folders(request: SetupRequest) -> None:

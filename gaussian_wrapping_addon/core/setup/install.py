@@ -63,6 +63,8 @@ _IGNORED_VARIABLES = (
 )  # fmt: skip
 # Pattern in pip's output, error message and next step; the first match is reported.
 _FAILURES = (
+    (r"Got\s+[0-9a-f]{64}", "A downloaded package is not the published one.",
+     "Do not use it. Look at network, proxy and mirror; log.txt in the worker's folder names it."),
     (r"No space left|not enough space|quota exceeded", "The disk is full.",
      "Free several GiB, then press Set Up Worker."),
     (r"NewConnection|[Nn]ame ?[Rr]esolution|Proxy|Timeout|timed out|SSLError|Max retries|No route",

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -107,6 +109,42 @@ def test_commands_are_shown_as_they_run(monkeypatch: pytest.MonkeyPatch) -> None
     assert not [word for word in pip if "http" in word]
 
 
+@pytest.mark.parametrize("torch", ["cpu", "cuda", "index"])
+@pytest.mark.parametrize("has_venv", [True, False])
+def test_files_are_installed_by_their_hashes(
+    monkeypatch: pytest.MonkeyPatch, torch: str, has_venv: bool
+) -> None:
+    monkeypatch.setattr(commands.platform, "system", lambda: "Linux")
+    ours = worker_requirements.requirements_file()
+    hashes = str(ours.with_name(worker_requirements.HASHES_NAME))
+    python = replace(PYTHON, has_venv=has_venv)
+    found = commands.all_commands(SetupRequest("/w", "/p", str(ours), torch), python)
+    first, second = (c for c in found if "install" in c)
+    assert first[first.index("--require-hashes") :][:3] == ("--require-hashes", "-r", hashes)
+    assert not [word for word in first if "index" in word]
+    (wanted,) = (r for r in read_requirements(ours) if r.name == "torch")
+    assert f"torch{wanted.versions}" in second
+    assert ("--no-deps" in second) == (torch == "cpu")
+    assert all(("--target" in c) != has_venv for c in (first, second))
+    wheels = SetupRequest("/w", "/p", str(ours), torch, "/wheels")
+    assert not [c for c in commands.all_commands(wheels, python) if "--require-hashes" in c]
+
+
+def test_the_list_with_hashes_is_that_of_our_requirements() -> None:
+    ours = worker_requirements.requirements_file()
+    text = ours.with_name(worker_requirements.HASHES_NAME).read_text()
+    entries = re.split(r"\n(?=\w)", text[text.index("\nfilelock") :].strip())
+    pinned: dict[str, list[str]] = {}
+    for entry in entries:
+        name, version = re.match(r"([\w-]+)==(\S+)", entry).groups()  # type: ignore[union-attr]
+        pinned.setdefault(name, []).append(version)
+        assert len(re.findall(r"--hash=sha256:[0-9a-f]{64}\b", entry)) >= 1, name
+    wanted = read_requirements(ours)
+    assert {r.name for r in wanted} - set(pinned) == {"torch"}
+    for requirement in wanted:
+        assert all(requirement.allows(v) for v in pinned.get(requirement.name, []))
+
+
 def test_a_python_without_venv_installs_into_a_folder() -> None:
     """Blender's own on Windows."""
     plain = FoundPython("/p", (3, 11, 2), has_venv=False)
@@ -152,6 +190,8 @@ def test_lists_that_are_refused(tmp_path: Path) -> None:
         ("WARNING: NewConnectionError\nERROR: No matching distribution found for torch",
          ResourceError, "cannot be reached"),
         ("ERROR: [Errno 28] No space left on device", ResourceError, "disk is full"),
+        ("        Expected     or " + 64 * "0" + "\n             Got        " + 64 * "a" + "\n",
+         ResourceError, "not the published one"),
         ("ERROR: odd\nlast", WorkerError, "ERROR: odd"),
     ],
 )  # fmt: skip
