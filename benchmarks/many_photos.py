@@ -3,69 +3,82 @@
 
 The same scene is wrapped from 120 photos and from every second of them, with the same settings, and
 both results are judged by the same test views and the true surface. Each run leaves a record in
-``benchmarks/records/many_photos``; runs with a record are not made again without ``--again``, and
-``docs/benchmarks/many-photos.md`` is written from the records.
+``benchmarks/records/many_photos``; a run that has one is not made again. At the end, or with
+``--document``, ``docs/benchmarks/many-photos.md`` is written from the records alone.
 """
 
 from __future__ import annotations
 
-import argparse
-import logging
 import shutil
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from gaussian_wrapping_addon.core.files import read_json, write_json
+from gaussian_wrapping_addon.core.files import write_bytes
 
-from .judged_run import SHARES, judged_run
 from .scenes import ensure_scene
-from .speed_error.plan import Run
-from .speed_error.runs import ROOT
+from .speed_error.plan import Photos
+from .speed_error.tables import SHARES, Row, table_of
+from .study.case import Case
+from .study.command import run_study
+from .study.figures import gaussians, normal_error, view_psnr
+from .study.making import KEPT_RUNS, make
+from .study.origin import made_by, reading
+from .study.record import Record
+from .study.spread import Spread, shown
 from .tables import Table
 
-_logger = logging.getLogger("benchmarks")
-
-PHOTOS = 120
-PARTS = (1, 2)
+STUDY = "many_photos"
+SCENES = ("room",)
+SEEDS = (0, 1, 2)
+MOST = 120
+STEPS = (2, 1)
 """Every n-th photo is used."""
-SCENES = ("room", "spot")
 WIDTH_PX, HEIGHT_PX = 320, 240
 ARGUMENTS = ("--holdout", "0", "--texture-size", "512")
-RECORDS = ROOT / "benchmarks" / "records" / "many_photos"
-DOCUMENT = ROOT / "docs" / "benchmarks" / "many-photos.md"
+PAGE, READING = "many-photos.md", "many-photos-reading.md"
+COMMAND = "python -m benchmarks.many_photos"
+_TRUTH = ("truth.npz", "crop.json", "scene.json", "region.json")
+"""Files of a scene by which a run is judged."""
+
+
+def photos_case(scene: str, step: int, seed: int) -> Case:
+    """Return the run on every ``step``-th photo of a scene."""
+    count = MOST // step
+    photos = Photos(count, WIDTH_PX, HEIGHT_PX)
+    return Case(STUDY, scene, f"photos{count}", seed, "draft", ARGUMENTS, photos=photos)
+
+
+def plan() -> list[Case]:
+    """Return all runs in the order in which they are made."""
+    return [photos_case(name, step, seed) for name in SCENES for seed in SEEDS for step in STEPS]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Make the runs that have no record, then write the document."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--again", action="store_true", help="make runs anew that have a record")
-    parser.add_argument("--label", default="", help="of the code, for a comparison of versions")
-    options = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    for name in options.scenes:
-        for part in PARTS:
-            words = [name, str(PHOTOS // part), *([options.label] if options.label else [])]
-            path = RECORDS / f"{'-'.join(words)}.json"
-            if options.again or not path.is_file():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_json(path, record(name, part, options.threads, options.label))
-                _logger.info("%s", path.name)
-    DOCUMENT.write_text(document(), encoding="utf-8")
-    return 0
+    """Do what the command line asks for; return 1 where a run failed, else 0."""
+    return run_study(arguments, __doc__, plan(), write_document, make_one, find_scene=find_scene)
 
 
-def record(name: str, part: int, threads: int, label: str) -> dict[str, Any]:
-    """Wrap every ``part``-th photo of a scene and return what is kept of the run."""
-    whole = ensure_scene(name, photos=PHOTOS, width=WIDTH_PX, height=HEIGHT_PX)
-    with tempfile.TemporaryDirectory() as folder:
-        scene = whole if part == 1 else every_nth_photo(whole, part, Path(folder) / name)
-        run = Run(name, "draft", 0, f"photos{PHOTOS // part}", ARGUMENTS)
-        found = judged_run(run, scene, whole, threads)
-    return {**found, "photos": PHOTOS // part, "label": label}
+def make_one(case: Case, *, threads: int, kept: Path = KEPT_RUNS) -> Record:
+    """Make one run and write its record."""
+    return make(case, threads=threads, kept=kept, find_scene=find_scene)
+
+
+def find_scene(case: Case) -> Path:
+    """Return the folder of a case's photos, with what they are judged by; make it if missing."""
+    whole = ensure_scene(case.scene, photos=MOST, width=WIDTH_PX, height=HEIGHT_PX)
+    step = MOST // case.photos.count
+    if step == 1:
+        return whole
+    part = KEPT_RUNS / STUDY / "scenes" / f"{whole.name}-every{step}"
+    if not part.is_dir():
+        making = part.with_name(f"{part.name}.making")
+        shutil.rmtree(making, ignore_errors=True)
+        every_nth_photo(whole, step, making)
+        for name in _TRUTH:
+            shutil.copy(whole / name, making)
+        shutil.copytree(whole / "test", making / "test")
+        making.rename(part)
+    return part
 
 
 def every_nth_photo(scene: Path, step: int, target: Path) -> Path:
@@ -100,8 +113,6 @@ def every_nth_photo(scene: Path, step: int, target: Path) -> Path:
         text += [pose, " ".join(seen)]
     (sparse / "images.txt").write_text("\n".join(text) + "\n", encoding="utf-8")
     (sparse / "points3D.txt").write_text("\n".join(points_out) + "\n", encoding="utf-8")
-    if (scene / "region.json").is_file():
-        shutil.copy(scene / "region.json", target)
     return target
 
 
@@ -110,54 +121,91 @@ def _content(path: Path) -> list[str]:
     return [line for line in lines[:-1] if not line.startswith("#")]
 
 
-_NOTE = (
-    "PSNR and SSIM of eight test views that no run was given; F1 over the whole true surface at "
-    "shares of the crop volume's diagonal."
-)
-
 _PURPOSE = (
-    f"The same scene from {PHOTOS} photos of {WIDTH_PX} x {HEIGHT_PX} pixels and from every second "
+    f"The same scenes from {MOST} photos of {WIDTH_PX} x {HEIGHT_PX} pixels and from every second "
     "of them; preset Draft, exact cameras, everything else as the program decides. Pruning by "
     "contribution must not remove what only some of many photos show."
 )
 
+_NOTES = (
+    "Mean ± standard deviation over the seeds; difference: 120 photos less 60 of the same seed.",
+    (
+        "PSNR and SSIM of eight test views that no run was given; F1 over the whole true surface "
+        "at shares of the crop volume's diagonal."
+    ),
+)
 
-def _cells(of: dict[str, Any]) -> tuple[str | float | int | None, ...]:
-    """Return one row of the table."""
-    scores = (f"{value:.3f}" for value in of["f1"].values())
-    version = of["label"] or "this version"
-    psnr, ssim = f"{of['psnr']:.2f}", f"{of['ssim']:.4f}"
-    return (of["scene"], version, of["photos"], of["gaussians"], psnr, ssim, *scores)
 
-
-def document() -> str:
-    """Return the document from all records."""
-    records = [read_json(path) for path in sorted(RECORDS.glob("*.json"))]
-    records.sort(key=lambda of: (of["scene"], of["label"], of["photos"]))
-    header = (
-        "scene",
-        "code",
-        "photos",
-        "Gaussians",
-        "PSNR dB",
-        "SSIM",
-        *(f"F1 {s}" for s in SHARES),
-    )
-    table = Table("Many photos", header, [_cells(of) for of in records], (_NOTE,))
-    facts = sorted({(of["label"] or "this version", of["code"], of["date"]) for of in records})
-    machines = sorted({f"{of['machine']}, {of['threads']} thread" for of in records})
+def write_document(out: Path, records: Mapping[str, Record], cases: Sequence[Case]) -> Path:
+    """Write the page into a folder."""
     lines = [
         "# Captures of many photos",
         "",
-        f"`python -m benchmarks.many_photos`; {'; '.join(machines)}.",
-        "",
-        *(f"- {label}: code {code}, {date}" for label, code, date in facts),
+        *made_by(COMMAND, list(records.values()), cases),
         "",
         _PURPOSE,
         "",
-        table.markdown(),
+        *reading(out / READING),
+        photos_table(records).markdown(),
     ]
-    return "\n".join(lines)
+    path = out / PAGE
+    write_bytes(path, ("\n".join(lines).rstrip() + "\n").encode())
+    return path
+
+
+def photos_table(records: Mapping[str, Record]) -> Table:
+    """Return a row for each number of photos of a scene, and one for their difference."""
+    rows: list[Row] = []
+    for scene in SCENES:
+        by_count = {
+            MOST // step: {
+                seed: records[case.identity]
+                for seed in SEEDS
+                if (case := photos_case(scene, step, seed)).identity in records
+            }
+            for step in STEPS
+        }
+        for count, made in by_count.items():
+            if made:
+                rows.append({"scene": scene, "photos": str(count), **_cells(list(made.values()))})
+        few, many = by_count.values()
+        pairs = [(few[seed], many[seed]) for seed in SEEDS if seed in few and seed in many]
+        if pairs:
+            rows.append({"scene": scene, "photos": "difference", **_differences(pairs)})
+    return table_of("Many photos", rows, *_NOTES)
+
+
+def _figures(record: Record) -> dict[str, tuple[float | None, int]]:
+    """Return the figures of a run with their decimals."""
+    return {
+        "PSNR dB": (view_psnr(record), 2),
+        "SSIM": (float(record.scores["gaussians"]["ssim"]), 4),
+        **{f"F1 {share}": (record.f1(index), 3) for index, share in enumerate(SHARES)},
+        "normal error": (normal_error(record), 3),
+    }
+
+
+def _cells(records: Sequence[Record]) -> Row:
+    found = [_figures(record) for record in records]
+    return {
+        "seeds": len(records),
+        "Gaussians": shown([gaussians(record) for record in records], 0),
+        **{k: shown([of[k][0] for of in found], digits) for k, (_, digits) in found[0].items()},
+    }
+
+
+def _differences(pairs: Sequence[tuple[Record, Record]]) -> Row:
+    found = [(_figures(few), _figures(many)) for few, many in pairs]
+    row: Row = {"seeds": len(pairs), "Gaussians": None}
+    for name, (_, digits) in found[0][0].items():
+        apart = [
+            many[name][0] - few[name][0]  # type: ignore[operator]
+            for few, many in found
+            if few[name][0] is not None and many[name][0] is not None
+        ]
+        spread = Spread.of(apart)
+        row[name] = None if spread is None else spread.text(digits, signed=True)
+    return row
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from gaussian_wrapping_addon.core.errors import UsageError
 
 from ..speed_error.runs import ROOT
 from .case import Case, named
-from .making import Maker, carry_out, make
+from .making import Maker, SceneFinder, carry_out, make, rendered_scene
 from .mesh_based import fill_in
 from .record import Record, read_records
 
@@ -31,6 +31,7 @@ def run_study(
     write_document: Writer,
     maker: Maker = make,
     draw: Callable[[Path], None] | None = None,
+    find_scene: SceneFinder = rendered_scene,
 ) -> int:
     """Do what the command line asks for; return 1 where a run failed or nothing is there, else 0.
 
@@ -42,6 +43,8 @@ def run_study(
         Makes one case and writes its record.
     draw : callable, optional
         Draws pictures of kept runs into the document's folder.
+    find_scene : callable
+        Where kernels are compiled on, before the first run.
     """
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--threads", type=int, default=1)
@@ -73,8 +76,9 @@ def run_study(
         failed = fill_in(chosen, threads=options.threads, runs=options.runs, again=options.again)
     elif not options.document:
         failed = carry_out(
-            chosen, threads=options.threads, again=options.again, runs=options.runs, maker=maker
-        )
+            chosen, threads=options.threads, again=options.again, runs=options.runs, maker=maker,
+            find_scene=find_scene,
+        )  # fmt: skip
     records = read_records(cases)
     if not records:
         _logger.error("there is no record yet, so no document")

@@ -5,19 +5,19 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from benchmarks import many_photos, published_preset
-from benchmarks.many_photos import every_nth_photo
+from benchmarks.many_photos import every_nth_photo, photos_case, plan, write_document
 from benchmarks.scenes.colmap_project import write_colmap
 from benchmarks.scenes.sparse_points import SparsePoints
 from gaussian_wrapping_addon.core.dataset.readers.colmap_reader import read_colmap
 from gaussian_wrapping_addon.core.files import write_json
 from gaussian_wrapping_addon.core.settings import preset
+from tests.benchmarks.invented_records import invented
 from tests.core.training.small_scene import ring_cameras
 
 FIGURES = {
@@ -62,19 +62,46 @@ def test_every_second_photo_is_a_project_of_its_own(project: Path, tmp_path: Pat
         np.testing.assert_array_equal(mine.cam_from_world, other.cam_from_world)
     # Of neighbours every second is gone, so that one photo is left for all points but the last.
     np.testing.assert_array_equal(found.points, whole.points[5:])
-    assert (half / "region.json").is_file()
 
 
-def test_records_become_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(many_photos, "RECORDS", tmp_path)
-    for photos in (120, 60):
-        values: dict[str, Any] = {**FIGURES, "scene": "room", "photos": photos, "label": ""}
-        write_json(tmp_path / f"room-{photos}.json", values)
-    rows = [line for line in many_photos.document().splitlines() if line.startswith("| room")]
-    assert [row.split("|")[3].strip() for row in rows] == ["60", "120"]
-    assert all(
-        [c.strip() for c in row.split("|")[-4:-1]] == ["0.250", "0.500", "0.750"] for row in rows
-    )
+def test_a_part_of_the_photos_is_judged_by_the_whole_scene(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("truth.npz", "crop.json", "scene.json"):
+        (project / name).write_text(name)
+    (project / "test").mkdir()
+    (project / "test" / "cameras.json").write_text("{}")
+    monkeypatch.setattr(many_photos, "ensure_scene", lambda *_, **__: project)
+    monkeypatch.setattr(many_photos, "KEPT_RUNS", tmp_path / "kept")
+    whole, half = (many_photos.find_scene(photos_case("room", step, 0)) for step in (1, 2))
+    assert whole == project
+    assert sorted(p.name for p in half.iterdir()) == sorted(p.name for p in project.iterdir())
+    assert len(list((half / "images").iterdir())) == 3
+    assert (half / "truth.npz").read_text() == "truth.npz"
+    assert many_photos.find_scene(photos_case("room", 2, 1)) == half
+
+
+def test_records_become_a_page(tmp_path: Path) -> None:
+    levels = {("room", 2, 0): 0.5, ("room", 1, 0): 0.53, ("room", 2, 1): 0.6, ("room", 1, 1): 0.61}
+    cases = {key: photos_case(*key) for key in levels}
+    records = {c.identity: invented(c, levels[key]) for key, c in cases.items()}
+    last = photos_case("room", 1, 2)
+    records[last.identity] = invented(last, 0.59)
+    text = write_document(tmp_path, records, plan()).read_text()
+    assert "1 of 6 planned runs are not made yet" in text
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in text.splitlines()
+        if line.startswith("| room")
+    ]
+    assert [row[:3] for row in rows] == [
+        ["room", "60", "2"],
+        ["room", "120", "3"],
+        ["room", "difference", "2"],
+    ]
+    f1 = [row[6] for row in rows]
+    assert f1[:2] == ["0.550 ± 0.071", "0.577 ± 0.042"]
+    assert f1[2] == "+0.020 ± 0.014"
 
 
 def test_the_page_of_the_published_settings_says_what_ran(
