@@ -142,9 +142,7 @@ def _points_of_charts(
     return points
 
 
-def _spread(
-    placed: list[int], rows: set[int], graph: FaceGraph
-) -> Iterator[tuple[int, int, int]]:
+def _spread(placed: list[int], rows: set[int], graph: FaceGraph) -> Iterator[tuple[int, int, int]]:
     """Walk from placed triangles to the others over their shared edges.
 
     Yields
@@ -174,4 +172,4 @@ def _laid_beside(
     one, two, three = (shapes[row, (corner + k) % 3] for k in range(3))
     edge, side, wanted = (complex(*v) for v in (two - one, three - one, end - begin))
     turned = side * wanted / edge if edge else 0j
-    return (begin.copy(), end.copy()), begin + [turned.real, turned.imag]
+    return (begin.copy(), end.copy()), begin + np.array([turned.real, turned.imag])
