@@ -348,7 +348,7 @@ def not_finite() -> None:
     ("make", "words"),
     [(add_line, "Line has no faces"), (with_modifier, "Modifiers of Foreign change its faces"),
      (without_uvs, "Foreign has no UV map"), (not_finite, "Vertex 3 of Foreign is not finite"),
-     (uneven_for_quads, "QuadriFlow cannot work on Foreign: at 4 edges"),
+     (uneven_for_quads, "QuadriFlow cannot work on Foreign: faces point to opposite sides at 4"),
      (not_finite_for_quads, "Vertex 3 of Foreign is not finite")],
 )  # fmt: skip
 def test_what_cannot_be_baked_is_refused_before_a_worker_starts(

@@ -178,8 +178,8 @@ def add_fin(work: Any) -> None:
 
 
 REFUSED = [
-    (flip, "at 3 edges, faces point to opposite sides"),
-    (add_fin, "1 edges have more than two faces"),
+    (flip, "faces point to opposite sides at 3 of its edges"),
+    (add_fin, "more than two faces meet at 1 of its edges"),
 ]
 
 

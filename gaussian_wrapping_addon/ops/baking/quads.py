@@ -17,7 +17,7 @@ import numpy as np
 
 from ...core.errors import UsageError
 from ...core.mesh.topology import edge_keys, edge_lengths, faces_per_edge, half_edges
-from ..common.mesh_data import build_polygons, evaluated, mesh_of
+from ..common.mesh_data import build_polygons, evaluated, mesh_of, values_of
 from .triangulation import Triangulation, triangulation_of
 
 _logger = logging.getLogger(__name__)
@@ -93,9 +93,8 @@ def _without_short_edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     if not short.any():
         return faces
     begin, end = begin[short], end[short]
-    joined, before = np.arange(len(vertices)), np.empty(0)
-    while not np.array_equal(joined, before):
-        before = joined.copy()
+    joined = np.arange(len(vertices))
+    while (joined[begin] != joined[end]).any():
         least = np.minimum(joined[begin], joined[end])
         np.minimum.at(joined, begin, least)
         np.minimum.at(joined, end, least)
@@ -112,8 +111,8 @@ def _refuse_unsound(name: str, vertices: np.ndarray, faces: np.ndarray) -> bool:
     keys = edge_keys(begin, end, len(vertices))
     counts = [len(np.unique(keys[bad])) for bad in (per_edge > 2, twice)]
     texts = (
-        "{} edges have more than two faces",
-        "at {} edges, faces point to opposite sides",
+        "more than two faces meet at {} of its edges",
+        "faces point to opposite sides at {} of its edges",
     )
     found = [text.format(count) for text, count in zip(texts, counts, strict=True) if count]
     if found:
@@ -161,9 +160,7 @@ def _run(name: str, thing: bpy.types.Object, quads: int, *, is_open: bool) -> No
             use_preserve_boundary=is_open,
             seed=SEED,
         )
-    polygons = mesh_of(thing).polygons
-    sides = np.zeros(len(polygons), np.int32)
-    polygons.foreach_get("loop_total", sides)
+    sides = values_of(mesh_of(thing).polygons, "loop_total", 1, np.int32)
     # Blender only warns where it refuses a mesh, which then stays as it was.
     if outcome != {"FINISHED"} or not len(sides) or (sides != 4).any():
         raise UsageError(
