@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -148,18 +148,18 @@ def _lent_object(
 def _run(name: str, thing: bpy.types.Object, quads: int, *, is_open: bool) -> None:
     before = len(mesh_of(thing).polygons)
     outcome: set[str] = set()
-    with (
-        suppress(RuntimeError),  # Blender's report of a failure
-        bpy.context.temp_override(active_object=thing, object=thing, selected_objects=[thing]),
-    ):
-        outcome = bpy.ops.object.quadriflow_remesh(
-            mode="FACES",
-            target_faces=quads,
-            use_mesh_symmetry=False,
-            use_preserve_sharp=False,
-            use_preserve_boundary=is_open,
-            seed=SEED,
-        )
+    try:
+        with bpy.context.temp_override(active_object=thing, object=thing, selected_objects=[thing]):
+            outcome = bpy.ops.object.quadriflow_remesh(
+                mode="FACES",
+                target_faces=quads,
+                use_mesh_symmetry=False,
+                use_preserve_sharp=False,
+                use_preserve_boundary=is_open,
+                seed=SEED,
+            )
+    except RuntimeError as error:  # what Blender reports as an error
+        _logger.warning("QuadriFlow on %s: %s", name, error)
     sides = values_of(mesh_of(thing).polygons, "loop_total", 1, np.int32)
     # Blender only warns where it refuses a mesh, which then stays as it was.
     if outcome != {"FINISHED"} or not len(sides) or (sides != 4).any():
