@@ -16,7 +16,9 @@ import pytest
 from gaussian_wrapping_addon.core.jobs.client import PYTHON_VARIABLE
 from gaussian_wrapping_addon.core.jobs.store.job_file import read_job
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder, JobStatus
+from gaussian_wrapping_addon.ops.baking.triangulation import world_mesh
 from gaussian_wrapping_addon.ops.common import tags
+from gaussian_wrapping_addon.ops.meshing import bake_actions
 from gaussian_wrapping_addon.ops.results.materials import shading_of
 from gaussian_wrapping_addon.ui.baking import bake_panel
 from tests.blender import job_play
@@ -32,6 +34,7 @@ pytestmark = [
 
 POLYGONS = 32 * 20
 """Of the ball: quads, and triangles around the poles."""
+QUADS = 32 * 18
 TRIANGLES = 2 * 32 * 18 + 2 * 32
 GOOD_DB = 20.0
 """Photos of 32 x 32 pixels: what the job's own mesh reaches."""
@@ -59,10 +62,18 @@ def press(job: JobFolder, *states: str) -> JobStatus:
     return job_play.play_to(job.root, *(states or ("DONE", "FAILED")))
 
 
-def test_a_foreign_mesh_without_uvs_gets_uvs_and_texture(job: JobFolder) -> None:
-    """The quads stay but for those that new seams cut; the object stays where it stands."""
+@pytest.mark.parametrize("told", [True, False])
+def test_a_foreign_mesh_without_uvs_gets_uvs_and_texture(
+    told: bool, job: JobFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its quads and the object stay; seams may only cut quads that the worker is not told of."""
+    if not told:
+        monkeypatch.setattr(
+            bake_actions, "world_mesh", lambda *a, **k: world_mesh(*a, **{**k, "with_polygons": 0})
+        )
     import_ball(job)
     thing = add_ball()
+    roughen(thing)
     before = np.array(thing.matrix_world), len(bpy.data.objects)
     assert not thing.data.uv_layers
     painted = thing.data.color_attributes.new("Painted", "BYTE_COLOR", "CORNER")
@@ -74,7 +85,7 @@ def test_a_foreign_mesh_without_uvs_gets_uvs_and_texture(job: JobFolder) -> None
     assert thing.data.uv_layers["Photos"].active_render
     sides = [len(polygon.vertices) for polygon in thing.data.polygons]
     assert sum(side - 2 for side in sides) == TRIANGLES
-    assert sides.count(4) > 0.5 * POLYGONS
+    assert sides.count(4) == QUADS if told else 0.5 * QUADS < sides.count(4) < QUADS
     colors = {tuple(c.color_srgb[:]) for c in thing.data.color_attributes["Painted"].data}
     assert len(colors) == 1, "divided polygons keep their other attributes"
     assert psnr_of_textures(thing) > GOOD_DB
@@ -84,6 +95,14 @@ def test_a_foreign_mesh_without_uvs_gets_uvs_and_texture(job: JobFolder) -> None
     assert Path(image_of(thing).filepath) == job.baked / "Foreign" / "albedo.png"
     assert "% seen by photos" in draw(bake_panel.GWRAP_PT_bake).texts
     assert job.read_status().state == "DONE"
+
+
+def roughen(thing: Any) -> None:
+    """Move the vertices a little, so that seams of new UVs are ragged."""
+    points = np.empty(3 * len(thing.data.vertices), np.float32)
+    thing.data.vertices.foreach_get("co", points)
+    points += np.random.default_rng(0).normal(0.0, 0.02, len(points)).astype(np.float32)
+    thing.data.vertices.foreach_set("co", points)
 
 
 def test_own_uvs_and_other_attributes_stay(job: JobFolder) -> None:
@@ -175,6 +194,78 @@ def test_fewer_faces_become_a_lighter_object_with_a_normal_map(job: JobFolder) -
     assert abs(len(bpy.data.objects["Foreign light"].data.polygons) - 300) <= 8
 
 
+def test_quads_become_an_object_with_photos_and_maps(job: JobFolder) -> None:
+    """One button: QuadriFlow, UVs, photos, the detail of the dense mesh and its occlusion."""
+    frame = import_ball(job)
+    thing = add_ball()
+    before = file_content()
+    choose_quads(400)
+    bpy.context.scene.gwrap.ambient_occlusion = True
+    assert {"retopology", "quads"} <= names_of_fields()
+    assert press(job).state == "DONE"
+    made = bpy.data.objects["Foreign quads"]
+    assert made.parent == frame
+    assert tags.kind_of(made) == "baked"
+    assert {len(polygon.vertices) for polygon in made.data.polygons} == {4}
+    assert 300 < len(made.data.polygons) < 440
+    assert all(polygon.use_smooth for polygon in made.data.polygons)
+    assert made.data.validate() is False
+    nodes = made.material_slots[0].material.node_tree.nodes
+    assert {"Normal Map", "Occlusion Texture"} <= set(nodes.keys())
+    assert Path(image_of(made).filepath) == job.baked / "Foreign_quads" / "albedo.png"
+    assert psnr_of_textures(made) > GOOD_DB
+    request = read_job(job.job_path).bake
+    assert request is not None
+    assert Path(request.dense).name == "Foreign_quads-dense.npz"
+    assert thing.hide_get()
+    assert file_content() - before == {("objects", made.name), ("meshes", made.name)}
+    assert before <= file_content()
+    assert not thing.data.uv_layers
+    assert not thing.data.materials
+    # Once more: the same object, not another one.
+    thing.hide_set(False)
+    thing.select_set(True)
+    choose_quads(200)
+    assert press(job).state == "DONE"
+    assert [t.name for t in bpy.data.objects if tags.kind_of(t) == "baked"] == ["Foreign quads"]
+    assert len(bpy.data.objects["Foreign quads"].data.polygons) < 250
+
+
+def choose_quads(count: int) -> None:
+    bake = bpy.context.scene.gwrap.bake
+    bake.retopology, bake.quads = "QUADS", count
+
+
+def names_of_fields() -> set[str]:
+    return {field.name for field in draw(bake_panel.GWRAP_PT_bake).fields}
+
+
+def file_content() -> set[tuple[str, str]]:
+    return {(k, block.name) for k in ("objects", "meshes") for block in getattr(bpy.data, k)}
+
+
+def test_a_bake_of_quads_that_fails_or_is_cancelled_leaves_nothing(job: JobFolder) -> None:
+    import_ball(job)
+    thing = add_ball()
+    choose_quads(400)
+    place = thing.location.copy()
+    thing.location.x += 500.0
+    before = file_content()
+    assert "No photo sees the mesh" in press(job, "FAILED").error
+    assert file_content() == before
+    thing.location = place
+    assert bpy.ops.gwrap.bake_photos() == {"FINISHED"}
+    job_play.play_to_stage(job.root, "bake")
+    assert file_content() == before
+    assert bpy.ops.gwrap.cancel_job() == {"FINISHED"}
+    job_play.play_to(job.root, "CANCELLED")
+    assert file_content() == before
+    assert not thing.hide_get()
+    assert bpy.ops.gwrap.resume_job() == {"FINISHED"}
+    assert job_play.play_to(job.root, "DONE", "FAILED").state == "DONE"
+    assert {len(p.vertices) for p in bpy.data.objects["Foreign quads"].data.polygons} == {4}
+
+
 def test_detail_comes_from_another_mesh(job: JobFolder) -> None:
     import_ball(job)
     dense = add_ball("Dense")
@@ -239,6 +330,16 @@ def without_uvs() -> None:
     bpy.context.scene.gwrap.bake.uvs = "OWN"
 
 
+def uneven_for_quads() -> None:
+    add_ball().data.polygons[40].flip()
+    choose_quads(400)
+
+
+def not_finite_for_quads() -> None:
+    not_finite()
+    choose_quads(400)
+
+
 def not_finite() -> None:
     add_ball().data.vertices[3].co.x = float("nan")
 
@@ -246,7 +347,9 @@ def not_finite() -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [(add_line, "Line has no faces"), (with_modifier, "Modifiers of Foreign change its faces"),
-     (without_uvs, "Foreign has no UV map"), (not_finite, "Vertex 3 of Foreign is not finite")],
+     (without_uvs, "Foreign has no UV map"), (not_finite, "Vertex 3 of Foreign is not finite"),
+     (uneven_for_quads, "QuadriFlow cannot work on Foreign: faces point to opposite sides at 4"),
+     (not_finite_for_quads, "Vertex 3 of Foreign is not finite")],
 )  # fmt: skip
 def test_what_cannot_be_baked_is_refused_before_a_worker_starts(
     make: Any, words: str, job: JobFolder

@@ -61,7 +61,8 @@ def bake_onto(
     Parameters
     ----------
     given : FileMesh
-        Scene frame. Its faces, and their order, stay unless they are decimated.
+        Scene frame. Its faces, and their order, stay unless they are decimated. New UVs cut no
+        polygon that they are parts of, where these are known.
     scene, photos, settings, work_folder, threads, free_bytes
         As for :func:`texture_mesh`.
     choices : BakeChoices
@@ -81,11 +82,12 @@ def bake_onto(
     validate_for_texturing(mesh)
     winding = _check_winding(mesh)
     own: OwnUvs | None = None
+    polygons = None if given.polygons is None else given.polygons.of_faces
     if choices.faces and len(mesh.faces) > choices.faces:
         dense = mesh if dense is None else dense
         progress.update(0.0, "decimating")
         fewer = decimate(mesh.vertices, mesh.faces, choices.faces, progress.span(0.0, 0.15))
-        mesh = SurfaceMesh(fewer.vertices, fewer.faces.astype(np.int32))
+        mesh, polygons = SurfaceMesh(fewer.vertices, fewer.faces.astype(np.int32)), None
     elif choices.uvs != "new":
         if given.corner_uvs is not None:
             own = own_uvs(mesh, given.corner_uvs)
@@ -94,7 +96,7 @@ def bake_onto(
     textured = texture_mesh(
         mesh, scene, photos, settings, work_folder, progress.span(0.15, 1.0),
         threads=threads, dense=dense, free_bytes=free_bytes,
-        unwrapped=None if own is None else own.unwrapped,
+        unwrapped=None if own is None else own.unwrapped, polygons=polygons,
     )  # fmt: skip
     if textured.statistics["texels_seen"] == 0:
         raise MeshingError(

@@ -56,6 +56,7 @@ def texture_mesh(
     dense: SurfaceMesh | None = None,
     free_bytes: int = 0,
     unwrapped: Unwrap | None = None,
+    polygons: np.ndarray | None = None,
 ) -> TexturedMesh:
     """Unwrap a mesh and bake its texture from the photos (docs/method.md, section 8).
 
@@ -82,6 +83,8 @@ def texture_mesh(
         Available memory; 0 if unknown, then memory is not checked.
     unwrapped : Unwrap, optional
         Existing UVs to keep.
+    polygons : (f,) int64, optional
+        Polygon that each face is a part of, for new UVs: see :func:`.unwrap.unwrap.unwrap`.
 
     Raises
     ------
@@ -106,7 +109,7 @@ def texture_mesh(
         progress.update(0.0, f"unwrapping for {atlases} x {size_px} x {size_px} texels")
         unwrapped = unwrap(
             mesh, size_px, gutter_px, work_folder, progress.span(0.0, 0.3),
-            threads=threads, atlases=atlases,
+            threads=threads, atlases=atlases, polygons=polygons,
         )  # fmt: skip
     atlases = unwrapped.atlases
     surface, sample, first = _sample_surface(mesh, graph, unwrapped, size_px, count, threads)

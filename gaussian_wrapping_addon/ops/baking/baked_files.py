@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.errors import DatasetError, ParseError
 from ...core.files import read_json
+from ...core.mesh.polygons import POLYGONS_FILE, Polygons, read_polygons
 from ...core.mesh.udims import FIRST_UDIM, LAST_UDIM, udim_uvs
 from ...core.regular_files import reject_foreign_entries
 from ...core.texture.files.file_checks import atlas_file
@@ -40,6 +41,8 @@ class BakedFiles:
     """Whether the UVs are those of the mesh that was handed over."""
     has_own_faces: bool
     """Whether the faces are."""
+    polygons: Polygons | None
+    """Polygons of faces that were made for the bake; ``None`` where the object has them already."""
     coverage: float
     """Share of the texels that photos see."""
     warnings: tuple[str, ...]
@@ -58,6 +61,8 @@ def read_baked(folder: Path) -> BakedFiles:
     if not path.is_file():
         raise DatasetError(f"{folder} holds no mesh.npz.", _HINT)
     vertices, faces, corner_uvs, face_atlas = read_mesh_arrays(path, repair=False)
+    made = folder / POLYGONS_FILE
+    polygons = read_polygons(made, len(faces)) if made.is_file() else None
     figures_path = folder / "bake.json"
     values = read_json(figures_path)
     try:
@@ -87,5 +92,5 @@ def read_baked(folder: Path) -> BakedFiles:
         corner_uvs = udim_uvs(corner_uvs, face_atlas, udims)
     return BakedFiles(
         folder.name, vertices, faces, corner_uvs, udims, albedo, normal_map, occlusion, has_own_uvs,
-        has_own_faces, coverage, warnings,
+        has_own_faces, polygons, coverage, warnings,
     )  # fmt: skip

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bring a finished bake into the scene: material and UVs of the object, or a lighter object."""
+"""Bring a finished bake into the scene: material and UVs of the object, or an object of its own."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import bpy
 import numpy as np
 
 from ...core.errors import UsageError
+from ...core.mesh.polygons import SAME_UV, join_triangles
 from ..common import tags
-from ..common.mesh_data import build_mesh, mesh_of
+from ..common.mesh_data import build_mesh, build_polygons, mesh_of
 from ..results.materials import (
     create_material,
     load_texture,
@@ -28,7 +29,8 @@ UV_NAME = "Photos"
 """UV map made for a bake."""
 MOVED_SHARE = 1e-4
 """Share of the mesh's extent by which corners may have moved since they were handed over."""
-SAME_UV = 1e-6
+SUFFIXES = {"KEEP": "", "DECIMATE": " light", "QUADS": " quads"}
+"""What the names of objects that bakes make end with, by the choice *Faces*."""
 
 
 def apply_bake(
@@ -37,8 +39,8 @@ def apply_bake(
     """Show a bake in a scene; return the object that shows it.
 
     The object gets the baked material in place of its own, and new UVs as a UV map of their own.
-    Polygons that new UVs cut are divided; all others stay. A bake with fewer faces becomes a new
-    object under the frame, and the dense one is hidden.
+    Polygons that new UVs cut are divided; all others stay. A bake with fewer faces or with quads
+    becomes a new object under the frame, and the dense one is hidden.
 
     Parameters
     ----------
@@ -55,8 +57,8 @@ def apply_bake(
         The object is gone, or its faces have changed since; nothing has been changed.
     """
     thing = _target(scene, baked.name, target_uid)
-    if not baked.has_own_faces:
-        thing = _lighter_object(scene, frame, thing, baked)
+    if not baked.has_own_faces or baked.polygons is not None:
+        thing = _new_object(scene, frame, thing, baked)
     else:
         if thing is None:
             raise UsageError(
@@ -80,7 +82,7 @@ def _target(scene: bpy.types.Scene, name: str, uid: int) -> bpy.types.Object | N
     return next(iter((*found, *tagged)), None)
 
 
-def _lighter_object(
+def _new_object(
     scene: bpy.types.Scene,
     frame: bpy.types.Object,
     dense: bpy.types.Object | None,
@@ -88,8 +90,13 @@ def _lighter_object(
 ) -> bpy.types.Object:
     known = (t for t in scene.objects if tags.kind_of(t) == "baked")
     thing = next((t for t in known if t.get(tags.BAKE) == baked.name), None)
-    name = f"{dense.name if dense else baked.name} light"
-    mesh = build_mesh(name, baked.vertices, baked.faces, baked.corner_uvs)
+    name = f"{dense.name}{SUFFIXES[_retopology(baked)]}" if dense else baked.name
+    if baked.polygons is None:
+        mesh = build_mesh(name, baked.vertices, baked.faces, baked.corner_uvs)
+    else:
+        joined = join_triangles(baked.faces, baked.corner_uvs, baked.polygons)
+        mesh = build_polygons(name, baked.vertices, joined.corners, joined.starts, joined.uvs)
+        mesh.validate()
     if thing is None:
         thing = bpy.data.objects.new(name, mesh)
         thing[tags.KIND] = "baked"
@@ -107,6 +114,10 @@ def _lighter_object(
         dense.hide_set(True)
         dense.hide_render = True
     return thing
+
+
+def _retopology(baked: BakedFiles) -> str:
+    return "DECIMATE" if baked.polygons is None else "QUADS"
 
 
 def _set_uvs(thing: bpy.types.Object, frame: bpy.types.Object, baked: BakedFiles) -> None:

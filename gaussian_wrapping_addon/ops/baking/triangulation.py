@@ -11,6 +11,7 @@ import numpy as np
 
 from ...core.errors import UsageError
 from ...core.mesh.exchange.mesh_reader import FileMesh
+from ...core.mesh.polygons import Polygons
 from ..common import tags
 from ..common.mesh_data import evaluated, mesh_of, values_of
 from ..placement.placement import placement_of
@@ -96,9 +97,18 @@ def scene_points(frame: bpy.types.Object, vertices: np.ndarray) -> np.ndarray:
 
 
 def world_mesh(
-    frame: bpy.types.Object, triangles: Triangulation, *, with_uvs: bool = True
+    frame: bpy.types.Object,
+    triangles: Triangulation,
+    *,
+    with_uvs: bool = False,
+    with_polygons: bool = False,
 ) -> FileMesh:
     """Return a mesh in the world of the input, wherever the result and the object stand.
+
+    Parameters
+    ----------
+    with_uvs, with_polygons : bool
+        Whether it has the UVs of the triangles, and what these are parts of.
 
     Raises
     ------
@@ -106,4 +116,8 @@ def world_mesh(
         The frame has no valid transform, or has lost its world coordinates.
     """
     world = tags.world_from_scene(frame).points(scene_points(frame, triangles.vertices))
-    return FileMesh(world, triangles.faces, triangles.corner_uvs if with_uvs else None)
+    polygons = Polygons(triangles.polygons.astype(np.int64), triangles.loops.astype(np.int64))
+    return FileMesh(
+        world, triangles.faces, triangles.corner_uvs if with_uvs else None,
+        polygons if with_polygons else None,
+    )  # fmt: skip

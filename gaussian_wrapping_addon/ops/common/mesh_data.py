@@ -70,22 +70,45 @@ def build_mesh(
     corner_uvs : (f, 3, 2) ndarray of float32
     face_material : (f,) ndarray of int, optional
     """
+    starts = np.arange(0, 3 * len(faces), 3)
+    mesh = build_polygons(name, vertices, faces.ravel(), starts, corner_uvs.reshape(-1, 2))
+    if face_material is not None:
+        polygons: Any = mesh.polygons
+        polygons.foreach_set("material_index", face_material.astype(np.int32))
+    return mesh
+
+
+def build_polygons(
+    name: str,
+    vertices: np.ndarray,
+    corners: np.ndarray,
+    starts: np.ndarray,
+    uvs: np.ndarray | None = None,
+) -> bpy.types.Mesh:
+    """Build mesh data from arrays: smooth shaded, with one UV layer or none.
+
+    Parameters
+    ----------
+    vertices : (v, 3) ndarray
+    corners : (c,) ndarray of int
+        Vertices of the polygons, one after another; valid as those of :func:`build_mesh`.
+    starts : (p,) ndarray of int
+        First corner of each polygon, ascending from 0.
+    uvs : (c, 2) ndarray, optional
+    """
     mesh = bpy.data.meshes.new(name)
-    count = len(faces)
     mesh.vertices.add(len(vertices))
-    mesh.loops.add(3 * count)
-    mesh.polygons.add(count)
+    mesh.loops.add(len(corners))
+    mesh.polygons.add(len(starts))
     # Attributes are copied as one block, unlike the properties of vertices and loops.
     attributes: Any = mesh.attributes
     polygons: Any = mesh.polygons
     positions = np.ascontiguousarray(vertices, np.float32)
     attributes["position"].data.foreach_set("vector", positions.ravel())
-    attributes[".corner_vert"].data.foreach_set("value", faces.astype(np.int32).ravel())
-    polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
-    if face_material is not None:
-        polygons.foreach_set("material_index", face_material.astype(np.int32))
-    layer = mesh.uv_layers.new(name="UVMap", do_init=False)
-    uvs: Any = layer.uv
-    uvs.foreach_set("vector", corner_uvs.astype(np.float32, copy=False).ravel())
+    attributes[".corner_vert"].data.foreach_set("value", corners.astype(np.int32))
+    polygons.foreach_set("loop_start", starts.astype(np.int32))
+    if uvs is not None:
+        layer: Any = mesh.uv_layers.new(name="UVMap", do_init=False)
+        layer.uv.foreach_set("vector", uvs.astype(np.float32, copy=False).ravel())
     mesh.update(calc_edges=True)
     return mesh

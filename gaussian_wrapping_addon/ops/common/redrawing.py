@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Redraw areas of Blender's windows."""
+"""Redraw areas of Blender's windows, and show that Blender is busy."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import bpy
 
@@ -12,3 +15,16 @@ def redraw(*kinds: str) -> None:
         for area in window.screen.areas:
             if area.type in (kinds or ("VIEW_3D",)):
                 area.tag_redraw()
+
+
+@contextmanager
+def waiting(context: bpy.types.Context) -> Iterator[None]:
+    """Show the wait cursor while Blender is blocked."""
+    window = None if bpy.app.background else context.window
+    if window is not None:
+        window.cursor_modal_set("WAIT")
+    try:
+        yield
+    finally:
+        if window is not None:
+            window.cursor_modal_restore()

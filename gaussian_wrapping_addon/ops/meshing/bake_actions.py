@@ -20,6 +20,8 @@ from ...core.mesh.exchange.handed_over import write_handed_over
 from ...core.mesh.exchange.mesh_reader import FileMesh
 from ...core.names import file_stem
 from ...core.settings import TextureSettings
+from ..baking.baked_objects import SUFFIXES
+from ..baking.quads import quads_of
 from ..baking.triangulation import Triangulation, triangulation_of, world_mesh
 from ..common import tags
 from ..common.addon import properties_of
@@ -56,7 +58,12 @@ def start_bake(
     Raises
     ------
     WrapError
-        The mesh cannot be baked onto, or the job has no finished training.
+        The mesh cannot be baked onto or made of quads, or the job has no finished training.
+
+    Notes
+    -----
+    Quads are made here, in Blender, which waits for them. They become an object when the bake is
+    done: until then, and where it fails, the scene stays as it is.
     """
     folder = JobFolder(job_folder_of(frame))
     if watched_jobs.is_running(str(folder.root)):
@@ -65,18 +72,27 @@ def start_bake(
     if not any(read_done(path) for path in folder.stages.glob("train-*")):
         raise no_finished_training(folder.root)
     chosen = properties_of(scene).bake
-    decimates = chosen.retopology == "DECIMATE"
+    keeps = chosen.retopology == "KEEP"
     triangles = triangulation_of(thing)
-    if not decimates:
+    dense = None
+    if keeps:
         _refuse_unusable(thing, triangles, chosen.uvs)
-    name = _name(thing, folder, light=decimates)
-    mesh = world_mesh(frame, triangles, with_uvs=chosen.uvs != "NEW" and not decimates)
-    dense = None if decimates or chosen.dense in (None, thing) else chosen.dense
+        if chosen.dense not in (None, thing):
+            dense = triangulation_of(chosen.dense)
+    elif chosen.retopology == "QUADS":
+        dense, triangles = triangles, quads_of(thing.name, triangles, chosen.quads)
+    name = _name(thing, folder, SUFFIXES[chosen.retopology])
+    makes_uvs = not keeps or chosen.uvs == "NEW" or triangles.corner_uvs is None
+    mesh = world_mesh(
+        frame, triangles, with_uvs=not makes_uvs,
+        with_polygons=makes_uvs and chosen.retopology != "DECIMATE",
+    )  # fmt: skip
+    mesh = replace(mesh, is_new=chosen.retopology == "QUADS")
     request = BakeRequest(
         mesh=str(_hand_over(folder, name, mesh)),
         name=name,
-        uvs="auto" if decimates else chosen.uvs.lower(),
-        faces=chosen.faces if decimates else 0,
+        uvs=chosen.uvs.lower() if keeps else "auto",
+        faces=chosen.faces if chosen.retopology == "DECIMATE" else 0,
         dense=_hand_over_dense(folder, name, frame, dense),
         texture=_texture(scene, has_dense=dense is not None),
     )
@@ -85,7 +101,7 @@ def start_bake(
     client = JobClient.start(
         folder.root, job, python=worker_python(choice.python), keep_running=choice.keep_running
     )
-    if not decimates:
+    if keeps:
         thing[tags.BAKE] = name
     properties_of(scene).job_command = "BAKE"
     job_timer.watch(scene, folder.root, client, target_uid=thing.session_uid)
@@ -108,16 +124,16 @@ def _refuse_unusable(thing: bpy.types.Object, triangles: Triangulation, uvs: str
         )
 
 
-def _name(thing: bpy.types.Object, folder: JobFolder, *, light: bool) -> str:
+def _name(thing: bpy.types.Object, folder: JobFolder, suffix: str) -> str:
     """Return the folder of an object's bake: its earlier one, or one that nothing uses."""
     own = thing.get(tags.BAKE, "")
     others = {t.get(tags.BAKE) for t in bpy.data.objects if t != thing}
-    stem = file_stem(f"{thing.name} light" if light else thing.name, 0)
-    if light and tags.kind_of(thing) != "baked":
-        lighter = [t for t in bpy.data.objects if tags.kind_of(t) == "baked"]
-        if any(t.get(tags.BAKE) == stem for t in lighter):
+    stem = file_stem(f"{thing.name}{suffix}", 0)
+    if suffix and tags.kind_of(thing) != "baked":
+        made = [t for t in bpy.data.objects if tags.kind_of(t) == "baked"]
+        if any(t.get(tags.BAKE) == stem for t in made):
             return stem  # made anew from the same object
-    elif not light and isinstance(own, str) and own and own not in others:
+    elif not suffix and isinstance(own, str) and own and own not in others:
         return own
     count, name = 1, stem
     while name in others or (folder.baked / name).exists():
@@ -137,12 +153,11 @@ def _hand_over(folder: JobFolder, name: str, mesh: FileMesh) -> Path:
 
 
 def _hand_over_dense(
-    folder: JobFolder, name: str, frame: bpy.types.Object, dense: bpy.types.Object | None
+    folder: JobFolder, name: str, frame: bpy.types.Object, dense: Triangulation | None
 ) -> str:
     if dense is None:
         return ""
-    mesh = world_mesh(frame, triangulation_of(dense), with_uvs=False)
-    return str(_hand_over(folder, f"{name}-dense", mesh))
+    return str(_hand_over(folder, f"{name}-dense", world_mesh(frame, dense)))
 
 
 def _texture(scene: bpy.types.Scene, *, has_dense: bool) -> TextureSettings:

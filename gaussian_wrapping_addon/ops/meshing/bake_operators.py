@@ -9,6 +9,7 @@ import bpy
 from ...core.errors import UsageError
 from ..common import tags
 from ..common.error_reporting import OperatorResult
+from ..common.redrawing import waiting
 from ..jobs.job_guards import ConfirmsFolder, has_worker, no_job_runs
 from ..worker import preferred_worker
 from .bake_actions import bake_target, start_bake
@@ -44,7 +45,8 @@ class GWRAP_OT_bake_photos(ConfirmsFolder, bpy.types.Operator):
         thing = bake_target(context)
         if frame is None or thing is None:
             raise UsageError("No mesh is selected.", "Select a mesh, and wrap the scene before.")
-        start_bake(context.scene, frame, thing, preferred_worker.worker_choice(context))
+        with waiting(context):
+            start_bake(context.scene, frame, thing, preferred_worker.worker_choice(context))
         self.report({"INFO"}, f"Baking photos onto {thing.name}")
         return {"FINISHED"}
 

@@ -40,7 +40,7 @@ class GWRAP_PT_bake(TabPanel, bpy.types.Panel):
             column.prop(bake, "uvs")
             column.prop(bake, "dense")
         else:
-            column.prop(bake, "faces")
+            column.prop(bake, "faces" if bake.retopology == "DECIMATE" else "quads")
         if draw_job(layout, context, "BAKE"):
             return
         characters = characters_of(context)

@@ -6,6 +6,8 @@ from typing import Final
 import bpy
 from bpy.props import EnumProperty, IntProperty, PointerProperty
 
+from ...ops.baking.quads import MAX_TRIANGLES
+
 _UVS: Final = (
     ("AUTO", "Automatic", "The active UV map of the mesh if it has one, else a new one"),
     ("OWN", "Active UV Map", "The active UV map of the mesh, with its UDIM tiles"),
@@ -14,6 +16,15 @@ _UVS: Final = (
 _FACES: Final = (
     ("KEEP", "As They Are", "Bake onto the selected mesh itself"),
     ("DECIMATE", "Decimate", "Make a lighter mesh of triangles; its lost detail is a normal map"),
+    (
+        "QUADS",
+        "Quads",
+        (
+            "Make a new mesh of quads with QuadriFlow; the detail of this one is a normal map. "
+            "Blender waits for QuadriFlow, for seconds or a few minutes; meshes of more than "
+            f"{MAX_TRIANGLES:,} triangles are decimated for it"
+        ),
+    ),
 )
 
 
@@ -32,6 +43,15 @@ class GWRAP_PG_bake(bpy.types.PropertyGroup):
         soft_min=100,
         soft_max=100_000,
         max=100_000_000,
+    )
+    quads: IntProperty(  # type: ignore[valid-type]
+        name="Target",
+        description="Quads of the new mesh; QuadriFlow makes up to a quarter fewer",
+        default=5000,
+        min=4,
+        soft_min=100,
+        soft_max=50_000,
+        max=100_000,
     )
     dense: PointerProperty(  # type: ignore[valid-type]
         name="Detail From",

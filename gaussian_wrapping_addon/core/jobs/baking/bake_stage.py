@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,6 +94,7 @@ def _bake(
     from ...dataset.refined_scene import load_refined_scene
     from ...evaluation.views.photo_comparison import compare_with_photos
     from ...limits import MAX_IMAGE_SIDE_PX
+    from ...mesh.polygons import POLYGONS_FILE, write_polygons
     from ...texture.bake_onto import BakeChoices, bake_onto, welded
     from ...texture.files.textured_files import write_textured
     from ..stages.region_meshing import free_bytes
@@ -120,6 +122,8 @@ def _bake(
     files = stage_folder / "files"
     progress.update(0.9, "writing the files")
     write_textured(textured, files, request.export, scene.world_from_scene)
+    if given.is_new and given.polygons is not None:
+        write_polygons(files / POLYGONS_FILE, given.polygons)
     progress.update(0.93, "comparing with photos")
     rendering = compare_with_photos(
         textured, scene, photos, (), files, progress.span(0.93, 1.0),
@@ -143,7 +147,7 @@ def _read_in_scene(path: str, request: BakeRequest, world_from_scene: Similarity
     """Read a mesh and bring it from its file's frame into the scene frame."""
     from ...mesh.exchange.handed_over import SUFFIX, read_handed_over
     from ...mesh.exchange.mesh_frame import world_from_file
-    from ...mesh.exchange.mesh_reader import FileMesh, read_mesh_file
+    from ...mesh.exchange.mesh_reader import read_mesh_file
 
     file = Path(path)
     if file.suffix.lower() == SUFFIX:
@@ -153,7 +157,7 @@ def _read_in_scene(path: str, request: BakeRequest, world_from_scene: Similarity
         mesh = read_mesh_file(file)
         sidecar = Path(request.sidecar) if request.sidecar else None
         world = world_from_file(file, sidecar, request.up).points(mesh.vertices)
-    return FileMesh(world_from_scene.inverse().points(world), mesh.faces, mesh.corner_uvs)
+    return replace(mesh, vertices=world_from_scene.inverse().points(world))
 
 
 def _fingerprint(path: str) -> str:

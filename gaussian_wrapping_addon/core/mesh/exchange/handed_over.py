@@ -14,6 +14,7 @@ import numpy as np
 from ...array_file import read_arrays
 from ...errors import ParseError
 from ...files import write_bytes
+from ..polygons import checked_polygons
 from .mesh_reader import FileMesh
 
 SUFFIX = ".npz"
@@ -30,6 +31,9 @@ def write_handed_over(path: Path, mesh: FileMesh) -> None:
         The file cannot be written.
     """
     arrays = {} if mesh.corner_uvs is None else {"corner_uvs": np.asarray(mesh.corner_uvs)}
+    if mesh.polygons is not None:
+        arrays |= {"polygons": mesh.polygons.of_faces, "loops": mesh.polygons.loops}
+        arrays |= {"is_new": np.array(mesh.is_new)}
     stream = io.BytesIO()
     np.savez(stream, frame=np.array("world"), vertices=mesh.vertices, faces=mesh.faces, **arrays)
     write_bytes(path, stream.getvalue())
@@ -46,7 +50,8 @@ def read_handed_over(path: Path) -> FileMesh:
     if not path.is_file():
         raise ParseError(path, "whole file", "the file does not exist.", _AGAIN)
     names = ("frame", "vertices", "faces")
-    arrays = read_arrays(path, names, optional=("corner_uvs",), most_bytes=MAX_BYTES, hint=_AGAIN)
+    optional = ("corner_uvs", "polygons", "loops", "is_new")
+    arrays = read_arrays(path, names, optional=optional, most_bytes=MAX_BYTES, hint=_AGAIN)
     try:
         if str(arrays["frame"]) != "world":
             raise ValueError("not in world coordinates")
@@ -57,6 +62,10 @@ def read_handed_over(path: Path) -> FileMesh:
             raise ValueError("not lists of triples")
         if uvs is not None and uvs.shape != (len(faces), 3, 2):
             raise ValueError("UVs are not those of the faces")
+        polygons = None
+        if "polygons" in arrays and "loops" in arrays:
+            polygons = checked_polygons(arrays["polygons"], arrays["loops"], len(faces))
+        is_new = polygons is not None and bool(arrays.get("is_new", np.array(False)).any())
     except (ValueError, TypeError) as error:
         raise ParseError(
             path, "whole file", f"not a mesh handed over by Blender ({error}).", _AGAIN
@@ -71,4 +80,4 @@ def read_handed_over(path: Path) -> FileMesh:
             path, f"vertex {int(bad[0])}", f"is not finite (as are {len(bad)} in all).",
             "Delete these vertices, or undo what made them.",
         )  # fmt: skip
-    return FileMesh(vertices, faces.astype(np.int64), uvs)
+    return FileMesh(vertices, faces.astype(np.int64), uvs, polygons, is_new)

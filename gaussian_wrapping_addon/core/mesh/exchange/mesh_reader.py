@@ -11,6 +11,7 @@ import numpy as np
 
 from ...dataset.photos.image_formats import forbid_ghostscript
 from ...errors import ParseError, WorkerError
+from ..polygons import Polygons
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
 _AGAIN = "Export the file again."
@@ -26,6 +27,10 @@ class FileMesh:
     """(f, 3) int64."""
     corner_uvs: np.ndarray | None = None
     """(f, 3, 2) float64, v upwards, not checked; ``None`` if a part of the mesh has no UVs."""
+    polygons: Polygons | None = None
+    """What its triangles are parts of; ``None`` if that is not known."""
+    is_new: bool = False
+    """Whether it was made for a bake, and Blender is to show it as an object of its own."""
 
 
 def read_mesh_file(path: Path) -> FileMesh:

@@ -62,7 +62,12 @@ def packing_scale(extents: np.ndarray, side_px: int, padding_px: int, squares: i
     return max(low, MIN_SCALE_SHARE * largest)
 
 
-def split_wide_charts(corner_uvs: np.ndarray, charts: np.ndarray, squares: int) -> np.ndarray:
+def split_wide_charts(
+    corner_uvs: np.ndarray,
+    charts: np.ndarray,
+    squares: int,
+    polygons: np.ndarray | None = None,
+) -> np.ndarray:
     """Split charts that are too wide for several squares.
 
     A chart cannot be larger than a square: if one chart holds most of the surface, several squares
@@ -75,6 +80,8 @@ def split_wide_charts(corner_uvs: np.ndarray, charts: np.ndarray, squares: int) 
     charts : (f,) int
         Labels from 0.
     squares : int
+    polygons : (f,) int, optional
+        Polygon of each face: those within one chart are not cut.
 
     Returns
     -------
@@ -86,6 +93,8 @@ def split_wide_charts(corner_uvs: np.ndarray, charts: np.ndarray, squares: int) 
     double = edge_one[:, 0] * edge_two[:, 1] - edge_one[:, 1] * edge_two[:, 0]
     side = math.sqrt(0.5 * float(np.abs(double).sum()) / (USED_SHARE * squares))
     centres = corner_uvs.mean(axis=1)  # (f, 2)
+    if polygons is not None:
+        centres = _centres_of_polygons(centres, labels, polygons)
     rows = np.arange(len(labels))
     corners = np.arange(3 * len(labels)).reshape(-1, 3)
     for _ in range(MAX_CUTS):
@@ -102,3 +111,13 @@ def split_wide_charts(corner_uvs: np.ndarray, charts: np.ndarray, squares: int) 
         labels[beyond] += count
         labels = np.unique(labels, return_inverse=True)[1].ravel()
     return labels.astype(np.int32)
+
+
+def _centres_of_polygons(
+    centres: np.ndarray, charts: np.ndarray, polygons: np.ndarray
+) -> np.ndarray:
+    """Return (f, 2) one centre for all faces of a polygon that are in the same chart."""
+    pairs = np.stack([charts, polygons], axis=1)
+    part = np.unique(pairs, axis=0, return_inverse=True)[1].ravel()
+    sums = np.stack([np.bincount(part, centres[:, axis]) for axis in range(2)], axis=1)
+    return np.asarray((sums / np.bincount(part)[:, None])[part])

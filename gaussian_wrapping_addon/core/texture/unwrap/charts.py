@@ -19,6 +19,7 @@ from .chart_overlaps import signed_areas, split_overlaps
 from .chart_shapes import chart_points, equalise_density, flatten_faces, relax, smooth_vertices
 from .chunks import split_into_chunks
 from .stretch import Stretch, texture_stretch
+from .whole_polygons import join_polygons, set_cut_apart
 
 _logger = logging.getLogger(__name__)
 
@@ -48,6 +49,8 @@ class Charts:
     labels: np.ndarray
     """(k,) int32."""
     stretch: Stretch
+    polygons: np.ndarray | None = None
+    """(k,) int64 polygon of each face, if polygons are to stay whole."""
 
     def density(self, size_px: int, gutter_px: int, atlases: int = 1) -> float:
         """Return the approximate texels per edge on all but 5 % of the surface."""
@@ -66,6 +69,7 @@ def find_charts(
     folder: Path,
     progress: Progress,
     atlases: int = 1,
+    polygons: np.ndarray | None = None,
 ) -> Charts:
     """Cut the mesh into charts without folds with xatlas.
 
@@ -87,6 +91,9 @@ def find_charts(
         Span of this step.
     atlases : int
         Number of textures for the charts.
+    polygons : (f,) int64, optional
+        Polygon that each face is a part of. Charts cut none of them, but for folded ones with more
+        than four sides.
 
     Raises
     ------
@@ -95,16 +102,16 @@ def find_charts(
     """
     copy = smooth_vertices(vertices, faces)
     try:
-        first = _charts(vertices, copy, faces, folder, progress.span(0.0, 0.6))
+        first = _charts(vertices, copy, faces, folder, progress.span(0.0, 0.6), polygons)
     except (WorkerError, ResourceError, DatasetError) as error:
         _logger.info("xatlas failed on the smoothed copy: %s", error.message)
-        return _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0))
+        return _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0), polygons)
     too_stretched = (
         first.stretch.mean > MAX_MEAN_STRETCH or first.stretch.collapsed_share > MAX_LOST_SHARE
     )
     if not too_stretched and len(first.faces) == len(faces):
         return first
-    second = _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0))
+    second = _charts(vertices, vertices, faces, folder, progress.span(0.6, 1.0), polygons)
     density = [one.density(size_px, gutter_px, atlases) for one in (first, second)]
     _logger.debug("texels for an edge: %.2f, without smoothing %.2f", *density)
     lost = first.stretch.collapsed_share - second.stretch.collapsed_share
@@ -113,7 +120,12 @@ def find_charts(
 
 
 def _charts(
-    vertices: np.ndarray, positions: np.ndarray, faces: np.ndarray, folder: Path, progress: Progress
+    vertices: np.ndarray,
+    positions: np.ndarray,
+    faces: np.ndarray,
+    folder: Path,
+    progress: Progress,
+    polygons: np.ndarray | None,
 ) -> Charts:
     """Cut the mesh into charts at given positions, and relax these to ``vertices``."""
     corner_uvs = _run_xatlas(positions, faces, folder, progress.span(0.0, 0.7))
@@ -126,13 +138,19 @@ def _charts(
     labels = uv_charts(graph, faces, corner_uvs)
     shapes = flatten_faces(vertices, faces)
     flat = equalise_density(_counter_clockwise(corner_uvs, labels), labels, shapes)
+    if polygons is not None:
+        polygons = polygons[kept]
+        flat = join_polygons(flat, labels, faces, shapes, graph, polygons)
+        labels = uv_charts(graph, faces, flat)
     flat = relax(flat, labels, shapes)
     progress.update(0.9, "splitting charts that fold")
     labels = split_overlaps(flat, labels, graph)
+    if polygons is not None:
+        flat, labels = set_cut_apart(flat, labels, faces, shapes, graph, polygons)
     flat = equalise_density(flat, labels, shapes)
     side = max(float(np.abs(flat).max()), 1e-300)
     stretch = texture_stretch(vertices, faces, flat / side)
-    return Charts(kept, flat, labels, stretch)
+    return Charts(kept, flat, labels, stretch, polygons)
 
 
 def _counter_clockwise(corner_uvs: np.ndarray, labels: np.ndarray) -> np.ndarray:
@@ -213,7 +231,7 @@ def pack_charts(
     flat = (charts.corner_uvs * [1.0, -1.0]).astype(np.float32)
     labels = charts.labels
     if atlases > 1:
-        labels = split_wide_charts(charts.corner_uvs, labels, atlases)
+        labels = split_wide_charts(charts.corner_uvs, labels, atlases, charts.polygons)
     corners, first = chart_points(flat, labels)
     np.savez(
         folder / "input.npz",

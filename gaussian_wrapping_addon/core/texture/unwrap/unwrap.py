@@ -67,6 +67,7 @@ def unwrap(
     *,
     threads: int = 1,
     atlases: int = 1,
+    polygons: np.ndarray | None = None,
 ) -> Unwrap:
     """Compute UVs for all face corners, without overlaps.
 
@@ -82,6 +83,9 @@ def unwrap(
         Span of this step.
     atlases : int
         Maximum number of textures for the charts, all at the same density.
+    polygons : (f,) int64, optional
+        Polygon that each face is a part of: seams run between polygons, not through them, but for
+        folded ones with more than four sides, and the fallback.
 
     Notes
     -----
@@ -91,8 +95,9 @@ def unwrap(
     graph = face_graph(mesh.vertices, mesh.faces)
     try:
         corner_uvs, face_atlas, gutter_left_px = _xatlas(
-            mesh, graph, size_px, gutter_px, work_folder, progress.span(0.0, 0.9), threads, atlases
-        )
+            mesh, graph, size_px, gutter_px, work_folder, progress.span(0.0, 0.9), threads, atlases,
+            polygons,
+        )  # fmt: skip
         method, reason = "xatlas", ""
     except (WorkerError, ResourceError, DatasetError) as error:
         if isinstance(error.__cause__, OSError):
@@ -137,6 +142,7 @@ def _xatlas(
     progress: Progress,
     threads: int,
     atlases: int = 1,
+    polygons: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     corners = mesh.vertices[mesh.faces]
     if not np.isfinite(corners).all():
@@ -153,8 +159,9 @@ def _xatlas(
     folder = Path(tempfile.mkdtemp(prefix="unwrap-", dir=work_folder))
     try:
         charts = find_charts(
-            scaled, faces, size_px, gutter_px, folder, progress.span(0.0, 0.7), atlases
-        )
+            scaled, faces, size_px, gutter_px, folder, progress.span(0.0, 0.7), atlases,
+            None if polygons is None else polygons[solid],
+        )  # fmt: skip
         texture_uvs, chart_atlas, gutter_left_px = pack_charts(
             charts, size_px, gutter_px, folder, progress.span(0.7, 0.9), atlases
         )

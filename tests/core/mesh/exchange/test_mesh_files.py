@@ -21,6 +21,7 @@ from gaussian_wrapping_addon.core.mesh.exchange.handed_over import (
 )
 from gaussian_wrapping_addon.core.mesh.exchange.mesh_frame import world_from_file
 from gaussian_wrapping_addon.core.mesh.exchange.mesh_reader import FileMesh, read_mesh_file
+from gaussian_wrapping_addon.core.mesh.polygons import Polygons
 from gaussian_wrapping_addon.core.texture.files.textured_files import write_glb, write_obj
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0], [0, 0, 3]], float)
@@ -181,6 +182,20 @@ def test_what_blender_hands_over_comes_back_bit_for_bit(tmp_path: Path) -> None:
         assert np.array_equal(found.faces, FACES)
         assert (found.corner_uvs is None) == (uvs is None)
         assert uvs is None or np.array_equal(found.corner_uvs, uvs)
+        assert found.polygons is None
+        assert not found.is_new
+
+
+@pytest.mark.parametrize("is_new", [True, False])
+def test_polygons_are_handed_over(is_new: bool, tmp_path: Path) -> None:
+    polygons = Polygons(np.zeros(len(FACES), np.int64), np.arange(3 * len(FACES)).reshape(-1, 3))
+    mesh = FileMesh(VERTICES, FACES, polygons=polygons, is_new=is_new)
+    write_handed_over(tmp_path / "m.npz", mesh)
+    found = read_handed_over(tmp_path / "m.npz")
+    assert found.polygons is not None
+    assert np.array_equal(found.polygons.of_faces, polygons.of_faces)
+    assert np.array_equal(found.polygons.loops, polygons.loops)
+    assert found.is_new == is_new
 
 
 @pytest.mark.parametrize(
@@ -190,7 +205,9 @@ def test_what_blender_hands_over_comes_back_bit_for_bit(tmp_path: Path) -> None:
      ({"faces": FACES + 2}, "out of range"),
      ({"faces": np.array([[0.0, 1.0, 2.0]])}, "not lists of triples"),
      ({"vertices": np.where(VERTICES == 3, np.nan, VERTICES)}, "vertex 4: is not finite"),
-     ({"corner_uvs": UVS[:1]}, "not those of the faces")],
+     ({"corner_uvs": UVS[:1]}, "not those of the faces"),
+     ({"polygons": np.zeros(1, int), "loops": FACES}, "polygons are not integers of shape"),
+     ({"polygons": np.zeros(len(FACES), int), "loops": FACES - 9}, "loops are out of range")],
 )  # fmt: skip
 def test_handed_over_files_that_are_none_are_refused(
     changed: dict, words: str, tmp_path: Path
