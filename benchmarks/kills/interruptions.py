@@ -20,7 +20,7 @@ from gaussian_wrapping_addon.core.errors import ResourceError
 from gaussian_wrapping_addon.core.jobs.store.job_folder import JobFolder
 from tools.version_comparison.contents import differences
 
-from ..speed_error.runs import BATCH
+from ..speed_error.runs import BATCH, ROOT
 from ..study.record import code_of_tree
 from .outcomes import Outcome
 from .processes import POLL_S, wait_until_gone, worker_of
@@ -70,7 +70,7 @@ def carry_out(trial: Trial, reference: Reference, place: Path) -> Outcome:
         trial=trial,
         hit=hit,
         code=code,
-        message=lines[-1].replace(str(job), "DIR") if lines else "",
+        message=_without_places(lines[-1], job) if lines else "",
         end_s=round(end_s, 2),
         left=len(left),
         traceback="Traceback" in said,
@@ -80,6 +80,11 @@ def carry_out(trial: Trial, reference: Reference, place: Path) -> Outcome:
         code_name=code_of_tree().name,
         date=datetime.date.today().isoformat(),
     )
+
+
+def _without_places(text: str, job: Path) -> str:
+    """Return a message without the folders of this machine: records are published."""
+    return text.replace(str(job), "DIR").replace(str(ROOT), "REPOSITORY")
 
 
 def _limit(trial: Trial, reference: Reference) -> int:

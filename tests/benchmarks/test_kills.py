@@ -12,10 +12,11 @@ import pytest
 
 from benchmarks.kills import processes
 from benchmarks.kills.document import page, write_document
-from benchmarks.kills.interruptions import _limit
+from benchmarks.kills.interruptions import _limit, _without_places
 from benchmarks.kills.outcomes import LONGEST_END_S, Outcome, read_outcomes, write_outcomes
 from benchmarks.kills.small_job import BLOCK_BYTES, LEFT_OUT, Reference, room
 from benchmarks.kills.trials import CALLER, DISK, KILL, MEMORY, STAGES, WAYS, Trial, draw
+from benchmarks.speed_error.runs import ROOT
 from tools.version_comparison.contents import Contents, differences, read_contents
 
 GOOD = Outcome(
@@ -82,6 +83,13 @@ def test_limits_lie_between_what_packages_and_what_the_job_take() -> None:
         assert 20_000 <= _limit(Trial(DISK, 0, "", share), reference) <= 1_000_000
         assert 100 < _limit(Trial(MEMORY, 0, "", share), reference) <= 1_000
     assert _limit(Trial(KILL, 0, "mesh", 0.5), reference) == 0
+
+
+def test_messages_name_no_folder_of_the_machine(tmp_path: Path) -> None:
+    said = f"error: {ROOT}/.venv/bin/python could not write {tmp_path}/stages/a."
+    told = _without_places(said, tmp_path)
+    assert told == "error: REPOSITORY/.venv/bin/python could not write DIR/stages/a."
+    assert not [o for o in read_outcomes().values() if str(ROOT) in o.message]
 
 
 def test_a_reused_stage_alone_is_no_difference(tmp_path: Path) -> None:
