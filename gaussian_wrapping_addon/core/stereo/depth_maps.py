@@ -167,6 +167,7 @@ class _Matcher:
         depths = level.inverse_depths()
         for view in range(len(level)):
             level.confirm(view, depths)
+        level.compare_brightness()
         for turn in range(COARSE_GEOMETRIC_SWEEPS):
             self._geometric_sweep(level, COARSE_SWEEPS + turn, turn == 0, 1)
         depths = level.inverse_depths()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..kernels.compiled import part
+from .brightness import GAIN, RATE
 from .plane_kernels import F32, NEAREST_Z, ONE, ZERO, back_error_px
 
 WORST_COST = F32(1.2)
@@ -20,6 +21,10 @@ surface is hidden would outweigh several that show it."""
 NOISE_VARIANCE = F32(4.0)
 """Added to both variances, squared grey levels: windows without texture cost about 1 for all
 planes, so that others decide there."""
+
+SHADING_COST, SHADING_TEXTURE = F32(1.0), F32(40)
+"""Cost of a window that is clearly brighter or darker than the other photo's; variance of grey at
+which half of it is left."""
 
 _OFFSETS = range(-5, 6, 2)
 WINDOW = np.array(
@@ -39,9 +44,13 @@ _BYTE = np.int32(255)
 @part(fast=True)
 def window_cost(
     quads: Any, base: Any, stride: Any, width: Any, height: Any, x: Any, y: Any,
-    xu: Any, xv: Any, yu: Any, yv: Any, table: Any, found: Any, mean: Any, variance: Any,
+    xu: Any, xv: Any, yu: Any, yv: Any, gain: Any, rate: Any, table: Any, found: Any, mean: Any,
+    variance: Any,
 ) -> Any:  # fmt: skip
-    """Return ``1 - correlation`` of the reference window with another photo's, affinely warped.
+    """Return the cost of the reference window in another photo, affinely warped.
+
+    ``1 - correlation`` of both windows, and where there is little texture the difference of their
+    mean levels.
 
     Three loops, because LLVM vectorises the first and the last and leaves only the loads scalar:
     2.4 times as fast as one loop.
@@ -59,6 +68,8 @@ def window_cost(
         Where the window's centre lands.
     xu, xv, yu, yv : float32
         Derivatives of that place by the pixel of the reference.
+    gain, rate : float32
+        Brightness of the other photo (:func:`~.brightness.brightness_of`).
     table : (6, SAMPLES) float32
         The reference window; the last two rows are scratch.
     found : (SAMPLES,) int32
@@ -94,13 +105,16 @@ def window_cost(
         product += table[WEIGHTED_GREY, i] * grey
     other = max(total_sq - total * total, ZERO)
     spread = np.sqrt((variance + NOISE_VARIANCE) * (other + NOISE_VARIANCE))
-    return min(ONE - product / spread, WORST_COST)
+    cost = ONE - product / spread
+    brighter = abs(gain * (total + mean) - mean) * rate
+    cost += SHADING_COST * SHADING_TEXTURE / (SHADING_TEXTURE + variance) * min(brighter, ONE)
+    return min(cost, WORST_COST)
 
 
 @part(fast=True)
 def view_cost(
     s: Any, u: Any, v: Any, w: Any, a: Any, b: Any, maps: Any, back_maps: Any, quads: Any,
-    sizes: Any, bases: Any, stride: Any, inverse_depths: Any, geometric: Any,
+    sizes: Any, bases: Any, stride: Any, brightness: Any, inverse_depths: Any, geometric: Any,
     table: Any, found: Any, mean: Any, variance: Any,
 ) -> Any:  # fmt: skip
     """Return the cost of plane (w, a, b) of pixel (u, v) in source ``s``.
@@ -119,7 +133,7 @@ def view_cost(
         quads, bases[s], stride, sizes[s, 0], sizes[s, 1], x, y,
         r * (m[0] + a * m[9] - x * zu), r * (m[1] + b * m[9] - x * zv),
         r * (m[3] + a * m[10] - y * zu), r * (m[4] + b * m[10] - y * zv),
-        table, found, mean, variance,
+        brightness[s, GAIN], brightness[s, RATE], table, found, mean, variance,
     )  # fmt: skip
     if geometric > ZERO and cost < WORST_COST:
         cost += geometric * back_error_px(

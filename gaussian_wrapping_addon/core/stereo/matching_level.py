@@ -6,8 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import ndimage
 
 from ..dataset.camera import Camera
+from .brightness import NO_BRIGHTNESS, brightness_of
 from .consistency import confirm
 from .matching_cost import WORST_COST
 from .sweep import sweep
@@ -21,6 +23,9 @@ _FAR_PX = (3, 5, 9, 7)
 
 _FIRST_SPAN, _LATER_SPAN = 0.1, 0.02
 """Relative change of the depth by the first refinement, while planes are random and later."""
+
+_MEAN_PX = 5
+"""Side of the window over which grey levels are averaged to compare the brightness of photos."""
 
 _MOST_SEED = 2**32 - 1
 """Seeds of a sweep lie between 1 and this: the generator would stay at 0."""
@@ -54,6 +59,9 @@ class MatchingLevel:
     costs, variances : list of (h, w) float32
     confirmed : list of (h, w) uint8
         Bits of the sources that agree, after :meth:`confirm`.
+    brightness : list of (k, 2) float32
+        Gain and rate of the sources of each photo (:func:`~.brightness.brightness_of`), after
+        :meth:`compare_brightness`; until then it is not compared.
     """
 
     def __init__(
@@ -83,6 +91,7 @@ class MatchingLevel:
         self._best_sources, self.confirmed = (
             [np.zeros(grey.shape, np.uint8) for grey in self.greys] for _ in range(2)
         )
+        self.brightness = [np.tile(NO_BRIGHTNESS, (len(chosen), 1)) for chosen in self.sources]
         self.lenses = [_lens(camera) for camera in self.cameras]
         self._joined = [self._join(view) for view in range(count)]
 
@@ -127,8 +136,9 @@ class MatchingLevel:
         sweep(
             self.greys[view], order, neighbours, fresh, planes, self.costs[view],
             self._best_sources[view], self.variances[view], maps, back_maps, self._quads, sizes,
-            bases, self._stride, inverse_depths, np.float32(geometric), self.lenses[view],
-            self.depth_ranges[view], np.float32(_FIRST_SPAN if fresh else _LATER_SPAN), prior,
+            bases, self._stride, self.brightness[view], inverse_depths, np.float32(geometric),
+            self.lenses[view], self.depth_ranges[view],
+            np.float32(_FIRST_SPAN if fresh else _LATER_SPAN), prior,
             np.uint32(1 + (7919 * (view + 1) + 104729 * turn + 31 * seed) % _MOST_SEED),
         )  # fmt: skip
         self.planes_of(view)[:] = planes
@@ -146,8 +156,20 @@ class MatchingLevel:
             )  # fmt: skip
         return means
 
+    def compare_brightness(self) -> None:
+        """Measure gains between photos on the confirmed pixels; costs compare them from now on."""
+        means = [
+            ndimage.uniform_filter(grey.astype(np.float32), _MEAN_PX, mode="nearest")
+            for grey in self.greys
+        ]
+        for view, chosen in enumerate(self.sources):
+            self.brightness[view] = brightness_of(
+                means[view], self.planes_of(view)[..., 0], self.confirmed[view],
+                self._joined[view][0], [means[source] for source in chosen],
+            )  # fmt: skip
+
     def start_from(self, coarse: MatchingLevel, view: int) -> None:
-        """Take over the planes of a level of half the size."""
+        """Take over planes and brightness of a level of half the size."""
         height, width = self.greys[view].shape
         last_row, last_column = (n - 1 for n in coarse.greys[view].shape)
         row, column = np.mgrid[:height, :width]
@@ -161,6 +183,7 @@ class MatchingLevel:
         self._best_sources[view][:] = coarse._best_sources[view][above]
         self.costs[view][:] = coarse.costs[view][above]
         self.confirmed[view][:] = coarse.confirmed[view][above]
+        self.brightness[view] = coarse.brightness[view]
 
     def _join(self, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return maps to the sources and back (s, 12), their sizes (s, 2) and first pixels (s,)."""

@@ -39,7 +39,7 @@ ALIKE_LEVELS = 12.0
 NORMAL_SPREAD = F32(20)
 """Relative change of the normal per relative change of the depth, at most 1."""
 
-PRIOR_STRENGTH, PRIOR_TEXTURE, PRIOR_SHARE = F32(0.5), F32(20), F32(0.01)
+PRIOR_STRENGTH, PRIOR_TEXTURE, PRIOR_SHARE = F32(0.25), F32(20), F32(0.01)
 """Largest cost of leaving the prior's plane; variance of grey at which half of it is left; share of
 the depth that counts as leaving it."""
 
@@ -64,7 +64,7 @@ def _prior_cost(
 @part(fast=True)
 def _cost_in(
     sources: Any, kept: Any, bound: Any, costs: Any, u: Any, v: Any, w: Any, a: Any, b: Any,
-    maps: Any, back_maps: Any, quads: Any, sizes: Any, bases: Any, stride: Any,
+    maps: Any, back_maps: Any, quads: Any, sizes: Any, bases: Any, stride: Any, brightness: Any,
     inverse_depths: Any, geometric: Any, table: Any, found: Any, mean: Any, variance: Any,
 ) -> Any:  # fmt: skip
     """Return the mean cost in a set of sources (bits), or ``bound`` once it cannot be less."""
@@ -72,8 +72,8 @@ def _cost_in(
     for s in range(maps.shape[0]):
         if (sources >> s) & 1:
             costs[s] = view_cost(
-                s, u, v, w, a, b, maps, back_maps, quads, sizes, bases, stride, inverse_depths,
-                geometric, table, found, mean, variance,
+                s, u, v, w, a, b, maps, back_maps, quads, sizes, bases, stride, brightness,
+                inverse_depths, geometric, table, found, mean, variance,
             )  # fmt: skip
             total += costs[s]
             if total >= limit:
@@ -86,8 +86,9 @@ def sweep(
     grey: np.ndarray, order: np.ndarray, neighbours: np.ndarray, fresh: bool,
     planes: np.ndarray, cost: np.ndarray, best_sources: np.ndarray, variances: np.ndarray,
     maps: np.ndarray, back_maps: np.ndarray, quads: np.ndarray, sizes: np.ndarray,
-    bases: np.ndarray, stride: float, inverse_depths: np.ndarray, geometric: float,
-    lens: np.ndarray, depth_range: np.ndarray, span: float, prior: np.ndarray, seed: int,
+    bases: np.ndarray, stride: float, brightness: np.ndarray, inverse_depths: np.ndarray,
+    geometric: float, lens: np.ndarray, depth_range: np.ndarray, span: float, prior: np.ndarray,
+    seed: int,
 ) -> None:  # fmt: skip
     """Visit the pixels of a photo once and give each the best plane found.
 
@@ -109,7 +110,8 @@ def sweep(
     planes : (h, w, 3) float32
         Changed: w, a, b of each pixel.
     cost, variances : (h, w) float32
-        Written: mean cost in the two best sources, and weighted variance of the window.
+        Written: mean cost in the two best sources, brightness left out, and weighted variance of
+        the window.
     best_sources : (h, w) uint8
         Changed: bits of the sources kept.
     maps, back_maps : (s, 12) float32
@@ -117,6 +119,8 @@ def sweep(
     quads, sizes, bases, stride
         Of the sources (:func:`~.matching_cost.window_cost`); ``sizes`` is (s, 2) float32, last
         column and row.
+    brightness : (s, 2) float32
+        Of the sources (:func:`~.brightness.brightness_of`).
     inverse_depths : (photos * height * stride,) float32
         Present depths of all photos; not read where ``geometric`` is 0.
     geometric : float32
@@ -139,6 +143,7 @@ def sweep(
     table, found = np.empty((6, SAMPLES), np.float32), np.empty(SAMPLES, np.int32)
     near, alike = np.empty(SAMPLES, np.float32), np.empty(256, np.float32)
     costs, trial = np.empty(count, np.float32), np.empty(count, np.float32)
+    not_compared = np.zeros((count, 2), np.float32)
     for i in range(SAMPLES):
         table[AT_X, i], table[AT_Y, i] = F32(WINDOW[i, 0]), F32(WINDOW[i, 1])
         distance_sq = table[AT_X, i] * table[AT_X, i] + table[AT_Y, i] * table[AT_Y, i]
@@ -164,7 +169,8 @@ def sweep(
                         if (known >> s) & 1 != others:
                             costs[s] = view_cost(
                                 s, u, v, w, a, b, maps, back_maps, quads, sizes, bases, stride,
-                                inverse_depths, geometric, table, found, mean, variance,
+                                brightness, inverse_depths, geometric, table, found, mean,
+                                variance,
                             )  # fmt: skip
                             total += costs[s]
                 chosen, total = 0, ZERO
@@ -219,8 +225,8 @@ def sweep(
                 continue
             value = extra + _cost_in(
                 sources, kept, best - extra, trial, u, v, new_w, new_a, new_b, maps, back_maps,
-                quads, sizes, bases, stride, inverse_depths, geometric, table, found, mean,
-                variance,
+                quads, sizes, bases, stride, brightness, inverse_depths, geometric, table, found,
+                mean, variance,
             )  # fmt: skip
             if value < best:
                 w, a, b, best = new_w, new_a, new_b, value
@@ -229,12 +235,14 @@ def sweep(
                     if (chosen >> s) & 1 and not judge:
                         costs[s] = trial[s]
         planes[row, column, 0], planes[row, column, 1], planes[row, column, 2] = w, a, b
-        first, second = WORST_COST, WORST_COST
+        # What others read of the cost is how well the windows match, however bright they are.
+        total = WORST_COST * F32(KEPT_SOURCES - kept)
         for s in range(count):
-            if costs[s] < first:
-                first, second = costs[s], first
-            elif costs[s] < second:
-                second = costs[s]
-        cost[row, column] = HALF * (first + second)
+            if (chosen >> s) & 1:
+                total += view_cost(
+                    s, u, v, w, a, b, maps, back_maps, quads, sizes, bases, stride, not_compared,
+                    inverse_depths, geometric, table, found, mean, variance,
+                )  # fmt: skip
+        cost[row, column] = total / F32(KEPT_SOURCES)
         best_sources[row, column] = np.uint8(chosen)
         variances[row, column] = variance

@@ -10,6 +10,7 @@ from gaussian_wrapping_addon.core.stereo.matching_cost import (
     AT_X,
     AT_Y,
     SAMPLES,
+    SHADING_COST,
     WEIGHT,
     WEIGHTED_GREY,
     WINDOW,
@@ -31,10 +32,13 @@ def costs(
     *,
     depth: float = 1.0,
     geometric: float = 0.0,
+    brightness: tuple[float, float] = (1.0, 0.0),
+    first: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the cost of planes at ``depth`` times the true one, in the second photo."""
     given, photos = plane_photos()
-    level = level_of([photos[0], other, photos[2]], list(given))
+    first = photos[0] if first is None else first
+    level = level_of([first, other, photos[2]], list(given))
     for view, camera in enumerate(given):
         level.planes_of(view)[:] = true_planes(camera)
     maps, back_maps, sizes, bases = level._joined[0]
@@ -42,13 +46,14 @@ def costs(
     table[AT_X], table[AT_Y] = WINDOW.T
     found = []
     for row, column in pixels:
-        mean, variance = fill_window.py_func(photos[0], row, column, NEAR, ALIKE, table)
+        mean, variance = fill_window.py_func(first, row, column, NEAR, ALIKE, table)
         plane = (true_planes(given[0])[row, column] / depth).astype(np.float32)
         found.append(
             view_cost.py_func(
                 0, np.float32(column), np.float32(row), *plane, maps, back_maps, level._quads,
-                sizes, bases, level._stride, level.inverse_depths(), np.float32(geometric),
-                table, np.empty(SAMPLES, np.int32), np.float32(mean), np.float32(variance),
+                sizes, bases, level._stride, np.tile(np.float32(brightness), (2, 1)),
+                level.inverse_depths(), np.float32(geometric), table, np.empty(SAMPLES, np.int32),
+                np.float32(mean), np.float32(variance),
             )
         )  # fmt: skip
     return np.array(found)
@@ -74,6 +79,21 @@ def test_a_photo_of_one_grey_costs_1_for_all_planes() -> None:
     flat = np.full_like(plane_photos()[1][1], 90)
     for depth in (0.9, 1.0, 1.1):
         assert costs(flat, depth=depth) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_plain_window_costs_by_how_much_its_brightness_differs() -> None:
+    tolerance = 10.0
+    plain = np.full_like(plane_photos()[1][0], 90)
+    for level, gain, added in ((90, 1.0, 0.0), (91, 1.0, 0.1), (100, 1.0, 1.0), (80, 1.125, 0.0)):
+        other = np.full_like(plain, level)
+        found = costs(other, first=plain, brightness=(gain, 1.0 / tolerance))
+        expected = min(1.0 + added * float(SHADING_COST), float(WORST_COST))
+        assert found == pytest.approx(expected, abs=2e-3)
+
+
+def test_brightness_hardly_counts_where_there_is_texture() -> None:
+    _, photos = plane_photos()
+    assert costs(photos[1], brightness=(1.2, 1.0)).max() < 0.15
 
 
 def test_windows_that_leave_the_photo_cost_most() -> None:

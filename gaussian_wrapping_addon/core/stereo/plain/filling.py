@@ -62,9 +62,10 @@ KEPT_SHARE = 0.003
 
 FILLED_CONFIDENCE, FILLED_AGREEING = 0.5, 2
 
-BEHIND_MARGIN_PX, BEHIND_VIEWS = 2, 2
+BEHIND_MARGIN_PX, BEHIND_VIEWS, BEHIND_PER_AGREEING = 2, 2, 2
 """Photos that must see a plane or something far away behind a confirmed point, so far from its
-border, for the point to be none."""
+border, for the point to be none; and photos whose own depth agrees with it that each outweighs. A
+plane that takes in a bit of a thing of like colour in two photos must not erase it from thirty."""
 
 _NOBODY, _FAR = -1, -2
 """Owners of pixels that lie on no plane: nothing is known, or too far away for parallax."""
@@ -319,8 +320,11 @@ class _Filled:
         if len(row):
             pixels = np.stack([column, row], 1).astype(np.float64)
             inverse = 1.0 / depth_map.depth[row, column].astype(np.float64)
-            counts = behind.counts(view, pixels, inverse)
-            found[row, column] = counts[:, THROUGH] >= BEHIND_VIEWS
+            through = behind.counts(view, pixels, inverse)[:, THROUGH]
+            asked = np.flatnonzero(through >= BEHIND_VIEWS)
+            agree = self.photos.counts(view, pixels[asked], inverse[asked])[:, AGREEING]
+            lost = asked[BEHIND_PER_AGREEING * through[asked] > agree]
+            found[row[lost], column[lost]] = True
         return found
 
     def behind(self) -> PackedPhotos:
