@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..kernels.compiled import part
-from .brightness import GAIN, RATE
+from .consistency import GAIN, RATE
 from .plane_kernels import F32, NEAREST_Z, ONE, ZERO, back_error_px
 
 WORST_COST = F32(1.2)
@@ -69,7 +69,7 @@ def window_cost(
     xu, xv, yu, yv : float32
         Derivatives of that place by the pixel of the reference.
     gain, rate : float32
-        Brightness of the other photo (:func:`~.brightness.brightness_of`).
+        Brightness of the other photo (:func:`~.consistency.brightness_of`).
     table : (6, SAMPLES) float32
         The reference window; the last two rows are scratch.
     found : (SAMPLES,) int32

@@ -9,8 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..dataset.camera import Camera
-from .brightness import NO_BRIGHTNESS, brightness_of
-from .consistency import confirm
+from .consistency import NO_BRIGHTNESS, brightness_of, confirm
 from .matching_cost import WORST_COST
 from .sweep import sweep
 
@@ -60,7 +59,7 @@ class MatchingLevel:
     confirmed : list of (h, w) uint8
         Bits of the sources that agree, after :meth:`confirm`.
     brightness : list of (k, 2) float32
-        Gain and rate of the sources of each photo (:func:`~.brightness.brightness_of`), after
+        Gain and rate of the sources of each photo (:func:`~.consistency.brightness_of`), after
         :meth:`compare_brightness`; until then it is not compared.
     """
 

@@ -120,7 +120,7 @@ def sweep(
         Of the sources (:func:`~.matching_cost.window_cost`); ``sizes`` is (s, 2) float32, last
         column and row.
     brightness : (s, 2) float32
-        Of the sources (:func:`~.brightness.brightness_of`).
+        Of the sources (:func:`~.consistency.brightness_of`).
     inverse_depths : (photos * height * stride,) float32
         Present depths of all photos; not read where ``geometric`` is 0.
     geometric : float32
