@@ -15,10 +15,17 @@ from scipy import ndimage
 
 from .evidence import PackedPhotos
 from .evidence_kernels import THROUGH_SHARE, correlate
+from .noise import noise_levels, smoothed_noise
 from .planes import LEAST_INVERSE_DEPTH, Plane, image_plane, lifted_pixels, with_ones
 
 SCALES_PX = ((1.5, 8.0), (0.7, 5.0))
-"""Standard deviations of the two Gaussians whose difference is the texture, coarse and fine."""
+"""Standard deviations of the two Gaussians whose difference is the texture, coarse and fine, of
+photos without noise."""
+
+MOST_NOISE_LEVELS, MOST_COARSENING = 0.2, 4.0
+"""Noise of a texture, grey levels, from which its scale is made coarser, and the largest factor.
+Noise lowers every correlation: those of a rendered room's true planes fell to .13 to .31
+where its photos were matched at full size."""
 
 STEPS = ((0.01, 0.005), (0.0025, 0.00125, 0.0006, 0.0003))
 """Of the search at each scale, as shares of the depth at the edges of the plane's segments."""
@@ -44,9 +51,11 @@ _WIDE = 0.3
 LEAST_GAIN, LEAST_CORRELATION = 0.01, 0.6
 """Gain of correlation by a move, and correlation after it, for which a plane is moved."""
 
-FALSE_CORRELATION, LEAST_TEXTURE = 0.4, 0.12
-"""A plane whose texture correlates less is no surface, if there is texture of so many grey levels
-(root mean square). True planes of rendered scenes reach .55 to .94, false ones .01 to .36."""
+FALSE_CORRELATION, LEAST_TEXTURE, NOISE_MARGIN = 0.4, 0.12, 1.25
+"""A plane whose texture correlates less at both scales is no surface, if there is texture of so
+many grey levels (root mean square) besides noise, taken so many times as large as measured. The
+fine scale alone refuses planes that are off by a pixel, and walls whose finest texture is that of
+rounding to whole levels."""
 
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
@@ -75,16 +84,23 @@ class Aligner:
     Parameters
     ----------
     photos : PackedPhotos
-    plain : (n, h, w) bool
-        Pixels of the plain segments.
+    segments : (n, h, w) int32
+        Numbers of the plain segments of each photo from 1, 0 elsewhere.
     """
 
     def __init__(
-        self, photos: PackedPhotos, plain: np.ndarray, random: np.random.Generator
+        self, photos: PackedPhotos, segments: np.ndarray, random: np.random.Generator
     ) -> None:
-        self.photos, self.plain, self.random = photos, plain, random
+        self.photos, self.plain, self.random = photos, segments > 0, random
         grey = photos.images @ _LUMA  # (n, h, w)
-        self.textures = [_textures(grey, plain, *scale) for scale in SCALES_PX]
+        scales = np.array(SCALES_PX)
+        # White noise falls with the standard deviation of the Gaussian that smooths it.
+        left = smoothed_noise(noise_levels(list(grey), list(self.plain)), scales[:, 0])  # (2,)
+        coarsening = np.clip(left / MOST_NOISE_LEVELS, 1.0, MOST_COARSENING)
+        scales *= coarsening[:, None]
+        self.noise = left / coarsening
+        """(2,) standard deviation of the noise of both textures, grey levels."""
+        self.textures = [_textures(grey, segments, *scale) for scale in scales]
 
     def aligned(self, plane: Plane, parts: Sequence[Part]) -> Plane | None:
         """Return the plane where it matches best, or ``None`` where it is no surface.
@@ -99,11 +115,18 @@ class Aligner:
         place, best = np.zeros(3), start
         for level, steps in enumerate(STEPS):
             place, best = search.climbed(place, level, steps)
-        if best < FALSE_CORRELATION and search.texture_levels() > LEAST_TEXTURE:
+        if search.is_false(place):
             return None
         if best > start + LEAST_GAIN and best > LEAST_CORRELATION:
             return plane.moved(*search.plane(place))
         return plane
+
+    def contradicts(self, plane: Plane, part: Part) -> bool:
+        """Tell whether the texture of a part is that of no surface on a plane."""
+        sampled = self._sampled(plane, part)
+        if sampled is None:
+            return False
+        return _Search(self, plane, [sampled]).is_false(np.zeros(3))
 
     def _sampled(self, plane: Plane, part: Part) -> _Sampled | None:
         """Choose samples, and sources that see them as plain pixels from elsewhere."""
@@ -204,24 +227,44 @@ class _Search:
                     break
         return place, best
 
-    def texture_levels(self) -> float:
-        """Return the root mean square of the fine texture at the samples, grey levels."""
-        textures = self.aligner.textures[1]
+    def is_false(self, place: np.ndarray) -> bool:
+        """Tell whether both textures correlate so little that there is no surface at a place."""
+        for level, noise in enumerate(self.aligner.noise):
+            power = self.texture_levels(level) ** 2
+            texture = power - (NOISE_MARGIN * noise) ** 2
+            # Noise takes its share of the correlation.
+            expected = FALSE_CORRELATION * texture / max(power, 1e-12)
+            if texture <= LEAST_TEXTURE**2 or self.score(place, level) >= expected:
+                return False
+        return True
+
+    def texture_levels(self, level: int) -> float:
+        """Return the root mean square of a texture at the samples, grey levels."""
+        textures = self.aligner.textures[level]
         values = [textures[part.view].reshape(-1)[part.at] for part in self.parts]
         clipped = np.clip(np.concatenate(values), -CLIPPED_LEVELS, CLIPPED_LEVELS)
         return float(np.sqrt(np.mean(clipped**2)))
 
 
-def _textures(grey: np.ndarray, plain: np.ndarray, fine_px: float, coarse_px: float) -> np.ndarray:
-    """Return (n, h, w) float32 band of the grey levels of plain pixels alone, NaN elsewhere."""
+def _textures(
+    grey: np.ndarray, segments: np.ndarray, fine_px: float, coarse_px: float
+) -> np.ndarray:
+    """Return (n, h, w) float32 band of the grey levels of each segment alone, NaN elsewhere.
+
+    The sky beside a wall would otherwise be a step in the wall's own texture.
+    """
     band = np.full(grey.shape, np.nan, np.float32)
-    for view in range(len(grey)):
-        weight = plain[view].astype(np.float32)
-        weighted = grey[view] * weight
-        means = [
-            ndimage.gaussian_filter(weighted, sigma)
-            / np.maximum(ndimage.gaussian_filter(weight, sigma), 1e-3)
-            for sigma in (fine_px, coarse_px)
-        ]
-        band[view][plain[view]] = (means[0] - means[1])[plain[view]]
+    for view, numbers in enumerate(segments):
+        for number, box in enumerate(ndimage.find_objects(numbers), 1):
+            if box is None:
+                continue
+            own = numbers[box] == number
+            weight = own.astype(np.float32)
+            weighted = grey[view][box] * weight
+            means = [
+                ndimage.gaussian_filter(weighted, sigma)
+                / np.maximum(ndimage.gaussian_filter(weight, sigma), 1e-3)
+                for sigma in (fine_px, coarse_px)
+            ]
+            band[view][box][own] = (means[0] - means[1])[own]
     return band

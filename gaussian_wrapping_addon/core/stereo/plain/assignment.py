@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,14 +91,17 @@ def on_planes(
 
 
 def assigned(
-    segment: Segment, planes: Sequence[Plane], photos: PackedPhotos, *, first: bool
-) -> Assignment | None:
+    segment: Segment, planes: Sequence[Plane], photos: PackedPhotos, *, first: bool,
+    is_false: Callable[[Assignment], bool] = lambda _: False,
+) -> Assignment | None:  # fmt: skip
     """Return the planes that explain most of what is known around a segment and pass the votes.
 
     Parameters
     ----------
     first : bool
         Planes are proposals of single segments still.
+    is_false : callable
+        Whether anything else speaks against an assignment that passes the votes.
     """
     if not planes or segment.weights.sum() < LEAST_WEIGHT:
         return None
@@ -107,7 +110,8 @@ def assigned(
     for assignment in choices.best():
         inverse = assignment.inverse_depths(choices.sampled_on(assignment))
         votes = photos.votes(segment.view, choices.sampled, inverse)
-        if votes.like >= LEAST_LIKE and votes.through <= through:
+        passes = votes.like >= LEAST_LIKE and votes.through <= through
+        if passes and not is_false(assignment):
             return assignment
     return None
 

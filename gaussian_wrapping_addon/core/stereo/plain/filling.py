@@ -104,8 +104,9 @@ def fill_plain_parts(
         if turn + 1 < TURNS:
             fitted = _fitted(planes, tried, found, depth_maps, photos)
             planes = pooled(fitted)
-    planes = _aligned(planes, tried, found, photos, _plain(segments, photos), random, progress)
-    found = _assigned(tried, planes, photos, progress, first=False)
+    aligner = Aligner(photos, _numbered(segments, photos), random)
+    planes = _aligned(planes, tried, found, photos, aligner, progress)
+    found = _assigned(tried, planes, photos, progress, first=False, aligner=aligner)
     every = [*tried, *(s for s in segments if not s.large)]
     found = continued(every, [*found, *[None] * (len(every) - len(tried))], planes, photos)
     found = [
@@ -124,7 +125,7 @@ def fill_plain_parts(
         "stereo: %d planes through plain parts, %.0f %% of the pixels",
         len(planes), 100.0 * whole / sum(m.depth.size for m in depth_maps),
     )  # fmt: skip
-    borrowed = _plain(tried, photos)
+    borrowed = _numbered(tried, photos) > 0
     behind = filled.behind()
     return [
         filled.applied(depth_map, view, borrowed, behind)
@@ -145,13 +146,30 @@ def _proposals(
 
 def _assigned(
     segments: Sequence[Segment], planes: Sequence[Plane], photos: PackedPhotos,
-    progress: Progress, *, first: bool,
+    progress: Progress, *, first: bool, aligner: Aligner | None = None,
 ) -> list[Assignment | None]:  # fmt: skip
+    """Return the planes of each segment, with an aligner only where the texture allows them."""
     found = []
     for segment in segments:
         progress.check()
-        found.append(assigned(segment, planes, photos, first=first))
+
+        def is_false(assignment: Assignment, segment: Segment = segment) -> bool:
+            parts = _parts(segment, assignment, planes, photos)
+            return aligner is not None and any(aligner.contradicts(*part) for part in parts)
+
+        found.append(assigned(segment, planes, photos, first=first, is_false=is_false))
     return found
+
+
+def _parts(
+    segment: Segment, assignment: Assignment, planes: Sequence[Plane], photos: PackedPhotos
+) -> list[tuple[Plane, Part]]:
+    """Return each plane of a segment with the pixels on it."""
+    owners = assignment.owners(on_planes(assignment, planes, photos, segment))
+    return [
+        (planes[number], Part(segment.view, segment.pixels[owners == place]))
+        for place, number in enumerate(assignment.planes)
+    ]
 
 
 def _fitted(
@@ -223,31 +241,31 @@ def _tilted_alike(
 
 def _aligned(
     planes: Sequence[Plane], segments: Sequence[Segment], found: Sequence[Assignment | None],
-    photos: PackedPhotos, plain: np.ndarray, random: np.random.Generator, progress: Progress,
+    photos: PackedPhotos, aligner: Aligner, progress: Progress,
 ) -> list[Plane]:  # fmt: skip
     """Return the planes where the texture of their segments matches; those of no surface go."""
-    aligner = Aligner(photos, plain, random)
     result = []
     for number, plane in enumerate(planes):
         progress.check()
-        parts = []
-        for segment, assignment in zip(segments, found, strict=True):
-            if assignment is None or number not in assignment.planes:
-                continue
-            owners = assignment.owners(on_planes(assignment, planes, photos, segment))
-            own = owners == assignment.planes.index(number)
-            parts.append(Part(segment.view, segment.pixels[own]))
+        parts = [
+            _parts(segment, assignment, planes, photos)[assignment.planes.index(number)][1]
+            for segment, assignment in zip(segments, found, strict=True)
+            if assignment is not None and number in assignment.planes
+        ]
         moved = aligner.aligned(plane, parts)
         if moved is not None:
             result.append(moved)
     return pooled(result, fit=False)
 
 
-def _plain(segments: Sequence[Segment], photos: PackedPhotos) -> np.ndarray:
-    plain = np.zeros(photos.depths.shape, bool)
+def _numbered(segments: Sequence[Segment], photos: PackedPhotos) -> np.ndarray:
+    """Return (n, h, w) int32 numbers of the segments of each photo from 1, 0 elsewhere."""
+    numbers = np.zeros(photos.depths.shape, np.int32)
+    count = np.zeros(len(numbers), np.int32)
     for segment in segments:
-        plain[segment.view, segment.rows, segment.columns] = True
-    return plain
+        count[segment.view] += 1
+        numbers[segment.view, segment.rows, segment.columns] = count[segment.view]
+    return numbers
 
 
 class _Filled:

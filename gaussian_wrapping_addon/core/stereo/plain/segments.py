@@ -12,11 +12,15 @@ from scipy import ndimage
 
 from ..depth_maps import DepthMap
 from ..planar_prior import points_in_view
+from .noise import noise_levels, smoothed_step_noise
 
 STEP_LEVELS = 2.5
-"""Largest difference of grey levels of neighbours, smoothed, within a plain segment."""
+"""Largest difference of grey levels of neighbours, smoothed by the first of the widths below,
+within a plain segment; as much less as the width is larger, as a step of colours is."""
 
-SMOOTHING_PX = 0.7
+SMOOTHING_PX = (0.7, 1.0, 1.4, 2.0, 2.8)
+CLEAR_OF_NOISE = 4.5
+"""The first width is taken at which that difference is so many standard deviations of noise."""
 
 LEAST_SHARE = 0.0008
 """Of the pixels of a photo that a segment needs."""
@@ -82,18 +86,33 @@ def segments_of(depth_maps: Sequence[DepthMap], points: np.ndarray) -> list[Segm
 
 def plain_pixels(depth_map: DepthMap) -> np.ndarray:
     """Return (h, w) bool: no step of grey levels to a neighbour, and no mask excludes the pixel."""
-    smooth = ndimage.gaussian_filter(
-        depth_map.color.astype(np.float32), (SMOOTHING_PX, SMOOTHING_PX, 0)
-    )
-    plain = np.ones(smooth.shape[:2], bool)
-    flat = np.abs(np.diff(smooth, axis=0)).max(-1) <= STEP_LEVELS
-    plain[:-1] &= flat
-    plain[1:] &= flat
-    flat = np.abs(np.diff(smooth, axis=1)).max(-1) <= STEP_LEVELS
-    plain[:, :-1] &= flat
-    plain[:, 1:] &= flat
+    color = depth_map.color.astype(np.float32)
+    plain = _without_steps(color, SMOOTHING_PX[-1])
+    noise = noise_levels(list(np.moveaxis(color, -1, 0)), [plain] * color.shape[-1])
+    for width in SMOOTHING_PX:
+        if _step_levels(width) >= CLEAR_OF_NOISE * smoothed_step_noise(noise, width):
+            break
+    plain = _without_steps(color, width)
     if depth_map.mask is not None:
         plain &= depth_map.mask
+    return plain
+
+
+def _step_levels(smoothing_px: float) -> float:
+    return STEP_LEVELS * SMOOTHING_PX[0] / smoothing_px
+
+
+def _without_steps(color: np.ndarray, smoothing_px: float) -> np.ndarray:
+    """Return (h, w) bool: pixels without a step to a neighbour in smoothed colours (h, w, 3)."""
+    smooth = ndimage.gaussian_filter(color, (smoothing_px, smoothing_px, 0))
+    most = _step_levels(smoothing_px)
+    plain = np.ones(smooth.shape[:2], bool)
+    flat = np.abs(np.diff(smooth, axis=0)).max(-1) <= most
+    plain[:-1] &= flat
+    plain[1:] &= flat
+    flat = np.abs(np.diff(smooth, axis=1)).max(-1) <= most
+    plain[:, :-1] &= flat
+    plain[:, 1:] &= flat
     return plain
 
 

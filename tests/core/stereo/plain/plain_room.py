@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -101,6 +102,17 @@ def depth_map(camera: Camera, gain: float = 1.0) -> DepthMap:
 def depth_maps() -> tuple[DepthMap, ...]:
     """Return the depth maps of all photos."""
     return tuple(depth_map(camera) for camera in cameras())
+
+
+def noisy_maps(noise: float) -> list[DepthMap]:
+    """Return the depth maps with noise of a standard deviation, grey levels, in the photos."""
+    random = np.random.default_rng(11)
+    found = []
+    for clean in depth_maps():
+        color = clean.color + noise * random.normal(size=clean.color.shape)
+        color = np.clip(np.rint(color), 0, 255).astype(np.uint8)
+        found.append(dataclasses.replace(clean, color=color))
+    return found
 
 
 @functools.cache

@@ -7,16 +7,19 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from gaussian_wrapping_addon.core.stereo.plain.alignment import Aligner, Part
 from gaussian_wrapping_addon.core.stereo.plain.evidence import packed
 from gaussian_wrapping_addon.core.stereo.plain.segments import plain_pixels
 from tests.core.stereo.plain.plain_room import (
+    FAINT_LEVELS,
     WALL,
     WALL_Y,
     cameras,
     depth_maps,
     near,
+    noisy_maps,
     traced,
 )
 from tests.core.stereo.plain.test_planes import wall_plane
@@ -24,15 +27,17 @@ from tests.core.stereo.plain.test_planes import wall_plane
 
 def aligner_of(maps) -> Aligner:
     photos = packed(maps, np.random.default_rng(0))
-    plain = np.stack([plain_pixels(found) for found in maps])
-    return Aligner(photos, plain, np.random.default_rng(0))
+    segments = np.stack([ndimage.label(plain_pixels(found))[0] for found in maps])
+    return Aligner(photos, segments, np.random.default_rng(0))
 
 
-def wall_parts() -> list[Part]:
+def wall_parts(plain: np.ndarray | None = None) -> list[Part]:
+    """Return the pixels of the wall in each photo, or those of them that are plain."""
     parts = []
     for view, camera in enumerate(cameras()):
         part = traced(camera)[1]
-        row, column = np.nonzero((part == WALL) & ~near(part != WALL, 4))
+        inner = (part == WALL) & ~near(part != WALL, 4)
+        row, column = np.nonzero(inner if plain is None else inner & plain[view])
         parts.append(Part(view, np.stack([column, row], 1).astype(float)))
     return parts
 
@@ -54,14 +59,54 @@ def test_a_plane_far_from_the_surface_is_none() -> None:
     assert aligner_of(depth_maps()).aligned(start, wall_parts()) is None
 
 
-def test_without_texture_a_plane_stays() -> None:
+@pytest.mark.parametrize("noise", [1.5, 3.0, 5.0])
+def test_noise_makes_no_true_plane_false(noise: float) -> None:
+    """Texture of 1.2 levels correlates hardly at all beneath noise of 3, pixel by pixel."""
+    aligner = aligner_of(noisy_maps(noise))
+    parts = wall_parts(aligner.plain)
+    found = aligner.aligned(wall_plane(), parts)
+    assert found is not None
+    corners = np.array([[-1.5, WALL_Y, 0.3], [1.5, WALL_Y, 0.3], [1.5, WALL_Y, 2.0]])
+    assert np.abs(corners @ found.normal - found.offset).max() < 0.02 * WALL_Y
+
+
+@pytest.mark.parametrize("noise", [1.5, 3.0])
+def test_noise_makes_no_false_plane_true(noise: float) -> None:
+    aligner = aligner_of(noisy_maps(noise))
+    false = wall_plane().moved(np.array([0.0, 1.0, 0.0]), 0.6 * WALL_Y)
+    assert aligner.aligned(false, wall_parts(aligner.plain)) is None
+
+
+def test_parts_on_a_false_plane_are_contradicted() -> None:
+    aligner, false = aligner_of(depth_maps()), wall_plane(0.6 * WALL_Y)
+    parts = wall_parts()
+    assert not any(aligner.contradicts(wall_plane(), part) for part in parts)
+    assert sum(aligner.contradicts(false, part) for part in parts) >= len(parts) - 1
+    few = Part(0, parts[0].pixels[:50])
+    assert not aligner.contradicts(false, few)
+
+
+def test_a_sky_beside_the_wall_is_not_its_texture() -> None:
+    aligner = aligner_of(depth_maps())
+    for view, camera in enumerate(cameras()):
+        part = traced(camera)[1]
+        for texture in aligner.textures:
+            values = texture[view][(part == WALL) & aligner.plain[view]]
+            assert np.abs(values).max() < 3.0 * FAINT_LEVELS
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.5, 3.0])
+def test_without_texture_a_plane_stays(noise: float) -> None:
     maps = []
-    for found in depth_maps():
+    for found, random in zip(noisy_maps(noise), np.random.default_rng(2).spawn(99), strict=False):
         color = found.color.copy()
-        color[traced(found.camera)[1] == WALL] = (140, 136, 130)
+        wall = traced(found.camera)[1] == WALL
+        levels = np.array([140, 136, 130]) + noise * random.normal(size=(int(wall.sum()), 3))
+        color[wall] = np.rint(levels).astype(np.uint8)
         maps.append(dataclasses.replace(found, color=color))
     start = wall_plane(WALL_Y + 0.05)
-    assert aligner_of(maps).aligned(start, wall_parts()) is start
+    aligner = aligner_of(maps)
+    assert aligner.aligned(start, wall_parts(aligner.plain)) is start
 
 
 def test_small_parts_do_not_move_a_plane() -> None:

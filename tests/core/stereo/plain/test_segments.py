@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 
 from gaussian_wrapping_addon.core.stereo.plain.segments import (
     INSIDE_WEIGHT,
@@ -19,6 +20,7 @@ from tests.core.stereo.plain.plain_room import (
     cameras,
     depth_maps,
     near,
+    noisy_maps,
     sparse_points,
     traced,
 )
@@ -30,6 +32,17 @@ def test_wall_and_sky_are_plain_and_texture_is_not() -> None:
         plain = plain_pixels(found)
         for number in (WALL, SKY):
             assert plain[(part == number) & ~near(part != number, 3)].all()
+        textured = (part != WALL) & (part != SKY)
+        assert plain[textured].mean() < 0.5
+
+
+@pytest.mark.parametrize("noise", [1.5, 3.0, 5.0])
+def test_noise_neither_breaks_the_wall_nor_makes_texture_plain(noise: float) -> None:
+    for camera, found in zip(cameras(), noisy_maps(noise), strict=True):
+        part = traced(camera)[1]
+        plain = plain_pixels(found)
+        inner = (part == WALL) & ~near(part != WALL, 7)
+        assert plain[inner].mean() > 0.98
         textured = (part != WALL) & (part != SKY)
         assert plain[textured].mean() < 0.5
 
